@@ -47,7 +47,7 @@ options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "  Options: TASK=arrow_puzzle PRESET=quick AGENTS='dqn oracle' SEEDS='0 1' BUDGETS='100 200'; any other in ARGS='--device cuda'."
-	@echo "  'imagine-bench list' names tasks, presets and agents; 'imagine-bench bench --help' the options."
+	@echo "  'imagine-bench describe' names tasks, presets and agents; 'imagine-bench bench --help' the options."
 
 ready:
 	@.ci/setup.sh $(VENV)
@@ -70,13 +70,13 @@ verify: ready  ## Play every test episode of the newest bench again and say whet
 	@$(BIN)/imagine-bench verify $(options)
 
 why: ready  ## Give every failed test episode of the newest bench the one cause that it has
-	@$(BIN)/imagine-bench why $(options)
+	@$(BIN)/imagine-bench verify --causes $(options)
 
 study: ready  ## Change one factor of the comparison on TASK at a time, on tuning seeds
-	@$(BIN)/imagine-bench study $(options)
+	@$(BIN)/imagine-bench sweep $(options)
 
-suite: ready  ## Run the ladder of experiments, each of which turns one dial; EXPERIMENT=memory runs one
-	@$(BIN)/imagine-bench suite $(options)
+suite: ready  ## Run the ladder of experiments, each of which changes one world parameter; EXPERIMENT=memory runs one
+	@$(BIN)/imagine-bench sweep $(options)
 
 view: ready  ## Open the newest recording in the Rerun viewer
 	@$(BIN)/imagine-bench view $(options)
@@ -91,7 +91,7 @@ encoder: ready  ## Train an encoder for TASK anew and say how it compares to the
 	@$(BIN)/imagine-bench encoder $(options)
 
 film: ready  ## Film an episode of TASK as a GIF
-	@$(BIN)/imagine-bench film $(options)
+	@$(BIN)/imagine-bench play --film $(options)
 
 doctor: ready  ## Say what this machine has, and in words what is wrong with it
 	@$(BIN)/imagine-bench doctor
@@ -125,8 +125,8 @@ build: ready  ## Build the wheel into dist/ and use it in an empty folder
 lock:  ## Pin every package in .ci/requirements.lock after a change of pyproject.toml; ARGS=--upgrade takes the newest
 	@PATH="$$PATH:$(BIN)" uv pip compile -q pyproject.toml --extra dev --extra docs --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --no-annotate --no-emit-package torch --config-file .ci/lock.toml --custom-compile-command 'make lock' -o .ci/requirements.lock $(ARGS) >/dev/null
 
-speed: ready  ## Measure every speed and fidelity figure that has a target
-	@OMP_NUM_THREADS=1 $(BIN)/imagine-bench speed $(options)
+speed: ready  ## Measure how fast everything is, as ratios to plain code in the same run
+	@OMP_NUM_THREADS=1 $(BIN)/python tests/measure/speed.py $(ARGS)
 
 clean:  ## Remove caches and build leftovers; results and .venv stay
 	@rm -rf build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis

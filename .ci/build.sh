@@ -14,7 +14,7 @@ for guest in agents/guests/*/; do
 done
 PYTHON="$top/$venv/bin/python" .ci/setup.sh "$empty/venv" "$top"/dist/*.whl
 mkdir "$empty/folder" && cd "$empty/folder"
-"$empty/venv/bin/imagine-bench" list >/dev/null
+"$empty/venv/bin/imagine-bench" describe >/dev/null
 "$empty/venv/bin/imagine-bench" doctor
 "$empty/venv/bin/imagine-bench" bench --task arrow_puzzle --preset smoke --agents random dqn oracle q_learning
 ls "$top"/dist/*

@@ -20,6 +20,7 @@ from . import snapshot
 from .dqn_settings import HYPERPARAMETERS, MORE_UPDATES, ControllerSettings, DQNSettings, GreedySettings
 from .encoders.perception import Perception, load_perception, prepare_torch
 from .meters import Meters
+from .networks.adam import Adam
 from .networks.mlp import mlp
 from .replay import Batch, RealMemory, Transitions
 from .settings import Hyperparameters, flatten
@@ -60,7 +61,7 @@ class Controller(nn.Module):
         self.network = self.target = network or mlp((latent_size, *settings.hidden, n_actions), generator)
         if settings.target_rate < 1.0:
             self.target = copy.deepcopy(self.network).requires_grad_(False)
-        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=settings.learning_rate, fused=True)
+        self.optimiser = Adam([(self.network.parameters(), 0.0)], settings.learning_rate)
 
     @torch.no_grad()
     def values(self, z: Tensor) -> Tensor:

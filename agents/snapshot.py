@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState
 
+from .networks.adam import MOMENTS, Adam
+
 Arrays = dict[str, NDArray[Any]]
-_MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
@@ -29,24 +30,26 @@ def below(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     return {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
 
 
-def training_arrays(module: nn.Module, optimiser: torch.optim.Adam) -> Arrays:
+def training_arrays(module: nn.Module, optimiser: Adam | torch.optim.Optimizer) -> Arrays:
     """Copies of a module's weights and, of those that learn, of Adam's moments and steps, 0 before the first step."""
     tensors: dict[str, Tensor] = {}
     for name, weight in module.named_parameters():
         tensors[f"{name}/weight"] = weight.detach()
         if weight.requires_grad:
-            blank = {**dict.fromkeys(_MOMENTS, torch.zeros_like(weight)), "step": torch.zeros(())}
+            blank = {**dict.fromkeys(MOMENTS, torch.zeros_like(weight)), "step": torch.zeros(())}
             tensors |= {f"{name}/{kind}": optimiser.state[weight].get(kind, blank[kind]) for kind in blank}
     return {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
 
 
 @torch.no_grad()
-def load_training(module: nn.Module, optimiser: torch.optim.Adam, arrays: Mapping[str, NDArray[Any]]) -> None:
+def load_training(
+    module: nn.Module, optimiser: Adam | torch.optim.Optimizer, arrays: Mapping[str, NDArray[Any]]
+) -> None:
     """Take up the result of :func:`training_arrays`."""
     for name, weight in module.named_parameters():
         weight.copy_(torch.tensor(arrays[f"{name}/weight"]))
         if weight.requires_grad:
-            kinds = (*_MOMENTS, "step")
+            kinds = (*MOMENTS, "step")
             optimiser.state[weight] = {k: torch.tensor(arrays[f"{name}/{k}"], device=weight.device) for k in kinds}
 
 

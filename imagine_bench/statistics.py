@@ -3,7 +3,7 @@
 The score of an agent is the interquartile mean over seeds (Agarwal et al., "Deep RL at the edge of the statistical
 precipice", 2021): the middle half, so that one seed that is stuck does not decide. Of three seeds that is their mean.
 Intervals and tests are Student's on trimmed means (Tukey and McLaughlin 1963; Yuen 1974), which keep their promise from
-three seeds on; ``imagine-bench coverage`` measures that on the scores kept in docs/results. Percentile bootstraps do
+three seeds on; ``tests/measure/coverage.py`` measures that on the scores kept in docs/results. Percentile bootstraps do
 not: of three seeds theirs cover 73 %.
 """
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, Rules
 from imagine_bench.rules import require_macrostates, states_of
 
-from .dials.gesture import HIDDEN
-from .rendering import Renderer
+from .parameters.gesture import HIDDEN
+from .rendering.cameras import FRAME_PX, agent_camera
+from .rendering.renderer import Renderer
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
-from .scenes.cameras import FRAME_PX, agent_camera
 from .world import World
 
 MakeWorld = Callable[[Appearance], World]

@@ -10,30 +10,31 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
-from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, State, TaskSpec
 from imagine_bench.rules import states_of
 
-from .dials.gesture import hides
-from .dials.lag import Lag
 from .frames import frames_of
-from .motion.executor import MacroResult, finish
-from .motion.executor import Motion as Acting
-from .observations import Observer
-from .rendering import Renderer, image_size
+from .motion.executor import MacroResult
+from .observations import Observed, Observer
+from .parameters.gesture import hides
+from .parameters.lag import Lag
+from .rendering.cameras import FRAME_PX, agent_camera, human_camera_view
+from .rendering.renderer import Renderer, image_size
+from .rendering.window import HAS_PYGAME, Window
 from .scene_reader import FilmedScene
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
-from .scenes.cameras import FRAME_PX, agent_camera, human_camera_view
 from .scenes.constants import HUMAN_CAMERA
-from .window import HAS_PYGAME, Window
 from .world import World, WorldState
 
+_BUILT = PhysicsSettings()
 _WINDOW_HZ = 25.0  # images a second of a window
+Info = dict[str, Any]
+"""What Gymnasium calls info: numpy scalars and arrays, and sentences."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +50,10 @@ class EnvState:
     people: tuple[NDArray[np.float64], NDArray[np.float64]] = field(repr=False)
     steps: int = 0
     #: what lag keeps back: observations, and what they show
-    under_way: tuple[tuple[Any, ...], ...] = field(default=((), ()), repr=False)
+    under_way: tuple[tuple[Observed, ...], tuple[State, ...]] = field(default=((), ()), repr=False)
 
 
-class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
+class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
     """Macro-actions on a real scene, seen by the wrist camera.
 
     Action Space: ``Discrete(A)``, the macro-actions in the order of ``TaskSpec.action_names``.
@@ -96,9 +97,17 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
     # Gymnasium's own declaration, whose checker opens a window for "human".
     metadata = {"render_modes": ["rgb_array", "human"][: 1 + HAS_PYGAME], "render_fps": 1}  # noqa: RUF012
     KEYWORDS = (
-        "execution", "appearance", "render_mode", "width", "height", "camera", "physics", "motion_hz", "observation",
+        "execution",
+        "appearance",
+        "render_mode",
+        "width",
+        "height",
+        "camera",
+        "physics",
+        "motion_hz",
+        "observation",
         "size",
-    )  # fmt: skip
+    )
     """The keyword arguments of its constructor."""
 
     def __init__(
@@ -112,7 +121,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         width: int = 640,
         height: int = 480,
         camera: str = HUMAN_CAMERA,
-        physics: PhysicsSettings | Mapping[str, Any] = PhysicsSettings(),  # noqa: B008 - frozen
+        physics: PhysicsSettings | Mapping[str, float | str] = _BUILT,
         motion_hz: float = 0.0,
         observation: str = "frame",
         size: int = FRAME_PX,
@@ -120,17 +129,24 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         modes = ("rgb_array", "human")
         self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
         self._execution = require_known("execution", execution, EXECUTIONS)
-        self._id, self._rules, self.preprocessing = spec.id, spec.rules, spec.preprocessing
-        self._starts, self.horizon = spec.rules.start_states, spec.horizon
-        self._sight, self._steps = spec.sight, 0
-        self._lag, self._shown_lag = self._lags = [Lag(spec.sight.lag if spec.sight else 0) for _ in range(2)]
+        self._id = spec.id
+        self._rules = spec.rules
+        self.preprocessing = spec.preprocessing
+        self._starts = spec.rules.start_states
+        self.horizon = spec.horizon
+        self._sight = spec.sight
+        self._steps = 0
+        lag = spec.sight.lag if spec.sight else 0
+        self._lag = Lag[Observed](lag)
+        self._shown_lag = Lag[State](lag)
         self._known = frozenset(states_of(spec.rules))
         settings = PhysicsSettings.of(physics)
         level = appearance_level(appearance)
         self._window = Window(spec.title) if self.render_mode == "human" else None
         FilmedScene.__init__(self, make_world(level), motion_hz or (_WINDOW_HZ if self._window else 0.0))
         self.world.set_physics(settings)
-        self._make_world, self._begun = make_world, False
+        self._make_world = make_world
+        self._begun = False
         self._kind = (spec.id, self._execution, level.name, settings)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._all_actions = np.ones(spec.n_actions, dtype=np.bool_)
@@ -141,7 +157,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
         """Start an episode.
 
         Args:
@@ -156,30 +172,34 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         self._show()
         return self.observe([self])[0], info
 
-    def restart(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
+    def restart(self, *, seed: int | None = None, options: Info | None = None) -> Info:
         """As :meth:`reset`, without an observation."""
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
-        self._begun, self._latest, self._steps, self._lag.kept, self._shown_lag.kept = True, None, 0, (), ()
+        self._begun = True
+        self._latest = None
+        self._steps = 0
+        self._lag.kept = ()
+        self._shown_lag.kept = ()
         self.world.place(start, self.np_random)
         self._vary()
         reading = self.world.read()
         self._reach(reading.macrostate)
         return self._info(success=False, legal=self._rules.is_legal(reading.macrostate), fault=reading.problem)
 
-    def step(self, action: np.int64 | int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64 | int) -> tuple[Observed, float, bool, bool, Info]:
         """Carry out one macro-action; also out of a terminal macrostate, as the rules continue there.
 
         Raises:
             InvalidValueError: No such action, or no episode was begun.
             DivergedError: The simulation blew up; the episode is over.
         """
-        reward, terminated, info = finish(self.acting(action))
+        reward, terminated, info = self.act(action)
         self._show()
         return self.observe([self])[0], reward, terminated, False, info
 
-    def acting(self, action: np.int64 | int) -> Acting[tuple[float, bool, dict[str, Any]]]:
-        """As :meth:`step`, by whoever runs the simulations it yields, and without an observation.
+    def act(self, action: np.int64 | int) -> tuple[float, bool, Info]:
+        """As :meth:`step`, without an observation. Nothing is drawn, so any thread may call it.
 
         Returns:
             Reward, whether the episode has terminated, and info.
@@ -197,7 +217,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         fault = None
         if self._execution == "physics":
             self._people = self._mocap()
-            self._latest = yield from self.world.acting(chosen, intended.macrostate, self.capture_motion_hz)
+            self._latest = self.world.execute(chosen, intended.macrostate, self.capture_motion_hz)
             fault = self._latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
@@ -222,16 +242,12 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         """Whether there is an episode to go on with."""
         return self._begun
 
-    def observe(self, envs: Sequence[MacroEnv]) -> list[Any]:
+    def observe(self, envs: Sequence[MacroEnv]) -> list[Observed]:
         """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
         now = self._observer.observe([(env._observer, env.world.shown(env._macrostate)) for env in envs])
         return [env._lag.deliver(observation) for env, observation in zip(envs, now, strict=True)]
 
-    def share(self, envs: Sequence[MacroEnv]) -> Callable[[mujoco.MjData], None]:
-        """Have a second process draw for :meth:`observe`, as :meth:`.Observer.share` says."""
-        return self._observer.share([env._observer for env in envs])
-
-    def diverged(self, error: DivergedError) -> dict[str, Any]:
+    def diverged(self, error: DivergedError) -> Info:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
         self._latest = None
         return self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=str(error))
@@ -247,9 +263,9 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
     def close(self) -> None:
         """Free the OpenGL contexts and close the window; may be called again."""
         renderers = self._agent_camera, self._render_camera, self._human_camera
-        open_ones: list[Any] = [each for each in (self._window, self._observer, *renderers) if each is not None]
-        for each in open_ones:
-            each.close()
+        for each in (self._window, self._observer, *renderers):
+            if each is not None:
+                each.close()
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
@@ -258,10 +274,16 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
     def get_state(self) -> EnvState:
         """All that decides how the episode goes on, copied; of a wrapper, such as a time limit, it knows nothing."""
         return EnvState(
-            kind=self._kind, world=self.world.get_state(), generator=copy.deepcopy(self.np_random.bit_generator.state),
-            macrostate=self._macrostate, begun=self._begun, latest=self._latest, people=self._people,
-            steps=self._steps, under_way=tuple(lag.kept for lag in self._lags),
-        )  # fmt: skip
+            kind=self._kind,
+            world=self.world.get_state(),
+            generator=copy.deepcopy(self.np_random.bit_generator.state),
+            macrostate=self._macrostate,
+            begun=self._begun,
+            latest=self._latest,
+            people=self._people,
+            steps=self._steps,
+            under_way=(self._lag.kept, self._shown_lag.kept),
+        )
 
     def set_state(self, state: EnvState) -> None:
         """Go on from where :meth:`get_state` was called, in this or another environment of the same kind, to the bit.
@@ -275,10 +297,12 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
             raise InvalidValueError(f"{brief(given)} is no state of {brief(self._kind)}; give one of {words}.")
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
-        self._macrostate, self._begun, self._latest, self._people = (
-            state.macrostate, state.begun, state.latest, state.people,
-        )  # fmt: skip
-        self._steps, (self._lag.kept, self._shown_lag.kept) = state.steps, state.under_way
+        self._macrostate = state.macrostate
+        self._begun = state.begun
+        self._latest = state.latest
+        self._people = state.people
+        self._steps = state.steps
+        self._lag.kept, self._shown_lag.kept = state.under_way
 
     def frame_of(self, macrostate: Sequence[int], rng: np.random.Generator | None = None) -> Frame:
         """The frame (64, 64, 3) that a macrostate would show, without going there: nothing changes here.
@@ -319,7 +343,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         self._macrostate = macrostate
         self._shown = self._shown_lag.deliver(self.world.shown(macrostate))
 
-    def _start(self, options: dict[str, Any]) -> tuple[int, ...]:
+    def _start(self, options: Info) -> tuple[int, ...]:
         if not isinstance(options, Mapping):
             raise InvalidValueError(
                 f"Reset options {brief(options)} are no mapping; give {{'macrostate': ...}} or nothing."
@@ -368,7 +392,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Any, np.int64]):
         chances = np.array([outcome.probability for outcome in outcomes])
         return outcomes[int(self.np_random.choice(len(outcomes), p=chances / chances.sum()))]
 
-    def _info(self, *, success: bool, legal: bool, fault: str | None) -> dict[str, Any]:
+    def _info(self, *, success: bool, legal: bool, fault: str | None) -> Info:
         latest = self._latest
         return {
             "macrostate": np.array(self._macrostate, dtype=np.int64),

@@ -7,19 +7,22 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Frame
 
-from .rendering import Renderer
+from .rendering.renderer import Renderer
 from .scene_reader import arm_columns, tcp_in_world
 from .scenes.arm import TCP_SITE
-from .second_process import SharedRenderer
 from .world import World
 
+Part = NDArray[np.uint8] | NDArray[np.float32]
+"""An image, or a vector."""
+Observed = Part | dict[str, Part]
+"""What is observed of one moment: one part, or several by name."""
+_Space = gymnasium.Space[Any]  # of one part, or of several
 _Camera = Callable[[str, int], Renderer]
 _Moment = tuple["Observer", tuple[int, ...]]
 _LOW = np.array([*[-2 * math.pi] * 7, -0.1, -0.1, *[-2.0] * 3, *[-1.0] * 4], dtype=np.float32)
@@ -56,20 +59,22 @@ class Observer:
         low, high = OBSERVATION_SIZES_PX
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not low <= size <= high:
             raise InvalidValueError(f"Observation size {brief(size)} must be an integer from {low} to {high} pixels.")
-        self._world, (self._arm_qpos, _, _) = world, arm_columns(world.model)
+        self._world = world
+        self._arm_qpos, _, _ = arm_columns(world.model)
         self._tcp = world.model.site(TCP_SITE).id
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
-        self._cameras: dict[str, Renderer | SharedRenderer] = {
-            name: camera(name, int(size)) for name in ("frame", "human") if name in names
-        }
+        self._cameras: dict[str, Renderer] = {}
+        for name in ("frame", "human"):
+            if name in names:
+                self._cameras[name] = camera(name, int(size))
         image = gymnasium.spaces.Box(0, 255, (int(size), int(size), 3), np.uint8)
         one_hot = gymnasium.spaces.Box(0.0, 1.0, (int(self._offsets[-1]),), np.float32)
         arm = gymnasium.spaces.Box(_LOW, -_LOW)
-        spaces: dict[str, gymnasium.Space[Any]] = {"frame": image, "human": image, "state": one_hot, "proprio": arm}
+        spaces: dict[str, _Space] = {"frame": image, "human": image, "state": one_hot, "proprio": arm}
         chosen = {name: spaces[name] for name in self._names}
-        self.space: gymnasium.Space[Any] = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
+        self.space: _Space = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
 
-    def observe(self, moments: Sequence[_Moment]) -> list[Any]:
+    def observe(self, moments: Sequence[_Moment]) -> Sequence[Observed]:
         """Worlds as they stand, each read as a macrostate, by observers like this one and drawn with its cameras."""
         scenes = [(observer._world.model, observer._world.data) for observer, _ in moments]
         images = {name: camera.frames(scenes) for name, camera in self._cameras.items()}
@@ -78,24 +83,12 @@ class Observer:
             return columns[self._names[0]]
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
-    def share(self, observers: Sequence[Observer]) -> Callable[[mujoco.MjData], None]:
-        """Have a second process draw frames of these, this one included; what is returned tells it what will be asked.
-
-        It takes the data of a world that stands as :meth:`observe` will find it.
-        """
-        camera = self._cameras.get("frame")
-        if not isinstance(camera, Renderer):
-            return lambda data: None
-        scenes = [(observer._world.model, observer._world.data) for observer in observers]
-        self._cameras["frame"] = shared = SharedRenderer(camera, scenes)
-        return shared.begin
-
     def close(self) -> None:
         """Free the OpenGL contexts; may be called again."""
         for camera in self._cameras.values():
             camera.close()
 
-    def _column(self, name: str, moments: Sequence[_Moment], images: list[Frame] | None) -> list[NDArray[Any]]:
+    def _column(self, name: str, moments: Sequence[_Moment], images: list[Frame] | None) -> Sequence[Part]:
         """One part of each moment."""
         if images is None:
             return [each._one_hot(state) if name == "state" else each._proprio() for each, state in moments]

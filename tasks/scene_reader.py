@@ -12,9 +12,9 @@ from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.interfaces import ArmMotion, Floats, Frame, Motion, Shape3D
 
 from .motion.executor import MacroResult
-from .rendering import Renderer, image_size
+from .rendering.cameras import DRAWN_GROUPS, agent_camera, human_camera_view
+from .rendering.renderer import Renderer, image_size
 from .scenes.arm import ARM_JOINTS, FINGER_JOINTS, TCP_SITE
-from .scenes.cameras import DRAWN_GROUPS, agent_camera, human_camera_view
 from .scenes.constants import HUMAN_CAMERA
 from .world import World
 
@@ -43,11 +43,11 @@ def shapes_of(model: mujoco.MjModel) -> tuple[Shape3D, ...]:
 
 def _shape(model: mujoco.MjModel, index: int) -> Shape3D:
     geom = model.geom(index)
-    geom_type, pose = (
-        mujoco.mjtGeom(model.geom_type[index]),
-        np.concatenate([model.geom_pos[index], model.geom_quat[index]]),
-    )
-    size, vertices, faces = np.zeros(3), None, None
+    geom_type = mujoco.mjtGeom(model.geom_type[index])
+    pose = np.concatenate([model.geom_pos[index], model.geom_quat[index]])
+    size = np.zeros(3)
+    vertices = None
+    faces = None
     if geom_type == mujoco.mjtGeom.mjGEOM_PLANE:
         kind = "box"
         size[:] = (*model.geom_size[index, :2], _PLANE_HALF_THICKNESS_M)
@@ -60,13 +60,20 @@ def _shape(model: mujoco.MjModel, index: int) -> Shape3D:
     material = int(model.geom_matid[index])
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[index]
     return Shape3D(
-        name=geom.name, body=model.body(int(model.geom_bodyid[index])).name, kind=kind, size=size,
-        pose_in_body=pose, rgba=np.array([*rgba[:3], 1.0]), vertices=vertices, faces=faces,
-    )  # fmt: skip
+        name=geom.name,
+        body=model.body(int(model.geom_bodyid[index])).name,
+        kind=kind,
+        size=size,
+        pose_in_body=pose,
+        rgba=np.array([*rgba[:3], 1.0]),
+        vertices=vertices,
+        faces=faces,
+    )
 
 
 def _mesh(model: mujoco.MjModel, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    vertex, face = int(model.mesh_vertadr[mesh]), int(model.mesh_faceadr[mesh])
+    vertex = int(model.mesh_vertadr[mesh])
+    face = int(model.mesh_faceadr[mesh])
     vertices = model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[mesh])]
     faces = model.mesh_face[face : face + int(model.mesh_facenum[mesh])]
     return vertices.astype(np.float64), faces.astype(np.int64)
@@ -80,20 +87,24 @@ def poses_of(
     ``qpos`` (K, nq) are positions at each time; mocap bodies, (nmocap, 3) and (nmocap, 4), stand still.
     """
     data = mujoco.MjData(model)
-    data.mocap_pos[:], data.mocap_quat[:] = mocap_pos, mocap_quat
+    data.mocap_pos[:] = mocap_pos
+    data.mocap_quat[:] = mocap_quat
     poses = np.empty((len(qpos), model.nbody, 7))
     for row, positions in enumerate(qpos):
         data.qpos[:] = positions
         mujoco.mj_kinematics(model, data)
-        poses[row, :, :3], poses[row, :, 3:] = data.xpos, data.xquat
+        poses[row, :, :3] = data.xpos
+        poses[row, :, 3:] = data.xquat
     return poses
 
 
 def arm_columns(model: mujoco.MjModel) -> tuple[list[int], list[int], list[int]]:
     """Where the seven joints, then the two fingers, are in positions, velocities and controls of a scene."""
     names = (*ARM_JOINTS, *FINGER_JOINTS)
-    joints, servos = [model.joint(name) for name in names], [f"{name.replace('_slide', '')}_servo" for name in names]
-    qpos, qvel = [int(joint.qposadr[0]) for joint in joints], [int(joint.dofadr[0]) for joint in joints]
+    joints = [model.joint(name) for name in names]
+    servos = [f"{name.replace('_slide', '')}_servo" for name in names]
+    qpos = [int(joint.qposadr[0]) for joint in joints]
+    qvel = [int(joint.dofadr[0]) for joint in joints]
     return qpos, qvel, [int(model.actuator(servo).id) for servo in servos]
 
 
@@ -110,7 +121,9 @@ def tcp_in_world(data: mujoco.MjData, tcp: int) -> Floats:
 
 def arm_motion_of(model: mujoco.MjModel, time_s: Floats, qpos: Floats, qvel: Floats, ctrl: Floats) -> ArmMotion:
     """The arm's part of a scene's motion: times (K,), positions (K, nq), velocities (K, nv) and commands (K, nu)."""
-    data, poses, tcp = mujoco.MjData(model), np.empty((len(qpos), 7)), model.site(TCP_SITE).id
+    data = mujoco.MjData(model)
+    poses = np.empty((len(qpos), 7))
+    tcp = model.site(TCP_SITE).id
     for row, positions in enumerate(qpos):
         data.qpos[:] = positions
         mujoco.mj_kinematics(model, data)
@@ -120,9 +133,14 @@ def arm_motion_of(model: mujoco.MjModel, time_s: Floats, qpos: Floats, qvel: Flo
         np.split(values, [len(ARM_JOINTS)], axis=1) for values in (qpos[:, at], qvel[:, moving], ctrl[:, told])
     )
     return ArmMotion(
-        time_s=time_s, joint_rad=joints, joint_rad_s=speeds, gripper_m=fingers,
-        joint_command_rad=commands, gripper_command_m=grips, tcp_in_world=poses,
-    )  # fmt: skip
+        time_s=time_s,
+        joint_rad=joints,
+        joint_rad_s=speeds,
+        gripper_m=fingers,
+        joint_command_rad=commands,
+        gripper_command_m=grips,
+        tcp_in_world=poses,
+    )
 
 
 class FilmedScene:
@@ -134,7 +152,8 @@ class FilmedScene:
     """
 
     def __init__(self, world: World, motion_hz: float) -> None:
-        self.world, self.capture_motion_hz = world, motion_hz
+        self.world = world
+        self.capture_motion_hz = motion_hz
         self._agent_camera = agent_camera(world.model)
         self._human_camera: Renderer | None = None
         self._latest: MacroResult | None = None
@@ -170,11 +189,13 @@ class FilmedScene:
 
         People stand still meanwhile; what they do when it is over is one sample more.
         """
-        latest, model, data = self._latest, self.world.model, self.world.data
-        standing = poses_of(model, data.qpos[None], *self._mocap())
-        if latest is None or not len(latest.time_s):
+        model = self.world.model
+        standing = poses_of(model, self.world.data.qpos[None], *self._mocap())
+        latest = self._captured()
+        if latest is None:
             return Motion(body_names=body_names(model), time_s=np.zeros(1), poses_in_world=standing)
-        time_s, poses = latest.time_s, poses_of(model, latest.qpos, *self._people)
+        time_s = latest.time_s
+        poses = poses_of(model, latest.qpos, *self._people)
         if not all(np.array_equal(*pair) for pair in zip(self._people, self._mocap(), strict=True)):
             time_s = np.append(time_s, time_s[-1] + _ANSWER_S)
             poses = np.concatenate([poses, standing])
@@ -182,8 +203,10 @@ class FilmedScene:
 
     def arm_motion(self) -> ArmMotion:
         """The arm during the latest macro-action as captured, else one sample of the standing scene."""
-        latest, model, data = self._latest, self.world.model, self.world.data
-        if latest is None or not len(latest.time_s):
+        model = self.world.model
+        data = self.world.data
+        latest = self._captured()
+        if latest is None:
             return arm_motion_of(model, np.zeros(1), data.qpos[None], data.qvel[None], data.ctrl[None].copy())
         return arm_motion_of(model, latest.time_s, latest.qpos, latest.qvel, latest.ctrl)
 
@@ -214,11 +237,13 @@ class FilmedScene:
         Yields:
             Simulated seconds since the macro-action began. One sample, the standing scene, where none were captured.
         """
-        world, latest = self.world, self._latest
-        if latest is None or not len(latest.time_s):
+        world = self.world
+        latest = self._captured()
+        if latest is None:
             yield 0.0
             return
-        standing, people = world.data.qpos.copy(), self._mocap()
+        standing = world.data.qpos.copy()
+        people = self._mocap()
         try:
             world.data.mocap_pos[:], world.data.mocap_quat[:] = self._people
             for time_s, qpos in zip(latest.time_s.tolist(), latest.qpos, strict=True):
@@ -229,6 +254,11 @@ class FilmedScene:
             world.data.qpos[:] = standing
             world.data.mocap_pos[:], world.data.mocap_quat[:] = people
             world.update()
+
+    def _captured(self) -> MacroResult | None:
+        """The latest macro-action, if its motion was captured."""
+        latest = self._latest
+        return latest if latest is not None and len(latest.time_s) else None
 
     def _mocap(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import Floats
-from imagine_bench.interfaces.regression import SCORES, Dataset, Predict, RegressionSpec
+from imagine_bench.interfaces.regression import SCORES, Predict, RegressionData, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
 DOMAIN = (-30.0, 30.0)
@@ -62,7 +62,7 @@ def require_variant(variant: str) -> None:
     require_known("variant of toy_regression", variant, VARIANTS)
 
 
-def training(variant: str, rng: np.random.Generator) -> Dataset:
+def training(variant: str, rng: np.random.Generator) -> RegressionData:
     """The training data: 2000 points, or with the region decimated by 50, as many as are expected to remain.
 
     Counts inside and outside of the region are at their expectation, so that all datasets of a variant are as long.
@@ -76,17 +76,17 @@ def training(variant: str, rng: np.random.Generator) -> Dataset:
     return _with_targets(variant, np.concatenate([left, right, rng.uniform(*REGION, size=kept)]), rng)
 
 
-def testing(variant: str, rng: np.random.Generator, count: int) -> Dataset:
+def testing(variant: str, rng: np.random.Generator, count: int) -> RegressionData:
     """Points of the same process, uniform over the training domain: the region has its full share here."""
     if count < 1:
         raise InvalidValueError(f"{count} test points say nothing; ask for at least 1.")
     return _with_targets(variant, rng.uniform(*DOMAIN, size=count), rng)
 
 
-def _with_targets(variant: str, x: Floats, rng: np.random.Generator) -> Dataset:
+def _with_targets(variant: str, x: Floats, rng: np.random.Generator) -> RegressionData:
     chosen = rng.integers(3, size=len(x))
     y = branches(x)[np.arange(len(x)), chosen] + noise_sigma(variant, x) * rng.standard_normal(len(x))
-    return Dataset(inputs=x[:, None], targets=y[:, None])
+    return RegressionData(inputs=x[:, None], targets=y[:, None])
 
 
 def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
@@ -140,7 +140,4 @@ SPEC = RegressionSpec(
     error_name="distance to the nearest branch (standard deviations of the noise)",
     wrong_above=3.0,
     evaluate=evaluate,
-    sections="imagine_bench.regression.report_toy_regression:sections",
-    recorder="imagine_bench.recording.toy_regression:record",
-    reference=None,
 )

@@ -1,9 +1,8 @@
-"""Many environments at once: their macro-actions are planned one after another and simulated on all cores.
+"""Many environments at once: each lane's macro-action runs on a thread, and contact physics uses all cores.
 
-While one lane is planned, the contact physics of those before it runs on other threads, each lane's on its own data and
-for as long as its own motion takes. So the lanes are equal to single environments, bit for bit. One
-``mujoco.batch.Batch`` called for each distinct end gives the same bits as fast, but needs every lane's data twice.
-Kinematic lanes have nothing to simulate: a second process draws some of them.
+MuJoCo simulates without holding Python's lock, each lane on its own data, so the lanes are equal to single environments
+bit for bit. Kinematic lanes have nothing to simulate: they act one after another.
+One camera draws all lanes, in the thread that calls.
 """
 
 from __future__ import annotations
@@ -22,39 +21,47 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
+from imagine_bench.interfaces import Frame
 
-from .macro_env import MacroEnv
-from .motion.executor import Motion
+from .macro_env import Info, MacroEnv
+from .observations import Observed
 
-_WORTH_A_PROCESS = 4
-"""Kinematic lanes from which on a second process draws beside this one."""
 _MODES = {mode.value: mode for mode in AutoresetMode}
-_Step = tuple[float, bool, dict[str, Any]]
-Batch = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]
+Batch = tuple[Observed, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]
 
 
-@dataclass
+@dataclass(frozen=True)
+class _Step:
+    """What became of a lane's macro-action."""
+
+    reward: float
+    terminated: bool
+    info: Info
+    diverged: bool = False
+
+
+@dataclass(frozen=True)
 class _Acting:
     """A lane in the middle of a macro-action, or of the reset that takes its place."""
 
-    motion: Motion[_Step] | None  #: None for a reset
-    simulated: Future[None] | None = None  #: what the motion waits for
-    due_s: float = 0.0  #: when it ends, on the clock that all lanes share
-    step: _Step | None = None  #: what became of it
+    begun_s: float  #: when it began, on the clock that all lanes share
+    step: Future[_Step] | None  #: what becomes of it; None for a reset
 
-    def go_on(self, threads: ThreadPoolExecutor, timestep_s: float) -> None:
-        """Up to where the motion needs its next simulation, or to its end."""
-        assert self.motion is not None
-        try:
-            simulation = next(self.motion)
-        except StopIteration as end:
-            self.simulated, self.step = None, end.value
-        else:
-            self.due_s += timestep_s * len(simulation.control)
-            self.simulated = threads.submit(simulation.run)
+    def due_s(self) -> float:
+        """When it ends on that clock; waits until it has been simulated."""
+        if self.step is None:
+            return self.begun_s
+        return self.begun_s + float(self.step.result().info["sim_time_s"])
 
 
-class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
+def _act(env: MacroEnv, action: int) -> _Step:
+    try:
+        return _Step(*env.act(action))
+    except DivergedError as error:
+        return _Step(0.0, False, env.diverged(error), diverged=True)
+
+
+class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]):
     """Several environments of one task in step, or each at its own pace by :meth:`send` and :meth:`recv`.
 
     Spaces, info and seeds are those of ``gymnasium.vector.SyncVectorEnv``: lane i is seeded ``seed + i``, info holds
@@ -67,8 +74,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         autoreset_mode: ``"SameStep"`` (the observation after an end is the next episode's first, the last is
             ``final_obs`` in info), ``"NextStep"`` (the action after an end is ignored) or ``"Disabled"`` (whoever acts
             resets, by ``reset(options={"reset_mask": ...})``), or Gymnasium's enum.
-        threads: Simulations at once; one a core if None. From 2 on, a second process draws for four and more kinematic
-            lanes, as :mod:`.second_process` says.
+        threads: Macro-actions simulated at once; one a core if None.
 
     Raises:
         UnknownNameError: Another mode.
@@ -89,27 +95,29 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         for what, value in (("num_envs", len(lanes)), ("threads", threads)):
             if not isinstance(value, int) or value < 1:
                 raise InvalidValueError(f"{what} is {brief(value)}; give an integer from 1 on.")
-        self.envs, self.num_envs, self._horizon = tuple(lanes), len(lanes), max_episode_steps
+        self.envs = tuple(lanes)
+        self.num_envs = len(lanes)
+        self._horizon = max_episode_steps
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1, "autoreset_mode": self.autoreset_mode}
         mode = lanes[0].render_mode
         self.render_mode = None if mode is None else require_known("render mode", mode, ("rgb_array",))
-        self.single_observation_space, self.single_action_space = lanes[0].observation_space, lanes[0].action_space
+        self.single_observation_space = lanes[0].observation_space
+        self.single_action_space = lanes[0].action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._threads = ThreadPoolExecutor(threads, "simulation")
-        self._seen: list[Any] = [None] * self.num_envs
+        self._seen: list[Observed | None] = [None] * self.num_envs
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.ones(self.num_envs, dtype=np.bool_)
         self._acting: dict[int, _Acting] = {}
-        self._clock_s, self._timestep_s = 0.0, float(lanes[0].model.opt.timestep)
-        helped = lanes[0].execution == "kinematic" and threads > 1 and len(lanes) >= _WORTH_A_PROCESS
-        self._begin_to_draw = lanes[0].share(lanes) if helped else None
+        self._clock_s = 0.0
+        self._simulates = lanes[0].execution == "physics"
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
+    ) -> tuple[Observed, Info]:
         """Start an episode in every lane, whatever it was doing, or in those of ``options["reset_mask"]``.
 
         Args:
@@ -125,8 +133,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         seeds = self._seeds(seed)
         for lane in chosen:
             acting = self._acting.pop(lane, None)
-            if acting is not None and acting.simulated is not None:
-                acting.simulated.exception()  # its data is in use until then
+            if acting is not None and acting.step is not None:
+                acting.step.result()  # its data is in use until then
         infos = self._restart(chosen, seeds, options)
         return self._stacked(range(self.num_envs)), _columns(infos, self.num_envs)
 
@@ -139,11 +147,11 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         self.send(actions)
         return self._received(list(range(self.num_envs)))
 
-    def render(self) -> tuple[Any, ...] | None:
+    def render(self) -> tuple[Frame, ...] | None:
         """An image of each lane, or None without a render mode."""
         return None if self.render_mode is None else tuple(self.envs[0].rendered(self.envs))
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Free threads and OpenGL contexts."""
         del kwargs
         self._threads.shutdown()
@@ -174,12 +182,8 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         given = actions.tolist() if isinstance(actions, np.ndarray) else actions
         chosen = [self.envs[lane].checked(action) for lane, action in zip(lanes, given, strict=True)]
         for lane, action in zip(lanes, chosen, strict=True):
-            motion = None if self._over[lane] else self.envs[lane].acting(action)
-            self._acting[lane] = acting = _Acting(motion=motion, due_s=self._clock_s)
-            if motion is not None:
-                acting.go_on(self._threads, self._timestep_s)
-                if self._begin_to_draw is not None:
-                    self._begin_to_draw(self.envs[lane].data)
+            step = None if self._over[lane] else self._begin(self.envs[lane], action)
+            self._acting[lane] = _Acting(self._clock_s, step)
 
     def recv(self, n: int | None = None) -> Batch:
         """What became of the ``n`` lanes, or all, that end first.
@@ -193,8 +197,9 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         n = len(self._acting) if n is None else n
         if not 1 <= n <= len(self._acting):
             raise InvalidValueError(f"{brief(n)} lanes cannot be received: {len(self._acting)} are acting.")
-        first = sorted(self._acting, key=lambda lane: self._acting[lane].due_s)[:n]
-        self._clock_s = max(self._acting[lane].due_s for lane in first)
+        due_s = {lane: acting.due_s() for lane, acting in self._acting.items()}
+        first = sorted(due_s, key=due_s.__getitem__)[:n]
+        self._clock_s = max(due_s[lane] for lane in first)
         batch = self._received(first)
         infos = _rows(batch[-1], first)
         infos["env_id"] = np.array(first)
@@ -203,16 +208,24 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
     # --- details -------------------------------------------------------------------------------------------------
 
     def _received(self, lanes: list[int]) -> Batch:
-        """Observations, rewards and ends of these lanes in this order; infos of all, masked."""
-        rewards, ends = np.zeros(len(lanes)), np.zeros((2, len(lanes)), dtype=np.bool_)
-        infos: dict[int, dict[str, Any]] = {}
+        """Observeds, rewards and ends of these lanes in this order; infos of all, masked."""
+        rewards = np.zeros(len(lanes))
+        terminated = np.zeros(len(lanes), dtype=np.bool_)
+        truncated = np.zeros(len(lanes), dtype=np.bool_)
+        infos: dict[int, Info] = {}
         for row, lane in enumerate(lanes):
             acting = self._acting.pop(lane)
-            if acting.motion is not None:
-                rewards[row], ends[0, row], ends[1, row], infos[lane] = self._conclude(lane, acting)
-        self._over[lanes] = ends.any(axis=0)
+            if acting.step is not None:
+                step = acting.step.result()
+                self._elapsed[lane] += 1
+                rewards[row] = step.reward
+                terminated[row] = step.terminated
+                out_of_time = self._horizon is not None and self._elapsed[lane] >= self._horizon
+                truncated[row] = step.diverged or out_of_time
+                infos[lane] = step.info
+        self._over[lanes] = terminated | truncated
         acted = [lane for lane in infos if self.envs[lane].begun]  # not those that diverged
-        collected: dict[str, Any] = {}
+        collected: Info = {}
         again = [lane for lane in lanes if lane not in infos]
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             again = [lane for lane in lanes if self._over[lane]]
@@ -222,30 +235,24 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         acted = [lane for lane in acted if lane not in again]
         infos.update(self._restart(again, [None] * self.num_envs, {}, also=acted))
         collected.update(_columns(infos, self.num_envs))
-        return self._stacked(lanes), rewards, ends[0], ends[1], collected
+        return self._stacked(lanes), rewards, terminated, truncated, collected
 
-    def _conclude(self, lane: int, acting: _Acting) -> tuple[float, bool, bool, dict[str, Any]]:
-        """Reward, terminated, truncated and info, when all has been simulated."""
-        self._elapsed[lane] += 1
-        try:
-            while acting.simulated is not None:
-                acting.simulated.result()
-                acting.go_on(self._threads, self._timestep_s)
-        except DivergedError as error:
-            return 0.0, False, True, self.envs[lane].diverged(error)
-        assert acting.step is not None
-        reward, terminated, info = acting.step
-        return reward, terminated, self._horizon is not None and self._elapsed[lane] >= self._horizon, info
+    def _begin(self, env: MacroEnv, action: int) -> Future[_Step]:
+        """Begin a macro-action on another thread; a kinematic one is done here and now."""
+        if self._simulates:
+            env.world.prepare()  # compiles, which only one thread may do at a time
+            return self._threads.submit(_act, env, action)
+        done = Future[_Step]()
+        done.set_result(_act(env, action))
+        return done
 
     def _restart(
-        self, lanes: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any], also: Sequence[int] = ()
-    ) -> dict[int, dict[str, Any]]:
+        self, lanes: Sequence[int], seeds: Sequence[int | None], options: Info, also: Sequence[int] = ()
+    ) -> dict[int, Info]:
         """Their infos; they and the lanes ``also`` are observed together, so that both processes draw until the end."""
         infos = {}
         for lane in lanes:
             infos[lane] = self.envs[lane].restart(seed=seeds[lane], options=options)
-            if self._begin_to_draw is not None:
-                self._begin_to_draw(self.envs[lane].data)
         self._elapsed[list(lanes)] = 0
         self._over[list(lanes)] = False
         self._look([*also, *lanes])
@@ -258,10 +265,12 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             for lane, observation in zip(lanes, seen, strict=True):
                 self._seen[lane] = observation
 
-    def _stacked(self, lanes: Sequence[int]) -> Any:
+    def _stacked(self, lanes: Sequence[int]) -> Observed:
         """The latest observations of these lanes, copied."""
-        out: Any = create_empty_array(self.single_observation_space, n=len(lanes))
-        return concatenate(self.single_observation_space, [self._seen[lane] for lane in lanes], out)
+        space = self.single_observation_space
+        empty: Any = create_empty_array(space, n=len(lanes))
+        stacked: Any = concatenate(space, [self._seen[lane] for lane in lanes], empty)
+        return stacked
 
     def _named(self, ids: Sequence[int] | None) -> list[int]:
         given = np.arange(self.num_envs) if ids is None else np.asarray(ids)
@@ -271,7 +280,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             raise InvalidValueError(f"Lanes {brief(ids)}: give different integers from 0 to {self.num_envs - 1}.")
         return lanes
 
-    def _masked(self, mask: Any) -> list[int]:
+    def _masked(self, mask: NDArray[np.bool_] | None) -> list[int]:
         if mask is None:
             return list(range(self.num_envs))
         mask = np.asarray(mask)
@@ -283,7 +292,7 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
             raise InvalidValueError("reset_mask leaves out lanes that were never reset; reset all lanes first.")
         return lanes
 
-    def _seeds(self, seed: Any) -> list[int | None]:
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None or isinstance(seed, (int, np.integer)):
             return [None if seed is None else int(seed) + lane for lane in range(self.num_envs)]
         if len(seed) != self.num_envs:
@@ -291,9 +300,10 @@ class MacroVectorEnv(VectorEnv[Any, NDArray[np.int64], NDArray[Any]]):
         return list(seed)
 
 
-def _columns(infos: dict[int, dict[str, Any]], n: int) -> dict[str, Any]:
+def _columns(infos: dict[int, Info], n: int) -> Info:
     """Infos of some lanes, alike, as arrays over all ``n`` with masks: as Gymnasium's ``_add_info``."""
-    lanes, columns = np.array(list(infos), dtype=np.int64), dict[str, Any]()
+    lanes = np.array(list(infos), dtype=np.int64)
+    columns = Info()
     mask = np.zeros(n, dtype=np.bool_)
     mask[lanes] = True
     for key, example in next(iter(infos.values()), {}).items():
@@ -311,7 +321,7 @@ def _columns(infos: dict[int, dict[str, Any]], n: int) -> dict[str, Any]:
     return columns
 
 
-def _rows(infos: dict[str, Any], lanes: list[int]) -> dict[str, Any]:
+def _rows(infos: Info, lanes: list[int]) -> Info:
     """Those lanes of arrays over all lanes."""
     return {key: _rows(value, lanes) if isinstance(value, dict) else value[lanes] for key, value in infos.items()}
 

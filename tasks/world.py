@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, PhysicsSettings
 
-from .dials.distractors import Distraction
-from .dials.gesture import HIDDEN
 from .motion import orientation
-from .motion.executor import MacroResult, Motion, at_rest, finish
+from .motion.executor import MacroExecutor, MacroResult, at_rest
 from .motion.sensing import Sensing
+from .parameters.distractors import Distraction
+from .parameters.gesture import HIDDEN
 from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA
@@ -64,13 +64,20 @@ class World(abc.ABC):
     """
 
     def __init__(
-        self, model: mujoco.MjModel, level: Appearance, *, objects: Mapping[str, str], materials: tuple[str, ...],
+        self,
+        model: mujoco.MjModel,
+        level: Appearance,
+        *,
+        objects: Mapping[str, str],
+        materials: tuple[str, ...],
         distractors: int = 0,
-    ) -> None:  # fmt: skip
-        self.model, self.data = model, mujoco.MjData(model)
+    ) -> None:
+        self.model = model
+        self.data = mujoco.MjData(model)
         self.sensing = Sensing()
         self._bodies = [model.body(body).id for body in objects]
-        self._level, self._names = level, tuple(objects.values())
+        self._level = level
+        self._names = tuple(objects.values())
         self._varies = level.varies_every_frame
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
         self._photographer = None if level.pool is None else Photographer(level)
@@ -87,7 +94,9 @@ class World(abc.ABC):
 
     def set_physics(self, settings: PhysicsSettings) -> None:
         """Change what decides whether a grasp holds; once, before the first macro-action."""
-        self.sensing.settings, model, built = settings, self.model, PhysicsSettings()
+        self.sensing.settings = settings
+        model = self.model
+        built = PhysicsSettings()
         if settings.pad_friction != built.pad_friction:
             tips = [index for index in range(model.ngeom) if TIP_IN_NAME in model.geom(index).name]
             model.geom_friction[tips, :2] *= settings.pad_friction / built.pad_friction
@@ -121,7 +130,8 @@ class World(abc.ABC):
     def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
         """Start anew, every object a little off its place as the appearance says; nothing from before remains."""
         mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:], self.data.ctrl[:] = self._rest_qpos, self._rest_ctrl
+        self.data.qpos[:] = self._rest_qpos
+        self.data.ctrl[:] = self._rest_ctrl
         *objects, gesture = macrostate
         for index, offset in enumerate(rng.uniform(-1.0, 1.0, (len(objects), 3)).tolist()):
             self._put(index, objects[index], offset)
@@ -166,7 +176,8 @@ class World(abc.ABC):
         self.update()
 
     def _patch(self, photographer: Photographer, rng: np.random.Generator, *, move_objects: bool) -> None:
-        (objects, _), gesture = self._objects(), self._read_gesture()
+        objects, _ = self._objects()
+        gesture = self._read_gesture()
         shot = photographer.draw(objects, self.shown((*objects, gesture))[-1], rng)  # light would tell what is hidden
         for index, (value, fragment) in enumerate(zip(objects, shot.objects, strict=True)):
             if move_objects:
@@ -185,17 +196,24 @@ class World(abc.ABC):
     def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
         """Kinematic execution: put the scene where a perfect ``action`` leads."""
 
+    @property
     @abc.abstractmethod
-    def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
-        """Physical execution; ``intended`` says what people in the scene do, never what the robot achieves."""
+    def executor(self) -> MacroExecutor:
+        """What carries macro-actions out in contact physics, made when it is first needed."""
 
+    def prepare(self) -> None:
+        """Make the executor, which otherwise the first execution makes."""
+        _ = self.executor
+
+    @abc.abstractmethod
     def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
-        """Physical execution, here and now.
+        """Physical execution: plan, simulate, and let people react.
+
+        ``intended`` says what people in the scene do, never what the robot achieves.
 
         Raises:
             DivergedError: The simulation blew up.
         """
-        return finish(self.acting(action, intended, capture_motion_hz))
 
     def read(self) -> Reading:
         """Read the macrostate back from where objects, gripper and hands are."""
@@ -231,7 +249,8 @@ class World(abc.ABC):
         return self._level.object_offset_m * x, self._level.object_offset_m * y, self._level.object_yaw_rad * yaw
 
     def _gesture(self, gesture: int, offset_m: Sequence[float] = (0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> None:
-        (x_m, y_m, z_m), turned = offset_m, orientation.about_vertical(yaw_rad)
+        x_m, y_m, z_m = offset_m
+        turned = orientation.about_vertical(yaw_rad)
         for mocap, place_m in self._hands_m(gesture).items():
             self.data.mocap_pos[mocap] = place_m[0] + x_m, place_m[1] + y_m, place_m[2] + z_m
             self.data.mocap_quat[mocap] = turned
@@ -251,7 +270,8 @@ class World(abc.ABC):
         if place != self._read_at:  # asked several times of one moment
             read = [self._read_object(index, pose) for index, pose in enumerate(self.object_poses().tolist())]
             problem = next((problem for _, problem in read if problem), None)
-            self._read_at, self._latest_objects = place, (tuple([value for value, _ in read]), problem)
+            self._read_at = place
+            self._latest_objects = (tuple([value for value, _ in read]), problem)
         return self._latest_objects
 
     def _tipped(self, index: int, pose: list[float]) -> str | None:

@@ -8,22 +8,21 @@ import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from typing import get_args
 
 import bench_fakes  # noqa: F401 - registers the fakes
 import pytest
+from small_runs import Inline
 
-from imagine_bench.cli import main
-from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.cli import Command, main
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 from imagine_bench.registry.entries import parse_settings
 from imagine_bench.running.launchers.jobs import LAUNCHERS
-from imagine_bench.running.launchers.local import LocalPool
 from imagine_bench.running.task_types import task_types
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.encoders import bundled
-from imagine_bench.studies.catalogue import STUDIES
-
-_HERE = Path(__file__).parent / "fakes"
+from imagine_bench.sweep.catalogue import GRIDS
 
 
 def bench_words(out: Path, *more: str) -> list[str]:
@@ -44,7 +43,7 @@ def bench_words(out: Path, *more: str) -> list[str]:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--task", "arrow_puzle"], "No task 'arrow_puzle'. Did you mean 'arrow_puzzle'? Known: arrow_puzzle, arrow_"),
+        (["--task=pick"], "Both arrow_puzzle and --task pick were given; leave one of them out."),
         (
             ["--preset", "quik"],
             "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full, ",
@@ -101,23 +100,28 @@ def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFix
         (["report", "a", "--merge"], "--merge has no value; give at least one behind it, or leave it out."),
         (["plan", str(tmp_path), "--max-epistemic", "nan"], "more epistemic uncertainty than nan: give at least 0."),
         (["plan", str(tmp_path), "--max-epistemic=-1"], "more epistemic uncertainty than -1.0: give at least 0."),
-        (
-            ["study", "--task", "toy_regression"],
-            "toy_regression is learned from data; a study compares agents that act",
-        ),
-        (["study", "--task", "toy"], "No task 'toy'."),
+        (["sweep", "toy_regression"], "toy_regression is learned from data; a study compares agents that act"),
+        (["sweep", "toy"], "No task 'toy'."),
+        (["sweep", "arrow_puzzle", "--name", "factor"], "No study 'factor'. Did you mean 'factors'?"),
+        (["sweep", "arrow_puzzle", "--name", "suite"], "ladder takes no --task; leave it out."),
+        (["sweep", "arrow_puzzle", "--experiment", "memory"], "factors takes no --experiment; leave it out."),
+        (["sweep", "--name", "smoke"], "smoke is a study of one task; give a task as the first word."),
+        (["sweep", "--experiment", "memry"], "No experiment 'memry'. Did you mean 'memory'?"),
+        (["bench", "arrow_puzzle", "--task", "pick_place"], "Both arrow_puzzle and --task pick_place were given"),
         *(
             ([command, "a", "--task", "arrow_puzzle"], "Both a and --task arrow_puzzle were given; leave one of them")
-            for command in ("report", "plan", "why", "view")
+            for command in ("report", "plan", "verify", "view")
         ),
         (["report", "--task", "pick", "--out", str(tmp_path)], "No task 'pick'. Did you mean 'pick_place'?"),
-        (["report", "--task", "robot_ik", "--out", str(tmp_path)], "There is no such bench below"),
+        (["report", "robot_ik", "--out", str(tmp_path)], "There is no such bench below"),
+        (["verify", "--causes", "--out", str(tmp_path)], "There is no such bench below"),
+        (["verify", "--encoder", "x"], "--encoder goes with --causes"),
         (["report", str(tmp_path)], "protocol.json, a bench's protocol."),
         (["view", "--out", str(tmp_path)], "There is no recording below"),
         (["view", str(tmp_path / "x.rrd")], "No recording"),
-        (["film", "--task", "arrow_puzzle", "--out", str(tmp_path / "film.mp4")], "does not end in .gif"),
-        (["speed", "--turns", "0"], "turns is 0; give at least 1"),
-        (["speed", "--out", str(tmp_path)], "is a folder; give the JSON file to write."),
+        (["play", "arrow_puzzle", "--film", "--out", str(tmp_path / "film.mp4")], "does not end in .gif"),
+        (["play", "--film"], "A film is of the oracle in a task"),
+        (["check", "--physics"], "Physics is measured of a task; give one."),
         (["encoder", "--task", "arow_puzzle"], "No task 'arow_puzzle'. Did you mean 'arrow_puzzle'?"),
         (
             ["encoder", "--task", "arrow_puzzle", "--out", "/dev/null/x"],
@@ -129,13 +133,44 @@ def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFix
         assert line.startswith("imagine-bench: ") and sentence in line
 
 
-def test_speed_without_gl_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def none() -> str:
-        raise SetupError("No OpenGL for headless rendering: install libegl1.")
+@pytest.mark.parametrize(
+    ("words", "now", "sentence"),
+    [
+        (["list"], "describe", None),
+        (["study", "--task", "arrow_puzzle", "--file", "x.toml"], "sweep --task arrow_puzzle --file x.toml", "x.toml"),
+        (["suite", "--experiment", "memry"], "sweep --experiment memry", "No experiment 'memry'"),
+        (["why", "nowhere"], "verify --causes nowhere", "nowhere"),
+        (["film", "--task", "arrow_puzzle", "--out", "x"], "play --film --task arrow_puzzle --out x", "end in .gif"),
+        (["margins", "--task", "none"], "check --physics --task none", "No task 'none'"),
+    ],
+)
+def test_a_former_command_runs_the_new_one(
+    words: list[str], now: str, sentence: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == (0 if sentence is None else 2)
+    first, *others = capsys.readouterr().err.splitlines()
+    assert first == f"imagine-bench: '{words[0]}' is now: imagine-bench {now}"
+    assert sentence is None or sentence in others[0]
 
-    monkeypatch.setattr("imagine_bench.tools.speed.gl_renderer", none)
-    assert main(["speed"]) == 2
-    assert capsys.readouterr() == ("", "imagine-bench: No OpenGL for headless rendering: install libegl1.\n")
+
+@pytest.mark.parametrize(("word", "line"), [("speed", "make speed"), ("coverage", "python tests/measure/coverage.py")])
+def test_a_command_that_went_names_the_line_to_type(word: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([word, "--turns", "5"]) == 2
+    assert f"In a checkout type: {line}." in capsys.readouterr().err
+    assert (Path(__file__).parents[1] / "tests/measure" / f"{word}.py").exists()
+
+
+def test_a_task_is_the_first_word_or_an_option(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (["bench", "--preset", "x"], ["judge"], ["sweep"], ["encoder"], ["describe"], ["dataset"], ["play"]):
+        said = set()
+        for task in (["nowhere"], ["--task", "nowhere"], ["--task=nowhere"]):
+            assert main([command[0], *task, *command[1:]]) == 2
+            said.add(capsys.readouterr().err)
+        assert len(said) == 1 and "No task 'nowhere'" in said.pop()
+
+
+def test_there_are_fourteen_commands() -> None:
+    assert len(get_args(Command)) == 14
 
 
 def test_the_program_itself_exits_without_a_traceback() -> None:
@@ -145,7 +180,7 @@ def test_the_program_itself_exits_without_a_traceback() -> None:
     assert done.stderr.startswith("imagine-bench: No task 'pick'.") and len(done.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize("word", ["--help", "list"])
+@pytest.mark.parametrize("word", ["--help", "describe"])
 def test_help_and_lists_load_nothing_heavy(word: str) -> None:
     probe = (
         f"import sys, runpy; sys.argv = ['imagine-bench', {word!r}]\n"
@@ -165,26 +200,33 @@ def test_settings_are_json_where_they_can_be() -> None:
         parse_settings(["a=1", "a=2"])
 
 
-def test_a_failing_seed_fails_the_command_and_names_its_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = bench_words(tmp_path, "--agents", "failing", "--seeds", "0", "1", "--budgets", "5", "--workers", "1")
-    command = [sys.executable, str(_HERE / "bench_fakes.py"), *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
+@pytest.fixture
+def inline(monkeypatch: pytest.MonkeyPatch) -> Inline:
+    """Runs of the command in this process, in the order in which the fixture notes them."""
+    launcher = Inline()
+    monkeypatch.setattr("imagine_bench.cli.options.launcher", lambda *_: launcher)
+    return launcher
+
+
+def test_a_failing_seed_fails_the_command_and_names_its_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline
+) -> None:
+    assert main(bench_words(tmp_path, "--agents", "failing", "--seeds", "0", "1", "--budgets", "5")) == 1
     folder = newest_bench(tmp_path)
-    assert done.stderr.splitlines()[-2:] == [
+    assert capsys.readouterr().err.splitlines()[-2:] == [
         "imagine-bench: 1 of 2 runs failed; the same command tries them again and keeps the others.",
-        f"  failing seed 1: RuntimeError: this agent breaks on purpose Log: {folder}/failing/seed_1/log.txt",
+        f"  failing seed 1: this agent breaks on purpose Log: {folder}/failing/seed_1/log.txt",
     ]
-    assert "Traceback" not in done.stderr
+    assert len(inline.order) == 2
     assert (folder / "failing/seed_0/DONE").exists() and not (folder / "failing/seed_1/DONE").exists()
     assert main(["report", str(folder)]) == 0
     assert "Missing are failing seed 1: 0 of 5" in capsys.readouterr().out, "what is missing is never left out"
 
 
 def test_a_bench_ends_with_a_table_a_report_and_recordings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline
 ) -> None:
-    words = bench_words(tmp_path, "--agents", "random", "oracle", "--evaluation-episodes", "10", "--workers", "1")
+    words = bench_words(tmp_path, "--agents", "random", "oracle", "--evaluation-episodes", "10")
     assert main(words) == 0
     said = capsys.readouterr()
     assert "oracle" in said.out and "100.0" in said.out
@@ -193,22 +235,18 @@ def test_a_bench_ends_with_a_table_a_report_and_recordings(
     assert (folder / "report" / "index.html").stat().st_size > 10_000
     assert len(list(folder.glob("*/seed_0/recording.rrd"))) == 2
     assert json.loads((folder / "environment.json").read_text())["versions"]["mujoco"].startswith("3.17")
-
-    def launch(*_: object) -> None:
-        raise AssertionError("a finished bench was run again")
-
-    monkeypatch.setattr(LocalPool, "launch", launch)
     assert main(words) == 0
+    assert len(inline.order) == 2, "a finished bench is not run again"
     assert capsys.readouterr().out.splitlines()[-4:] == said.out.splitlines()[-4:]
 
 
 def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["list"]) == 0
+    assert main(["describe"]) == 0
     out = capsys.readouterr().out
     words = set(re.split(r"[\s,]+", out))
     for kind in task_types().values():
         assert words >= {*kind.tasks(), *kind.learners(), *kind.presets}
-    assert words >= {*STUDIES, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *bundled()}
+    assert words >= {*GRIDS, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *bundled()}
     assert words >= {"arrow_puzzle_hard", "imagination_uncertainty", "mc_dropout", "thesis", "arrow_puzzle-mild"}
 
 
@@ -218,7 +256,7 @@ def test_the_program_says_which_version_it_is(capsys: pytest.CaptureFixture[str]
 
 
 def test_who_stops_reading_gets_no_traceback() -> None:
-    command = [sys.executable, "-m", "imagine_bench", "list"]
+    command = [sys.executable, "-m", "imagine_bench", "describe"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stderr is not None
         process.stdout.close()
@@ -248,7 +286,7 @@ def test_the_home_folder_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.chdir(tmp_path)
     for words in (["--out", "~/x"], ["--out=~/x"]):
         assert main(["report", *words]) == 2
-        assert main(["film", "--task", "none", *words]) == 2
+        assert main(["play", "none", "--film", *words]) == 2
     assert main(["bench", "--task", "toy_regression", "--preset", "smoke", "--agents", "none", "--out", "~/x"]) == 2
     assert not (tmp_path / "~").exists()
 
@@ -259,7 +297,7 @@ def test_the_home_folder_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyP
     [(">/dev/full", "standard output cannot be read or written: the disk is full"), (">&-", "output is closed")],
 )
 def test_output_that_cannot_be_written_is_one_line(redirection: str, sentence: str) -> None:
-    line = f"{sys.executable} -m imagine_bench list {redirection}"
+    line = f"{sys.executable} -m imagine_bench describe {redirection}"
     done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
     assert done.returncode == 2 and sentence in done.stderr and len(done.stderr.splitlines()) == 1
 

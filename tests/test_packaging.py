@@ -72,6 +72,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 def test_the_wheel_holds_only_imagine_bench(wheel: list[str]) -> None:
     tops = {name.split("/")[0] for name in wheel}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"imagine_bench"}
+    of_guests = [f"imagine_bench/agents/guests/{guest}/pyproject.toml" for guest in ("controls", "peers")]
+    assert sorted(name for name in wheel if "guest" in name) == [*of_guests, "imagine_bench/registry/guests.py"]
 
 
 def test_the_wheel_holds_every_module_and_resource(wheel: list[str]) -> None:

@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from imagine_bench.errors import DivergedError
 
+from ..networks.adam import Adam
 from ..networks.mlp import Masks, MemberMLP, clip_unit_norms
 from ..networks.precision import hidden_dtype
 from ..networks.weight_samples import sample_outputs
@@ -108,7 +109,7 @@ class WorldModel(nn.Module):
         self.head = RewardTerminationHead(latent_size, n_actions, settings, generator)
         self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.head.networks)
         self.clipped: tuple[nn.Module, ...] = self.networks
-        self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
+        self.optimiser = Adam([(self.parameters(), 0.0)], settings.learning_rate)
         self._one_hot = torch.eye(n_actions, device=generator.device)
 
     def losses(self, batch: Batch, dropout: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:

@@ -18,6 +18,7 @@ from ..imagination.agent import ImaginingAgent, build
 from ..imagination.rollouts import Imagination
 from ..imagination.settings import Settings, WorldModelSettings
 from ..imagination.world_model import WorldModel
+from ..networks.adam import Adam
 from ..replay import Batch
 from .agent import RememberingAgent
 from .recurrence import Recurrence
@@ -33,7 +34,7 @@ class RecurrentWorldModel(WorldModel):
         super().__init__(state_size, n_actions, settings, generator, predicted=state_size - units)
         self.recurrence = Recurrence(self.predicted, n_actions, units, generator)
         self.clipped = (*self.networks, self.recurrence)
-        self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, fused=True)
+        self.optimiser = Adam([(self.parameters(), 0.0)], settings.learning_rate)
 
     def keep_dynamics_of(self, other: WorldModel) -> None:
         """Take over what another model of the same shape knows of where actions lead, and how it remembers."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,6 +18,7 @@ from imagine_bench.errors import DivergedError
 
 from ..imagination import mixture as mdn
 from ..imagination.mixture import Mixture
+from ..networks.adam import Adam
 from ..networks.mlp import MemberMLP, clip_member_gradients
 from ..networks.normed_mlp import NormedMLP
 from ..networks.precision import hidden_dtype
@@ -40,8 +40,7 @@ class BayesianMDN:
         self.network = NormedMLP(sizes, generators=generators, dropout=settings.dropout, precision=precision)
         hidden = [*self.network.weights[:-1], *self.network.biases[:-1]]
         output = [self.network.weights[-1], self.network.biases[-1]]
-        groups: list[dict[str, Any]] = [{"params": hidden, "weight_decay": settings.weight_decay}, {"params": output}]
-        self.optimiser = torch.optim.Adam(groups, lr=settings.learning_rate, fused=True)
+        self.optimiser = Adam([(hidden, settings.weight_decay), (output, 0.0)], settings.learning_rate)
 
     def mixture(self, outputs: Tensor) -> Mixture:
         """Network outputs (..., out) as mixtures."""

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentState, Floats
-from imagine_bench.interfaces.regression import Dataset, Mixtures, Prediction, RegressorContext
+from imagine_bench.interfaces.regression import Mixtures, Prediction, RegressionData, RegressorContext
 
 from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn
@@ -83,8 +83,7 @@ class MixtureRegressor:
         batches = 1 if self.settings.batch_size is None else -(-rows // self.settings.batch_size)
         owner = torch.arange(self.networks, device=self._device).repeat_interleave(self.settings.members)[:, None]
         for _ in range(epochs):
-            for group in self._model.optimiser.param_groups:
-                group["lr"] = self._rate()
+            self._model.optimiser.learning_rate = self._rate()
             orders = torch.stack(
                 [torch.randperm(rows, generator=g, device=self._device) for g in self._generators["batches"]]
             )
@@ -205,7 +204,7 @@ def _require_data(context: RegressorContext) -> None:
             raise InvalidValueError(f"Dataset {index} holds values that are not finite.")
 
 
-def _shapes(data: Dataset) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _shapes(data: RegressionData) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return np.shape(data.inputs), np.shape(data.targets)
 
 

@@ -91,11 +91,16 @@ _BATCH = Override(1000, "where there are more data: few epochs, more steps (all 
 _FALLING = Override(0.01, "a rate that stays leaves the mixtures blunt; the thesis names no schedule")
 _FORMAT = Override("auto", "CPU time; see docs/explanation/uncertainty_method.md for what it changes")
 
+_SMALLEST = "shows that every part works, within seconds"
 _SHORT = {
     "batch_size": _BATCH, "learning_rate": Override(3e-3, "fewer epochs want larger steps"), "precision": _FORMAT,
 }  # fmt: skip
 _SETS: dict[str, dict[str, Override]] = {
-    "minimal": {"epochs": Override(20, "shows that every part works, within a minute"), **_SHORT},
+    "minimal": {
+        "epochs": Override(20, _SMALLEST),
+        "weight_samples": Override(10, _SMALLEST),
+        **_SHORT,
+    },
     "fast": {"epochs": Override(600, "CPU time"), **_SHORT, "final_rate": _FALLING},
     "published": {"final_rate": _FALLING, "precision": _FORMAT},
 }

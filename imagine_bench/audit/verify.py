@@ -18,8 +18,7 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, brief
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report.page import report_page, texts
-from imagine_bench.running.counters import EvaluationCounts, Played
-from imagine_bench.running.evaluation import Env, replay
+from imagine_bench.running.evaluation import Env, EpisodeRecord, EvaluationCounts, replay
 from imagine_bench.running.progress import counted
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
@@ -93,13 +92,13 @@ class Replays:
 
     def __init__(self, env: Env, test_env: Env) -> None:
         self._env, self._test_env = env, test_env
-        self._known: dict[tuple[int, ...], tuple[Played, bool]] = {}
+        self._known: dict[tuple[int, ...], tuple[EpisodeRecord, bool]] = {}
 
     def start(self, seed: int) -> list[int]:
         """Where a training episode begins."""
         return replay(self._env, seed, [])[0].start
 
-    def test(self, seed: int, actions: list[int]) -> tuple[Played, bool]:
+    def test(self, seed: int, actions: list[int]) -> tuple[EpisodeRecord, bool]:
         """A test episode, and whether the actions are all of it."""
         key = (seed, *actions)
         if key not in self._known:

@@ -3,65 +3,40 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
-import unicodedata
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import tyro
 
-from imagine_bench.cli.analysis import Judge, Plan, Verify, Why
-from imagine_bench.cli.benches import Bench, List, Report, Study
-from imagine_bench.cli.data import Dataset
-from imagine_bench.cli.suite import Suite
-from imagine_bench.cli.tools import Check, Coverage, Describe, Doctor, Encoder, Film, Margins, New, Play, Speed, View
-from imagine_bench.errors import EXTRAS, ImagineBenchError, InvalidValueError, SetupError, brief, lacking, plain
+from imagine_bench.cli.analysis import Judge, Plan, Verify
+from imagine_bench.cli.benches import Bench, Report, Sweep
+from imagine_bench.cli.data import Dataset, Encoder
+from imagine_bench.cli.tools import Check, Describe, Doctor, New, Play, View
+from imagine_bench.cli.words import understood
+from imagine_bench.errors import EXTRAS, ImagineBenchError, SetupError, lacking, plain
 from imagine_bench.store.files import reason
 from imagine_bench.version import __version__
 
-_LONGEST_WORD = 1000
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
 Command = (
-    Bench
-    | Report
-    | Plan
-    | Judge
-    | Verify
-    | Why
-    | Study
-    | Suite
-    | Dataset
-    | View
-    | Encoder
-    | Film
-    | Play
-    | Speed
-    | Margins
-    | Coverage
-    | Check
-    | Describe
-    | New
-    | Doctor
-    | List
+    Bench | Report | Judge | Verify | Plan | Sweep | Dataset | Encoder | View | Play | Describe | Check | New | Doctor
 )
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Carry out a command line and return its exit code: 0, 1 (a run or check failed), 2 (bad input), 130 (Ctrl-C)."""
-    given = sys.argv[1:] if words is None else list(words)
-    command: Any = None
+    command: Callable[[], None] | None = None
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; a window system's backend would fail only at the end
     if sys.stderr is None:
         sys.stderr = Path(os.devnull).open("w")
     try:
         if sys.stdout is None:
             raise SetupError("Standard output is closed; open it, or send it to a file or /dev/null.")
-        given = [_readable(word) for word in given]
+        given = understood(sys.argv[1:] if words is None else words)
         if given == ["--version"]:
             print(f"imagine-bench {__version__}")
             return 0
@@ -71,7 +46,7 @@ def main(words: Sequence[str] | None = None) -> int:
             description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs. "
             "--version says which this is.",
             args=given,
-            config=(tyro.conf.OmitArgPrefixes,),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
         command()
         sys.stdout.flush()
@@ -85,24 +60,14 @@ def main(words: Sequence[str] | None = None) -> int:
     except (ModuleNotFoundError, MemoryError, RecursionError, UnicodeError) as error:
         return _say(_words(error))
     except KeyboardInterrupt:
-        resumes = isinstance(command, Bench | Judge | Study | Suite)
+        resumes = isinstance(command, Bench | Judge | Sweep)
         then = "goes on from the last checkpoints" if resumes else "begins anew"
         return _say(f"interrupted; the same command {then}.", INTERRUPTED)
     return 0
 
 
-def _readable(word: str) -> str:
-    """A word of a command with ``~`` as the home folder, or InvalidValueError where no terminal could show it."""
-    if len(word) > _LONGEST_WORD or any(unicodedata.category(mark) in ("Cc", "Cs") for mark in word):
-        raise InvalidValueError(
-            f"The word {brief(word)} cannot be meant: give at most {_LONGEST_WORD:,} characters, none of them a "
-            "control character or outside Unicode."
-        )
-    return re.sub(r"^(--[a-z-]+=)?~(?=/|$)", lambda found: f"{found[1] or ''}{Path.home()}", word)
-
-
 def _words(error: Exception) -> object:
-    """What to say of an error of Python's own; one that nobody foresaw is raised again."""
+    """The words for an error of Python's own; an unforeseen missing module is raised again."""
     if not isinstance(error, ModuleNotFoundError):
         return f"{type(error).__name__}: {error}"
     if error.name not in EXTRAS:
@@ -111,7 +76,7 @@ def _words(error: Exception) -> object:
 
 
 def _say(error: object, exit_code: int = 2) -> int:
-    """Say what went wrong, and let nothing that is still to be written fail after that."""
+    """Print an error, and let nothing that is still to be written fail after that."""
     with suppress(OSError):
         print(f"imagine-bench: {plain(error)}", file=sys.stderr)
     try:

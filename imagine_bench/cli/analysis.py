@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from imagine_bench import registry
-from imagine_bench.cli.options import ANY, NEWEST, listed, shown
-from imagine_bench.errors import RunFailedError
+from imagine_bench.cli.options import FolderOrTask, MaybeEncoder, OfTask, TaskWord, listed, path_or_task, shown
+from imagine_bench.errors import InvalidValueError, RunFailedError
 from imagine_bench.interfaces import APPEARANCES
 
 
@@ -21,9 +19,9 @@ from imagine_bench.interfaces import APPEARANCES
 class Plan:
     """Imagine whole plans from one frame each and let the arm carry them out blindly; leaves figures, a recording."""
 
-    run: Annotated[Path | None, tyro.conf.Positional, NEWEST] = None
-    """The folder of a run, or of a bench, whose best imagining run is taken."""
-    task: Annotated[str | None, ANY] = None
+    run: FolderOrTask = None
+    """The folder of a run, or of a bench, whose best imagining run is taken; or a task whose newest bench is."""
+    task: OfTask = None
     """Task whose newest bench is taken."""
     count: int = 100
     """Plans."""
@@ -33,7 +31,7 @@ class Plan:
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     max_epistemic: Annotated[float | None, shown("FLOAT", "(default: the agent's own filter)")] = None
     """A plan with an imagined step of more epistemic uncertainty is refused."""
-    encoder: Annotated[str | None, shown("NAME|FILE", "(default: the run's, if bundled)")] = None
+    encoder: MaybeEncoder = None
     """The encoder the run saw through, where it is not bundled."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
@@ -43,11 +41,12 @@ class Plan:
         from imagine_bench.recording.plans import record_plans  # noqa: PLC0415 - Rerun, fonts and pillow load slowly
         from imagine_bench.report.plans import plan_report  # noqa: PLC0415 - as above
 
+        run, task = path_or_task(self.run, self.task)
         print(
             plan_report(
-                self.run,
+                run,
                 root=self.out,
-                task=self.task,
+                task=task,
                 count=self.count,
                 recorded=self.recorded,
                 record=record_plans,
@@ -62,10 +61,10 @@ class Plan:
 class Judge:
     """Judge world models, of this suite and of other packages, against the exact truth of a task's rules."""
 
-    task: str = "arrow_puzzle"
-    """Task whose world is imagined."""
+    task: TaskWord = "arrow_puzzle"
+    """Task whose world is imagined, also as --task TASK."""
     models: Annotated[tuple[str, ...] | None, listed("STR", "(default: all of this suite but slow ones)")] = None
-    """World models, as 'imagine-bench list' names them, or folders of a finished run or of all of an agent's."""
+    """World models, as 'imagine-bench describe' names them, or folders of a finished run or of all of an agent's."""
     sizes: Annotated[tuple[int, ...], listed("INT", "(default: 100 300 1000 3000 10000)")] = (
         100,
         300,
@@ -109,42 +108,36 @@ class Judge:
 
 @dataclass(frozen=True, kw_only=True)
 class Verify:
-    """Play every test episode of a bench again, and say in a line a run whether its tables follow from them."""
+    """Play every test episode of a bench again, and say in a line a run whether its tables follow from them.
 
-    folder: Annotated[Path | None, tyro.conf.Positional, NEWEST] = None
-    """A bench's folder."""
-    task: Annotated[str | None, ANY] = None
+    With --causes, every failed test episode gets the one cause that it has instead; the report then shows them.
+    """
+
+    folder: FolderOrTask = None
+    """A bench's folder, or a task whose newest bench is taken."""
+    task: OfTask = None
     """Task whose newest bench is taken."""
+    causes: bool = False
+    """Find the causes of failures: play, swap truth in for each part of the agent, report."""
+    encoder: MaybeEncoder = None
+    """With --causes: the encoder the runs saw through, where it is not bundled."""
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 
     def __call__(self) -> None:
         """Play and compare."""
-        from imagine_bench.audit.verify import price, verify  # noqa: PLC0415 - as above
+        from imagine_bench.audit import verify, why  # noqa: PLC0415 - as above
         from imagine_bench.report.analysis import chosen  # noqa: PLC0415 - as above
 
-        folder, begun_s = chosen(self.folder, self.out, self.task), time.process_time()
-        verdicts = verify(folder)
-        print(*verdicts, price(folder, verdicts, time.process_time() - begun_s), sep="\n")
+        given, task = path_or_task(self.folder, self.task)
+        if self.causes:
+            print(why.why_report(given, root=self.out, task=task, encoder=self.encoder))
+            return
+        if self.encoder is not None:
+            raise InvalidValueError("--encoder goes with --causes; replaying episodes needs none.")
+        folder = chosen(given, self.out, task)
+        begun_s = time.process_time()
+        verdicts = verify.verify(folder)
+        print(*verdicts, verify.price(folder, verdicts, time.process_time() - begun_s), sep="\n")
         if any(verdict.complaint for verdict in verdicts):
             sys.exit(1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Why:
-    """Give every failed test episode of a bench the one cause that it has; its report then shows them."""
-
-    folder: Annotated[Path | None, tyro.conf.Positional, NEWEST] = None
-    """A bench's folder."""
-    task: Annotated[str | None, ANY] = None
-    """Task whose newest bench is taken."""
-    encoder: Annotated[str | None, shown("NAME|FILE", "(default: the runs', if bundled)")] = None
-    """The encoder the runs saw through, where it is not bundled."""
-    out: Path = Path("runs")
-    """Folder of all benches, where the newest is looked for."""
-
-    def __call__(self) -> None:
-        """Play, swap truth in, report."""
-        from imagine_bench.audit.why import why_report  # noqa: PLC0415 - as above
-
-        print(why_report(self.folder, root=self.out, task=self.task, encoder=self.encoder))

@@ -130,7 +130,8 @@ def require_fits(dataset: Dataset, spec: TaskSpec, appearance: str) -> None:
     """
     task = None if dataset.card is None else dataset.card.get("task")
     if task not in (None, spec.id) or dataset.episodes.n_actions != spec.n_actions:
-        given, wanted = f"{dataset.episodes.n_actions} macro-actions", f"{spec.id}, which has {spec.n_actions}"
+        given = f"{dataset.episodes.n_actions} macro-actions"
+        wanted = f"{spec.id}, which has {spec.n_actions}"
         raise InvalidValueError(f"{dataset.folder} is of {task or 'a task'} with {given}; give one of {wanted}.")
     looks = appearance if dataset.card is None else dataset.card.get("appearance")
     if looks != appearance:

@@ -27,10 +27,15 @@ from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes
 from imagine_bench.store.files import make_folder, read_json, reading, write_json
 
-_VERSION, _INFO, _FINAL = "v3.0", "meta/info.json", "final_frames.parquet"
+_VERSION = "v3.0"
+_INFO = "meta/info.json"
+_FINAL = "final_frames.parquet"
 _PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-_IMAGE, _MASK, _EPISODE = "observation.image", "available", "episode_index"
-_ROWS, _FILES = 20_000, 1000
+_IMAGE = "observation.image"
+_MASK = "available"
+_EPISODE = "episode_index"
+_ROWS = 20_000
+_FILES = 1000
 """Rows of a file, at most 100 MB; files of a chunk."""
 _TYPES = {
     "action": "float32", "next.reward": "float64", "next.terminated": "bool", "next.truncated": "bool",
@@ -42,9 +47,13 @@ _TYPES = {
 
 def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
     """Write data, metadata and statistics of episodes; ``card`` has the task's ``description``."""
-    firsts, (before, last) = np.cumsum(episodes.lengths) - episodes.lengths, episodes.rows
-    columns, frames, masks = _columns(episodes, firsts), episodes.frames[before], episodes.action_masks.astype(np.bool_)
-    table, text = _table({**columns, _MASK: masks[before]}, frames), [str(card["description"])]
+    firsts = np.cumsum(episodes.lengths) - episodes.lengths
+    before, last = episodes.rows
+    columns = _columns(episodes, firsts)
+    frames = episodes.frames[before]
+    masks = episodes.action_masks.astype(np.bool_)
+    table = _table({**columns, _MASK: masks[before]}, frames)
+    text = [str(card["description"])]
     places = [divmod(file, _FILES) for file in (firsts // _ROWS).tolist()]
     spans = [slice(*span) for span in zip(firsts.tolist(), (firsts + episodes.lengths).tolist(), strict=True)]
     for place, there in itertools.groupby(zip(places, spans, strict=True), key=operator.itemgetter(0)):
@@ -67,7 +76,8 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
 
 def _columns(episodes: Episodes, firsts: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """The columns of one number a row, in the order of their types."""
-    which, index = np.repeat(np.arange(len(firsts)), episodes.lengths), np.arange(len(episodes.actions))
+    which = np.repeat(np.arange(len(firsts)), episodes.lengths)
+    index = np.arange(len(episodes.actions))
     done = episodes.terminated | episodes.truncated
     count = index - firsts[which]
     columns = (
@@ -126,7 +136,8 @@ def _statistics(columns: Mapping[str, NDArray[Any]], frames: Frame) -> dict[str,
 
 def _tasks(text: list[str]) -> pa.Table:
     """What pandas writes of a table whose index is the description and whose one column is ``task_index``."""
-    index, column = "__index_level_0__", {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+    index = "__index_level_0__"
+    column = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
     columns = [
         {**column, "name": "task_index", "field_name": "task_index"},
         {**column, "name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object"},
@@ -151,7 +162,8 @@ def _info(episodes: Episodes) -> dict[str, Any]:
 
 def read(path: Path) -> Episodes:
     """Read such a dataset from its ``info.json``. Raises ArtefactError: damaged, not whole, or not of our columns."""
-    info, folder = read_json(path, "the metadata of a LeRobot dataset"), path.parents[1]
+    info = read_json(path, "the metadata of a LeRobot dataset")
+    folder = path.parents[1]
     with reading(folder, f"a LeRobot dataset of macro-actions, version {_VERSION}"):
         if info["codebase_version"] != _VERSION:
             raise InvalidValueError(f"it is of version {info['codebase_version']}")

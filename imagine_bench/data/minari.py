@@ -30,7 +30,8 @@ _ROOT = "MINARI_DATASETS_PATH"
 def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
     """Write the dataset ``<task>-<policy>-v0``; the card says which environment it is of."""
     name = re.sub(r"[^\w-]+", "_", f"{card['task']}-{card['policy']}")
-    env_id, made = registry.task_entry(card["task"]).env_id, {name: card[name] for name in ("execution", "appearance")}
+    env_id = registry.task_entry(card["task"]).env_id
+    made = {name: card[name] for name in ("execution", "appearance")}
     with _below(folder), warnings.catch_warnings(), closing(gymnasium.make(env_id, **made)) as env:
         warnings.simplefilter("ignore")  # about what we do not know, such as whom to write to
         minari.create_dataset_from_buffers(

@@ -21,11 +21,15 @@ from imagine_bench.seeding import SeedTree
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Dataset:
+class RegressionData:
     """Pairs to learn from or to be tested on: inputs (N, X), targets (N, D)."""
 
     inputs: Floats
     targets: Floats
+
+
+Dataset = RegressionData
+"""The former name of :class:`RegressionData`, which other packages' tasks may use."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,7 +119,7 @@ class Regressor(Protocol):
 class RegressorContext:
     """What a regressor is built from."""
 
-    datasets: tuple[Dataset, ...]  #: one a network, all of the same size. Length E.
+    datasets: tuple[RegressionData, ...]  #: one a network, all of the same size. Length E.
     seeds: tuple[SeedTree, ...]  #: one node of the seed tree a network. Length E.
     hyperparameters: str = "fast"  #: name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``
     overrides: Mapping[str, Any] = field(default_factory=dict)  #: single settings that replace the set's
@@ -156,15 +160,16 @@ class RegressionSpec:
     variants: tuple[str, ...]  #: those of the thesis, in its order
     #: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
     require_variant: Callable[[str], None]
-    training: Callable[[str, np.random.Generator], Dataset]  #: data of a variant, drawn from a generator
+    training: Callable[[str, np.random.Generator], RegressionData]  #: data of a variant, drawn from a generator
     #: The given number of rows of the same process, never trained on.
-    testing: Callable[[str, np.random.Generator, int], Dataset]
+    testing: Callable[[str, np.random.Generator, int], RegressionData]
     #: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
     errors: Callable[[str, Floats, Floats], Floats]
     error_name: str  #: what ``errors`` gives, with its unit; above ``wrong_above`` a prediction counts as wrong
     wrong_above: float
     evaluate: Evaluate
-    sections: str  #: ``"module:attr"`` of the function that turns them into sections of the report
+    #: ``"module:attr"`` of the function that makes sections of the report of them; another package's task has one.
+    sections: str | None = None
     recorder: str | None = None  #: ``"module:attr"`` of the function that records them, or None
     scene: Callable[[], MovingScene] | None = None  #: gives the robot that carries out predictions, where there is one
     reference: str | None = None  #: name of the thesis' tables

@@ -33,7 +33,7 @@ class PhysicsSettings:
     """What decides whether a grasp holds. The defaults are the scene as it is built, to the bit.
 
     Errors of the planner are drawn from the environment's generator, anew for each macro-action and only where they
-    are not 0. How far each may go is measured by ``imagine-bench margins``.
+    are not 0. How far each may go is measured by ``imagine-bench check --physics``.
 
     Raises:
         InvalidValueError: A number out of its range in :data:`PHYSICS_RANGES`.
@@ -91,7 +91,7 @@ class RenderMacrostates(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class PerformanceTargets:
-    """What ``make speed`` holds a task in contact physics to."""
+    """What ``imagine-bench check TASK --physics`` holds a task in contact physics to."""
 
     objects: tuple[str, ...]  #: bodies of the loose objects; coordinate i of a macrostate is object i's
     as_ruled: float  #: least share of random macro-actions that end exactly as the rules say, at clean
@@ -130,7 +130,7 @@ class TaskSpec:
     #: what each protocol preset changes for this task: fields of the protocol by preset
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     success_threshold: float = 0.95  #: success rate, in (0, 1], at which the task counts as learned
-    #: what ``make speed`` measures it against; None for a task whose scene another one measures
+    #: what ``check --physics`` measures it against; None for a task whose scene another one measures
     targets: PerformanceTargets | None = None
     sight: Sight | None = None  #: what frames show; None: each the whole macrostate of its own moment
     executions: tuple[str, ...] = EXECUTIONS  #: how macro-actions can happen, the usual way first

@@ -20,7 +20,15 @@ from imagine_bench.interfaces import (
     TaskSpec,
     appearance_of_tests,
 )
-from imagine_bench.protocols.data import LATER, MOST, ProtocolData, require_ascending, require_different, require_seeds
+from imagine_bench.protocols.data import (
+    LATER,
+    MOST,
+    ProtocolData,
+    require_ascending,
+    require_between,
+    require_different,
+    require_seeds,
+)
 from imagine_bench.registry import agent_entry, task, task_entry
 from imagine_bench.registry import task_name as canonical
 from imagine_bench.registry.entries import entrant
@@ -33,33 +41,86 @@ _AFTER_EPISODES = 100
 _FIRST_STAGE = 2000
 """Real episodes to which all runs are taken first: the thesis' smallest budget, and below it waiting would not pay."""
 
-_NONE_ALLOWED = ("demonstrations", "queries", "open_loop_starts", "sampled_futures", "recorded_episodes")
-_LEAST = {"evaluation_episodes": 1, "after_episodes": 1, **dict.fromkeys(_NONE_ALLOWED, 0)}
+
+def _set(section: object, name: str, value: object) -> None:
+    """Replace a value of a frozen section by its one spelling."""
+    object.__setattr__(section, name, value)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Protocol(ProtocolData):
-    """A comparison of agents that act; see :class:`.ProtocolData` for what it shares with others."""
+class WorldSection:
+    """What the world is like, in training and in tests."""
+
+    execution: str = "physics"  #: ``"physics"`` or ``"kinematic"``
+    appearance: str = "clean"  #: As :func:`imagine_bench.appearance.appearance_name` gives it
+    #: What decides whether a grasp holds: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
+    #: (name, value) pairs.
+    physics: tuple[tuple[str, float | str], ...] = field(default=(), metadata=LATER)
+    #: What agents see: parts of :data:`.interfaces.OBSERVATIONS`, separated by commas.
+    observation: str = field(default=OBSERVATIONS[0], metadata=LATER)
+    observation_size: int = field(default=FRAME_PX, metadata=LATER)  #: Edge of its images in pixels
+    #: Training and tests start from different macrostates, ``"plan_length=2@<12 hex digits>"``: see :mod:`.splits`.
+    split: str | None = field(default=None, metadata=LATER)
+
+    def _check_world(self) -> None:
+        """Write each choice in one way. Raises InvalidValueError or UnknownNameError for a value out of range."""
+        require_known("execution", self.execution, EXECUTIONS)
+        _set(self, "appearance", appearance_name(self.appearance))
+        settings = dataclasses.asdict(PhysicsSettings.of(dict(self.physics)))
+        usual = dataclasses.asdict(PhysicsSettings())
+        changed = tuple(sorted((name, value) for name, value in settings.items() if value != usual[name]))
+        _set(self, "physics", changed)
+        if changed and self.execution == "kinematic":
+            raise InvalidValueError("Physics settings change nothing in kinematic execution; leave one of them out.")
+        parts = tuple(self.observation.split(","))
+        for part in parts:
+            require_known("observation", part, OBSERVATIONS)
+        require_different("observation", parts)
+        _set(self, "observation", ",".join(sorted(parts, key=OBSERVATIONS.index)))
+        low, high = OBSERVATION_SIZES_PX
+        if not low <= self.observation_size <= high:
+            raise InvalidValueError(f"observation_size is {brief(self.observation_size)}; give {low} to {high} pixels.")
+
+    @property
+    def shows_frames_alone(self) -> bool:
+        """Whether agents see 64 x 64 frames and nothing else."""
+        return (self.observation, self.observation_size) == (OBSERVATIONS[0], FRAME_PX)
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """What the environments of this protocol are made with, but for their appearance."""
+        made: dict[str, Any] = {"execution": self.execution}
+        if self.physics:
+            made["physics"] = dict(self.physics)
+        if not self.shows_frames_alone:
+            made["observation"] = self.observation
+            made["size"] = self.observation_size
+        return made
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnerSection:
+    """What learners are made of; see also ``overrides`` and ``device`` of :class:`.ProtocolData`."""
 
     config_group: str = "chapter_5"  #: config group of the agents' settings, as the task names it
     #: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
     hyperparameters: str = "fast"
-    agents: tuple[str, ...] = _ALL_AGENTS  #: Entrants: agents, also with settings of their own (:mod:`.entries`)
-    seeds: tuple[int, ...] = (0, 1, 2)
-    #: Real training episodes at which the agent is evaluated, ascending.
-    budgets: tuple[int, ...] = (100, 250, 500)
-    evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
-    execution: str = "physics"  #: ``"physics"`` or ``"kinematic"``
-    appearance: str = "clean"  #: As :func:`imagine_bench.appearance.appearance_name` gives it
-    #: Real frames from which open-loop imagination is compared with the rules at each budget.
-    open_loop_starts: int = 100
-    #: Futures that benches of before 2026-11-25 sampled; nothing reads it now.
-    sampled_futures: int = 0
-    recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
     #: The encoder's identity, ``"<name>@<12 hex digits of its content>"``; None if no agent needs one.
     encoder: str | None = None
     #: That of the encoder for the agents that see codes of parts; None if there is no such agent.
     codes: str | None = None
+
+    def encoder_of(self, kind: str) -> str | None:
+        """Return the identity of the encoder for the agents that take this kind."""
+        return self.codes if kind == "codes" else self.encoder
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetSection:
+    """What learners are given: real episodes, and help in them."""
+
+    #: Real training episodes at which the agent is evaluated, ascending.
+    budgets: tuple[int, ...] = (100, 250, 500)
     #: Tasks of the same world that learners are trained on before, in this order; what they know of the world is
     #: carried over, what is rewarded is learned anew. Budgets count episodes of ``task`` alone.
     after: tuple[str, ...] = ()
@@ -76,39 +137,18 @@ class Protocol(ProtocolData):
     feedback: float = field(default=0.0, metadata=LATER)
     #: Probability with which the teacher says the opposite, at most 0.5.
     feedback_error: float = field(default=0.0, metadata=LATER)
-    #: Appearance of the tests where it is another one than the training's.
-    test_appearance: str | None = field(default=None, metadata=LATER)
-    #: What decides whether a grasp holds: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
-    #: (name, value) pairs.
-    physics: tuple[tuple[str, Any], ...] = field(default=(), metadata=LATER)
-    #: What agents see: parts of :data:`.interfaces.OBSERVATIONS`, separated by commas.
-    observation: str = field(default=OBSERVATIONS[0], metadata=LATER)
-    observation_size: int = field(default=FRAME_PX, metadata=LATER)  #: Edge of its images in pixels
-    #: Training and tests start from different macrostates, ``"plan_length=2@<12 hex digits>"``: see :mod:`.splits`.
-    split: str | None = field(default=None, metadata=LATER)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
-        for name in ("appearance", "test_appearance"):
-            if (looks := getattr(self, name)) is not None:
-                object.__setattr__(self, name, appearance_name(looks))
-        require_known("execution", self.execution, EXECUTIONS)
-        require_known("device", self.device, DEVICES)
+    def _check_budget(self) -> None:
+        """Raise InvalidValueError for a value out of range, and for two that exclude each other."""
         require_ascending("budgets", self.budgets, at_least=1)
-        require_seeds(self.seeds)
-        require_different("agents", self.agents)
-        for name, least in _LEAST.items():
-            if not least <= (value := getattr(self, name)) <= MOST:
-                allowed = f"at least {least}" if value < least else f"at most {MOST:,}"
-                raise InvalidValueError(f"{name} is {brief(value)}; give {allowed}.")
+        require_between("after_episodes", self.after_episodes, at_least=1)
+        require_between("demonstrations", self.demonstrations, at_least=0)
+        require_between("queries", self.queries, at_least=0)
         if not 0.0 <= self.feedback <= MOST or not 0.0 <= self.feedback_error <= (0.5 if self.feedback else 0.0):
             raise InvalidValueError(
                 f"feedback is {brief(self.feedback)} and feedback_error {brief(self.feedback_error)}; give a reward of "
                 f"at least 0 and at most {MOST:,}, and with it a probability of at most 0.5."
             )
-        self._require_physics()
-        self._require_observation()
         if self.dataset is not None and self.demonstrations:
             raise InvalidValueError("Both a dataset and demonstrations would come first; give one of them.")
         if not self.after and self.after_episodes != _AFTER_EPISODES:
@@ -116,49 +156,68 @@ class Protocol(ProtocolData):
                 f"after_episodes is {self.after_episodes}, but no task comes before; give it in after."
             )
 
-    def work(self, agent: str, until: int | None = None) -> int:
-        """Episodes that a run of this agent plays as far as the budget ``until``, for training and for tests."""
-        budgets = [budget for budget in self.budgets if until is None or budget <= until]
-        tests = self.evaluation_episodes
-        return self.episodes_before + budgets[-1] + len(budgets) * tests if agent_entry(agent).learns else tests
+    @property
+    def episodes_before(self) -> int:
+        """Real training episodes on earlier tasks."""
+        return len(self.after) * self.after_episodes
 
-    def _require_physics(self) -> None:
-        """One way to write each setting; errors as of :class:`.PhysicsSettings`, and where nothing would feel them."""
-        settings = dataclasses.asdict(PhysicsSettings.of(dict(self.physics)))
-        usual = dataclasses.asdict(PhysicsSettings())
-        changed = tuple(sorted((name, value) for name, value in settings.items() if value != usual[name]))
-        object.__setattr__(self, "physics", changed)
-        if changed and self.execution == "kinematic":
-            raise InvalidValueError("Physics settings change nothing in kinematic execution; leave one of them out.")
 
-    def _require_observation(self) -> None:
-        """One way to write each choice; errors for an unknown part, one that is given twice, or a size out of range."""
-        parts = tuple(self.observation.split(","))
-        for part in parts:
-            require_known("observation", part, OBSERVATIONS)
-        require_different("observation", parts)
-        object.__setattr__(self, "observation", ",".join(sorted(parts, key=OBSERVATIONS.index)))
-        low, high = OBSERVATION_SIZES_PX
-        if not low <= self.observation_size <= high:
-            raise InvalidValueError(f"observation_size is {brief(self.observation_size)}; give {low} to {high} pixels.")
+@dataclass(frozen=True, kw_only=True)
+class EvaluationSection:
+    """How agents are tested, and what is measured and recorded beside."""
+
+    evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
+    #: Appearance of the tests where it is another one than the training's.
+    test_appearance: str | None = field(default=None, metadata=LATER)
+    #: Real frames from which open-loop imagination is compared with the rules at each budget.
+    open_loop_starts: int = 100
+    #: Futures that benches of before 2026-11-25 sampled; nothing reads it now.
+    sampled_futures: int = 0
+    recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
+
+    def _check_tests(self) -> None:
+        """Write the appearance in one way. Raises InvalidValueError for a value out of range."""
+        if self.test_appearance is not None:
+            _set(self, "test_appearance", appearance_name(self.test_appearance))
+        require_between("evaluation_episodes", self.evaluation_episodes, at_least=1)
+        require_between("open_loop_starts", self.open_loop_starts, at_least=0)
+        require_between("sampled_futures", self.sampled_futures, at_least=0)
+        require_between("recorded_episodes", self.recorded_episodes, at_least=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, ProtocolData):
+    """A comparison of agents that act, in four sections; see :class:`.ProtocolData` for what it shares with others.
+
+    A new option is a field of one section, checked there. Files and hashes have all fields side by side.
+    """
+
+    agents: tuple[str, ...] = _ALL_AGENTS  #: Entrants: agents, also with settings of their own (:mod:`.entries`)
+    seeds: tuple[int, ...] = (0, 1, 2)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _set(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
+        require_known("device", self.device, DEVICES)
+        require_seeds(self.seeds)
+        require_different("agents", self.agents)
+        self._check_world()
+        self._check_budget()
+        self._check_tests()
         if self.dataset is not None and not self.shows_frames_alone:
             raise InvalidValueError("A dataset holds 64 x 64 frames alone; leave the observation as it is by default.")
 
-    @property
-    def shows_frames_alone(self) -> bool:
-        """Whether agents see 64 x 64 frames and nothing else."""
-        return (self.observation, self.observation_size) == (OBSERVATIONS[0], FRAME_PX)
+    def work(self, agent: str, until: int | None = None) -> int:
+        """Return the episodes that a run of this agent plays up to the budget ``until``, for training and for tests."""
+        if not agent_entry(agent).learns:
+            return self.evaluation_episodes
+        budgets = [budget for budget in self.budgets if until is None or budget <= until]
+        return self.episodes_before + budgets[-1] + len(budgets) * self.evaluation_episodes
 
     @property
     def appearance_in_tests(self) -> str:
         """The appearance that tests have; of finitely many looks, those kept for tests."""
         return appearance_of_tests(self.test_appearance or self.appearance)
-
-    @property
-    def world(self) -> dict[str, Any]:
-        """What the environments of this protocol are made with, but for their appearance."""
-        seen = {} if self.shows_frames_alone else {"observation": self.observation, "size": self.observation_size}
-        return {"execution": self.execution, **({"physics": dict(self.physics)} if self.physics else {}), **seen}
 
     def spec(self, *, testing: bool) -> TaskSpec:
         """The task with the starts that training or tests have. Raises InvalidValueError: another split than here."""
@@ -175,18 +234,9 @@ class Protocol(ProtocolData):
         return ", ".join(words)
 
     @property
-    def episodes_before(self) -> int:
-        """Real training episodes on earlier tasks."""
-        return len(self.after) * self.after_episodes
-
-    @property
     def stages(self) -> tuple[int | None, ...]:
         """See :class:`ProtocolData`: the thesis' smallest budget, then each one after it."""
         return (*(budget for budget in self.budgets[:-1] if budget >= _FIRST_STAGE), None)
-
-    def encoder_of(self, kind: str) -> str | None:
-        """Identity of the encoder for the agents that take this kind."""
-        return self.codes if kind == "codes" else self.encoder
 
 
 def spec_of(name: str, split: str | None, *, testing: bool) -> TaskSpec:
@@ -285,7 +335,8 @@ def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
     for other in earlier:
         task_entry(other)
         for fact in ("encoder", "preprocessing", "action_names"):
-            here, there = getattr(task(name), fact), getattr(task(other), fact)
+            here = getattr(task(name), fact)
+            there = getattr(task(other), fact)
             if here != there:
                 raise InvalidValueError(
                     f"{name} cannot come after {other}: what is known of one world is of no use in another ({fact} is "

@@ -23,6 +23,11 @@ MOST = 10_000_000
 """Episodes, budgets and the like; a real robot lives to see a thousandth of it."""
 
 
+Scalar = bool | int | float | str | None
+Setting = Scalar | tuple[Scalar, ...] | list[Scalar] | dict[str, Scalar]
+"""The value of an agent's setting, as JSON has it."""
+
+
 def digest(values: Any) -> str:
     """Twelve hex digits that change when anything in JSON-like values does."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
@@ -39,7 +44,7 @@ class ProtocolData(ABC):
     #: are tested on starts that no reported run meets; the two kinds never mix.
     seeds: tuple[int, ...]
     #: Settings that replace those of the hyper-parameter set, as sorted (dotted name, value) pairs.
-    overrides: tuple[tuple[str, Any], ...] = ()
+    overrides: tuple[tuple[str, Setting], ...] = ()
     #: :func:`digest` of every setting of every learner: a hyper-parameter set may be another one tomorrow, and what was
     #: run with it is then another bench. Empty in a protocol that no plan made.
     settings_digest: str = ""
@@ -112,6 +117,13 @@ def require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> N
         raise InvalidValueError(
             f"{name} {brief(values)} must be one or more different integers of at least {at_least}{most}, ascending."
         )
+
+
+def require_between(name: str, value: int, *, at_least: int) -> None:
+    """Raise InvalidValueError unless a number is at least ``at_least`` and at most :data:`MOST`."""
+    if not at_least <= value <= MOST:
+        allowed = f"at least {at_least}" if value < at_least else f"at most {MOST:,}"
+        raise InvalidValueError(f"{name} is {brief(value)}; give {allowed}.")
 
 
 def require_different(name: str, values: tuple[str, ...]) -> None:

@@ -41,7 +41,8 @@ class RunSpec(Generic[P_co]):
 
     def context(self: RunSpec[Protocol]) -> AgentContext:
         """What the run's agent is built from."""
-        protocol, entry = self.protocol, registry.agent_entry(self.agent)
+        protocol = self.protocol
+        entry = registry.agent_entry(self.agent)
         task = registry.task(protocol.task)
         return AgentContext(
             n_actions=task.n_actions,

@@ -54,21 +54,30 @@ class _Group(NamedTuple):
     """A group of entry points."""
 
     what: str  #: one of it, in words
-    kind: str  #: ``"module:attr"`` of the class of its objects
+    kind: type  #: the class of its objects
     own: Callable[[], Iterable[str]]  #: gives the names that are this suite's
 
 
 _GROUPS = {
-    TASK_GROUP: _Group("task", f"{__name__}:TaskEntry", lambda: (*TASKS, *REGRESSIONS)),
-    AGENT_GROUP: _Group("agent", f"{__name__}:AgentEntry", lambda: (*AGENTS, *REGRESSORS)),
-    ENCODER_GROUP: _Group("encoder", f"{__name__}:EncoderEntry", tuple),
-    REGRESSION_GROUP: _Group("regression task", f"{__name__}:RegressionSpec", lambda: (*TASKS, *REGRESSIONS)),
-    REGRESSOR_GROUP: _Group("regressor", f"{__name__}:RegressorEntry", lambda: (*AGENTS, *REGRESSORS)),
-    STUDY_GROUP: _Group(
-        "study", "imagine_bench.studies.study:Study", lambda: load("imagine_bench.studies.catalogue:STUDIES")
-    ),
-    WORLD_MODEL_GROUP: _Group("world model", f"{__name__}:WorldModelEntry", lambda: WORLD_MODELS),
+    TASK_GROUP: _Group("task", TaskEntry, lambda: (*TASKS, *REGRESSIONS)),
+    AGENT_GROUP: _Group("agent", AgentEntry, lambda: (*AGENTS, *REGRESSORS)),
+    ENCODER_GROUP: _Group("encoder", EncoderEntry, tuple),
+    REGRESSION_GROUP: _Group("regression task", RegressionSpec, lambda: (*TASKS, *REGRESSIONS)),
+    REGRESSOR_GROUP: _Group("regressor", RegressorEntry, lambda: (*AGENTS, *REGRESSORS)),
+    WORLD_MODEL_GROUP: _Group("world model", WorldModelEntry, lambda: WORLD_MODELS),
 }
+
+
+def describe_group(group: str, *, what: str, kind: type, own: Iterable[str]) -> None:
+    """Say what packages offer in a group; a room above the registry says it of its own group when it is imported.
+
+    Args:
+        group: Name of the group of entry points.
+        what: One of its objects, in a word.
+        kind: The class of its objects.
+        own: The names that are this suite's.
+    """
+    _GROUPS[group] = _Group(what, kind, lambda: own)
 
 
 def load(target: str) -> Any:
@@ -132,7 +141,7 @@ def offers(group: str) -> Mapping[str, Any]:
     found: dict[str, Any] = {}
     for point in entry_points(group=group):
         what = _GROUPS[group].what
-        kind = load(_GROUPS[group].kind)
+        kind = _GROUPS[group].kind
         package = point.dist.name if point.dist else point.module
         offer = f"The package {package} offers {point.value} as {what} {point.name}"
         if point.name in found or point.name in _GROUPS[group].own():
@@ -183,7 +192,7 @@ def guest_packages() -> dict[str, frozenset[str]]:
     """
     found: dict[str, frozenset[str]] = {}
     everything = entry_points()
-    for point in (point for group in _GROUPS for point in everything.select(group=group)):
+    for point in (point for group in {*_GROUPS, STUDY_GROUP} for point in everything.select(group=group)):
         if point.dist:
             found[point.dist.name] = found.get(point.dist.name, frozenset()) | {point.module.partition(".")[0]}
     return dict(sorted(found.items()))
@@ -215,7 +224,9 @@ def _options(base: str, entry: TaskEntry, said: str) -> dict[str, Any]:
     """What is said after the colon, ``key=value,...`` or ``@`` and a JSON file, by option."""
     if not entry.world:
         raise InvalidValueError(f"Task {base} takes no options; leave out {brief(':' + said)}.")
-    kinds = {each.name: str(each.type) for each in dataclasses.fields(load(entry.world))}
+    world = load(entry.world)
+    kinds = {each.name: str(each.type) for each in dataclasses.fields(world)}
+    kinds |= {old: kinds[new] for new, old in getattr(world, "NAMED", {}).items()}
     given = read_mapping(Path(said[1:])) if said.startswith("@") else parse_options(said, kinds, f"task {base}:")
     for key in given:
         if key not in kinds:

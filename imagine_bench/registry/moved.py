@@ -18,6 +18,13 @@ MOVED = {
     "imagine_bench.entrants": "imagine_bench.registry.entries",
     "imagine_bench.machine": "imagine_bench.registry.machine",
     "imagine_bench.regression.interfaces": "imagine_bench.interfaces.regression",
+    "imagine_bench.studies": "imagine_bench.sweep.catalogue",
+    "imagine_bench.studies.catalogue": "imagine_bench.sweep.catalogue",
+    "imagine_bench.studies.study": "imagine_bench.sweep.grid",
+    "imagine_bench.suite": "imagine_bench.sweep.catalogue",
+    "imagine_bench.suite.experiments": "imagine_bench.sweep.catalogue",
+    "imagine_bench.suite.run": "imagine_bench.sweep.run",
+    "imagine_bench.suite.score": "imagine_bench.sweep.score",
     "imagine_bench.world_models": "imagine_bench.interfaces.model",
 }
 """Where each module lies now, by the path that it had."""

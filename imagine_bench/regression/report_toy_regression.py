@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from imagine_bench import registry
-from imagine_bench.regression.results import RegressionResult
+from imagine_bench.regression.results import Pair, RegressionResult, Values
 from imagine_bench.report.figures import image
 from imagine_bench.report.tables import Image, Section, Table, number
+from imagine_bench.store.codec import Arrays
 
-_REGION, _EDGE = (-10.0, 10.0), 30.0
+_EDGE = 30.0
+"""Where the data ends; beyond, networks extrapolate."""
+_REGION = 10.0
+"""Half the width of the region around 0 where the datasets differ."""
 _SHADE = {"low_data": "#f0e442", "high_noise": "#e69f00"}
-_KINDS = ("epistemic", "modal", "aleatoric")
+_BLUE = "#0072b2"
+_TOPS = {"epistemic": 60, "modal": 60, "aleatoric": 20}
+"""The kinds of uncertainty, and the top of each one's axis in figure 4.1."""
 _TITLES = {"base": "base", "low_data": "little data in the region", "high_noise": "much noise in the region"}
-
-Values = NDArray[np.float64]
 
 
 def sections(result: RegressionResult) -> list[Section]:
-    """The claims of the thesis in numbers, and figure 4.1 for every regressor."""
-    tables = [_claims(result, agent) for agent in result.protocol.agents]
-    truth = [_against_truth(result, agent) for agent in result.protocol.agents]
-    answers = [answer for agent in result.protocol.agents for answer in _answers(result, agent)]
+    """The claims of the thesis in numbers, figure 4.1 for every regressor, estimates and errors against the truth."""
+    agents = result.protocol.agents
+    claims = [_claims(result, agent) for agent in agents]
+    answers = [answer for agent in agents for answer in _answers(result, agent)]
     return [
         Section(
             title="The thesis' claims, in numbers",
@@ -35,14 +39,13 @@ def sections(result: RegressionResult) -> list[Section]:
                 "Rank correlation: of epistemic uncertainty with the distance from the data, for x from 30 to 40. "
                 "Values are the median over networks, in brackets the smallest and the largest.",
             ),
-            tables=[table for table in tables if table.rows],
-            answers=answers
-            or ["What little data and much noise do is said against base: run low_data or high_noise beside it."],
+            tables=[table for table in claims if table.rows],
+            answers=answers or ["Little data and much noise are compared with base: run low_data or high_noise too."],
         ),
         Section(
             title="Figure 4.1: what is uncertain, and why",
             words=("Shaded: yellow or orange where the datasets differ, red where the networks extrapolate.",),
-            images=[_figure_4_1(result, agent) for agent in result.protocol.agents],
+            images=[_figure_4_1(result, agent) for agent in agents],
         ),
         Section(
             title="Estimates against the truth",
@@ -53,7 +56,7 @@ def sections(result: RegressionResult) -> list[Section]:
                 "plus its variance, which is the estimate itself: the rank correlation is with the error alone, and "
                 "the difference can have one sign only.",
             ),
-            tables=truth,
+            tables=[_against_truth(result, agent) for agent in agents],
         ),
         Section(
             title="Equation 4.8: the squared error, cause by cause",
@@ -63,23 +66,22 @@ def sections(result: RegressionResult) -> list[Section]:
                 "true distance of the branches, and the spread of what is drawn (estimated aleatoric and modal). "
                 "Measured: against targets drawn anew; what remains is 0 but for sampling (95 %). Means over x, in y².",
             ),
-            tables=[_decomposition(result, agent) for agent in result.protocol.agents],
+            tables=[_decomposition(result, agent) for agent in agents],
         ),
     ]
 
 
 def ratio(result: RegressionResult, agent: str, kind: str, variant: str) -> Values:
     """Mean uncertainty in the region over that of the base networks, network by network. Shape (E,)."""
-    x = result.first(agent, variant)["x"]
-    inside = (x >= _REGION[0]) & (x <= _REGION[1])
-    changed, base = (result.arrays(agent, v, kind)[:, inside].mean(axis=1) for v in (variant, "base"))
-    return changed / base
+    inside = np.abs(result.first((agent, variant))["x"]) <= _REGION
+    changed = result.arrays((agent, variant), kind)[:, inside].mean(axis=1)
+    return changed / result.arrays((agent, "base"), kind)[:, inside].mean(axis=1)
 
 
 def rank_correlation(result: RegressionResult, agent: str, kind: str, variant: str) -> Values:
     """Spearman's correlation of an uncertainty with the distance from the data, where x > 30. Shape (E,)."""
-    x = result.first(agent, variant)["x"]
-    rows = result.arrays(agent, variant, kind)[:, x > _EDGE]
+    x = result.first((agent, variant))["x"]
+    rows = result.arrays((agent, variant), kind)[:, x > _EDGE]
     return np.array([stats.spearmanr(x[x > _EDGE], row).statistic for row in rows])
 
 
@@ -93,11 +95,11 @@ _CLAIMS = (
     ("base", rank_correlation, "epistemic", f"{_FAR} epistemic with distance", "> 0"),
     ("base", rank_correlation, "aleatoric", f"{_FAR} aleatoric with distance", "> 0"),
 )
-"""The variant a claim needs beside the base, its measure of which uncertainty, its words, and what is asked of it."""
+"""The variant a claim needs beside the base, its measure of which uncertainty, its words, and the condition on it."""
 
 
 def holds(values: Values, asked: str) -> NDArray[np.bool_]:
-    """Whether each network meets what is asked, such as ``"≥ 3"``."""
+    """Whether each network meets a condition, such as ``"≥ 3"``."""
     sign, _, limit = asked.partition(" ")
     above = {"≥": values >= float(limit), "≤": values <= float(limit), ">": values > float(limit)}
     return above[sign]
@@ -111,49 +113,56 @@ def _claims(result: RegressionResult, agent: str) -> Table:
             met = f"{int(holds(values, asked).sum())} of {len(values)}" if asked else ""
             spread = f"[{number(values.min())}, {number(values.max())}]"
             rows.append([words, f"{number(float(np.median(values)))} {spread}", asked, met])
-    title = registry.regressor_entry(agent).title
-    return Table(name=f"claims_{agent}", header=[title, "measured", "asked", "networks that hold"], rows=rows)
+    return Table(
+        name=f"claims_{agent}", header=[result.title(agent), "measured", "asked", "networks that hold"], rows=rows
+    )
 
 
 def _answers(result: RegressionResult, agent: str) -> list[str]:
-    title, variants = registry.regressor_entry(agent).title, set(result.protocol.variants)
-
-    def times(kind: str, variant: str) -> str:
-        return f"{number(float(np.median(ratio(result, agent, kind, variant))))} times"
-
     sentences = []
-    if {"base", "low_data"} <= variants:
-        sentences.append(
-            f"{title}: where data is scarce, epistemic uncertainty is {times('epistemic', 'low_data')} that of the "
-            f"base networks and aleatoric {times('aleatoric', 'low_data')} (medians over networks)."
-        )
-    if {"base", "high_noise"} <= variants:
-        sentences.append(
-            f"{title}: where noise is high, aleatoric uncertainty is {times('aleatoric', 'high_noise')} that of the "
-            f"base networks (truth 9) and epistemic {times('epistemic', 'high_noise')}."
-        )
+    for variant, where in (("low_data", "data is scarce"), ("high_noise", "noise is high (truth 9 times)")):
+        if {"base", variant} <= set(result.protocol.variants):
+            epistemic, aleatoric = (np.median(ratio(result, agent, kind, variant)) for kind in _TOPS if kind != "modal")
+            sentences.append(
+                f"{result.title(agent)}: where {where}, epistemic uncertainty is {number(float(epistemic))} times that "
+                f"of the base networks and aleatoric {number(float(aleatoric))} times (medians over networks)."
+            )
     return sentences
+
+
+def _truth(result: RegressionResult, pair: Pair, kind: str) -> Values:
+    """True variance by cause, of every network. Shape (E, GRID)."""
+    if kind == "epistemic":
+        return result.arrays(pair, "true_epistemic")
+    return np.broadcast_to(result.first(pair)[f"true_{kind}"], result.arrays(pair, kind).shape)
 
 
 def _against_truth(result: RegressionResult, agent: str) -> Table:
     rows = []
     for variant in result.protocol.variants:
-        first = result.first(agent, variant)
-        inside = np.abs(first["x"]) <= _EDGE
-        for kind in _KINDS:
-            estimate = np.sqrt(result.arrays(agent, variant, kind)[:, inside])
-            name = f"true_{kind}"
-            known = first[name] if first[name].ndim == 1 else result.arrays(agent, variant, name)
-            truth = np.broadcast_to(np.sqrt(known[..., inside]), estimate.shape)
+        pair = agent, variant
+        inside = np.abs(result.first(pair)["x"]) <= _EDGE
+        for kind in _TOPS:
+            estimated = np.sqrt(result.arrays(pair, kind)[:, inside])
+            true = np.sqrt(_truth(result, pair, kind)[:, inside])
             # equation 4.6 contains the estimate, which would agree with itself: the rest is the error of the mean
-            target = truth**2 - estimate**2 if kind == "epistemic" else truth
-            varies, pairs = np.ptp(target, axis=1).max() > 0, zip(estimate, target, strict=True)
-            along = np.mean([stats.spearmanr(*pair).statistic for pair in pairs]) if varies else np.nan
-            off = np.median(np.abs(estimate - truth), axis=1).mean()
-            cells = [np.median(estimate, axis=1).mean(), np.median(truth, axis=1).mean(), off, along]
+            target = true**2 - estimated**2 if kind == "epistemic" else true
+            cells = [
+                np.median(estimated, axis=1).mean(),
+                np.median(true, axis=1).mean(),
+                np.median(np.abs(estimated - true), axis=1).mean(),
+                _agreement(estimated, target),
+            ]
             rows.append([f"{_TITLES[variant]}: {kind}", *(number(float(cell)) for cell in cells)])
-    header = [registry.regressor_entry(agent).title, "estimated (y)", "true (y)", "difference (y)", "rank correlation"]
-    return Table(name=f"truth_{agent}", header=header, rows=rows)
+    header = ["estimated (y)", "true (y)", "difference (y)", "rank correlation"]
+    return Table(name=f"truth_{agent}", header=[result.title(agent), *header], rows=rows)
+
+
+def _agreement(estimated: Values, target: Values) -> float:
+    """Mean rank correlation along x over networks, rows of both; not a number where the target is constant."""
+    if np.ptp(target, axis=1).max() == 0:
+        return np.nan
+    return float(np.mean([stats.spearmanr(*rows).statistic for rows in zip(estimated, target, strict=True)]))
 
 
 def squared_error_terms(result: RegressionResult, agent: str, variant: str) -> dict[str, Values]:
@@ -161,68 +170,67 @@ def squared_error_terms(result: RegressionResult, agent: str, variant: str) -> d
 
     The thesis' first term, true epistemic uncertainty, is split into ``bias²`` and ``epistemic`` (equation 4.6).
     """
-    first = result.first(agent, variant)
-    estimated = {name: result.arrays(agent, variant, name) for name in _KINDS}
+    pair = agent, variant
+    epistemic = result.arrays(pair, "epistemic")
     return {
-        "bias²": result.arrays(agent, variant, "true_epistemic") - estimated["epistemic"],
-        "epistemic": estimated["epistemic"],
-        "aleatoric": np.broadcast_to(first["true_aleatoric"], estimated["epistemic"].shape),
-        "modal": np.broadcast_to(first["true_modal"], estimated["epistemic"].shape),
-        "spread": estimated["aleatoric"] + estimated["modal"],
-        "measured": result.arrays(agent, variant, "squared_error"),
+        "bias²": _truth(result, pair, "epistemic") - epistemic,
+        "epistemic": epistemic,
+        "aleatoric": _truth(result, pair, "aleatoric"),
+        "modal": _truth(result, pair, "modal"),
+        "spread": result.arrays(pair, "aleatoric") + result.arrays(pair, "modal"),
+        "measured": result.arrays(pair, "squared_error"),
     }
 
 
 def _decomposition(result: RegressionResult, agent: str) -> Table:
     rows = []
     for variant in result.protocol.variants:
-        terms, x = squared_error_terms(result, agent, variant), result.first(agent, variant)["x"]
-        for words, here in (("data", np.abs(x) <= _EDGE), ("region", np.abs(x) <= _REGION[1]), ("beyond", x > _EDGE)):
+        terms = squared_error_terms(result, agent, variant)
+        x = result.first((agent, variant))["x"]
+        for words, here in (("data", np.abs(x) <= _EDGE), ("region", np.abs(x) <= _REGION), ("beyond", x > _EDGE)):
             *causes, measured = (values[:, here] for values in terms.values())
             rest = measured - np.sum(causes, axis=0)
             interval = f"{number(rest.mean())} ± {number(1.96 * rest.std() / np.sqrt(rest.size))}"
             cells = [number(float(values.mean())) for values in (*causes, measured)]
             rows.append([f"{_TITLES[variant]}: {words}", *cells, interval])
-    header = [registry.regressor_entry(agent).title, "bias²", "epistemic", "true aleatoric", "true modal", "spread"]
-    header += ["measured", "measured − sum"]
-    return Table(name=f"decomposition_{agent}", header=header, rows=rows)
+    header = ["bias²", "epistemic", "true aleatoric", "true modal", "spread", "measured", "measured − sum"]
+    return Table(name=f"decomposition_{agent}", header=[result.title(agent), *header], rows=rows)
 
 
 def _figure_4_1(result: RegressionResult, agent: str) -> Image:
-    title = registry.regressor_entry(agent).title
+    data = {variant: result.first((agent, variant)) for variant in result.protocol.variants}
     caption = (
-        f"{title}, the first network of each dataset, after figure 4.1 of the thesis. Top: training data (gray) and "
-        "predictions (blue). Below: standard deviation of each kind of uncertainty (blue) and its true value (black)."
+        f"{result.title(agent)}, the first network of each dataset, after figure 4.1 of the thesis. Top: training data "
+        "(gray) and predictions (blue). Below: standard deviation of each kind of uncertainty (blue) and its true "
+        "value (black)."
     )
     alt = "Predictions and epistemic, modal and aleatoric uncertainty along x for three datasets, with true values."
-    return image(f"figure_4_1_{agent}", lambda: figure_4_1(result, agent), alt=alt, caption=caption)
+    return image(f"figure_4_1_{agent}", lambda: figure_4_1(data), alt=alt, caption=caption)
 
 
-def figure_4_1(result: RegressionResult, agent: str) -> Figure:
-    """Three columns, a dataset each; four rows: predictions, epistemic, modal, aleatoric."""
-    variants = result.protocol.variants
-    figure = Figure(figsize=(3.9 * len(variants) + 0.4, 9.6), layout="constrained")
-    grid = figure.subplots(4, len(variants), squeeze=False, sharex=True, sharey="row")
-    for column, variant in zip(grid.T, variants, strict=True):
-        data = result.first(agent, variant)
-        x = data["x"]
-        column[0].scatter(data["training_x"], data["training_y"], s=2, color="#a8a8a8", linewidths=0)
-        column[0].scatter(x, data["prediction"][0], s=2.5, color="#0072b2", linewidths=0)
+def figure_4_1(data: dict[str, Arrays]) -> Figure:
+    """A column a dataset; four rows: predictions, epistemic, modal, aleatoric."""
+    figure = Figure(figsize=(3.9 * len(data) + 0.4, 9.6), layout="constrained")
+    grid = figure.subplots(4, len(data), squeeze=False, sharex=True, sharey="row")
+    for column, (variant, found) in zip(grid.T, data.items(), strict=True):
+        column[0].scatter(found["training_x"], found["training_y"], s=2, color="#a8a8a8", linewidths=0)
+        column[0].scatter(found["x"], found["prediction"][0], s=2.5, color=_BLUE, linewidths=0)
         column[0].set(title=_TITLES[variant], ylim=(-120, 140))
-        for axes, kind in zip(column[1:], _KINDS, strict=True):
-            truth = data[f"true_{kind}"]
-            known = truth if truth.ndim == 1 else truth[0]
-            axes.plot(x, np.sqrt(known), color="#2b2b2f", linewidth=1.2, label="true")
-            axes.plot(x, np.sqrt(data[kind][0]), color="#0072b2", linewidth=1.3, label="estimated")
+        for axes, kind in zip(column[1:], _TOPS, strict=True):
+            _uncertainty(axes, found, kind)
         for axes in column:
             if variant in _SHADE:
-                axes.axvspan(*_REGION, color=_SHADE[variant], alpha=0.25, linewidth=0)
+                axes.axvspan(-_REGION, _REGION, color=_SHADE[variant], alpha=0.25, linewidth=0)
             axes.axvspan(_EDGE, 40.0, color="#d55e00", alpha=0.15, linewidth=0)
-            axes.set_xlim(-30, 40)
-        column[3].set_xlabel("x")
-    for row, words in zip(grid, ("y", *(f"{kind} (std of y)" for kind in _KINDS)), strict=True):
+        column[3].set(xlabel="x", xlim=(-30, 40))
+    for row, words in zip(grid, ("y", *(f"{kind} (std of y)" for kind in _TOPS)), strict=True):
         row[0].set_ylabel(words)
-    for row, top in zip(grid[1:], (60, 60, 20), strict=True):
-        row[0].set_ylim(0, top)
     grid[1][0].legend(loc="upper left", fontsize=8.5)
     return figure
+
+
+def _uncertainty(axes: Axes, found: Arrays, kind: str) -> None:
+    true = np.atleast_2d(found[f"true_{kind}"])[0]
+    axes.plot(found["x"], np.sqrt(true), color="#2b2b2f", linewidth=1.2, label="true")
+    axes.plot(found["x"], np.sqrt(found[kind][0]), color=_BLUE, linewidth=1.3, label="estimated")
+    axes.set_ylim(0, _TOPS[kind])

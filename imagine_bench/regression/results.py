@@ -11,23 +11,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import ArtefactError
+from imagine_bench import registry
 from imagine_bench.regression.protocol import RegressionProtocol
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_protocol_as
 from imagine_bench.store.codec import Arrays, grouped, read_arrays, table_rows, table_text, write_arrays
 from imagine_bench.store.files import write_bytes
-from imagine_bench.store.results import require_one_setting
+from imagine_bench.store.results import require_every_run
 
 METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
-
+Values = NDArray[np.float64]
 Row = dict[str, float | str]
 """One network of one variant: ``variant``, ``network``, and every measure by name."""
+Pair = tuple[str, str]
+"""A regressor and a variant."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionRun:
-    """One finished run of a registered regressor, whose files lie in ``folder``."""
+    """One finished run of a registered regressor."""
 
     agent: str
     seed: int
@@ -36,21 +38,16 @@ class RegressionRun:
     #: The task's own measurements by variant, and under ``calibration/`` those of calibration.
     evaluations: Mapping[str, Arrays]
     folder: Path  #: where the run's files lie
-    #: Its Rerun recording, or None.
     recording: Path | None  #: its Rerun recording, or None
 
-    def values(self, variant: str, name: str) -> NDArray[np.float64]:
+    def values(self, variant: str, name: str) -> Values:
         """One measure of every network of a variant. Shape (E,)."""
         return np.array([float(row[name]) for row in self.rows if row["variant"] == variant])
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegressionResult:
-    """All runs of a protocol. Every regressor and seed is there, or this cannot be built.
-
-    Attributes:
-        environment: Command, commit, versions, machine; JSON-like.
-        wall_s: Wall seconds of the bench, over all its sessions.
+    """All runs of a protocol.
 
     Raises:
         ArtefactError: A run is missing or doubled, or two runs of a regressor had different settings.
@@ -58,21 +55,14 @@ class RegressionResult:
 
     protocol: RegressionProtocol
     runs: tuple[RegressionRun, ...]
-    environment: Mapping[str, Any]
-    folder: Path
-    wall_s: float
-    missing: tuple[str, ...] = ()
+    environment: Mapping[str, Any]  #: command, commit, versions, machine; JSON-like
+    folder: Path  #: where the bench's files lie
+    wall_s: float  #: wall seconds of the bench, over all its sessions
+    missing: tuple[str, ...] = ()  #: sentences about runs that a part lacks; a regression bench is whole
 
     def __post_init__(self) -> None:
-        wanted = {(agent, seed) for agent in self.protocol.agents for seed in self.protocol.seeds}
-        found = [(run.agent, run.seed) for run in self.runs]
-        if set(found) != wanted or len(found) != len(wanted):
-            raise ArtefactError(
-                f"{self.folder} should hold one run for each of {len(wanted)} regressors and seeds and holds "
-                f"{len(found)}; missing: {sorted(wanted - set(found)) or 'none'}. Run the same bench command again."
-            )
-        for agent in self.protocol.agents:
-            require_one_setting([(run.folder, run.settings) for run in self.of(agent)])
+        runs = [(run.agent, run.seed, run.folder, run.settings) for run in self.runs]
+        require_every_run(self.folder, self.protocol, runs)
 
     @property
     def protocol_hash(self) -> str:
@@ -80,25 +70,36 @@ class RegressionResult:
         return self.protocol.hash
 
     @property
-    def pairs(self) -> list[tuple[str, str]]:
+    def pairs(self) -> list[Pair]:
         """Every regressor and variant."""
         return list(itertools.product(self.protocol.agents, self.protocol.variants))
+
+    def title(self, agent: str) -> str:
+        """The name of a regressor for people."""
+        return registry.regressor_entry(agent).title
+
+    def label(self, pair: Pair) -> str:
+        """Title of the regressor, and the variant."""
+        return f"{self.title(pair[0])}, {pair[1]}"
 
     def of(self, agent: str) -> tuple[RegressionRun, ...]:
         """The runs of one regressor, in the order of the protocol's seeds."""
         by_seed = {run.seed: run for run in self.runs if run.agent == agent}
         return tuple(by_seed[seed] for seed in self.protocol.seeds)
 
-    def values(self, agent: str, variant: str, name: str) -> NDArray[np.float64]:
+    def values(self, pair: Pair, name: str) -> Values:
         """One measure of every network of all seeds. Shape (seeds E,)."""
+        agent, variant = pair
         return np.concatenate([run.values(variant, name) for run in self.of(agent)])
 
-    def arrays(self, agent: str, variant: str, name: str) -> NDArray[Any]:
-        """An array of the task's measurements, whose first axis is the network, of all seeds. Shape (seeds E, ...)."""
+    def arrays(self, pair: Pair, name: str) -> NDArray[Any]:
+        """A measurement of the task whose first axis is the network, of all seeds. Shape (seeds E, ...)."""
+        agent, variant = pair
         return np.concatenate([run.evaluations[variant][name] for run in self.of(agent)])
 
-    def first(self, agent: str, variant: str) -> Arrays:
+    def first(self, pair: Pair) -> Arrays:
         """Everything measured in the run of the first seed."""
+        agent, variant = pair
         return self.of(agent)[0].evaluations[variant]
 
 
@@ -110,11 +111,13 @@ def write_rows(folder: Path, rows: Sequence[Row]) -> None:
 def finish(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:
     """Write the results of a run and mark it as done."""
     write_rows(folder, rows)
-    flat = {  # sorted, for a checkpoint gives arrays back in any order
-        f"{variant}/{name}": array for variant, arrays in evaluations.items() for name, array in sorted(arrays.items())
-    }
-    write_arrays(folder / EVALUATION, flat)
+    write_arrays(folder / EVALUATION, flattened(evaluations))
     run_folder.mark_done(folder, ["config.json", METRICS, EVALUATION])
+
+
+def flattened(evaluations: Mapping[str, Arrays]) -> Arrays:
+    """Arrays by ``variant/name``, those of a variant sorted, for a checkpoint gives them back in any order."""
+    return {f"{variant}/{name}": arrays[name] for variant, arrays in evaluations.items() for name in sorted(arrays)}
 
 
 def load_run(folder: Path) -> RegressionRun:

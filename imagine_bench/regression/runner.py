@@ -18,21 +18,24 @@ from imagine_bench.interfaces.regression import Prediction, Regressor, Regressor
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.protocol import RegressionProtocol, overrides_of
-from imagine_bench.regression.results import RegressionRun, Row, finish, load_run, write_rows
+from imagine_bench.regression.results import RegressionRun, Row, finish, flattened, load_run, write_rows
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
 from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot, sweep_partial
 from imagine_bench.store.codec import Arrays, grouped
 from imagine_bench.store.files import lock, make_folder, reading, sweep, writing
 
-_SLICES = 100
-"""Steps of progress in which a variant's training is reported."""
-_MEASURING = 10
-"""Steps of progress that measuring counts."""
+TRAINING, MEASURING = 100, 10
+"""Steps of progress of a variant."""
+_RECORDERS = {
+    "toy_regression": "imagine_bench.recording.toy_regression:record",
+    "robot_ik": "imagine_bench.recording.robot_ik:record",
+}
+"""Functions that record the suite's own tasks; another package's task names its own."""
 
 
 def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> RegressionRun:
-    """Do a run, or what is left of it, and read its result; a finished run is only read.
+    """Do a run, or finish one that was begun, and load its result. A finished run is only loaded.
 
     Raises:
         BusyError: Another process is at this run.
@@ -49,17 +52,20 @@ def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress
 
 class _Run:
     def __init__(self, spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> None:
-        self.spec, self.folder, self.on_progress = spec, folder, on_progress
-        self.protocol, self.task = spec.protocol, registry.regression(spec.protocol.task)
+        self.spec = spec
+        self.folder = folder
+        self.on_progress = on_progress
+        self.protocol = spec.protocol
+        self.task = registry.regression(spec.protocol.task)
         self.seeds = SeedTree(spec.seed)
         self.networks = tuple(self.seeds.child("network", index) for index in range(self.protocol.networks))
         self.rows: list[Row] = []
         self.evaluations: dict[str, Arrays] = {}
         self.train_cpu_s = 0.0
-        self.snapshot = load_newest(folder / "checkpoints")
         with writing(folder):
             sweep(folder)
             sweep_partial(folder / "checkpoints")
+        self.snapshot = load_newest(folder / "checkpoints")
         if self.snapshot is not None:
             self.rows = list(self.snapshot.values["rows"])
             found = grouped(self.snapshot.arrays)  # files give arrays back in any order
@@ -86,32 +92,32 @@ class _Run:
             device=self.protocol.device,
         )
         regressor = registry.make_regressor(self.spec.agent, context)
-        self._check_config(regressor)
-        snapshot, self.snapshot, self.train_cpu_s = self.snapshot, None, 0.0
+        settings = getattr(regressor, "settings", None)
+        config: dict[str, Any] = {
+            "protocol": self.protocol.as_dict(),
+            "protocol_hash": self.protocol.hash,
+            "agent": self.spec.agent,
+            "seed": self.spec.seed,
+            "settings": {} if settings is None else dataclasses.asdict(settings),
+        }
+        run_folder.check_config(self.folder, config)
+        snapshot = self.snapshot
+        self.snapshot = None
+        self.train_cpu_s = 0.0
         if snapshot is not None and snapshot.values["variant"] == variant:
             with reading(self.folder / "checkpoints", f"a checkpoint of {self.spec.agent!r}"):
                 regressor.restore(snapshot.agent)
             self.train_cpu_s = snapshot.values["train_cpu_s"]
         return regressor
 
-    def _check_config(self, regressor: Regressor) -> None:
-        settings: Any = getattr(regressor, "settings", None)
-        run_folder.check_config(self.folder, {
-            "protocol": self.protocol.as_dict(),
-            "protocol_hash": self.protocol.hash,
-            "agent": self.spec.agent,
-            "seed": self.spec.seed,
-            "settings": {} if settings is None else dataclasses.asdict(settings),
-        })  # fmt: skip
-
     def _train(self, regressor: Regressor, variant: str) -> None:
-        step = max(1, regressor.epochs // _SLICES)
+        step = max(1, regressor.epochs // TRAINING)
         try:
             while regressor.epoch < regressor.epochs:
                 start_s = time.process_time()
                 regressor.train(min(step, regressor.epochs - regressor.epoch))
                 self.train_cpu_s += time.process_time() - start_s
-                done = _SLICES * regressor.epoch // regressor.epochs
+                done = TRAINING * regressor.epoch // regressor.epochs
                 self._report("training", f"{variant}, epoch {regressor.epoch} of {regressor.epochs}", done)
                 if time.monotonic() - self.saved_s >= self.spec.checkpoint_every_s:
                     self._save(regressor, variant)
@@ -121,12 +127,11 @@ class _Run:
         self._save(regressor, variant)
 
     def _measure(self, regressor: Regressor, variant: str) -> None:
-        self._report("testing", f"{variant}, measuring", _SLICES)
+        self._report("testing", f"{variant}, measuring", TRAINING)
         start_s = time.process_time()
-        rows, arrays = calibrate(
-            self.task, regressor, variant, self.networks, points=self.protocol.test_points,
-            rng=self.seeds.child("calibration", variant).generator(),
-        )  # fmt: skip
+        rng = self.seeds.child("calibration", variant).generator()
+        points = self.protocol.test_points
+        rows, arrays = calibrate(self.task, regressor, variant, self.networks, points=points, rng=rng)
 
         def predict(inputs: Floats, name: str) -> Prediction:
             return regressor.predict(inputs, self.seeds.child("predict", variant, name).generator())
@@ -142,16 +147,16 @@ class _Run:
 
     def _record(self) -> None:
         """Record beside the results; the file appears whole or not at all."""
-        if self.task.recorder is None or not self.protocol.recorded:
+        recorder = self.task.recorder or _RECORDERS.get(self.task.id)
+        if recorder is None or not self.protocol.recorded:
             return
         self._report("recording", "recording", 0)
-        registry.load(self.task.recorder)(
-            self.evaluations, task=self.task, name=self.spec.agent, path=run_folder.recording_path(self.folder)
-        )
+        path = run_folder.recording_path(self.folder)
+        registry.load(recorder)(self.evaluations, task=self.task, name=self.spec.agent, path=path)
 
     def _snapshot(self, regressor: Regressor, variant: str) -> Snapshot:
-        arrays = {f"{v}/{name}": array for v, found in self.evaluations.items() for name, array in found.items()}
         values = {"variant": variant, "rows": self.rows, "train_cpu_s": self.train_cpu_s}
+        arrays = flattened(self.evaluations)
         return Snapshot(episode=regressor.epoch, agent=regressor.state(), arrays=arrays, values=values)
 
     def _save(self, regressor: Regressor, variant: str) -> None:
@@ -159,9 +164,9 @@ class _Run:
         self.saved_s = time.monotonic()
 
     def _report(self, phase: Phase, detail: str, done: int) -> None:
-        done = min((_SLICES + _MEASURING) * len(self.evaluations) + done, self.spec.work)
-        spec, bench = self.spec, self.protocol.hash
-        where = Progress(
-            agent=spec.agent, seed=spec.seed, bench=bench, phase=phase, done=done, work=spec.work, detail=detail
+        done = min((TRAINING + MEASURING) * len(self.evaluations) + done, self.spec.work)
+        agent, seed, bench = self.spec.agent, self.spec.seed, self.protocol.hash
+        work = self.spec.work
+        self.on_progress(
+            Progress(agent=agent, seed=seed, bench=bench, phase=phase, done=done, work=work, detail=detail)
         )
-        self.on_progress(where)

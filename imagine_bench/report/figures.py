@@ -82,7 +82,8 @@ def image(name: str, draw: Callable[[], Figure], *, alt: str, caption: str, svg:
     def drawn() -> tuple[bytes, str]:
         with mpl.rc_context(STYLE):
             figure = draw()
-            FigureCanvasAgg(figure).draw()
+            FigureCanvasAgg(figure)
+            figure.draw_without_rendering()
             figure.set_layout_engine("none")  # laid out once, for both files
             vector, png = io.StringIO(), io.BytesIO()
             if svg:

@@ -16,7 +16,8 @@ from imagine_bench.report.analysis import markdown
 from imagine_bench.report.figures import image
 from imagine_bench.report.text import estimate_text, percent
 from imagine_bench.store.files import csv_text, make_folder, write_bytes, write_json
-from imagine_bench.studies.study import Line, Study
+from imagine_bench.sweep.grid import Study
+from imagine_bench.sweep.run import Line
 
 _HELPS, _HURTS, _UNCLEAR = "#009e73", "#d55e00", "#8c8c8c"  # Okabe and Ito's palette
 

@@ -17,8 +17,8 @@ from imagine_bench.report.tables import DASH, Cell, Page, Section, Table, second
 from imagine_bench.report.text import agent_words, percent
 from imagine_bench.statistics import Estimate
 from imagine_bench.store.files import csv_text, json_text
-from imagine_bench.suite.experiments import Experiment
-from imagine_bench.suite.run import LevelResult, SuiteResult
+from imagine_bench.sweep.grid import Experiment
+from imagine_bench.sweep.run import LevelResult, SuiteResult
 
 _COLUMNS = 4
 

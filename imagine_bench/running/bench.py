@@ -71,7 +71,8 @@ def carry_out(
     """
     require_modules("matplotlib", "PIL", "rerun")  # torch only where an agent is made of it
     with ExitStack() as held:
-        work, missing = list[_Bench](), 0
+        work = list[_Bench]()
+        missing = 0
         for wanted, paths in planned:
             store = BenchStore(bench_folder(root, wanted), wanted)
             store.open()
@@ -82,7 +83,8 @@ def carry_out(
                 work.append((store, paths))
         if any(task_type(store.protocol.task).draws for store, _ in work):
             gl_renderer()  # fails here, in one sentence, rather than in every run
-        environment, certify = describe_environment() if work else {}, functools.cache(certificate_of)
+        environment = describe_environment() if work else {}
+        certify = functools.cache(certificate_of)
         for store, _ in work:
             _warn(store.begin_session(environment), store.folder)
             if isinstance(store.protocol, Protocol):

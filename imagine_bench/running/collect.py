@@ -93,7 +93,8 @@ def collect(
     starts = SeedTree(seed).child("dataset", "starts").generator()
     open_states = [state for state in states_of(spec.rules) if not spec.rules.is_terminal(state)]
     seeds = [episode_seed("dataset", seed, index) for index in range(episodes)]
-    parts, motion = [], list[ArmMotion]()
+    parts = []
+    motion = list[ArmMotion]()
     env_id = registry.task_entry(spec.id).env_id
     with closing(gymnasium.make(env_id, execution=execution, appearance=appearance)) as env:
         watch = _watching(env, motion_hz, motion)
@@ -134,7 +135,9 @@ def _episode(
     """One episode, its arrays as lists; with ``options`` of a start, one macro-action and then a truncation."""
     frame, info = env.reset(seed=seed, options=options)
     begin_episode(player[0])
-    mask, faults, ended = np.ones(int(env.action_space.n), dtype=np.int8), 0, False  # type: ignore[attr-defined]
+    mask = np.ones(int(env.action_space.n), dtype=np.int8)  # type: ignore[attr-defined]
+    faults = 0
+    ended = False
     kept: dict[str, list[Any]] = {name: [] for name in ("frames", "action_masks", "macrostates")}
     seen: dict[str, list[Any]] = {name: [] for name in ("actions", "rewards", "terminated", "truncated")}
     while True:
@@ -148,7 +151,8 @@ def _episode(
         truncated = truncated or (options is not None and not terminated)
         for each, value in zip(seen.values(), (action, float(reward), bool(terminated), bool(truncated)), strict=True):
             each.append(value)
-        faults, ended = faults + bool(info["fault"]), terminated or truncated
+        faults = faults + bool(info["fault"])
+        ended = terminated or truncated
 
 
 def _card(spec: TaskSpec, policy: Policy, played: Episodes) -> dict[str, Any]:
@@ -165,7 +169,8 @@ def _card(spec: TaskSpec, policy: Policy, played: Episodes) -> dict[str, Any]:
 
 def describe(dataset: Dataset) -> str:
     """A dataset in words, for a terminal. Raises ArtefactError: a file apart or the card is damaged."""
-    episodes, card = dataset.episodes, dataset.card
+    episodes = dataset.episodes
+    card = dataset.card
     low, high = statistics.wilson(int(episodes.success.sum()), len(episodes))
     lines = {
         "episodes": f"{len(episodes):,} of {len(episodes.actions):,} transitions, as {dataset.format}",

@@ -112,7 +112,8 @@ def resolved_settings(wanted: Protocol) -> dict[str, Any]:
     for name in overrides:
         if name not in known:
             raise UnknownNameError("setting", name, sorted(known))
-    name, group = wanted.hyperparameters, wanted.config_group
+    name = wanted.hyperparameters
+    group = wanted.config_group
     found = {agent: registry.settings(agent, name, overrides, group) for agent in wanted.agents}
     learners = [agent for agent in wanted.agents if registry.agent_entry(agent).learns]
     return {agent: {} if found[agent] is None else dataclasses.asdict(found[agent]) for agent in learners}

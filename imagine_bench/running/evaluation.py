@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
@@ -13,19 +15,99 @@ import numpy as np
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, State, Transition
 from imagine_bench.interfaces.capabilities import begin_episode
-from imagine_bench.running.counters import Counters, EvaluationCounts, Played
 from imagine_bench.seeding import Purpose, episode_seed
+from imagine_bench.store.results import KeptEpisodes
 
 Info = dict[str, Any]
 Env = gymnasium.Env[Any, Any]
 
 
-class ByName(gymnasium.ObservationWrapper[Any, Any, Any]):
+@dataclass
+class EpisodeRecord:
+    """What is kept of a test episode, while it is played; see :class:`.KeptEpisodes`."""
+
+    start: list[int]
+    fingerprint: int
+    actions: list[int] = field(default_factory=list)
+    total: float = 0.0
+    faults: int = 0
+    success: bool = False
+
+    @classmethod
+    def begun(cls, env: gymnasium.Env[Any, Any], info: Mapping[str, Any]) -> EpisodeRecord:
+        """One that has just been reset."""
+        start = [int(value) for value in info["macrostate"]]
+        return cls(start, zlib.crc32(f"{start} {env.unwrapped.np_random.bit_generator.state}".encode()))
+
+    def add(self, action: int, reward: float, info: Mapping[str, Any]) -> None:
+        """Take in one macro-action."""
+        self.actions.append(int(action))
+        self.total += reward
+        self.faults += bool(info["fault"])
+        self.success = bool(info["is_success"])
+        happened = np.array([*info["macrostate"], reward], dtype=np.float64)
+        self.fingerprint = zlib.crc32(happened.tobytes(), self.fingerprint)
+
+
+@dataclass
+class EvaluationCounts:
+    """Test episodes, in their order, as :class:`.KeptEpisodes` has them; a checkpoint may carry them half way."""
+
+    starts: list[list[int]] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)
+    actions: list[int] = field(default_factory=list)
+    returns: list[float] = field(default_factory=list)
+    solved: str = ""  #: ``1`` for each that ended in success, ``0`` for each other
+    faults: list[int] = field(default_factory=list)
+    fingerprints: list[int] = field(default_factory=list)
+    cpu_s: float = 0.0  #: CPU seconds spent
+    diagnostics: dict[str, float] = field(default_factory=dict)  #: The agent's own means at the moment the test began
+
+    @property
+    def episodes(self) -> int:
+        """Test episodes done."""
+        return len(self.solved)
+
+    @property
+    def successes(self) -> int:
+        """Those that ended in success."""
+        return self.solved.count("1")
+
+    def add(self, played: EpisodeRecord) -> None:
+        """Count one that is over."""
+        self.starts.append(played.start)
+        self.lengths.append(len(played.actions))
+        self.actions += played.actions
+        self.returns.append(played.total)
+        self.solved += "1" if played.success else "0"
+        self.faults.append(played.faults)
+        self.fingerprints.append(played.fingerprint)
+
+    def figures(self) -> dict[str, Any]:
+        """The fields of a :class:`.Checkpoint` that follow from the episodes."""
+        return {
+            "test_episodes": self.episodes, "successes": self.successes, "solved": self.solved,
+            "mean_return": sum(self.returns) / self.episodes, "mean_length": len(self.actions) / self.episodes,
+            "faults": sum(self.faults),
+        }  # fmt: skip
+
+    def kept(self) -> KeptEpisodes:
+        """All of them as arrays."""
+        return KeptEpisodes(
+            starts=np.array(self.starts, dtype=np.int64), lengths=np.array(self.lengths, dtype=np.int64),
+            actions=np.array(self.actions, dtype=np.int64), returns=np.array(self.returns, dtype=np.float64),
+            success=np.array([each == "1" for each in self.solved]), faults=np.array(self.faults, dtype=np.int64),
+            fingerprints=np.array(self.fingerprints, dtype=np.int64),
+        )  # fmt: skip
+
+
+class AsDict(gymnasium.ObservationWrapper[Any, Any, Any]):
     """An observation of one part, as a dict of that part."""
 
     def __init__(self, env: Env, name: str) -> None:
         super().__init__(env)
-        self._name, self.observation_space = name, gymnasium.spaces.Dict({name: env.observation_space})
+        self._name = name
+        self.observation_space = gymnasium.spaces.Dict({name: env.observation_space})
 
     def observation(self, observation: Any) -> dict[str, Any]:
         """See above."""
@@ -49,7 +131,8 @@ def play(
     frame, info = env.reset(seed=seed)
     _require_sound(env, frame, 0.0)
     begin_episode(agent)
-    before, over = Observation.of(frame, info, privileged=privileged), False
+    before = Observation.of(frame, info, privileged=privileged)
+    over = False
     while not over:
         if before_acting is not None:
             before_acting(before, info)
@@ -62,7 +145,8 @@ def play(
             terminated=bool(terminated), truncated=bool(truncated),
         )  # fmt: skip
         yield transition, info
-        before, over = after, terminated or truncated
+        before = after
+        over = terminated or truncated
 
 
 def _require_sound(env: Env, seen: Any, reward: Any) -> None:
@@ -70,7 +154,8 @@ def _require_sound(env: Env, seen: Any, reward: Any) -> None:
     space = env.observation_space
     named = isinstance(space, gymnasium.spaces.Dict) and isinstance(seen, Mapping)
     for name, wanted in space.spaces.items() if named else [("frame", space)]:  # type: ignore[attr-defined]
-        part, more = seen.get(name) if named else seen, "'imagine-bench check --task' finds such faults."
+        part = seen.get(name) if named else seen
+        more = "'imagine-bench check --task' finds such faults."
         if isinstance(wanted, gymnasium.spaces.Box):
             given = (getattr(part, "shape", None), getattr(part, "dtype", type(part)))
             if given != (wanted.shape, wanted.dtype):
@@ -86,11 +171,12 @@ def _require_sound(env: Env, seen: Any, reward: Any) -> None:
 
 def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privileged: bool, purpose: Purpose) -> None:
     """Play the next test episode of ``purpose`` greedily and count it; the count says which start it has."""
-    start_s, begun = time.process_time(), list[Played]()
+    start_s = time.process_time()
+    begun = list[EpisodeRecord]()
 
     def begin(observation: Observation, info: Info) -> None:
         if not begun:
-            begun.append(Played.begun(env, info))
+            begun.append(EpisodeRecord.begun(env, info))
 
     seed = episode_seed(purpose, 0, counts.episodes)
     for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged, before_acting=begin):
@@ -99,10 +185,11 @@ def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privi
     counts.cpu_s += time.process_time() - start_s
 
 
-def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[Played, bool]:
+def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[EpisodeRecord, bool]:
     """Play the macro-actions of an episode again, as far as it goes, and whether it ends with the last of them."""
     _, info = env.reset(seed=seed)
-    played, over = Played.begun(env, info), False
+    played = EpisodeRecord.begun(env, info)
+    over = False
     for action in actions:
         if over or action not in env.action_space:
             return played, False
@@ -112,29 +199,7 @@ def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[Played, bool]:
     return played, bool(over)
 
 
-class Watched(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Counts where training episodes start and which macro-actions are tried where; the agent is told nothing."""
-
-    def __init__(self, env: Env, counters: Counters) -> None:
-        super().__init__(env)
-        self._counters, self._at = counters, list[int]()
-
-    def reset(self, **options: Any) -> tuple[Any, Info]:
-        """As the environment's."""
-        seen, info = self.env.reset(**options)
-        self._at = np.asarray(info["macrostate"]).tolist()
-        self._counters.starts.append(self._at)
-        return seen, info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, Info]:
-        """As the environment's."""
-        after = self.env.step(action)
-        self._counters.try_out(self._at, int(action))
-        self._at = np.asarray(after[4]["macrostate"]).tolist()
-        return after
-
-
-class StartsFrom(gymnasium.Wrapper[Any, Any, Any, Any]):
+class StartFrom(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Starts every episode in one of some macrostates, equally likely, that its seed decides."""
 
     def __init__(self, env: Env, starts: Sequence[State]) -> None:
@@ -154,7 +219,8 @@ class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: Env, seed: int) -> None:
         super().__init__(env)
-        self._seed, self._episode = seed, 0
+        self._seed = seed
+        self._episode = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
         """Start the next training episode; ``seed`` changes nothing."""

@@ -13,7 +13,7 @@ from imagine_bench import registry
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import Agent, Observation
 from imagine_bench.interfaces.capabilities import EpisodeRememberer
-from imagine_bench.running.counters import Played
+from imagine_bench.running.evaluation import EpisodeRecord
 from imagine_bench.running.run_state import Run
 
 LEAST_EPISODES = 50
@@ -34,7 +34,7 @@ def lanes_pay(run: Run, episodes: int) -> bool:
     return simulated and offered and episodes >= LEAST_EPISODES and run.spec.cores > 1
 
 
-def episodes_in_lanes(run: Run, seeds: Sequence[int]) -> Iterator[Played]:
+def episodes_in_lanes(run: Run, seeds: Sequence[int]) -> Iterator[EpisodeRecord]:
     """Greedy test episodes of a run, one for each seed and in their order.
 
     Raises:
@@ -53,11 +53,14 @@ def episodes_in_lanes(run: Run, seeds: Sequence[int]) -> Iterator[Played]:
         yield from _play(lanes, run.agent, seeds, privileged=run.entry.privileged)
 
 
-def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -> Iterator[Played]:
-    waiting, everyone = list(enumerate(seeds))[::-1], range(lanes.num_envs)
-    playing: dict[int, tuple[int, Played]] = {}  # by lane: the number of its episode, and what is kept of it
-    over: dict[int, Played] = {}  # by number, until those before it are over
-    free, following, actions = list(everyone), 0, dict[int, int]()
+def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -> Iterator[EpisodeRecord]:
+    waiting = list(enumerate(seeds))[::-1]
+    everyone = range(lanes.num_envs)
+    playing: dict[int, tuple[int, EpisodeRecord]] = {}  # by lane: the number of its episode, and what is kept of it
+    over: dict[int, EpisodeRecord] = {}  # by number, until those before it are over
+    free = list(everyone)
+    following = 0
+    actions = dict[int, int]()
 
     def act(lane: int, frame: Any, info: dict[str, Any]) -> None:
         actions[lane] = int(agent.act(Observation.of(frame, info, privileged=privileged), explore=False))
@@ -70,12 +73,13 @@ def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -
             frames, infos = lanes.reset(seed=given, options={"reset_mask": np.isin(everyone, list(begun))})
             for lane, (number, _) in begun.items():
                 info = _row(infos, lane)
-                playing[lane] = number, Played.begun(lanes.envs[lane], info)
+                playing[lane] = number, EpisodeRecord.begun(lanes.envs[lane], info)
                 act(lane, frames[lane], info)
         frames, rewards, terminated, truncated, infos = lanes.recv(max(1, len(playing) // 2))
         free = []
         for row, lane in enumerate(infos["env_id"].tolist()):
-            info, (number, played) = _row(infos, row), playing[lane]
+            info = _row(infos, row)
+            number, played = playing[lane]
             if truncated[row] and not lanes.envs[lane].begun:
                 raise DivergedError(info["fault_reason"])
             played.add(actions[lane], float(rewards[row]), info)

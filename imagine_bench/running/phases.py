@@ -15,11 +15,17 @@ from imagine_bench.interfaces.capabilities import (
     begin_episode,
 )
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.running.counters import EvaluationCounts
-from imagine_bench.running.evaluation import Env, Info, TrainingStarts, Watched, play, play_test_episode
+from imagine_bench.running.evaluation import (
+    Env,
+    EvaluationCounts,
+    Info,
+    TrainingStarts,
+    play,
+    play_test_episode,
+)
 from imagine_bench.running.lanes import episodes_in_lanes, lanes_pay
 from imagine_bench.running.queries import LabelOracle, QueryBudget, Teacher, as_seen
-from imagine_bench.running.run_state import Run, make_env
+from imagine_bench.running.run_state import CountVisits, Run, make_env
 from imagine_bench.seeding import episode_seed, evaluation_split
 
 
@@ -27,7 +33,8 @@ def transfer(run: Run) -> None:
     """Train on the tasks that come before; after the last episode of each, the agent takes its model to the next."""
     if not isinstance(run.agent, TransferLearner):
         return
-    protocol, counters = run.protocol, run.counters
+    protocol = run.protocol
+    counters = run.counters
     for index, task in enumerate(protocol.after):
         end = (index + 1) * protocol.after_episodes
         if counters.before >= end:
@@ -61,7 +68,8 @@ def train(run: Run, budget: int) -> None:
 
 
 def _episode_of_dataset(run: Run, dataset: Episodes) -> None:
-    counters, episode = run.counters, run.counters.episode
+    counters = run.counters
+    episode = run.counters.episode
     begin_episode(run.agent)
     for transition in dataset.transitions(episode):
         run.agent.observe(transition, episode=episode)
@@ -69,7 +77,9 @@ def _episode_of_dataset(run: Run, dataset: Episodes) -> None:
 
 
 def _training_episode(run: Run, *, demonstrated: bool) -> None:
-    counters, length, success = run.counters, 0, False
+    counters = run.counters
+    length = 0
+    success = False
     seed = episode_seed("training", run.spec.seed, counters.episode)
     if demonstrated:
         begin_episode(run.agent)  # an agent that acts is told by play()
@@ -82,7 +92,7 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
             watcher(observation, info)
 
     episode = play(
-        Watched(run.env, counters),
+        CountVisits(run.env, counters),
         run.demonstrator if demonstrated else run.agent,
         seed=seed,
         explore=True,
@@ -92,7 +102,8 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
     for lived, info in episode:
         transition = lived if teacher is None else teacher.told(lived)
         run.agent.observe(transition if run.entry.privileged else as_seen(transition), episode=counters.episode)
-        length, success = length + 1, bool(info["is_success"])
+        length = length + 1
+        success = bool(info["is_success"])
     counters.add_episode(success, length, queries=0 if queries is None else queries.asked)
 
 
@@ -112,7 +123,8 @@ def _teacher(run: Run) -> Teacher | None:
 
 def train_externally(run: Run, agent: ExternalTrainer, test: Callable[[int], None]) -> None:
     """Let the agent train in its own loop through all budgets, and test it, in an environment apart, at each."""
-    budgets, start_s = run.protocol.budgets, time.process_time()
+    budgets = run.protocol.budgets
+    start_s = time.process_time()
 
     def on_episode(success: bool, length: int) -> bool:
         nonlocal start_s
@@ -125,7 +137,7 @@ def train_externally(run: Run, agent: ExternalTrainer, test: Callable[[int], Non
         return run.counters.episode < budgets[-1]
 
     with closing(make_env(run.protocol, run.task.id)) as own:
-        starts = TrainingStarts(Watched(own, run.counters), run.spec.seed)
+        starts = TrainingStarts(CountVisits(own, run.counters), run.spec.seed)
         agent.train(starts, episodes=budgets[-1], horizon=run.task.horizon, on_episode=on_episode)
 
 
@@ -144,7 +156,8 @@ def test(run: Run) -> EvaluationCounts:
     if counters.test is None:
         train_in_model(run)
         counters.test = EvaluationCounts(diagnostics=run.agent.diagnostics())
-    purpose, privileged = evaluation_split(run.spec.seed), run.entry.privileged
+    purpose = evaluation_split(run.spec.seed)
+    privileged = run.entry.privileged
     seeds = [episode_seed(purpose, 0, each) for each in range(counters.test.episodes, run.protocol.evaluation_episodes)]
     if lanes_pay(run, len(seeds)):
         start_s = time.process_time()

@@ -49,7 +49,8 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
     def __call__(self, progress: Progress) -> None:
         """Show how far a run is."""
-        run, pauses = (progress.bench, progress.agent, progress.seed), progress.phase == "done"
+        run = (progress.bench, progress.agent, progress.seed)
+        pauses = progress.phase == "done"
         if progress.phase == "failed":
             self._drop(run, f"{progress.agent} seed {progress.seed} failed: {progress.detail}")
             return
@@ -79,8 +80,10 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
 
     def _times(self) -> str:
         """Time gone and, once there is something to judge by, time left."""
-        gone_s, done = time.monotonic() - self._began_s, sum(self._done.values())
-        played, missing = done - sum(self._before.values()), sum(self._works.values()) - done
+        gone_s = time.monotonic() - self._began_s
+        done = sum(self._done.values())
+        played = done - sum(self._before.values())
+        missing = sum(self._works.values()) - done
         left = f", {tqdm.format_interval(gone_s * missing / played)} left" if played else ""
         return f" {tqdm.format_interval(gone_s)} gone{left}"
 

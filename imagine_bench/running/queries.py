@@ -101,8 +101,10 @@ class Teacher:
 
     def __init__(self, rules: Rules, feedback: float, error: float) -> None:
         tables = tabulate(rules)
-        self._rows, self._optimal = tables.index, optimal_actions(tables)
-        self._feedback, self._error = feedback, error
+        self._rows = tables.index
+        self._optimal = optimal_actions(tables)
+        self._feedback = feedback
+        self._error = error
 
     def begin(self, seed: int) -> None:
         """A new episode, of which ``seed`` decides the errors."""
@@ -124,7 +126,9 @@ class QueryBudget:
     """The ``queries`` that ``learner`` may ask in one episode, before each of its macro-actions."""
 
     def __init__(self, learner: QueryingAgent, oracle: LabelOracle, queries: int) -> None:
-        self._learner, self._oracle, self._left = learner, oracle, queries
+        self._learner = learner
+        self._oracle = oracle
+        self._left = queries
         self.asked = 0
 
     def __call__(self, observation: Observation, info: Info) -> None:
@@ -135,4 +139,5 @@ class QueryBudget:
                 return
             macrostate = tuple(int(value) for value in info["macrostate"])
             self._learner.learn_label(observation, actions, self._oracle.label(macrostate, actions))
-            self._left, self.asked = self._left - 1, self.asked + 1
+            self._left = self._left - 1
+            self.asked = self.asked + 1

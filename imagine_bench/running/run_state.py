@@ -4,31 +4,113 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
+from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import OBSERVATIONS, Agent
+from imagine_bench.interfaces import OBSERVATIONS, Agent, AgentState
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
-from imagine_bench.running.counters import Counters
-from imagine_bench.running.evaluation import ByName, Env, StartsFrom
+from imagine_bench.running.evaluation import AsDict, Env, EvaluationCounts, Info, StartFrom
 from imagine_bench.running.queries import Teacher, demonstrator, require_able
 from imagine_bench.store import encoders, run_folder
-from imagine_bench.store.checkpoints import load_newest, save_snapshot, sweep_partial
+from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot, sweep_partial
+from imagine_bench.store.codec import pack, unpack
 from imagine_bench.store.files import reading, sweep, writing
+from imagine_bench.store.results import Checkpoint
 
 _RECENT = 100
 """Training episodes whose success is shown while running."""
 _REPORT_EVERY_S = 0.25
+
+
+@dataclass
+class Counters:
+    """The runner's own state."""
+
+    before: int = 0  #: Training episodes on earlier tasks done
+    episode: int = 0  #: Training episodes done
+    env_steps: int = 0  #: Macro-actions in them
+    train_cpu_s: float = 0.0  #: CPU seconds of training
+    rows: list[Checkpoint] = field(default_factory=list)  #: One a budget done
+    success: list[bool] = field(default_factory=list)  #: Whether each training episode succeeded
+    length: list[int] = field(default_factory=list)  #: Macro-actions of each training episode
+    queries: list[int] = field(default_factory=list)  #: Oracle queries in each training episode
+    starts: list[list[int]] = field(default_factory=list)  #: Where training episodes began, but those of a dataset
+    #: The episode in which each macro-action was first tried in a macrostate, by both, separated by blanks
+    tried: dict[str, int] = field(default_factory=dict)
+    test: EvaluationCounts | None = None  #: The test that is going on, if one is
+
+    def add_episode(self, success: bool, length: int, queries: int = 0) -> None:
+        """Count a training episode of so many macro-actions, and queries in it."""
+        self.episode += 1
+        self.env_steps += length
+        self.success.append(success)
+        self.length.append(length)
+        self.queries.append(queries)
+
+    def try_out(self, macrostate: Sequence[int], action: int) -> None:
+        """Count a macro-action of the training episode that goes on."""
+        self.tried.setdefault(" ".join(map(str, (*macrostate, action))), self.episode)
+
+    def training(self) -> dict[str, NDArray[Any]]:
+        """What ``training.npz`` holds.
+
+        ``success``, ``length`` and ``queries`` of every training episode, shape (episodes,); ``starts`` of those that
+        were played, (played, M); and ``tried``, a row a macrostate, macro-action and first episode, (pairs, M + 2).
+        """
+        pairs = [[*map(int, pair.split()), episode] for pair, episode in self.tried.items()]
+        return {
+            "success": np.array(self.success, dtype=np.bool_),
+            "length": np.array(self.length, dtype=np.int64),
+            "queries": np.array(self.queries, dtype=np.int64),
+            "starts": np.array(self.starts[: self.episode], dtype=np.int16),  # a library begins one more at its end
+            "tried": np.array(pairs, dtype=np.int32),
+        }
+
+    def snapshot(self, agent: AgentState) -> Snapshot:
+        """Everything, with the agent's state, as a checkpoint."""
+        values, arrays = pack(self)
+        return Snapshot(episode=self.episode, agent=agent, arrays=arrays, values=values)
+
+    @classmethod
+    def of(cls, snapshot: Snapshot) -> Counters:
+        """The inverse of :meth:`snapshot`."""
+        return unpack(cls, snapshot.values, snapshot.arrays)
+
+
+class CountVisits(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Counts where training episodes start and which macro-actions are tried where; the agent is told nothing."""
+
+    def __init__(self, env: Env, counters: Counters) -> None:
+        super().__init__(env)
+        self._counters = counters
+        self._at = list[int]()
+
+    def reset(self, **options: Any) -> tuple[Any, Info]:
+        """As the environment's."""
+        seen, info = self.env.reset(**options)
+        self._at = np.asarray(info["macrostate"]).tolist()
+        self._counters.starts.append(self._at)
+        return seen, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, Info]:
+        """As the environment's."""
+        after = self.env.step(action)
+        self._counters.try_out(self._at, int(action))
+        self._at = np.asarray(after[4]["macrostate"]).tolist()
+        return after
 
 
 def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options: Any) -> Env:
@@ -40,10 +122,10 @@ def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options:
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
     if protocol.observation in OBSERVATIONS[1:]:
-        env = ByName(env, protocol.observation)
+        env = AsDict(env, protocol.observation)
     if protocol.split is None or task != protocol.task:
         return env
-    return StartsFrom(env, protocol.spec(testing=testing).rules.start_states)
+    return StartFrom(env, protocol.spec(testing=testing).rules.start_states)
 
 
 @contextmanager
@@ -66,9 +148,13 @@ class Run:
     """
 
     def __init__(self, spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, env: Env, test_env: Env) -> None:
-        self.spec, self.protocol, self.folder = spec, spec.protocol, folder
-        self.env, self.test_env = env, test_env
-        self.task, self.entry = registry.task(spec.protocol.task), registry.agent_entry(spec.agent)
+        self.spec = spec
+        self.protocol = spec.protocol
+        self.folder = folder
+        self.env = env
+        self.test_env = test_env
+        self.task = registry.task(spec.protocol.task)
+        self.entry = registry.agent_entry(spec.agent)
         self._require_its_encoder()
         self.dataset = self._its_dataset() if self.entry.learns else None
         self.agent: Agent = registry.make_agent(spec.agent, spec.context())
@@ -159,7 +245,8 @@ class Run:
         if not at_once and now_s - self._reported_s < _REPORT_EVERY_S:
             return
         self._reported_s = now_s
-        counters, test = self.counters, self.counters.test
+        counters = self.counters
+        test = self.counters.test
         tested = len(counters.rows) if self.entry.learns else min(1, len(counters.rows))
         played = counters.before + counters.episode + tested * self.protocol.evaluation_episodes
         recent = counters.success[-_RECENT:]
@@ -167,7 +254,9 @@ class Run:
             success: float | None = test.successes / test.episodes
         else:
             success = sum(recent) / len(recent) if recent else None
-        spec, done, episode = self.spec, played + (test.episodes if test else 0), counters.episode
+        spec = self.spec
+        done = played + (test.episodes if test else 0)
+        episode = counters.episode
         where = Progress(
             agent=spec.agent, seed=spec.seed, bench=self.protocol.hash, phase=phase, done=done, work=spec.work,
             episode=episode, success=success,

@@ -100,7 +100,8 @@ def _test(run: Run, budget: int, observers: Sequence[RunObserver]) -> None:
 
 
 def _row(run: Run, budget: int, observers: Sequence[RunObserver]) -> Checkpoint:
-    test, start_s = phases.test(run), time.process_time()
+    test = phases.test(run)
+    start_s = time.process_time()
     measured = AtBudget()
     for observer in observers:
         measured.update(observer.at_budget(run, budget))

@@ -34,7 +34,8 @@ from imagine_bench.store.files import (
 )
 
 FORMAT = "imagine_bench checkpoint 2"
-_NAME, _PARTIAL = re.compile(r"checkpoint_([0-9]{6,})_episode_([0-9]+)"), ".partial_"
+_NAME = re.compile(r"checkpoint_([0-9]{6,})_episode_([0-9]+)")
+_PARTIAL = ".partial_"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -114,7 +114,8 @@ def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
     named = registry.is_own(spec.id) and appearance in APPEARANCES
     looks_bundled = named and any(name.startswith(f"{spec.encoder}-") for name in bundled())
     if not looks_bundled and bundled_name(spec.encoder, appearance, kind) not in bundled():
-        path, recipe = cached(spec, appearance, kind), "codes" if kind == "codes" else "default"
+        path = cached(spec, appearance, kind)
+        recipe = "codes" if kind == "codes" else "default"
         settings = {"recipe": recipe, "appearance": appearance, "seed": 0, "out": path.parent}
         what = f"{spec.id} has no encoder for {kind} at {appearance}; one is trained"
         _once(path, what, lambda: registry.load(_TRAIN)(spec, **settings))

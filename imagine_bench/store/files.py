@@ -208,7 +208,8 @@ def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
         BusyError: Another live process holds it for longer than ``patience_s`` seconds; the message says which.
         SetupError: The folder cannot be written or locked.
     """
-    held, holder = FileLock(path, timeout=patience_s), path.with_name(f"{path.name}.holder")
+    held = FileLock(path, timeout=patience_s)
+    holder = path.with_name(f"{path.name}.holder")
     with writing(path):
         for each in (path, holder):
             if os.path.lexists(each) and not stat.S_ISREG(each.lstat().st_mode):

@@ -14,6 +14,7 @@ from imagine_bench.errors import ArtefactError
 from imagine_bench.exact.certificate import Certificate
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.store.files import first_difference
 
 
@@ -141,18 +142,36 @@ class RunResult:
     sampled_rollouts: tuple[ComparedRollout, ...] = ()
 
 
-def require_one_setting(runs: Sequence[tuple[Path, Mapping[str, Any]]]) -> None:
-    """Raise ArtefactError for runs of an agent, by folder, of different settings; kept results have none and pass."""
-    known = [(folder, settings) for folder, settings in runs if settings]
-    for folder, settings in known[1:]:
-        difference = first_difference(known[0][1], settings)
-        if difference is not None:
-            name, value, other = difference
-            raise ArtefactError(
-                f"{known[0][0]} ran with {name} {value!r} and {folder} with {other!r}, as another kind of machine may "
-                f"choose. Runs that are compared need one value: give it with --set {name}=..., or use one kind of "
-                "machine."
-            )
+def require_every_run(
+    folder: Path, protocol: ProtocolData, runs: Sequence[tuple[str, int, Path, Mapping[str, Any]]]
+) -> None:
+    """Raise ArtefactError unless there is one run for each learner and seed, and all of a learner had equal settings.
+
+    Runs are agent, seed, folder and settings; kept results have no settings and pass.
+    """
+    wanted = {(agent, seed) for agent in protocol.agents for seed in protocol.seeds}
+    found = [(agent, seed) for agent, seed, _, _ in runs]
+    missing = sorted(wanted - set(found))
+    if missing or len(found) != len(wanted):
+        raise ArtefactError(
+            f"{folder} should hold one run for each of {len(wanted)} agents and seeds and holds {len(found)}; "
+            f"missing: {missing or 'none'}. Run the same bench command again to complete it."
+        )
+    first: dict[str, tuple[Path, Mapping[str, Any]]] = {}
+    for agent, _, where, settings in runs:
+        if settings:
+            known, wanted_settings = first.setdefault(agent, (where, settings))
+            _require_same_settings(known, wanted_settings, where, settings)
+
+
+def _require_same_settings(known: Path, wanted: Mapping[str, Any], other: Path, given: Mapping[str, Any]) -> None:
+    difference = first_difference(wanted, given)
+    if difference is not None:
+        name, value, differs = difference
+        raise ArtefactError(
+            f"{known} ran with {name} {value!r} and {other} with {differs!r}, as another kind of machine may choose. "
+            f"Runs that are compared need one value: give it with --set {name}=..., or use one kind of machine."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,20 +193,12 @@ class BenchResult:
     made_with: str = ""  #: Of kept results, the hash that their protocol had then; names may have changed since
 
     def __post_init__(self) -> None:
-        wanted = {(agent, seed) for agent in self.protocol.agents for seed in self.protocol.seeds}
-        found = [(run.agent, run.seed) for run in self.runs]
-        missing = sorted(wanted - set(found))
-        if missing or len(found) != len(wanted):
-            raise ArtefactError(
-                f"{self.folder} should hold one run for each of {len(wanted)} agents and seeds and holds {len(found)}; "
-                f"missing: {missing or 'none'}. Run the same bench command again to complete it."
-            )
+        runs = [(run.agent, run.seed, run.folder, run.settings) for run in self.runs]
+        require_every_run(self.folder, self.protocol, runs)
         for run in self.runs:
             budgets = tuple(checkpoint.episodes for checkpoint in run.checkpoints)
             if budgets != self.protocol.budgets:
                 raise ArtefactError(f"{run.folder} has budgets {budgets}, the protocol says {self.protocol.budgets}.")
-        for agent in self.protocol.agents:
-            require_one_setting([(run.folder, run.settings) for run in self.of(agent)])
 
     @property
     def protocol_hash(self) -> str:

@@ -30,9 +30,8 @@ from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.running import phases
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.control import plan_control
-from imagine_bench.running.counters import Counters
 from imagine_bench.running.evaluation import Env, play
-from imagine_bench.running.run_state import Run, make_env
+from imagine_bench.running.run_state import Counters, Run, make_env
 from imagine_bench.store import encoders
 from imagine_bench.testing.common import NotOffered, require
 from imagine_bench.testing.of_agents import CheckedAgent, greedy, same_arrays

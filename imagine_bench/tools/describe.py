@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 
 import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate, certificate_rows
-from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
+from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, TaskSpec, bundled_name
 from imagine_bench.rules import evaluate, greedy, is_random, optimal_policy, states_of, tabulate
+from imagine_bench.running.launchers.jobs import LAUNCHERS
+from imagine_bench.running.task_types import task_types
 from imagine_bench.store.encoders import bundled
+from imagine_bench.sweep.catalogue import all_grids
 
 _MOST = 10
 """Plan lengths that are listed one by one."""
@@ -41,6 +45,26 @@ def describe(name: str) -> str:
         "encoders": _encoders(spec),
     }
     return _page(spec.title, spec.description, rows)
+
+
+def names() -> str:
+    """The names of all tasks, agents, presets and so on, one kind a line; then what packages offer in vain."""
+    kinds: dict[str, Iterable[str]] = {}
+    for name, kind in task_types().items():
+        kinds[f"{name} tasks"] = kind.tasks()
+        kinds[f"{name} learners"] = kind.learners()
+        kinds[f"{name} presets"] = kind.presets
+    kinds["grids"] = all_grids()
+    kinds["world models"] = registry.world_models()
+    kinds["executions"] = EXECUTIONS
+    kinds["launchers"] = LAUNCHERS
+    kinds["appearances"] = APPEARANCES
+    kinds["encoders"] = {**bundled(), **registry.usable(registry.ENCODER_GROUP)}
+    lines = [f"{kind:22}{', '.join(members)}" for kind, members in kinds.items()]
+    for guest in registry.absent_guests():
+        absent = [name for each in guest.names.values() for name in each]
+        lines.append(f"{'not installed':22}{', '.join(absent)} ({guest.install})")
+    return "\n".join([*lines, *(f"\n{error}" for error in registry.refused_offers().values())])
 
 
 def _page(title: str, description: str, rows: dict[str, str]) -> str:

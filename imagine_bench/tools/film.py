@@ -1,4 +1,4 @@
-"""``imagine-bench film``: a GIF of the oracle at work, the whole scene beside the frame that agents see."""
+"""``imagine-bench play --film``: a GIF of the oracle at work, the whole scene beside the frame that agents see."""
 
 from __future__ import annotations
 

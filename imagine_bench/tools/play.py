@@ -169,7 +169,7 @@ def play(
         raise InvalidValueError("There is nothing to play; give a task or --model.")
     spec = registry.task(task)
     chosen |= {name: value for name, value in (("execution", execution), ("appearance", appearance)) if value}
-    registry.load("imagine_bench.tasks.window:open_display")(seen=True)
+    registry.load("imagine_bench.tasks.rendering.window:open_display")(seen=True)
     with warnings.catch_warnings():  # it wants matplotlib to open windows, too
         warnings.simplefilter("ignore")
         from gymnasium.utils.play import play as keyboard  # noqa: PLC0415 - an extra

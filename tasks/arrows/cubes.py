@@ -12,8 +12,11 @@ from ..scenes.meshes import prism
 
 _ARROW_THICKNESS_M = 0.0008
 _HALF_M = c.CUBE_EDGE_M / 2
-_TIP_M, _BARB_M, _TAIL_M = 0.023, 0.020, 0.022
-_NECK_X_M, _SHAFT_HALF_M = 0.001, 0.0075
+_TIP_M = 0.023
+_BARB_M = 0.020
+_TAIL_M = 0.022
+_NECK_X_M = 0.001
+_SHAFT_HALF_M = 0.0075
 
 
 def arrow_outline() -> np.ndarray:
@@ -32,11 +35,24 @@ def add_cubes(spec: mujoco.MjSpec, slots_xy_m: Sequence[tuple[float, float]]) ->
         body = spec.worldbody.add_body(name=f"cube_{cube}", pos=(x_m, y_m, c.TABLE_HEIGHT_M + _HALF_M))
         body.add_freejoint(name=f"cube_{cube}_joint")
         body.add_geom(
-            name=f"cube_{cube}_box", type=mujoco.mjtGeom.mjGEOM_BOX, size=(_HALF_M,) * 3, mass=c.CUBE_MASS_KG,
-            material="cube", group=c.SCENE_GROUP, condim=3, friction=(0.8, 0.005, 0.0001),
+            name=f"cube_{cube}_box",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(_HALF_M,) * 3,
+            mass=c.CUBE_MASS_KG,
+            material="cube",
+            group=c.SCENE_GROUP,
+            condim=3,
+            friction=(0.8, 0.005, 0.0001),
             solref=(2 * c.TIMESTEP_S, 1.0),
-        )  # fmt: skip
+        )
         body.add_geom(
-            name=f"cube_{cube}_arrow", type=mujoco.mjtGeom.mjGEOM_MESH, meshname="arrow", material="arrow",
-            pos=(0.0, 0.0, _HALF_M), mass=0.0, contype=0, conaffinity=0, group=c.SCENE_GROUP,
-        )  # fmt: skip
+            name=f"cube_{cube}_arrow",
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname="arrow",
+            material="arrow",
+            pos=(0.0, 0.0, _HALF_M),
+            mass=0.0,
+            contype=0,
+            conaffinity=0,
+            group=c.SCENE_GROUP,
+        )

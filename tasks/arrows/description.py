@@ -15,7 +15,7 @@ import numpy as np
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
 
-from ..dials.dials import Dials
+from ..parameters.parameters import WorldParameters
 
 MAX_CUBES = 6
 N_DIRECTIONS = 4
@@ -33,7 +33,7 @@ class Turn:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arrows(Dials):
+class Arrows(WorldParameters):
     """A world; its canonical name says what differs from the defaults.
 
     Raises:
@@ -56,8 +56,11 @@ class Arrows(Dials):
 
     FAMILY: ClassVar[str] = "arrows"
     RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
-        "cubes": (1, MAX_CUBES), "shuffle": (0, 2**32 - 1), "horizon": (1, 1000), **Dials.RANGES,
-    }  # fmt: skip
+        "cubes": (1, MAX_CUBES),
+        "shuffle": (0, 2**32 - 1),
+        "horizon": (1, 1000),
+        **WorldParameters.RANGES,
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -66,7 +69,7 @@ class Arrows(Dials):
         require_known("coupling", self.coupling, COUPLINGS)
         self._check_goal()
         self._check_forbid()
-        for name in ("fickle", "coupling"):
+        for name in ("goal_change", "coupling"):
             if self.cubes == 1 and getattr(self, name) != getattr(Arrows, name):
                 raise InvalidValueError(f"{name}={getattr(self, name)} needs another cube; give at least 2 cubes.")
 

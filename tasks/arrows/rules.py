@@ -1,12 +1,12 @@
 """The rules of arrow puzzles (thesis, chapter 5): no physics, no images, exact.
 
-A world is a goal, what is forbidden, what a turn turns, the order of the macro-actions and its dials; see
+A world is a goal, what is forbidden, what a turn turns, the order of the macro-actions and its parameters; see
 :class:`.description.Arrows`, which also says what a macrostate is.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count, pairwise, product
 
@@ -17,8 +17,8 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import optimal_policy, tabulate
 
-from ..dials.fickle import fickle
-from ..dials.slip import slipping
+from ..parameters.goal_change import changing_goal
+from ..parameters.slip import slipping
 from .description import N_DIRECTIONS, Arrows
 
 TOWARD_HUMAN, RIGHT, TOWARD_AGENT, LEFT = range(N_DIRECTIONS)
@@ -71,7 +71,7 @@ class ArrowRules:
         world: The world.
     """
 
-    world: Arrows = Arrows()  # noqa: RUF009 - frozen
+    world: Arrows = field(default_factory=Arrows)
 
     @cached_property
     def goal(self) -> Goal:
@@ -91,7 +91,7 @@ class ArrowRules:
 
     @cached_property
     def start_states(self) -> tuple[tuple[int, ...], ...]:
-        """The macrostates that are no end and from which turns lead to a goal, whatever the dials are.
+        """The macrostates that are no end and from which turns lead to a goal, whatever slips or changes.
 
         Raises:
             InvalidValueError: There is none; the message says what there is.
@@ -108,7 +108,7 @@ class ArrowRules:
 
     @cached_property
     def plan_lengths(self) -> NDArray[np.int64]:
-        """Fewest turns from each macrostate to a goal, dials apart; 0 at goals, -1 where no turns do. Shape (S,)."""
+        """Fewest turns from each macrostate to a goal without slips; 0 at goals, -1 where no turns do. Shape (S,)."""
         states = np.array(self.states)
         legal, goal = (np.array([what(state) for state in self.states]) for what in (self.is_legal, self.is_goal))
         after = []
@@ -134,7 +134,8 @@ class ArrowRules:
 
     def is_legal(self, macrostate: tuple[int, ...]) -> bool:
         """Whether no two arrows are alike that may not be."""
-        directions, forbidden = macrostate[:-1], self.world.forbidden
+        directions = macrostate[:-1]
+        forbidden = self.world.forbidden
         if "equal" in forbidden and len(set(directions)) < len(directions):
             return False
         return "neighbours" not in forbidden or all(left != right for left, right in pairwise(directions))
@@ -170,11 +171,13 @@ class ArrowRules:
         return Outcome(1.0, reached, STEP_REWARD, terminated=False, success=False)
 
     def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
-        """The result of a turn, which is certain but for the dials."""
+        """The result of a turn, which is certain but for the world's parameters."""
         found: tuple[Outcome, ...] = (self.judge(macrostate, action, self.turned(macrostate, action)),)
         if self.world.slip:
             found = slipping(found, self.judge(macrostate, action, macrostate), self.world.slip)
-        return fickle(found, self._pointed_elsewhere, self.world.fickle) if self.world.fickle else found
+        return (
+            changing_goal(found, self._pointed_elsewhere, self.world.goal_change) if self.world.goal_change else found
+        )
 
     def _pointed_elsewhere(self, outcome: Outcome) -> list[Outcome]:
         *directions, pointed = outcome.macrostate

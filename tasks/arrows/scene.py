@@ -7,7 +7,7 @@ import functools
 
 import mujoco
 
-from ..dials.distractors import add_distractors
+from ..parameters.distractors import add_distractors
 from ..scenes.arm import arm_spec, let_arm_touch
 from ..scenes.constants import AGENT_CAMERA
 from ..scenes.hand import add_pointing_hand

@@ -1,7 +1,7 @@
 """Arrow puzzles (thesis, chapter 5): what the bench needs to know of each world, and the environments.
 
-Worlds of as many cubes share scene and encoders, whatever their goals and dials: what has been learned of how one of
-them moves is true in every other whose turns are the same.
+Worlds of as many cubes share scene and encoders, whatever their goals and other parameters. What an agent has learned
+of how one of them moves is true in every other one with the same turns.
 
 Importing this module is cheap: MuJoCo loads when an environment or a frame is made.
 """
@@ -42,11 +42,13 @@ _NAMED = {
     Arrows(horizon=10): ("arrow_puzzle", "Arrow puzzle", "ArrowPuzzle"),
     Arrows(forbid="equal+agent", horizon=10): ("arrow_puzzle_hard", "Arrow puzzle, hard", "ArrowPuzzleHard"),
     Arrows(goal="toward_agent", horizon=10): (
-        "arrow_puzzle_toward", "Arrow puzzle, toward the agent", "ArrowPuzzleToward",
+        "arrow_puzzle_toward",
+        "Arrow puzzle, toward the agent",
+        "ArrowPuzzleToward",
     ),
     Arrows(goal="clockwise", horizon=10): ("arrow_puzzle_clockwise", "Arrow puzzle, clockwise", "ArrowPuzzleClockwise"),
     Arrows(cubes=1, horizon=2): ("arrow_puzzle_easy", "Arrow puzzle, easy", "ArrowPuzzleEasy"),
-}  # fmt: skip
+}
 """Registered points of the family: name, title, and Gymnasium's name of the task."""
 _IN_THESIS = ("arrow_puzzle", "arrow_puzzle_hard")
 _TARGETS = PerformanceTargets(
@@ -100,7 +102,7 @@ def spec_of(**world: Any) -> TaskSpec:
         InvalidValueError: No such world, or one whose goal cannot be reached from anywhere.
         UnknownNameError: An unknown goal, forbid or coupling.
     """
-    return _spec(Arrows(**world))
+    return _spec(Arrows.taken_from(world))
 
 
 @functools.cache
@@ -123,9 +125,9 @@ def _spec(world: Arrows) -> TaskSpec:
         macrostate_names=(*(f"{cube} arrow" for cube in cubes), "pointed cube"),
         macrostate_values=(_DIRECTIONS,) * world.cubes + (cubes,),
         preprocessing=gray_name(world.cubes),
-        encoder=("arrow_puzzle" if world.cubes == Arrows.cubes else f"arrows_{world.cubes}") + world.looks,
+        encoder=("arrow_puzzle" if world.cubes == Arrows.cubes else f"arrows_{world.cubes}") + world.encoder_suffix,
         rules=rules,
-        sight=world.sight(),
+        sight=world.observation_model(),
         facts=functools.partial(facts, rules, rules.horizon),
         render_macrostates=functools.partial(_rendered, rules),
         reference=name if name in _IN_THESIS else None,

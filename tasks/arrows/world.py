@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ..motion import orientation
-from ..motion.executor import MacroResult, Motion
+from ..motion.executor import MacroResult
 from ..scenes import constants as c
 from ..scenes.appearance import Appearance
 from ..scenes.layout import layout
@@ -21,14 +21,17 @@ if TYPE_CHECKING:
     from ..motion.turn import TurnExecutor
 
 _QUARTER_RAD = math.pi / 2
+_THESIS = Arrows()
+"""The puzzle of three cubes."""
 MAX_OFF_SLOT_M = 0.015
 
 
 class ArrowWorld(World):
     """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
 
-    def __init__(self, level: Appearance, arrows: Arrows = Arrows()) -> None:  # noqa: B008 - frozen
-        self._turns, self._layout = arrows.turns, layout(arrows.cubes)
+    def __init__(self, level: Appearance, arrows: Arrows = _THESIS) -> None:
+        self._turns = arrows.turns
+        self._layout = layout(arrows.cubes)
         objects = {f"cube_{cube}": f"cube {cube}" for cube in range(arrows.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
         model = compile_arrow_scene(arrows.cubes, arrows.distractors)
@@ -50,20 +53,26 @@ class ArrowWorld(World):
         self._gesture(intended[-1])
         self.update()
 
-    def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
+    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """Physical execution: the arm turns cubes in contact physics, one after another, then everything is at rest.
 
         A cube that is due and shall stay as it is slips out of the fingers.
         """
-        turns, before = self._turns[action], self.object_poses()
+        turns = self._turns[action]
+        before = self.object_poses()
         slipping = [turn.cube for turn in turns if self._stays(turn.cube, intended)]
-        results = []
-        for turn in turns:
-            results.append((yield from self.executor.turn(
-                self.data, cube=turn.cube, clockwise=turn.clockwise, slips=turn.cube in slipping,
-                off=self._off(self._aims[turn.cube]), capture_motion_hz=capture_motion_hz,
-            )))  # fmt: skip
-        self.executor.executor.rest(self.data)
+        results = [
+            self.executor.turn(
+                self.data,
+                cube=turn.cube,
+                clockwise=turn.clockwise,
+                slips=turn.cube in slipping,
+                off=self._off(self._aims[turn.cube]),
+                capture_motion_hz=capture_motion_hz,
+            )
+            for turn in turns
+        ]
+        self.executor.rest(self.data)
         self._gesture(intended[-1])
         self.update()
         result = functools.reduce(MacroResult.then, results)
@@ -76,11 +85,14 @@ class ArrowWorld(World):
         return self._objects()[0][cube] == intended[cube]
 
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        (x_m, y_m), (right_m, up_m, turned_rad) = self._layout.slots_xy_m[index], self._off(offset)
+        x_m, y_m = self._layout.slots_xy_m[index]
+        right_m, up_m, turned_rad = self._off(offset)
         self.data.qpos[self.object_qpos[index]] = (
-            x_m + right_m, y_m + up_m, c.CUBE_REST_Z_M,
+            x_m + right_m,
+            y_m + up_m,
+            c.CUBE_REST_Z_M,
             *orientation.about_vertical(-(_QUARTER_RAD * value - turned_rad)),
-        )  # fmt: skip
+        )
 
     def _hands_m(self, gesture: int) -> dict[int, tuple[float, float, float]]:
         return {self._hand: self._layout.fingertips_m[gesture]}
@@ -89,7 +101,8 @@ class ArrowWorld(World):
         """The nearest direction of a cube's arrow, and what is wrong with how the cube stands."""
         turned_rad = orientation.yaw_rad(*pose[3:])
         quarters = round(turned_rad / _QUARTER_RAD)
-        skew_rad, off_m = abs(turned_rad - quarters * _QUARTER_RAD), math.dist(pose[:2], self._layout.slots_xy_m[index])
+        skew_rad = abs(turned_rad - quarters * _QUARTER_RAD)
+        off_m = math.dist(pose[:2], self._layout.slots_xy_m[index])
         problem = self._tipped(index, pose)
         if problem is None and off_m > MAX_OFF_SLOT_M:
             problem = f"{self._names[index]} stands {1e3 * off_m:.0f} mm off its slot"

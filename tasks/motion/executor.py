@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import mujoco
 import mujoco.rollout
@@ -18,6 +17,7 @@ from imagine_bench.interfaces import Floats
 from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 from .arm_model import ArmModel
+from .sensing import Sensing
 from .trajectory import Trajectory, Waypoint, plan
 
 REST_OPENING_M = 0.0365
@@ -46,61 +46,13 @@ def back_to_rest(opening_m: float, settle_s: float) -> list[Waypoint]:
 
 def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
     """Positions (nq,) and controls (nu,) of a whole scene, its arm at the observation pose with open fingers."""
-    qpos, ctrl = model.qpos0.copy(), np.zeros(model.nu)
+    qpos = model.qpos0.copy()
+    ctrl = np.zeros(model.nu)
     targets = [*zip(ARM_JOINTS, OBSERVATION_QPOS_RAD, strict=True), *((name, REST_OPENING_M) for name in FINGER_JOINTS)]
     for name, value in targets:
         qpos[model.joint(name).qposadr[0]] = value
         ctrl[model.actuator(name.replace("_slide", "") + "_servo").id] = value
     return qpos, ctrl
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Simulation:
-    """A planned motion that waits to be simulated; neither the thread nor the moment changes a bit of it."""
-
-    model: mujoco.MjModel
-    data: mujoco.MjData  #: at the canonical start, and at the end once it has run
-    states: Floats  #: row 0 is the start, :meth:`run` fills in what follows each step. Shape (N + 1, FULLPHYSICS).
-    control: Floats  #: controls, then mocap poses, of each step. Shape (N, C).
-
-    def run(self) -> None:
-        """Simulate; other threads go on meanwhile.
-
-        Raises:
-            DivergedError: NaN, infinity or runaway speed; the message names the saved start.
-        """
-        states, control = self.states, self.control
-        mujoco.rollout.rollout(self.model, self.data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
-        warnings = (self.data.warning[int(kind)].number for kind in _BAD_STATE)
-        if not any(warnings) and np.isfinite(states[-1]).all() and np.abs(self.data.qvel).max() < _RUNAWAY_RAD_S:
-            return
-        handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, start_state=states[0], control=control[:, : self.model.nu])
-        raise DivergedError(
-            "The simulation of a macro-action diverged (NaN, infinity or runaway speed); "
-            f"its start state and controls were saved in {path}."
-        )
-
-
-_Value = TypeVar("_Value")
-Motion = Generator[Simulation, None, _Value]
-"""What carries a macro-action out: it yields each simulation that it needs, and goes on when that has run."""
-
-
-def finish(motion: Motion[_Value]) -> _Value:
-    """Carry a motion out here and now.
-
-    Raises:
-        DivergedError: As :meth:`Simulation.run`.
-    """
-    while True:
-        try:
-            simulation = next(motion)
-        except StopIteration as end:
-            value: _Value = end.value
-            return value
-        simulation.run()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,14 +81,16 @@ class MacroResult:
 
 
 class MacroExecutor:
-    """Executes trajectories on a compiled scene that holds the arm.
+    """Executes trajectories on a compiled scene that holds the arm: the base of what plans macro-actions.
 
     Before and after each macro-action the arm is set onto its observation pose; one that ended further off it than
     0.02 rad is a fault. What plans for it measures true poses of objects, unless :class:`.sensing.Sensing` says else.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, sensing: Sensing | None = None) -> None:
         self.model = model
+        self.arm = ArmModel()
+        self.sensing = sensing or Sensing()
         self._arm_qpos = np.array([int(model.joint(name).qposadr[0]) for name in ARM_JOINTS])
         self._finger_qpos = np.array([int(model.joint(name).qposadr[0]) for name in FINGER_JOINTS])
         self._arm_ctrl = np.array([model.actuator(f"{name}_servo").id for name in ARM_JOINTS])
@@ -154,9 +108,13 @@ class MacroExecutor:
         positions and on ``squeeze_m`` alone: the command to each finger that keeps an object held, or None, which opens
         the fingers to where they rest. Derived quantities are not updated.
         """
-        qpos, mocap_pos, mocap_quat = data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()
+        qpos = data.qpos.copy()
+        mocap_pos = data.mocap_pos.copy()
+        mocap_quat = data.mocap_quat.copy()
         mujoco.mj_resetData(self.model, data)
-        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = qpos, mocap_pos, mocap_quat
+        data.qpos[:] = qpos
+        data.mocap_pos[:] = mocap_pos
+        data.mocap_quat[:] = mocap_quat
         data.qpos[self._arm_qpos] = OBSERVATION_QPOS_RAD
         if squeeze_m is None:
             data.qpos[self._finger_qpos] = REST_OPENING_M
@@ -166,13 +124,12 @@ class MacroExecutor:
     def perform(
         self,
         data: mujoco.MjData,
-        arm: ArmModel,
         waypoints: Sequence[Waypoint],
         *,
         ik_error_m: float,
         squeeze_m: float | None = None,
         capture_motion_hz: float = 0.0,
-    ) -> Motion[tuple[MacroResult, Floats, Trajectory]]:
+    ) -> tuple[MacroResult, Floats, Trajectory]:
         """Plan a motion through ``waypoints``, the last of which is the observation pose, and execute it.
 
         ``squeeze_m`` is as in :meth:`rest`, ``capture_motion_hz`` as in :meth:`capture`.
@@ -180,20 +137,26 @@ class MacroExecutor:
         Returns:
             The result, whose fault says whether the arm came back; the positions as :meth:`run`; and the plan.
         """
-        timestep_s, start_rad = self.model.opt.timestep, np.array(OBSERVATION_QPOS_RAD)
+        timestep_s = self.model.opt.timestep
+        start_rad = np.array(OBSERVATION_QPOS_RAD)
         start_m = REST_OPENING_M if squeeze_m is None else squeeze_m
         trajectory = plan(
-            arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
+            self.arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
         )
-        qpos = yield from self.run(data, trajectory, squeeze_m=squeeze_m)
+        qpos = self.run(data, trajectory, squeeze_m=squeeze_m)
         time_s, samples, qvel, ctrl = self.capture(len(qpos) - 1, capture_motion_hz)
         off_rad = float(np.abs(self.arm_qpos_rad(qpos[-1]) - OBSERVATION_QPOS_RAD).max())
         astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
         sim_time_s = (len(qpos) - 1) * timestep_s
         result = MacroResult(
-            sim_time_s=sim_time_s, ik_error_m=ik_error_m, fault=astray,
-            time_s=time_s, qpos=samples, qvel=qvel, ctrl=ctrl,
-        )  # fmt: skip
+            sim_time_s=sim_time_s,
+            ik_error_m=ik_error_m,
+            fault=astray,
+            time_s=time_s,
+            qpos=samples,
+            qvel=qvel,
+            ctrl=ctrl,
+        )
         return result, qpos, trajectory
 
     def refused(self, reason: str) -> MacroResult:
@@ -201,7 +164,7 @@ class MacroExecutor:
         time_s, qpos, qvel, ctrl = self.capture(0, 0.0)
         return MacroResult(sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=time_s, qpos=qpos, qvel=qvel, ctrl=ctrl)
 
-    def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Motion[Floats]:
+    def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
         """Execute ``trajectory``, planned at the model's timestep, from the canonical start.
 
         The derived quantities of ``data`` (such as ``xpos``) are then those of the last step.
@@ -209,20 +172,36 @@ class MacroExecutor:
         Returns:
             Positions of the whole scene, row 0 at the start, row k after step k; valid until the next run.
             Shape (N + 1, nq).
+
+        Raises:
+            DivergedError: NaN, infinity or runaway speed; the message names the saved start.
         """
         self.rest(data, squeeze_m=squeeze_m)
         steps = len(trajectory.opening_m)
         if len(self._control) < steps:
             self._states = np.empty((steps + 1, self._states.shape[1]))
             self._control = np.empty((steps, self._control.shape[1]))
-        states, control = self._states[: steps + 1], self._control[:steps]
+        states = self._states[: steps + 1]
+        control = self._control[:steps]
         mujoco.mj_getState(self.model, data, states[0], _STATE.mjSTATE_FULLPHYSICS.value)
         mujoco.mj_getState(self.model, data, control[0], _INPUTS)
         control[1:] = control[0]
         control[:, self._arm_ctrl] = trajectory.arm_command_rad
         control[:, self._finger_ctrl] = trajectory.opening_m[:, None]
-        yield Simulation(model=self.model, data=data, states=states, control=control)
+        mujoco.rollout.rollout(self.model, data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
+        if _diverged(data, states[-1]):
+            raise self._divergence(states[0], control)
         return states[:, self._qpos_column : self._qpos_column + self.model.nq]
+
+    def _divergence(self, start: Floats, control: Floats) -> DivergedError:
+        """Save a start and its controls (N, C) to be looked into."""
+        handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, start_state=start, control=control[:, : self.model.nu])
+        return DivergedError(
+            "The simulation of a macro-action diverged (NaN, infinity or runaway speed); "
+            f"its start state and controls were saved in {path}."
+        )
 
     def arm_qpos_rad(self, qpos: Floats) -> Floats:
         """The arm's joints in positions of the scene: (..., nq) to (..., 7)."""
@@ -242,7 +221,10 @@ class MacroExecutor:
             Times in s (K,), positions (K, nq), velocities (K, nv) and commands (K, nu), with the first and the last
             step whenever ``motion_hz > 0``.
         """
-        timestep_s, (nq, nv, nu) = self.model.opt.timestep, (self.model.nq, self.model.nv, self.model.nu)
+        timestep_s = self.model.opt.timestep
+        nq = self.model.nq
+        nv = self.model.nv
+        nu = self.model.nu
         if motion_hz <= 0:
             return np.empty(0), np.empty((0, nq)), np.empty((0, nv)), np.empty((0, nu))
         stride = 1.0 / (motion_hz * timestep_s)
@@ -255,3 +237,10 @@ class MacroExecutor:
         for row in np.flatnonzero(share % 1.0):
             mujoco.mj_normalizeQuat(self.model, samples[row, :nq])
         return at * timestep_s, samples[:, :nq], samples[:, nq:], self._control[before, :nu]
+
+
+def _diverged(data: mujoco.MjData, state: Floats) -> bool:
+    """Whether the simulation that ends in ``state`` has exploded."""
+    if any(data.warning[int(kind)].number for kind in _BAD_STATE):
+        return True
+    return not (np.isfinite(state).all() and np.abs(data.qvel).max() < _RUNAWAY_RAD_S)

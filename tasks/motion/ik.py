@@ -66,11 +66,15 @@ class ArmIK:
             TCP_SITE, "site", position_cost=1.0, orientation_cost=_ORIENTATION_COST, lm_damping=_FAR_DAMPING
         )
         self._home_rad = np.array(HOME_QPOS_RAD)
-        n_joints, limits = arm.model.nv, mink.ConfigurationLimit(arm.model)
-        self._lower_rad, self._upper_rad, self._gain = limits.lower, limits.upper, limits.gain
+        n_joints = arm.model.nv
+        limits = mink.ConfigurationLimit(arm.model)
+        self._lower_rad = limits.lower
+        self._upper_rad = limits.upper
+        self._gain = limits.gain
         self._weights = np.vstack([np.zeros((6, n_joints)), _POSTURE_COST * np.eye(n_joints)])  # of reach and posture
         self._bounded = np.vstack([np.eye(n_joints), -np.eye(n_joints)])
-        self._unbounded, self._kind = np.full(2 * n_joints, -1e30), np.zeros(2 * n_joints, dtype=c_int)
+        self._unbounded = np.full(2 * n_joints, -1e30)
+        self._kind = np.zeros(2 * n_joints, dtype=c_int)
 
     def solve(
         self,
@@ -95,7 +99,8 @@ class ArmIK:
         self._configuration.update(np.array(HOME_QPOS_RAD if start_qpos_rad is None else start_qpos_rad))
         for iteration in range(max_iterations + 1):
             error = self._reach.compute_error(self._configuration)  # [6], position then rotation vector
-            position_error_m, angle_error_rad = math.hypot(*error[:3]), math.hypot(*error[3:])
+            position_error_m = math.hypot(*error[:3])
+            angle_error_rad = math.hypot(*error[3:])
             if position_error_m < POSITION_TOLERANCE_M and angle_error_rad < ANGLE_TOLERANCE_RAD:
                 errors = {"position_error_m": position_error_m, "angle_error_rad": angle_error_rad}
                 return IKSolution(qpos_rad=self._configuration.q.copy(), iterations=iteration, **errors)

@@ -23,7 +23,8 @@ class Sensing:
     def draw(self, rng: np.random.Generator) -> None:
         """Draw the errors of the next macro-action; nothing is drawn where they are 0."""
         if self.settings.plan_error_mm:
-            angle_rad, off_m = rng.uniform(-math.pi, math.pi), 1e-3 * self.settings.plan_error_mm
+            angle_rad = rng.uniform(-math.pi, math.pi)
+            off_m = 1e-3 * self.settings.plan_error_mm
             self.aside_m = (off_m * math.cos(angle_rad), off_m * math.sin(angle_rad))
         if self.settings.plan_error_deg:
             self.turned_rad = math.radians(self.settings.plan_error_deg) * (1 if rng.random() < 0.5 else -1)

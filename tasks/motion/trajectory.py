@@ -18,7 +18,8 @@ from imagine_bench.interfaces import Floats
 
 from .arm_model import ArmModel
 
-PEAK_SPEED, PEAK_ACCELERATION = 15 / 8, 10 / math.sqrt(3)
+PEAK_SPEED = 15 / 8
+PEAK_ACCELERATION = 10 / math.sqrt(3)
 """Of the minimum-jerk profile, in Δq / T and Δq / T²."""
 SPEED_SHARE = 0.97
 """Share of the speed limits that a plan uses; the rest is left to the servos."""
@@ -76,12 +77,15 @@ def plan(
     (gravity is compensated in the model). M is taken halfway along each motion. The arm (7,) and each finger rest at
     their starts before; there is at least one waypoint.
     """
-    at_qpos_rad, at_opening_m, first = start_qpos_rad, start_opening_m, 0
+    at_qpos_rad = start_qpos_rad
+    at_opening_m = start_opening_m
+    first = 0
     motions: list[tuple[int, Floats]] = []  # first step, rows [steps, 15]
     last_step: dict[str, int] = {}
     for waypoint in waypoints:
         delta_rad = waypoint.qpos_rad - at_qpos_rad
-        duration_s, inertial_nms2 = max(waypoint.min_duration_s, timestep_s), np.zeros(7)
+        duration_s = max(waypoint.min_duration_s, timestep_s)
+        inertial_nms2 = np.zeros(7)
         if delta_rad.any():
             inertia = arm.inertia(at_qpos_rad + delta_rad / 2)
             inertial_nms2 = inertia @ delta_rad
@@ -97,7 +101,8 @@ def plan(
         motions.append((first, minimum_jerk(steps) @ weights))
         last_step[waypoint.name] = first + steps - 1
         first += max(0, steps - math.floor(waypoint.blend_s / timestep_s + 1e-9))
-        at_qpos_rad, at_opening_m = waypoint.qpos_rad, waypoint.opening_m
+        at_qpos_rad = waypoint.qpos_rad
+        at_opening_m = waypoint.opening_m
     rows = np.empty((max(last_step.values()) + 1, 15))
     rows[:] = np.concatenate([start_qpos_rad, start_qpos_rad, [start_opening_m]])
     for first, motion in motions:

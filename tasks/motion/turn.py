@@ -13,8 +13,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 
 from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M
-from .arm_model import ArmModel
-from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, Motion, back_to_rest
+from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose
 from .sensing import Sensing
@@ -25,21 +24,25 @@ _MIDDLE_YAW_RAD = math.pi / 4
 """IK is solved halfway of the turn, which keeps the wrist's whole quarter within its limits."""
 _MAX_SKEW_RAD = math.radians(8)
 """Beyond it the last joint might leave its range, so the other pair of faces is gripped."""
-_FINGER_M, _FINGER_HALF_WIDTH_M, _CLEARANCE_M = 0.011, 0.014, 0.003
+_FINGER_M = 0.011
+_FINGER_HALF_WIDTH_M = 0.014
+_CLEARANCE_M = 0.003
 """How far a finger reaches beyond its opening, its back included, and what is left between it and other cubes."""
 _LEAST_OPENING_M = CUBE_EDGE_M / 2 + 0.002
 _LIFT_M = 0.06
 """The fingers come from and go to so far above the grip: the cube's top and 16 mm."""
 _SQUEEZE_M = 0.004
 """Each finger's command lies so far inside the cube: about 13 N."""
-_CLOSE_S, _OPEN_S, _SETTLE_S = 0.10, 0.07, 0.03
+_CLOSE_S = 0.10
+_OPEN_S = 0.07
+_SETTLE_S = 0.03
 _MAX_TILT_RAD = math.radians(10)
 _SQUEEZED_M = CUBE_EDGE_M / 2 - _SQUEEZE_M
 _MISSED_M = 0.0001
 """Fingers that come so near to their command, on the average, have nothing between them; smooth ones sink in deep."""
 
 
-class TurnExecutor:
+class TurnExecutor(MacroExecutor):
     """Turns the cubes of a compiled scene: mink plans, the servos move the arm, and contact alone moves the cube.
 
     The jaws are flat, so a cube turns with them by its shape and hardly needs friction. The planner knows the cubes'
@@ -49,17 +52,22 @@ class TurnExecutor:
     def __init__(
         self, model: mujoco.MjModel, slots_xy_m: Sequence[tuple[float, float]], sensing: Sensing | None = None
     ) -> None:
-        self._sensing = sensing or Sensing()
-        self.executor = MacroExecutor(model)
-        self._arm = ArmModel()
-        self._ik = ArmIK(self._arm)
+        super().__init__(model, sensing)
+        self._ik = ArmIK(self.arm)
         self._cube_qpos = [int(model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(len(slots_xy_m))]
-        self._slots_xy_m, self._slots = slots_xy_m, [self._reach(np.array(slot), None) for slot in slots_xy_m]
+        self._slots_xy_m = slots_xy_m
+        self._slots = [self._reach(np.array(slot), None) for slot in slots_xy_m]
 
     def turn(
-        self, data: mujoco.MjData, *, cube: int, clockwise: bool, slips: bool = False,
-        off: tuple[float, float, float] = (0.0, 0.0, 0.0), capture_motion_hz: float = 0.0,
-    ) -> Motion[MacroResult]:  # fmt: skip
+        self,
+        data: mujoco.MjData,
+        *,
+        cube: int,
+        clockwise: bool,
+        slips: bool = False,
+        off: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        capture_motion_hz: float = 0.0,
+    ) -> MacroResult:
         """Turn a cube by a quarter, as seen from above and in the frame, to a right angle on its nominal slot.
 
         ``off`` has it come down so far off both: metres in x and y, and radians. One that ``slips`` stays: the fingers
@@ -72,11 +80,13 @@ class TurnExecutor:
         if not 0 <= cube < len(self._slots):
             raise InvalidValueError(f"No cube {cube}; there are 0 to {len(self._slots) - 1}.")
         poses = [
-            self._sensing.pose(data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
+            self.sensing.pose(data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
             for start, place_m in zip(self._cube_qpos, self._slots_xy_m, strict=True)
         ]
-        true, slot, (right_m, up_m, turned_rad) = poses[cube], self._slots[cube], off
-        pose = self._sensing.erring(true)
+        true = poses[cube]
+        slot = self._slots[cube]
+        right_m, up_m, turned_rad = off
+        pose = self.sensing.erring(true)
         if pose.tilt_rad > _MAX_TILT_RAD:
             return self._refuse(data, f"cube {cube} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
         place_m = np.add(self._slots_xy_m[cube], (right_m, up_m))
@@ -96,14 +106,15 @@ class TurnExecutor:
             there = replace(pose, position_m=np.array([*place_m, CUBE_REST_Z_M]))
             beyond_m = _FINGER_HALF_WIDTH_M * abs(math.sin(turned_rad))  # a finger that is turned reaches further
             leaves_m = max(_rooms_m(others, there)[int(begins_along_x)] - beyond_m, _LEAST_OPENING_M)
-        skews_rad, openings_m = (_skew_rad(pose), turned_rad), (opening_m, leaves_m)
+        skews_rad = (_skew_rad(pose), turned_rad)
+        openings_m = (opening_m, leaves_m)
         waypoints = _waypoints(grip, slot, skews_rad, clockwise, begins_along_x != clockwise, slips, openings_m)
         error_m = max(grip.error_m, slot.error_m)
-        result, qpos, trajectory = yield from self.executor.perform(
-            data, self._arm, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
+        result, qpos, trajectory = self.perform(
+            data, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
         )
         holding = qpos[trajectory.last_step["close" if slips else "turn"] + 1]
-        if self.executor.opening_m(holding).mean() < _SQUEEZED_M + _MISSED_M:
+        if self.opening_m(holding).mean() < _SQUEEZED_M + _MISSED_M:
             return replace(result, fault=f"the fingers closed past cube {cube}")
         return result
 
@@ -113,8 +124,8 @@ class TurnExecutor:
         return self._ik.reach(place_m, yaw_rad=_MIDDLE_YAW_RAD, lift_m=_LIFT_M, start=start)
 
     def _refuse(self, data: mujoco.MjData, reason: str) -> MacroResult:
-        self.executor.rest(data)
-        return self.executor.refused(reason)
+        self.rest(data)
+        return self.refused(reason)
 
 
 def _skew_rad(pose: ObjectPose) -> float:
@@ -141,9 +152,14 @@ def _room_m(other: ObjectPose, gripped: ObjectPose, axis: int) -> float:
 
 
 def _waypoints(
-    grip: Reach, slot: Reach, skews_rad: tuple[float, float], clockwise: bool, other_faces: bool, slips: bool,
+    grip: Reach,
+    slot: Reach,
+    skews_rad: tuple[float, float],
+    clockwise: bool,
+    other_faces: bool,
+    slips: bool,
     openings_m: tuple[float, float],
-) -> list[Waypoint]:  # fmt: skip
+) -> list[Waypoint]:
     """Down over the cube as it stands, turned to where it shall stand, and back; or let go too early.
 
     ``skews_rad`` are how far the cube is turned off a right angle, and shall be; ``openings_m`` how far fingers open
@@ -155,7 +171,9 @@ def _waypoints(
     """
     sense = 1.0 if clockwise else -1.0
     extra_rad = -_QUARTER_RAD if other_faces else 0.0
-    (opening_m, leaves_m), before, after = openings_m, np.zeros(7), np.zeros(7)
+    opening_m, leaves_m = openings_m
+    before = np.zeros(7)
+    after = np.zeros(7)
     before[-1] = extra_rad - sense * _QUARTER_RAD / 2 - skews_rad[0]
     after[-1] = extra_rad + sense * _QUARTER_RAD / 2 - skews_rad[1]
     if slips:

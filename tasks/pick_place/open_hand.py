@@ -28,9 +28,12 @@ _THUMB: tuple[Joint, ...] = ((0.03, -0.034, -0.012, 0.014), (0, -0.060, -0.004, 
 _HEEL: tuple[Joint, ...] = ((0.020, 0.0, -0.020, 0.022), (0.070, 0.004, -0.020, 0.024), (0.100, 0.006, -0.016, 0.023))
 _FOREARM: tuple[Joint, ...] = ((0.090, 0.006, -0.016, 0.024), (0.160, 0.010, 0.004, 0.029))
 _SLEEVE: tuple[Joint, ...] = ((0.160, 0.010, 0.004, 0.038), (0.365, 0.0, 0.094, 0.050), (0.565, -0.02, 0.200, 0.062))
-_PALM_CENTER_M, _PALM_RADII_M = (0.004, 0.0, -0.014), (0.056, 0.047, 0.015)
+_PALM_CENTER_M = (0.004, 0.0, -0.014)
+_PALM_RADII_M = (0.056, 0.047, 0.015)
 
-_PLATE_HALF_M, _RIM_M, _RIM_RADIUS_M = (0.050, 0.042, 0.008), (0.046, 0.040), 0.007
+_PLATE_HALF_M = (0.050, 0.042, 0.008)
+_RIM_M = (0.046, 0.040)
+_RIM_RADIUS_M = 0.007
 
 
 def open_hand_meshes() -> dict[str, Mesh]:
@@ -45,10 +48,16 @@ def add_open_hand(spec: mujoco.MjSpec, palm_m: tuple[float, float, float]) -> No
     """Add the mocap body ``palm`` with the middle of its palm at a place in the world."""
     body = add_limb(spec, "palm", palm_m, open_hand_meshes())
     touch = {"mass": 0.0, "group": c.COLLISION_GROUP, "friction": (0.9, 0.01, 0.002)}
-    body.add_geom(name="palm_plate", type=mujoco.mjtGeom.mjGEOM_BOX, size=_PLATE_HALF_M,
-                  pos=(0, 0, -_PLATE_HALF_M[2]), **touch)  # fmt: skip
+    body.add_geom(
+        name="palm_plate", type=mujoco.mjtGeom.mjGEOM_BOX, size=_PLATE_HALF_M, pos=(0, 0, -_PLATE_HALF_M[2]), **touch
+    )
     x, y, z = *_RIM_M, 0.5 * _RIM_RADIUS_M
     corners = ((-x, -y, z), (-x, y, z), (x, y, z), (x, -y, z))
     for number, (start, end) in enumerate(zip(corners, corners[1:] + corners[:1], strict=True)):
-        body.add_geom(name=f"palm_rim_{number}", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=(_RIM_RADIUS_M, 0, 0),
-                      fromto=(*start, *end), **touch)  # fmt: skip
+        body.add_geom(
+            name=f"palm_rim_{number}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=(_RIM_RADIUS_M, 0, 0),
+            fromto=(*start, *end),
+            **touch,
+        )

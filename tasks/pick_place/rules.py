@@ -15,19 +15,23 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
 from imagine_bench.rules import optimal_policy, tabulate
 
-from ..dials.dials import Dials
-from ..dials.fickle import fickle
-from ..dials.slip import slipping
+from ..parameters.goal_change import changing_goal
+from ..parameters.parameters import WorldParameters
+from ..parameters.slip import slipping
 
 N_OBJECTS = 3
 PLACED, PICKED, HANDED_OVER = range(3)
 POINTING = tuple(range(N_OBJECTS))
 """Gesture ``i`` points at object i."""
-OPEN_PALM, WITHDRAWN = N_OBJECTS, N_OBJECTS + 1
+OPEN_PALM = N_OBJECTS
+WITHDRAWN = N_OBJECTS + 1
 HAND_OVER = N_OBJECTS
 """The action after the three that pick or place an object."""
 
-PICK_REWARD, PLACE_REWARD, HANDOVER_REWARD, WRONG_REWARD = 1.0, 0.0, 5.0, -5.0
+PICK_REWARD = 1.0
+PLACE_REWARD = 0.0
+HANDOVER_REWARD = 5.0
+WRONG_REWARD = -5.0
 
 _ALL_PLACED = (PLACED,) * N_OBJECTS
 
@@ -42,8 +46,8 @@ def _with(objects: tuple[int, ...], index: int, value: int) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PickPlace(Dials):
-    """A world: dials only."""
+class PickPlace(WorldParameters):
+    """A world: the parameters of all tasks, and no others."""
 
     FAMILY: ClassVar[str] = "pick_place"
 
@@ -53,7 +57,7 @@ class PickPlaceRules:
     """The macrostate machine: action i picks object i, or places it if it is held; action 3 hands over.
 
     The human's next gesture is drawn: after a pick that was asked for, the two other objects and the open palm are
-    equally likely. Everything else is certain but for the dials.
+    equally likely. Everything else is certain but for the world's parameters.
     """
 
     world: PickPlace = PickPlace()
@@ -94,7 +98,8 @@ class PickPlaceRules:
         """Whether ``action`` is what the human wants now, or the step toward it."""
         if self.is_terminal(macrostate):
             return False
-        held, gesture = held_object(macrostate), macrostate[N_OBJECTS]
+        held = held_object(macrostate)
+        gesture = macrostate[N_OBJECTS]
         if held is None:
             return action == gesture
         return action == (HAND_OVER if gesture == OPEN_PALM else held)
@@ -107,7 +112,8 @@ class PickPlaceRules:
         """
         if not 0 <= action < self.n_actions:
             raise InvalidValueError(f"Action {action} does not exist; give an integer from 0 to {self.n_actions - 1}.")
-        objects, held = macrostate[:N_OBJECTS], held_object(macrostate)
+        objects = macrostate[:N_OBJECTS]
+        held = held_object(macrostate)
         if HANDED_OVER in objects:
             return objects
         if action == HAND_OVER:
@@ -125,10 +131,11 @@ class PickPlaceRules:
         if self.world.slip:
             unmoved = Outcome(1.0, macrostate, PLACE_REWARD, terminated=False, success=False)
             found = slipping(found, unmoved, self.world.slip)
-        return fickle(found, self._asked_otherwise, self.world.fickle) if self.world.fickle else found
+        return changing_goal(found, self._asked_otherwise, self.world.goal_change) if self.world.goal_change else found
 
     def _asked_otherwise(self, outcome: Outcome) -> list[Outcome]:
-        objects, gesture = outcome.macrostate[:N_OBJECTS], outcome.macrostate[N_OBJECTS]
+        objects = outcome.macrostate[:N_OBJECTS]
+        gesture = outcome.macrostate[N_OBJECTS]
         held = held_object(outcome.macrostate)
         wishes = POINTING if held is None else self._wishes(held)
         return [replace(outcome, macrostate=(*objects, wish)) for wish in wishes if wish != gesture]

@@ -8,7 +8,7 @@ import math
 
 import mujoco
 
-from ..dials.distractors import add_distractors
+from ..parameters.distractors import add_distractors
 from ..scenes import constants as c
 from ..scenes.arm import arm_spec, let_arm_touch
 from ..scenes.hand import add_pointing_hand
@@ -30,7 +30,8 @@ IDLE_FINGERTIP_M = (0.96, 0.26, c.TABLE_HEIGHT_M + 0.02)
 IDLE_PALM_M = (1.00, -0.26, c.TABLE_HEIGHT_M + 0.04)
 """Where the human's hands rest when they say nothing: at the table's far edge, outside the agent's frame."""
 
-_FOVY_DEG, _PITCH_RAD = 57.0, math.radians(5.5)
+_FOVY_DEG = 57.0
+_PITCH_RAD = math.radians(5.5)
 """Wide, and tilted toward the tool: the frame shows the row, the hands, and at its bottom what the gripper holds."""
 
 
@@ -44,7 +45,8 @@ def _compiled(distractors: int) -> mujoco.MjModel:
     add_open_hand(spec, IDLE_PALM_M)
     add_distractors(spec, distractors)
     for geom in spec.geoms:
-        geom.solref, geom.solimp[:2] = (2 * TIMESTEP_S, 1.0), _SOLIMP
+        geom.solref = (2 * TIMESTEP_S, 1.0)
+        geom.solimp[:2] = _SOLIMP
     let_arm_touch(spec)
     camera = spec.camera(c.AGENT_CAMERA)
     camera.fovy = _FOVY_DEG

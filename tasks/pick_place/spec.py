@@ -100,26 +100,32 @@ SPEC = TaskSpec(
 
 
 def spec_of(**world: Any) -> TaskSpec:
-    """The task with its dials turned. Raises as :class:`.rules.PickPlace`."""
-    return _spec(PickPlace(**world))
+    """The task in a world of these parameters. Raises as :class:`.rules.PickPlace`."""
+    return _spec(PickPlace.taken_from(world))
 
 
 @functools.cache
 def _spec(world: PickPlace) -> TaskSpec:
     if world == PickPlace():
         return SPEC
-    rules, dials = PickPlaceRules(world), str(world).partition(":")[2].replace(",", ", ")
+    rules = PickPlaceRules(world)
+    parameters = str(world).partition(":")[2].replace(",", ", ")
     return replace(
-        SPEC, id=str(world), title=f"{SPEC.title} ({dials})", env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
-        encoder=SPEC.encoder + world.looks,
-        sight=world.sight(lambda state: HANDED_OVER in state[:N_OBJECTS]),  # a palm that carries is seen
-        rules=rules, facts=functools.partial(facts, rules, HORIZON),
-        render_macrostates=functools.partial(_rendered, rules), reference=None,
-    )  # fmt: skip
+        SPEC,
+        id=str(world),
+        title=f"{SPEC.title} ({parameters})",
+        env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
+        encoder=SPEC.encoder + world.encoder_suffix,
+        sight=world.observation_model(lambda state: HANDED_OVER in state[:N_OBJECTS]),  # a palm that carries is seen
+        rules=rules,
+        facts=functools.partial(facts, rules, HORIZON),
+        render_macrostates=functools.partial(_rendered, rules),
+        reference=None,
+    )
 
 
 def make_env(**options: Any) -> MacroEnv:
-    """Pick-and-place with a human; ``options`` are its dials and the keyword arguments of MacroEnv.
+    """Pick-and-place with a human; ``options`` are its parameters and the keyword arguments of MacroEnv.
 
     Actions 0, 1, 2 pick object i up, or put it back if it is held; action 3 hands over. What the robot is told it does
     as far as that is possible, asked for or not; what is not possible it reaches out for in vain. The human answers

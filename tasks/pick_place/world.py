@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..motion import orientation
-from ..motion.executor import REST_OPENING_M, MacroResult, Motion
+from ..motion.executor import REST_OPENING_M, MacroResult
 from ..scenes.appearance import Appearance
 from ..scenes.arm import FINGER_JOINTS, TCP_SITE
 from ..scenes.constants import TABLE_HEIGHT_M
@@ -45,13 +45,15 @@ class PickWorld(World):
 
     def __init__(self, level: Appearance, distractors: int = 0) -> None:
         objects = {spec.name: f"the {spec.name}" for spec in OBJECTS}
-        model, materials = compile_pick_scene(distractors), ("table_top", "skin", *MATERIALS)
+        model = compile_pick_scene(distractors)
+        materials = ("table_top", "skin", *MATERIALS)
         super().__init__(model, level, objects=objects, materials=materials, distractors=distractors)
         self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in FINGER_JOINTS]
         self._finger_ctrl = [self.model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS]
         self._tcp = self.model.site(TCP_SITE).id
         self._hand, self._palm = (int(self.model.body(name).mocapid[0]) for name in ("hand", "palm"))
-        self._tcp_m, self._palm_m = self.data.site_xpos[self._tcp], self.data.mocap_pos[self._palm]
+        self._tcp_m = self.data.site_xpos[self._tcp]
+        self._palm_m = self.data.mocap_pos[self._palm]
         self._tcp_at_rest_m = tuple(self.data.site_xpos[self._tcp].tolist())
 
     @functools.cached_property
@@ -65,14 +67,21 @@ class PickWorld(World):
 
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Put an object on its place, into the gripper or into the palm."""
-        spec, (right_m, up_m, turned_rad) = OBJECTS[index], self._off(offset)
+        spec = OBJECTS[index]
+        right_m, up_m, turned_rad = self._off(offset)
         if value == PLACED:
-            base_m, share_x, share_y = standing_m(index), 1.0, 1.0
+            base_m = standing_m(index)
+            share_x = 1.0
+            share_y = 1.0
         elif value == PICKED:
-            base_m, share_x, share_y = self._tcp_at_rest_m, _GRIP_SHARE, 0.0
+            base_m = self._tcp_at_rest_m
+            share_x = _GRIP_SHARE
+            share_y = 0.0
             self._fingers(spec.grip_opening_m, spec.squeeze_m)
         else:
-            base_m, share_x, share_y = (*PALM_M[:2], PALM_M[2] + spec.grip_height_m), 1.0, 1.0
+            base_m = (*PALM_M[:2], PALM_M[2] + spec.grip_height_m)
+            share_x = 1.0
+            share_y = 1.0
         self.data.qpos[self.object_qpos[index]] = (
             base_m[0] + share_x * right_m,
             base_m[1] + share_y * up_m,
@@ -109,17 +118,18 @@ class PickWorld(World):
         self._gesture(intended[N_OBJECTS])
         self.update()
 
-    def acting(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> Motion[MacroResult]:
+    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
         """Physical execution: the arm acts in contact, everything comes to rest, and then the human answers.
 
         The human answers as ``intended`` says if the objects are where that says, and stand as they should; whatever
         else happened is not what they asked for, so they withdraw.
         """
-        before, poses = self._objects()[0], self.object_poses()
+        before = self._objects()[0]
+        poses = self.object_poses()
         stays = before == intended[:N_OBJECTS]
-        result = yield from self._act(action, before, stays, capture_motion_hz)
+        result = self._act(action, before, stays, capture_motion_hz)
         self.update()
-        self.executor.rest(self.data, held_object(self._objects()[0]))
+        self.executor.rest_holding(self.data, held_object(self._objects()[0]))
         self.update()
         after, problem = self._objects()
         if HANDED_OVER not in after:  # a palm stays as it is under what lies in it
@@ -129,9 +139,10 @@ class PickWorld(World):
         moving = [index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])]
         return replace(result, fault=result.fault or self._pushed(moving, poses, "by the way"))
 
-    def _act(self, action: int, objects: tuple[int, ...], stays: bool, capture_motion_hz: float) -> Motion[MacroResult]:
+    def _act(self, action: int, objects: tuple[int, ...], stays: bool, capture_motion_hz: float) -> MacroResult:
         """What the robot does, possible or not: what it cannot do, or slips, it reaches out for in vain."""
-        held, executor = held_object(objects), self.executor
+        held = held_object(objects)
+        executor = self.executor
         if action == HAND_OVER:
             palm_m = self.data.mocap_pos[self._palm].copy()
             if held is not None and self._read_gesture() == OPEN_PALM and not stays:
@@ -150,7 +161,10 @@ class PickWorld(World):
     # --- reading -------------------------------------------------------------------------------------------------
 
     def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
-        spec, name, position_m, palm_m = OBJECTS[index], self._names[index], pose[:3], self._palm_m.tolist()
+        spec = OBJECTS[index]
+        name = self._names[index]
+        position_m = pose[:3]
+        palm_m = self._palm_m.tolist()
         in_the_air = position_m[2] > TABLE_HEIGHT_M + _IN_THE_AIR_M
         if in_the_air and math.dist(position_m, self._tcp_m.tolist()) < MAX_OFF_GRIP_M:
             return PICKED, None

@@ -18,6 +18,8 @@ from ..scene_reader import body_names, poses_of, shapes_of
 
 MOVE_S = 1.6
 """Simulated seconds of a movement; the servos have come to rest by then (a test says how near)."""
+_REMEMBERED = 50_000
+"""Movements whose end is kept: every variant of a network's data begins with the same ones."""
 _START_RAD = np.zeros(3)
 _TIP = "tip"
 _IK_TOLERANCE_M, _IK_STEPS, _IK_STARTS = 1e-4, 60, 8
@@ -32,6 +34,7 @@ class PlanarArm:
         self._data = mujoco.MjData(self.model)
         self._site = self.model.site(_TIP).id
         self._steps = round(MOVE_S / self.model.opt.timestep)
+        self._tip_at_rest = functools.lru_cache(maxsize=_REMEMBERED)(self._carry_out)
 
     def execute(self, joints_rad: Floats) -> Floats:
         """Let the servos move the arm from rest at zero to each configuration, and measure where its tip comes to rest.
@@ -49,14 +52,15 @@ class PlanarArm:
         """
         if not np.isfinite(joints_rad).all():
             raise InvalidValueError("Joints that are NaN or infinite cannot be carried out; give finite radians.")
-        data, reached = self._data, np.empty((len(joints_rad), 2))
-        for row, target in enumerate(joints_rad):
-            mujoco.mj_resetData(self.model, data)
-            data.ctrl[:] = target
-            mujoco.mj_step(self.model, data, self._steps)
-            mujoco.mj_kinematics(self.model, data)
-            reached[row] = data.site_xpos[self._site, :2]
-        return reached
+        places = [self._tip_at_rest(*target) for target in joints_rad.tolist()]
+        return np.array(places).reshape(-1, 2)
+
+    def _carry_out(self, *target_rad: float) -> tuple[float, ...]:
+        mujoco.mj_resetData(self.model, self._data)
+        self._data.ctrl[:] = target_rad
+        mujoco.mj_step(self.model, self._data, self._steps)
+        mujoco.mj_kinematics(self.model, self._data)
+        return tuple(self._data.site_xpos[self._site, :2].tolist())
 
     def tip(self, joints_rad: Floats) -> Floats:
         """The model's own forward kinematics, without moving: (N, 3) to (N, 2), in metres."""
@@ -115,10 +119,8 @@ def _solve_one(
     target_m: Floats,
     starts_rad: list[NDArray[np.float64]],
 ) -> Floats:
-    best_rad, best_m = (
-        starts_rad[0],
-        np.inf,
-    )  # of an error that also grows with the tool's angle: not below the distance
+    best_rad = starts_rad[0]
+    best_m = np.inf  # of an error that also grows with the tool's angle: not below the distance
     for start in starts_rad:
         configuration.update(start)
         height = configuration.get_transform_frame_to_world(_TIP, "site").translation()[2]

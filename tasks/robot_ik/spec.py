@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
-from imagine_bench.interfaces.regression import SCORES, Dataset, Predict, RegressionSpec
+from imagine_bench.interfaces.regression import SCORES, Predict, RegressionData, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
 if TYPE_CHECKING:
@@ -107,19 +107,19 @@ def require_variant(variant: str) -> None:
     samples_of(variant)
 
 
-def training(variant: str, rng: np.random.Generator) -> Dataset:
+def training(variant: str, rng: np.random.Generator) -> RegressionData:
     """Motor babbling: uniform joint configurations, carried out; the place reached, and the joints with noise."""
     return testing(variant, rng, samples_of(variant))
 
 
-def testing(variant: str, rng: np.random.Generator, count: int) -> Dataset:
+def testing(variant: str, rng: np.random.Generator, count: int) -> RegressionData:
     """More of the same babbling."""
     require_variant(variant)
     if count < 1:
         raise InvalidValueError(f"{count} test points say nothing; ask for at least 1.")
     joints_rad = rng.uniform(LOW_RAD, HIGH_RAD, size=(count, 3))
     noise_rad = NOISE_RAD * rng.standard_normal(joints_rad.shape)
-    return Dataset(inputs=arm().execute(joints_rad), targets=joints_rad + noise_rad)
+    return RegressionData(inputs=arm().execute(joints_rad), targets=joints_rad + noise_rad)
 
 
 def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
@@ -206,8 +206,6 @@ SPEC = RegressionSpec(
     error_name="distance between the place asked for and the place reached (m)",
     wrong_above=0.1,
     evaluate=evaluate,
-    sections="imagine_bench.regression.report_robot_ik:sections",
-    recorder="imagine_bench.recording.robot_ik:record",
     scene=arm,
     reference="robot_ik",
 )

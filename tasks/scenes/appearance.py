@@ -38,7 +38,8 @@ class Appearance:
     @property
     def varies_every_frame(self) -> bool:
         """Whether anything but the objects' start varies."""
-        hand, camera = (self.hand_offset_m, self.hand_yaw_rad), (self.camera_offset_m, self.camera_angle_rad)
+        hand = (self.hand_offset_m, self.hand_yaw_rad)
+        camera = (self.camera_offset_m, self.camera_angle_rad)
         return any(amount > 0 for amount in (*hand, *camera, self.light_fraction, self.color_fraction))
 
 
@@ -128,11 +129,13 @@ class AppearanceSampler:
     """
 
     def __init__(self, model: mujoco.MjModel, level: Appearance, *, camera: str, materials: tuple[str, ...]) -> None:
-        self._model, self._level = model, level
+        self._model = model
+        self._level = level
         self._camera = model.camera(camera).id
         self._materials = np.array([model.material(name).id for name in materials])
         headlight = model.vis.headlight
-        self._ambient, self._diffuse = headlight.ambient.copy(), headlight.diffuse.copy()
+        self._ambient = headlight.ambient.copy()
+        self._diffuse = headlight.diffuse.copy()
         self._light_diffuse = model.light_diffuse.copy()
         self._rgba = model.mat_rgba[self._materials].copy()
         self._camera_pos = model.cam_pos[self._camera].copy()
@@ -140,7 +143,8 @@ class AppearanceSampler:
 
     def vary(self, rng: np.random.Generator) -> None:
         """Write one new sample; it replaces the one before, nothing adds up."""
-        level, model = self._level, self._model
+        level = self._level
+        model = self._model
         if level.light_fraction:
             brightness = 1.0 + level.light_fraction * rng.uniform(-1.0, 1.0)
             model.vis.headlight.ambient = self._ambient * brightness

@@ -23,7 +23,8 @@ JOINT_SPEED_LIMITS_RAD_S = (1.74, 1.328, 1.957, 1.957, 3.485, 3.485, 4.545)
 
 
 _TOUCHING = ("l4_", "l5_", "l6_", "hand_mount", "hand_rail", "finger_left_back", "finger_right_back")
-_GRIPS, _ARM = 1, 2
+_GRIPS = 1
+_ARM = 2
 """Bits of collision: of fingertips and all that they touch, and of the rest of the arm."""
 
 
@@ -35,7 +36,8 @@ def let_arm_touch(spec: mujoco.MjSpec) -> None:
     """
     for geom in spec.geoms:
         if geom.name.startswith(_TOUCHING):
-            geom.contype, geom.conaffinity = _ARM, 0
+            geom.contype = _ARM
+            geom.conaffinity = 0
         elif geom.contype == _GRIPS and TIP_IN_NAME not in geom.name:
             geom.conaffinity = _GRIPS | _ARM
 

@@ -26,11 +26,15 @@ OBSERVATION_QPOS_RAD = (-0.012, -1.013, -0.388, 1.66, 0.245, 0.972, 4.401)
 HOME_QPOS_RAD = (0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161)
 """Published Sawyer home configuration (gripper straight down), the posture that IK prefers."""
 
-SCENE_GROUP, ARM_GROUP, SETTING_GROUP, COLLISION_GROUP = 0, 2, 3, 5
+SCENE_GROUP = 0
+ARM_GROUP = 2
+SETTING_GROUP = 3
+COLLISION_GROUP = 5
 """Geom groups: table top, loose objects and hands; the arm, so that a view can leave it out; what only the human's view
 shows (floor, legs, person); what only contact sees."""
 
-AGENT_CAMERA, HUMAN_CAMERA = "wrist", "human"
+AGENT_CAMERA = "wrist"
+HUMAN_CAMERA = "human"
 
 FINGERTIP_IN_SLOT_M = (0.048, 0.0, 0.040)
 """Nominal tip of the pointing index finger relative to the centre of the cube it points at."""

@@ -19,7 +19,8 @@ from imagine_bench.seeding import SeedTree
 
 from .appearance import Appearance
 
-HAND_FRAGMENTS, OBJECT_FRAGMENTS = 50, 16
+HAND_FRAGMENTS = 50
+OBJECT_FRAGMENTS = 16
 """Of each microstate, in training; as many others are held out."""
 HAND_SHARE = 34 / 64
 """Of the rows of a frame, from its top: an object's fragment never covers the fingertip."""
@@ -79,9 +80,11 @@ class Photographer:
 
     def develop(self, frame: Frame) -> Frame:
         """The photograph of a rendered frame (H, W, 3): the same one until the next draw."""
-        shot, (height, width, channels) = self.shot, frame.shape
+        shot = self.shot
+        height, width, channels = frame.shape
         light = np.empty((height, width, channels))
-        top, seams = round(height * HAND_SHARE), np.linspace(0, width, len(shot.objects) + 1).round().astype(int)
+        top = round(height * HAND_SHARE)
+        seams = np.linspace(0, width, len(shot.objects) + 1).round().astype(int)
         light[:top] = _spread(shot.hand.light, top, width)
         for left, right, fragment in zip(seams[:-1], seams[1:], shot.objects, strict=True):
             light[top:, left:right] = _spread(fragment.light, height - top, right - left)

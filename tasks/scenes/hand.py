@@ -23,7 +23,8 @@ _CURLED: tuple[tuple[Joint, ...], ...] = (
 _THUMB: tuple[Joint, ...] = ((0.135, 0, 0.030, 0.0130), (0.102, -0.019, 0.016, 0.0105), (0.074, -0.014, 0.006, 0.0085))
 _FOREARM: tuple[Joint, ...] = ((0.165, 0.030, 0.046, 0.024), (0.235, 0.034, 0.075, 0.029))
 _SLEEVE: tuple[Joint, ...] = ((0.235, 0.034, 0.075, 0.038), (0.440, 0.048, 0.165, 0.050), (0.640, 0.075, 0.270, 0.062))
-_PALM_CENTER_M, _PALM_RADII_M = (0.118, 0.028, 0.037), (0.052, 0.040, 0.019)
+_PALM_CENTER_M = (0.118, 0.028, 0.037)
+_PALM_RADII_M = (0.052, 0.040, 0.019)
 
 
 def hand_meshes() -> dict[str, Mesh]:
@@ -68,7 +69,19 @@ def add_drawn_mesh(
 
     MuJoCo moves a mesh into its own inertial frame and the geom back: positions stay as given.
     """
-    spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), userface=mesh.faces.ravel(),
-                  inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)  # fmt: skip
-    body.add_geom(name=geom, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=material, mass=0.0, contype=0,
-                  conaffinity=0, group=group)  # fmt: skip
+    spec.add_mesh(
+        name=name,
+        uservert=mesh.vertices.ravel(),
+        userface=mesh.faces.ravel(),
+        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+    )
+    body.add_geom(
+        name=geom,
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname=name,
+        material=material,
+        mass=0.0,
+        contype=0,
+        conaffinity=0,
+        group=group,
+    )

@@ -40,7 +40,8 @@ def _rings_to_mesh(rings: NDArray[np.float64], first: NDArray[np.float64], last:
     following = (side + 1) % n_sides
     faces = [np.stack([np.full(n_sides, len(vertices) - 2), following, side], axis=1)]
     for ring in range(n_rings - 1):
-        low, high = ring * n_sides, (ring + 1) * n_sides
+        low = ring * n_sides
+        high = (ring + 1) * n_sides
         faces.append(np.stack([low + side, low + following, high + following], axis=1))
         faces.append(np.stack([low + side, high + following, high + side], axis=1))
     top = (n_rings - 1) * n_sides
@@ -88,7 +89,8 @@ def ellipsoid(center: ArrayLike, radii: ArrayLike, *, sides: int = 10, rings: in
         sides: Corners of a cross-section.
         rings: Cross-sections between the poles.
     """
-    center, radii = np.asarray(center, dtype=np.float64), np.asarray(radii, dtype=np.float64)
+    center = np.asarray(center, dtype=np.float64)
+    radii = np.asarray(radii, dtype=np.float64)
     latitude = np.linspace(-np.pi / 2, np.pi / 2, rings + 2)[1:-1, None]
     angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)[None, :]
     unit = np.stack([np.cos(latitude) * np.cos(angle), np.cos(latitude) * np.sin(angle), np.sin(latitude + 0 * angle)])
@@ -118,13 +120,17 @@ def box(low: ArrayLike, high: ArrayLike, *, taper: float = 1.0) -> Mesh:
         high: Metres. Shape (3,).
         taper: Size of the top face relative to the bottom face, in (0, 1].
     """
-    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-    middle, half = (low + high) / 2, (high - low) / 2
+    low = np.asarray(low, dtype=np.float64)
+    high = np.asarray(high, dtype=np.float64)
+    middle = (low + high) / 2
+    half = (high - low) / 2
     corners = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-    rings = np.stack([
-        np.concatenate([middle[:2] + scale * half[:2] * corners, np.full((4, 1), z)], axis=1)
-        for scale, z in ((1.0, low[2]), (taper, high[2]))
-    ])  # fmt: skip
+    rings = np.stack(
+        [
+            np.concatenate([middle[:2] + scale * half[:2] * corners, np.full((4, 1), z)], axis=1)
+            for scale, z in ((1.0, low[2]), (taper, high[2]))
+        ]
+    )
     return _rings_to_mesh(rings, np.array([*middle[:2], low[2]]), np.array([*middle[:2], high[2]]))
 
 

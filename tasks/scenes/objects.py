@@ -19,13 +19,21 @@ SPACING_M = 0.10
 SLOTS_XY_M = ((c.ROW_X_M, SPACING_M), (c.ROW_X_M, 0.0), (c.ROW_X_M, -SPACING_M))
 """Nominal places, left to right in the agent's frame."""
 
-TIP_RADIUS_M, TIP_OFFSET_M = 0.004, 0.010
+TIP_RADIUS_M = 0.004
+TIP_OFFSET_M = 0.010
 """Of the gripper's rubber tips, two a pad: their radius, and their distance from the pad's middle along the pad."""
 
 _BALL_RADIUS_M = 0.028
-_CAR_HALF_M, _CAR_CLEARANCE_M, _WHEEL_M, _CAR_GRIP_Z_M = (0.034, 0.022, 0.012), 0.008, 0.010, 0.024
-_CUP_RADIUS_M, _CUP_HEIGHT_M, _CUP_FOOT_M, _CUP_GRIP_Z_M = 0.026, 0.062, 0.004, 0.038
-_MASS_KG, _SQUEEZE_M = 0.10, 0.004
+_CAR_HALF_M = (0.034, 0.022, 0.012)
+_CAR_CLEARANCE_M = 0.008
+_WHEEL_M = 0.010
+_CAR_GRIP_Z_M = 0.024
+_CUP_RADIUS_M = 0.026
+_CUP_HEIGHT_M = 0.062
+_CUP_FOOT_M = 0.004
+_CUP_GRIP_Z_M = 0.038
+_MASS_KG = 0.10
+_SQUEEZE_M = 0.004
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +84,12 @@ def standing_m(index: int) -> tuple[float, float, float]:
 def car_body() -> Mesh:
     """Chassis and bonnet, its nose toward the human (+x)."""
     x, y, z = _CAR_HALF_M
-    return merge([box((-x, -y, _CAR_CLEARANCE_M - _CAR_GRIP_Z_M), (x, y, _CAR_CLEARANCE_M + 2 * z - _CAR_GRIP_Z_M)),
-                  box((-0.024, -0.019, 0.006), (0.012, 0.019, 0.021), taper=0.82)])  # fmt: skip
+    return merge(
+        [
+            box((-x, -y, _CAR_CLEARANCE_M - _CAR_GRIP_Z_M), (x, y, _CAR_CLEARANCE_M + 2 * z - _CAR_GRIP_Z_M)),
+            box((-0.024, -0.019, 0.006), (0.012, 0.019, 0.021), taper=0.82),
+        ]
+    )
 
 
 def car_trim() -> Mesh:
@@ -97,7 +109,8 @@ def car_trim() -> Mesh:
 
 def cup_body() -> Mesh:
     """A mug, its handle toward the robot."""
-    low, high = _CUP_FOOT_M - _CUP_GRIP_Z_M, _CUP_HEIGHT_M - _CUP_GRIP_Z_M
+    low = _CUP_FOOT_M - _CUP_GRIP_Z_M
+    high = _CUP_HEIGHT_M - _CUP_GRIP_Z_M
     wall = turned_profile([(0.85 * _CUP_RADIUS_M, low), (_CUP_RADIUS_M, low + 0.01), (_CUP_RADIUS_M, high)], sides=14)
     handle = arch((-_CUP_RADIUS_M + 0.002, 0.0, -0.004), radius=0.018, thickness=0.0045)
     return merge([wall, handle])
@@ -116,21 +129,34 @@ def add_objects(spec: mujoco.MjSpec) -> None:
     ball, car, cup = (_body(spec, index) for index in range(len(OBJECTS)))
     kind = mujoco.mjtGeom
     ball.add_geom(
-        name="ball_skin", type=kind.mjGEOM_SPHERE, size=(_BALL_RADIUS_M, 0, 0), mass=_MASS_KG, material="ball",
-        group=c.SCENE_GROUP, condim=6, friction=(0.8, 0.005, 0.002),
-    )  # fmt: skip
+        name="ball_skin",
+        type=kind.mjGEOM_SPHERE,
+        size=(_BALL_RADIUS_M, 0, 0),
+        mass=_MASS_KG,
+        material="ball",
+        group=c.SCENE_GROUP,
+        condim=6,
+        friction=(0.8, 0.005, 0.002),
+    )
 
     body_z = _CAR_CLEARANCE_M + _CAR_HALF_M[2] - _CAR_GRIP_Z_M
-    car.add_geom(name="car_box", type=kind.mjGEOM_BOX, size=_CAR_HALF_M, pos=(0, 0, body_z), mass=0.8 * _MASS_KG,
-                 **_TOUCH)  # fmt: skip
+    car.add_geom(
+        name="car_box", type=kind.mjGEOM_BOX, size=_CAR_HALF_M, pos=(0, 0, body_z), mass=0.8 * _MASS_KG, **_TOUCH
+    )
     _add_supports(car, "car_wheel", _WHEEL_M, (0.021, 0.014, _WHEEL_M - _CAR_GRIP_Z_M))
     _skin(spec, car, "car_skin", car_body(), "car")
     _skin(spec, car, "car_trim", car_trim(), "car_dark")
 
     half_m = (_CUP_HEIGHT_M - _CUP_FOOT_M) / 2
     middle_z = _CUP_FOOT_M + half_m - _CUP_GRIP_Z_M
-    cup.add_geom(name="cup_wall", type=kind.mjGEOM_CYLINDER, size=(_CUP_RADIUS_M, half_m, 0), pos=(0, 0, middle_z),
-                 mass=0.8 * _MASS_KG, **_TOUCH)  # fmt: skip
+    cup.add_geom(
+        name="cup_wall",
+        type=kind.mjGEOM_CYLINDER,
+        size=(_CUP_RADIUS_M, half_m, 0),
+        pos=(0, 0, middle_z),
+        mass=0.8 * _MASS_KG,
+        **_TOUCH,
+    )
     _add_supports(cup, "cup_foot", _CUP_FOOT_M, (0.014, 0.014, _CUP_FOOT_M - _CUP_GRIP_Z_M))
     _skin(spec, cup, "cup_skin", cup_body(), "cup")
     _skin(spec, cup, "cup_hole", cup_inside(), "cup_inside")
@@ -146,8 +172,14 @@ def _add_supports(body: mujoco.MjsBody, name: str, radius_m: float, corner_m: tu
     """Four spheres to stand on, at the corners of a rectangle about the body's z axis."""
     x_m, y_m, z_m = corner_m
     for number, (x_sign, y_sign) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):
-        body.add_geom(name=f"{name}_{number}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius_m, 0, 0),
-                      pos=(x_sign * x_m, y_sign * y_m, z_m), mass=0.05 * _MASS_KG, **_TOUCH)  # fmt: skip
+        body.add_geom(
+            name=f"{name}_{number}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=(radius_m, 0, 0),
+            pos=(x_sign * x_m, y_sign * y_m, z_m),
+            mass=0.05 * _MASS_KG,
+            **_TOUCH,
+        )
 
 
 def _skin(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, mesh: Mesh, material: str) -> None:

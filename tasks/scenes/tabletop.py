@@ -12,7 +12,9 @@ _TABLE_X_M = 0.72
 _FLOOR_Z_M = -0.92
 _LEG_INSET_M = 0.05
 
-_HUMAN_CAMERA_M, _HUMAN_TARGET_M, _HUMAN_FOVY_DEG = (1.44, 1.14, 0.70), (0.46, 0.03, 0.215), 41.0
+_HUMAN_CAMERA_M = (1.44, 1.14, 0.70)
+_HUMAN_TARGET_M = (0.46, 0.03, 0.215)
+_HUMAN_FOVY_DEG = 41.0
 _DRAWN_ONLY = {"contype": 0, "conaffinity": 0, "group": c.SETTING_GROUP}
 """Of geoms that only the human's view shows."""
 
@@ -21,30 +23,46 @@ def set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     """Solver settings in which friction alone holds what is lifted; `make speed` measures how well."""
     option = spec.option
     option.timestep = timestep_s
-    option.integrator, option.solver = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtSolver.mjSOL_NEWTON
-    option.cone, option.impratio = mujoco.mjtCone.mjCONE_PYRAMIDAL, 1.0
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.impratio = 1.0
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP.value  # resting cubes cost nothing: halves a macro-action
 
 
 def set_quality(spec: mujoco.MjSpec) -> None:
     """Cheap frames: no shadow map, no multisampling, coarse primitives; the human's renderer asks for more itself."""
-    visual, size = spec.visual, spec.visual.global_
-    visual.quality.shadowsize, visual.quality.offsamples = 0, 0
-    visual.quality.numslices, visual.quality.numstacks, visual.quality.numquads = 12, 6, 1
-    visual.map.znear, visual.map.zfar = 0.01, 20.0
-    size.offwidth, size.offheight = 64, 64
-    spec.stat.extent, spec.stat.center = 1.0, (c.ROW_X_M, 0.0, c.TABLE_HEIGHT_M)
+    visual = spec.visual
+    size = spec.visual.global_
+    visual.quality.shadowsize = 0
+    visual.quality.offsamples = 0
+    visual.quality.numslices = 12
+    visual.quality.numstacks = 6
+    visual.quality.numquads = 1
+    visual.map.znear = 0.01
+    visual.map.zfar = 20.0
+    size.offwidth = 64
+    size.offheight = 64
+    spec.stat.extent = 1.0
+    spec.stat.center = (c.ROW_X_M, 0.0, c.TABLE_HEIGHT_M)
     headlight = visual.headlight
-    headlight.ambient, headlight.diffuse, headlight.specular = (0.42,) * 3, (0.12,) * 3, (0.0,) * 3
+    headlight.ambient = (0.42,) * 3
+    headlight.diffuse = (0.12,) * 3
+    headlight.specular = (0.0,) * 3
 
 
 def add_lights(spec: mujoco.MjSpec) -> None:
     """One key light over the human's left shoulder; shadows fall only where a renderer draws them."""
     spec.worldbody.add_light(
-        name="key", type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=True, pos=(1.0, 0.9, 1.6),
-        dir=(-0.28, -0.42, -1.0), diffuse=(0.5, 0.49, 0.47), specular=(0.06, 0.06, 0.06),
-    )  # fmt: skip
+        name="key",
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=True,
+        pos=(1.0, 0.9, 1.6),
+        dir=(-0.28, -0.42, -1.0),
+        diffuse=(0.5, 0.49, 0.47),
+        specular=(0.06, 0.06, 0.06),
+    )
 
 
 def add_table(spec: mujoco.MjSpec, timestep_s: float) -> None:
@@ -53,9 +71,14 @@ def add_table(spec: mujoco.MjSpec, timestep_s: float) -> None:
     spec.add_material(name="table_leg", rgba=(0.30, 0.27, 0.25, 1.0), specular=0.1)
     table = spec.worldbody.add_body(name="table", pos=(_TABLE_X_M, 0.0, c.TABLE_HEIGHT_M - _TABLE_HALF_M[2]))
     table.add_geom(
-        name="table_top", type=mujoco.mjtGeom.mjGEOM_BOX, size=_TABLE_HALF_M, material="table_top",
-        group=c.SCENE_GROUP, friction=(0.8, 0.005, 0.0001), solref=(2 * timestep_s, 1.0),
-    )  # fmt: skip
+        name="table_top",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=_TABLE_HALF_M,
+        material="table_top",
+        group=c.SCENE_GROUP,
+        friction=(0.8, 0.005, 0.0001),
+        solref=(2 * timestep_s, 1.0),
+    )
     leg_half_m = (c.TABLE_HEIGHT_M - 2 * _TABLE_HALF_M[2] - _FLOOR_Z_M) / 2
     x_m, y_m = (half_m - _LEG_INSET_M for half_m in _TABLE_HALF_M[:2])
     for name, x_sign, y_sign in (
@@ -65,34 +88,67 @@ def add_table(spec: mujoco.MjSpec, timestep_s: float) -> None:
         ("near_right", -1, -1),
     ):
         table.add_geom(
-            name=f"table_leg_{name}", type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.025, 0.025, leg_half_m),
-            material="table_leg", pos=(x_sign * x_m, y_sign * y_m, -_TABLE_HALF_M[2] - leg_half_m), **_DRAWN_ONLY,
-        )  # fmt: skip
+            name=f"table_leg_{name}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(0.025, 0.025, leg_half_m),
+            material="table_leg",
+            pos=(x_sign * x_m, y_sign * y_m, -_TABLE_HALF_M[2] - leg_half_m),
+            **_DRAWN_ONLY,
+        )
 
 
 def add_floor(spec: mujoco.MjSpec) -> None:
     """Floor, sky and the arm's pedestal, for the human's view only."""
-    kind, builtin, geom = mujoco.mjtTexture, mujoco.mjtBuiltin, mujoco.mjtGeom
-    spec.add_texture(name="sky", type=kind.mjTEXTURE_SKYBOX, builtin=builtin.mjBUILTIN_GRADIENT,
-                     rgb1=(0.86, 0.90, 0.94), rgb2=(0.60, 0.67, 0.75), width=64, height=384)  # fmt: skip
-    spec.add_texture(name="floor", type=kind.mjTEXTURE_2D, builtin=builtin.mjBUILTIN_CHECKER,
-                     rgb1=(0.74, 0.75, 0.77), rgb2=(0.69, 0.70, 0.72), width=128, height=128)  # fmt: skip
+    kind = mujoco.mjtTexture
+    builtin = mujoco.mjtBuiltin
+    geom = mujoco.mjtGeom
+    spec.add_texture(
+        name="sky",
+        type=kind.mjTEXTURE_SKYBOX,
+        builtin=builtin.mjBUILTIN_GRADIENT,
+        rgb1=(0.86, 0.90, 0.94),
+        rgb2=(0.60, 0.67, 0.75),
+        width=64,
+        height=384,
+    )
+    spec.add_texture(
+        name="floor",
+        type=kind.mjTEXTURE_2D,
+        builtin=builtin.mjBUILTIN_CHECKER,
+        rgb1=(0.74, 0.75, 0.77),
+        rgb2=(0.69, 0.70, 0.72),
+        width=128,
+        height=128,
+    )
     floor = spec.add_material(name="floor", texrepeat=(8, 8), specular=0.05)
     floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
     spec.add_material(name="pedestal", rgba=(0.22, 0.23, 0.25, 1.0), specular=0.2)
-    spec.worldbody.add_geom(name="floor", type=geom.mjGEOM_PLANE, size=(4.0, 4.0, 0.1), pos=(0.5, 0.0, _FLOOR_Z_M),
-                            material="floor", **_DRAWN_ONLY)  # fmt: skip
+    spec.worldbody.add_geom(
+        name="floor",
+        type=geom.mjGEOM_PLANE,
+        size=(4.0, 4.0, 0.1),
+        pos=(0.5, 0.0, _FLOOR_Z_M),
+        material="floor",
+        **_DRAWN_ONLY,
+    )
     for name, radius_m, half_m, z_m in (
         ("pedestal", 0.12, -_FLOOR_Z_M / 2, _FLOOR_Z_M / 2),
         ("pedestal_foot", 0.28, 0.02, _FLOOR_Z_M + 0.02),
     ):
-        spec.worldbody.add_geom(name=name, type=geom.mjGEOM_CYLINDER, size=(radius_m, half_m, 0), pos=(0, 0, z_m),
-                                material="pedestal", **_DRAWN_ONLY)  # fmt: skip
+        spec.worldbody.add_geom(
+            name=name,
+            type=geom.mjGEOM_CYLINDER,
+            size=(radius_m, half_m, 0),
+            pos=(0, 0, z_m),
+            material="pedestal",
+            **_DRAWN_ONLY,
+        )
 
 
 def add_human_camera(spec: mujoco.MjSpec) -> None:
     """The view a person wants: arm, cubes and pointing hand from the far left."""
-    camera, target = np.array(_HUMAN_CAMERA_M), np.array(_HUMAN_TARGET_M)
+    camera = np.array(_HUMAN_CAMERA_M)
+    target = np.array(_HUMAN_TARGET_M)
     backward = (camera - target) / np.linalg.norm(camera - target)
     right = np.cross((0.0, 0.0, 1.0), backward)
     right /= np.linalg.norm(right)

@@ -20,8 +20,7 @@ from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.page import report_page, texts
 from imagine_bench.running.bench import bench
-from imagine_bench.running.counters import EvaluationCounts
-from imagine_bench.running.evaluation import play_test_episode, replay
+from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode, replay
 from imagine_bench.running.run_state import environments
 from imagine_bench.running.task_types import load_bench
 from imagine_bench.seeding import episode_seed

@@ -17,7 +17,7 @@ from worlds import WORLDS
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.interfaces import EXECUTIONS
 
 SHADE = 16
 """Gray levels of 256: a ball that was turned a little is shaded differently all over."""
@@ -46,21 +46,7 @@ def walk(env, actions):
     return np.array(frames), rewards, np.array(states)
 
 
-@pytest.mark.parametrize("appearance", APPEARANCES)
-@pytest.mark.parametrize("execution", EXECUTIONS)
-@pytest.mark.parametrize("task", WORLDS)
-def test_equal_seeds_give_equal_frames_and_states(task, execution, appearance):
-    walks = []
-    for _ in range(2):
-        env = make(task, execution=execution, appearance=appearance)
-        first, _ = env.reset(seed=11)
-        walks.append((first, *walk(env, (0, 3, 4))))
-        env.close()
-    for one, other in zip(*walks, strict=True):
-        assert np.array_equal(one, other)
-
-
-@pytest.mark.parametrize("appearance", APPEARANCES)
+@pytest.mark.parametrize("appearance", ["clean", "photo"])
 @pytest.mark.parametrize("task", WORLDS)
 def test_other_seeds_give_other_frames(task, appearance):
     env, options = (
@@ -72,11 +58,13 @@ def test_other_seeds_give_other_frames(task, appearance):
     assert len(frames) == 8
 
 
-@pytest.mark.parametrize("execution", EXECUTIONS)
+@pytest.mark.parametrize(
+    ("execution", "appearance"), [("physics", "strong"), ("kinematic", "strong"), ("kinematic", "photo")]
+)
 @pytest.mark.parametrize("task", WORLDS)
-def test_a_dirty_reset_is_a_fresh_environment(task, execution):
-    """Including velocities, warm starts, controls and time, and whatever looks came before."""
-    dirty, fresh = (make(task, execution=execution, appearance="strong") for _ in range(2))
+def test_equal_seeds_give_equal_bits_whatever_was_before(task, execution, appearance):
+    """Including velocities, warm starts, controls and time, and looks."""
+    dirty, fresh = (make(task, execution=execution, appearance=appearance) for _ in range(2))
     dirty.reset(seed=1)
     walk(dirty, (0, 2, 5))
     dirty.world.data.qvel[:] = 0.3
@@ -91,42 +79,7 @@ def test_a_dirty_reset_is_a_fresh_environment(task, execution):
     fresh.close()
 
 
-def test_a_macro_action_depends_on_where_the_cubes_stand_alone():
-    """The same cubes and action, reached by different pasts and in another MjData: the same bits."""
-    env, other = make(), make()
-    env.reset(seed=2, options={"macrostate": (1, 2, 0, 0)})
-    walk(env, (0, 3))
-    cubes = env.world.data.qpos.copy()
-    *_, states = walk(env, (4,))
-    other.reset(seed=9, options={"macrostate": (3, 3, 3, 0)})
-    walk(other, (5,))
-    other.world.data.qpos[:] = cubes
-    other._macrostate = other.world.read().macrostate
-    *_, again = walk(other, (4,))
-    assert np.array_equal(states, again)
-    env.close()
-    other.close()
-
-
 @pytest.mark.parametrize("task", WORLDS)
-def test_a_recorded_walk_replays_to_the_same_bits(task):
-    env = make(task, appearance="mild")
-    generator = np.random.default_rng(0)
-    first, _ = env.reset(seed=21)
-    actions, total = [], []
-    for _ in range(5):
-        action = int(generator.integers(env.action_space.n))
-        frame, reward, *_ = env.step(action)
-        actions.append(action)
-        total.append((frame.tobytes(), reward, full_state(env).tobytes()))
-    again, _ = env.reset(seed=21)
-    replay = [(*env.step(action)[:2], full_state(env).tobytes()) for action in actions]
-    env.close()
-    assert np.array_equal(first, again)
-    assert [(frame.tobytes(), reward, state) for frame, reward, state in replay] == total
-
-
-@pytest.mark.parametrize("task", tuple(registry.TASKS))
 def test_both_executions_walk_the_same_macrostates(task):
     physics, kinematic = (make(task, execution=execution) for execution in EXECUTIONS)
     generator, moved = np.random.default_rng(5), 0
@@ -183,7 +136,7 @@ def test_frames_of_macrostates_depend_on_the_generator_alone():
 
 @pytest.mark.parametrize("task", WORLDS)
 @pytest.mark.parametrize(
-    ("execution", "appearance"), [("physics", "strong"), *(("kinematic", level) for level in APPEARANCES)]
+    ("execution", "appearance"), [("physics", "strong"), ("kinematic", "strong"), ("kinematic", "photo")]
 )
 def test_a_state_goes_on_to_the_same_bits(task, execution, appearance):
     """In the middle of an episode, after something else was done, and in another environment."""

@@ -44,7 +44,7 @@ import dataclasses
 import numpy as np
 from imagine_bench import registry
 from imagine_bench.registry import EncoderEntry, RegressorEntry
-from imagine_bench.studies.study import Study, Variant
+from imagine_bench.sweep.grid import Study, Variant
 
 class Tiles:
     """Mean colors of 16 tiles, in thousands, so that somebody must scale them."""

@@ -18,7 +18,7 @@ from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.registry.old_names import agent_label, label_today
 from imagine_bench.running.task_types import read_protocol
 from imagine_bench.store import encoders
-from imagine_bench.studies.catalogue import STUDIES
+from imagine_bench.sweep.catalogue import STUDIES
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"

@@ -30,7 +30,8 @@ from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.results import BenchResult
-from imagine_bench.studies.study import _plan, load_study
+from imagine_bench.sweep.grid import read_grid
+from imagine_bench.sweep.run import plan_variant
 from imagine_bench.testing.contract import checks, report
 
 EXAMPLES = ROOT / "docs" / "examples"
@@ -172,8 +173,8 @@ def test_the_study_on_a_page_could_be_run(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "how_to" / "add_agent.md").read_text()
     (text,) = re.findall(r"^```toml\n(question.*?)^```", page, re.MULTILINE | re.DOTALL)
     (tmp_path / "mine.toml").write_text(text)
-    study = load_study(tmp_path / "mine.toml")
-    found = [_plan(study, "arrow_puzzle", variant)[0] for variant in study.variants]
+    study = read_grid(tmp_path / "mine.toml")
+    found = [plan_variant(study, "arrow_puzzle", variant)[0] for variant in study.variants]
     assert [(dict(each.overrides), each.looks) for each in found if isinstance(each, Protocol)] == [
         ({}, "clean"), ({"controller.discount": 0.9}, "clean"), ({}, "clean, tested at strong"),
     ]  # fmt: skip

@@ -15,8 +15,8 @@ def draw_quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let views for people be drawn without shadows and soft edges, which cost a software renderer 30 ms each."""
 
     from imagine_bench.tasks import macro_env, scene_reader
-    from imagine_bench.tasks.rendering import View
-    from imagine_bench.tasks.scenes.cameras import DRAWN_GROUPS
+    from imagine_bench.tasks.rendering.cameras import DRAWN_GROUPS
+    from imagine_bench.tasks.rendering.renderer import View
 
     def view(camera: str, width: int, height: int) -> View:
         return View(camera=camera, width=width, height=height, groups=DRAWN_GROUPS)

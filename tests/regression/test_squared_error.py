@@ -89,7 +89,7 @@ def test_networks_err_by_the_sum_of_the_causes(tmp_path: Path) -> None:
         rest = terms.pop("measured") - sum(terms.values())
         error = rest.std() / np.sqrt(rest.size)
         assert abs(rest.mean()) < SURE * error
-        found = result.first("mc_dropout", variant)
+        found = result.first(("mc_dropout", variant))
         np.testing.assert_allclose(terms["bias²"], (found["true_mean"] - found["mean"]) ** 2, atol=1e-6)
         np.testing.assert_array_equal(terms["aleatoric"][0], toy.noise_sigma(variant, found["x"]) ** 2)
         for name in ("modal", "spread"):

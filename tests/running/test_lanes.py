@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from bench_fakes import Rememberer
-from imagine_bench.tasks.motion.executor import Simulation
+from imagine_bench.tasks.motion.executor import MacroExecutor
 from small_runs import same_but_for_time, small
 
 from imagine_bench.cli.observers import run_observed
@@ -79,15 +80,17 @@ def test_a_test_that_was_interrupted_goes_on(
 def test_a_simulation_that_blows_up_ends_the_run(
     tmp_path: Path, in_lanes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, runs = Simulation.run, []
+    run = MacroExecutor.run
+    runs = itertools.count()
 
-    def failing(simulation: Simulation) -> None:
-        run(simulation)
-        runs.append(simulation)
-        if in_lanes and len(runs) > 25:
+    def failing(executor: MacroExecutor, data: Any, trajectory: Any, **options: Any) -> Any:
+        qpos = run(executor, data, trajectory, **options)
+        number = next(runs)
+        if in_lanes and number > 25:
             raise DivergedError("The simulation diverged.")
+        return qpos
 
-    monkeypatch.setattr(Simulation, "run", failing)
+    monkeypatch.setattr(MacroExecutor, "run", failing)
     with pytest.raises(DivergedError, match=r"The simulation diverged\. The agent's state lies in"):
         do(tmp_path / "run")
 

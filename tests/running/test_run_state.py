@@ -13,8 +13,8 @@ from small_runs import small
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.runs import Progress, RunSpec
-from imagine_bench.running.counters import Counters, EvaluationCounts
-from imagine_bench.running.run_state import Run
+from imagine_bench.running.evaluation import EvaluationCounts
+from imagine_bench.running.run_state import Counters, Run
 from imagine_bench.store import encoders
 
 

@@ -27,8 +27,7 @@ from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.running import run_state
-from imagine_bench.running.counters import EvaluationCounts
-from imagine_bench.running.evaluation import play_test_episode
+from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
 from imagine_bench.store.checkpoints import load_newest
 

@@ -13,7 +13,8 @@ import pytest
 
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.interfaces import AgentState
-from imagine_bench.running.counters import Counters, EvaluationCounts
+from imagine_bench.running.evaluation import EvaluationCounts
+from imagine_bench.running.run_state import Counters
 from imagine_bench.store import checkpoints as checkpointing
 from imagine_bench.store.checkpoints import Snapshot, load_newest, load_snapshot, save_snapshot
 from imagine_bench.store.results import Checkpoint

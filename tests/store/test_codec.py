@@ -12,7 +12,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 import pytest
 
-from imagine_bench.running.counters import Counters, EvaluationCounts
+from imagine_bench.running.evaluation import EvaluationCounts
+from imagine_bench.running.run_state import Counters
 from imagine_bench.store.codec import pack, unpack
 from imagine_bench.store.results import Beliefs, Checkpoint, ComparedRollout, KeptEpisodes, OpenLoop
 

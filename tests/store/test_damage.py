@@ -8,19 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_runs import Inline, do, same_but_for_time, small
+from small_runs import do, same_but_for_time, small
 
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.running.bench import bench
 from imagine_bench.running.task_types import load_bench
+from imagine_bench.store.bench_folder import bench_folder
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.files import lock, read_json, write_bytes
-from imagine_bench.store.run_folder import load_so_far
+from imagine_bench.store.run_folder import load_run, load_so_far, mark_done, recording_path
+
+WHOLE = Path(__file__).parent / "of_abcb05c/whole"
+"""A finished bench of :func:`small`."""
 
 
 def unfinished(folder: Path) -> Path:
     """A run that lacks its end, and its only checkpoint."""
-    do(folder)
+    shutil.copytree(WHOLE / "table/seed_0", folder, dirs_exist_ok=True)
     (folder / "DONE").unlink()
     (checkpoint,) = (folder / "checkpoints").iterdir()
     return checkpoint
@@ -34,18 +37,17 @@ def change(path: Path, **values: Any) -> None:
 def test_a_changed_state_of_a_checkpoint_is_refused(tmp_path: Path, values: dict[str, Any]) -> None:
     change(unfinished(tmp_path) / "state.json", **values)
     with pytest.raises(ArtefactError, match=r"state\.json is damaged"):
-        do(tmp_path)
+        load_so_far(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["config.json", "state.json"])
 @pytest.mark.parametrize("content", ["[" * 10**5, "[]", "{}", "1" * 5000, "\x00", "null"])
 def test_whatever_json_holds_is_one_sentence(tmp_path: Path, name: str, content: str) -> None:
-    path = unfinished(tmp_path) / name if name == "state.json" else tmp_path / name
-    do(tmp_path)
-    (tmp_path / "DONE").unlink()
+    checkpoint = unfinished(tmp_path)
+    path = checkpoint / name if name == "state.json" else tmp_path / name
     path.write_text(content)
     with pytest.raises(ArtefactError, match=name) as caught:
-        do(tmp_path)
+        load_so_far(tmp_path)
     assert len(str(caught.value)) < 500 and "\n" not in str(caught.value)
 
 
@@ -53,8 +55,8 @@ def test_whatever_json_holds_is_one_sentence(tmp_path: Path, name: str, content:
 def test_folders_of_other_names_are_no_checkpoints(tmp_path: Path, name: str) -> None:
     checkpoint = unfinished(tmp_path)
     shutil.copytree(checkpoint, checkpoint.with_name(name))
-    whole = do(tmp_path)
-    assert whole.checkpoints[-1].episodes == 9 and checkpoint.with_name(name).is_dir()
+    whole = load_so_far(tmp_path)
+    assert whole is not None and whole.checkpoints[-1].episodes == 9 and checkpoint.with_name(name).is_dir()
 
 
 def test_a_renamed_checkpoint_is_named(tmp_path: Path) -> None:
@@ -98,19 +100,22 @@ def test_a_long_name_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_a_recording_that_changed_is_noticed_one_that_was_removed_is_not(tmp_path: Path) -> None:
-    before = do(tmp_path, recorded_episodes=1)
-    assert before.recording is not None
-    with before.recording.open("r+b") as stream:
-        stream.seek(100)
-        stream.write(b"?????")
+    unfinished(tmp_path)
+    recording = recording_path(tmp_path)
+    recording.write_bytes(b"as it was recorded")
+    mark_done(tmp_path, ["config.json", "metrics.csv"])
+    before = load_run(tmp_path)
+    assert before.recording == recording
+    recording.write_bytes(b"as it was changed")
     with pytest.raises(ArtefactError, match=r"recording\.rrd is not as the run left it"):
-        do(tmp_path, recorded_episodes=1)
-    before.recording.unlink()
-    assert same_but_for_time(before, do(tmp_path, recorded_episodes=1))
+        load_run(tmp_path)
+    recording.unlink()
+    assert same_but_for_time(before, load_run(tmp_path))
 
 
 def test_a_protocol_stands_for_its_folder_and_its_runs(tmp_path: Path) -> None:
-    folder = bench(small(), {}, root=tmp_path, launcher=Inline()).folder
+    folder = bench_folder(tmp_path, small())
+    shutil.copytree(WHOLE, folder)
     path = folder / "protocol.json"
     values = read_json(path, "a protocol")
     assert values.pop("execution") == "kinematic"
@@ -124,7 +129,8 @@ def test_a_protocol_stands_for_its_folder_and_its_runs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["environment.json", "sessions.json"])
 def test_changed_facts_of_a_bench_are_refused(tmp_path: Path, name: str) -> None:
-    folder = bench(small(), {}, root=tmp_path, launcher=Inline()).folder
+    folder = tmp_path / "bench"
+    shutil.copytree(WHOLE, folder)
     change(folder / name, commit="other")
     with pytest.raises(ArtefactError, match=rf"{name} is damaged"):
         load_bench(folder)
@@ -133,5 +139,6 @@ def test_changed_facts_of_a_bench_are_refused(tmp_path: Path, name: str) -> None
 def test_changed_settings_of_an_unfinished_run_are_refused(tmp_path: Path) -> None:
     unfinished(tmp_path)
     change(tmp_path / "config.json", settings={"rate": 0.1})
-    with pytest.raises(ArtefactError, match=r"config\.json is damaged"):
-        load_so_far(tmp_path)
+    for read in (load_so_far, do):
+        with pytest.raises(ArtefactError, match=r"config\.json is damaged"):
+            read(tmp_path)

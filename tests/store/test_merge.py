@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +31,20 @@ def load_merged(folders: list[Path], root: Path) -> BenchResult:
     return merge([load_archive(each) if is_archive(each) else load_so_far(each) for each in folders], root)
 
 
+_MADE = tempfile.TemporaryDirectory()
+"""Every bench of this module, made once."""
+
+
+@functools.cache
+def _made(protocol: Protocol) -> Path:
+    return bench(protocol, {}, root=Path(_MADE.name), launcher=Inline()).folder
+
+
 def do(root: Path, *agents: str, **changes: Any) -> Path:
-    result: BenchResult = bench(
-        small(agents=agents, evaluation_episodes=3, **changes), {}, root=root, launcher=Inline()
-    )
-    return result.folder
+    made = _made(small(agents=agents, evaluation_episodes=3, **changes))
+    folder = root / made.relative_to(_MADE.name)
+    shutil.copytree(made, folder)
+    return folder
 
 
 def kept_from(folder: Path, kept: Path) -> Path:

@@ -59,7 +59,7 @@ def test_all_parts_are_of_one_moment_of_the_same_walk(task, execution):
     whole.close()
 
 
-@pytest.mark.parametrize("choice", ["frame", "proprio", "human,state"])
+@pytest.mark.parametrize("choice", ["proprio", "human,state"])
 def test_gymnasium_s_checker_is_content(choice):
     env = make(observation=choice, size=32, **KINEMATIC)
     with warnings.catch_warnings():
@@ -93,15 +93,7 @@ def test_every_size_shows_the_same_view():
         assert np.abs(image - images[2]).mean() < 0.4 * contrast  # sensor noise is each pixel's own
 
 
-def test_vectors_and_pickles_of_dicts_work():
-    vector = gymnasium.make_vec(
-        registry.TASKS["arrow_puzzle"].env_id, num_envs=2, vectorization_mode="sync", observation=ALL, **KINEMATIC
-    )
-    parts, _ = vector.reset(seed=1)
-    assert {name: part.shape for name, part in parts.items()} == {
-        "frame": (2, 64, 64, 3), "human": (2, 64, 64, 3), "state": (2, 15), "proprio": (2, 16),
-    }  # fmt: skip
-    vector.close()
+def test_a_pickled_environment_observes_the_same_parts():
     env = make(observation="frame,state", size=48, **KINEMATIC)
     env.reset(seed=1)
     twin = pickle.loads(pickle.dumps(env))

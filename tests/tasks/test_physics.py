@@ -15,7 +15,7 @@ from imagine_bench.tasks.scenes.constants import HOME_QPOS_RAD, TABLE_HEIGHT_M
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import PHYSICS_RANGES, PhysicsSettings
-from imagine_bench.tools.margins import as_ruled, walk
+from imagine_bench.testing.margins import as_ruled, walk
 
 COMPILE = {"arrow_puzzle": compile_arrow_scene, "pick_place": compile_pick_scene}
 TASKS = tuple(COMPILE)
@@ -84,12 +84,9 @@ def test_wrong_settings_name_what_is_allowed(given, error, message):
     [
         ("arrow_puzzle", "pad_friction", 0.01, 11, 12),  # flat jaws turn a box by its shape
         ("arrow_puzzle", "finger_force_n", 0.9, 12, 12),
-        ("arrow_puzzle", "finger_force_n", 0.1, 0, 0),
-        ("arrow_puzzle", "plan_error_mm", 40.0, 0, 1),
         ("arrow_puzzle", "plan_error_deg", 45.0, 0, 0),
         ("pick_place", "pad_friction", 0.01, 0, 0),  # where something is lifted, friction decides
         ("pick_place", "finger_force_n", 0.3, 0, 0),
-        ("pick_place", "object_mass", 60.0, 0, 0),
         ("pick_place", "plan_error_mm", 8.0, 12, 12),
         ("pick_place", "plan_error_mm", 40.0, 0, 0),
     ],
@@ -187,12 +184,6 @@ def test_the_arm_does_touch_what_is_in_its_way():
         found = touching(env.model, mujoco.MjData(env.model), qpos, names)
         assert {name for pair in found for name in pair} >= ({expected, "table_top"} if expected else set())
         assert bool(found) == bool(expected)
-
-
-def test_what_only_contact_feels_is_not_drawn():
-    shapes = {shape.name for shape in make("arrow_puzzle").shapes()}
-    assert "finger_left_pad" in shapes
-    assert not {name for name in shapes if "back" in name and name.startswith("finger") and "tip" not in name}
 
 
 @pytest.mark.slow

@@ -85,7 +85,7 @@ def test_who_must_be_seen_needs_a_desktop():
     words = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     quiet = {name: value for name, value in os.environ.items() if name not in words}
     code = (
-        "from imagine_bench.tasks.window import open_display; pygame = open_display(seen=False)\n"
+        "from imagine_bench.tasks.rendering.window import open_display; pygame = open_display(seen=False)\n"
         "print(pygame.display.get_driver()); pygame.quit(); open_display(seen=True)"
     )
     done = subprocess.run([sys.executable, "-c", code], env=quiet, capture_output=True, text=True, check=False)

@@ -67,7 +67,7 @@ def test_the_command_is_what_a_shell_takes(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("sys.argv", ["/x/imagine_bench/__main__.py", "bench", "--task", "a b"])
     assert environment.command() == "python -m imagine_bench bench --task 'a b'"
     monkeypatch.setattr("sys.argv", ["/x/bin/imagine-bench", "list"])
-    assert environment.command() == "imagine-bench list"
+    assert environment.command() == "imagine-bench describe"
 
 
 @pytest.mark.parametrize("package", ["mink", "jinja2", "safetensors"])

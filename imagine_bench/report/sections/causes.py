@@ -1,4 +1,4 @@
-"""The section on why agents failed, from what 'imagine-bench why' left in the bench's folder."""
+"""The section on why agents failed, from what 'imagine-bench verify --causes' left in the bench's folder."""
 
 from __future__ import annotations
 

@@ -131,7 +131,8 @@ class _Board:
         self._news[progress.agent, progress.seed] = progress
 
     def take(self) -> list[Progress]:
-        news, self._news = list(self._news.values()), {}
+        news = list(self._news.values())
+        self._news = {}
         return news
 
 

@@ -42,11 +42,13 @@ class SlurmCluster:
             import submitit  # noqa: PLC0415 - an extra
         except ImportError as error:
             raise lacking("submitit") from error
-        self._workers, self._submitit = workers, submitit
+        self._workers = workers
+        self._submitit = submitit
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job, in order; those in the queue are cancelled when this is interrupted."""
-        waiting, failures = [absolute(job) for job in jobs][::-1], []
+        waiting = [absolute(job) for job in jobs][::-1]
+        failures = []
         queued: dict[Any, Job] = {}
         try:
             while waiting or queued:

@@ -13,7 +13,7 @@ from imagine_bench.agents.imagination.settings import WorldModelSettings
 from imagine_bench.agents.imagination.uncertainty import decompose
 from imagine_bench.agents.imagination.world_model import WorldModel, log_cosh
 from imagine_bench.agents.replay import Batch
-from imagine_bench.agents.speed import PlainWorldModel
+from plain_torch import PlainWorldModel
 
 from imagine_bench.errors import DivergedError
 

@@ -9,14 +9,14 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.description import COUPLINGS, FORBIDS, GOALS, Arrows, Turn
-from imagine_bench.tasks.dials.dials import GESTURES
+from imagine_bench.tasks.parameters.parameters import GESTURES
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, UnknownNameError
 from imagine_bench.protocols.control import protocol
 from imagine_bench.registry.entries import file_name, parse_options
 
-KINDS = {name: str(kind) for name, kind in {**Arrows.__base__.__annotations__, **Arrows.__annotations__}.items()}
+KINDS = {name: str(Arrows.__dataclass_fields__[field].type) for name, field in Arrows.spellings().items()}
 KEPT = {
     ("ArrowPuzzle", "clean"): ("f59f3c47a32ff7f2", "d9f5eeb372d00e0a"),
     ("ArrowPuzzle", "strong"): ("d5a66fefe14d69be", "5167ba48bf5a69bf"),
@@ -72,7 +72,7 @@ def drawn(rng):
         "shuffle": int(rng.integers(2**32)),
         "horizon": int(rng.integers(1, 1001)),
         "slip": float(rng.uniform(0, 0.99)),
-        "fickle": float(rng.choice([0.25, 1.0, rng.uniform()])),
+        "goal_change": float(rng.choice([0.25, 1.0, rng.uniform()])),
         "gesture": [*GESTURES, float(rng.uniform())][rng.integers(3)],
         "lag": int(rng.integers(11)),
         "distractors": int(rng.integers(5)),
@@ -86,11 +86,11 @@ def drawn(rng):
 
 def test_a_canonical_name_says_its_world_and_only_it():
     rng = np.random.default_rng(0)
-    worlds = [world for world in (drawn(rng) for _ in range(2000)) if world is not None]
-    assert len(worlds) > 1000
+    worlds = [world for world in (drawn(rng) for _ in range(600)) if world is not None]
+    assert len(worlds) > 300
     for world in worlds:
         _, _, said = str(world).partition(":")
-        again = Arrows(**parse_options(said, KINDS, "")) if said else Arrows()
+        again = Arrows.taken_from(parse_options(said, KINDS, "")) if said else Arrows()
         assert again == world and str(again) == str(world) and again.hash == world.hash
     assert len({str(world) for world in worlds}) == len(set(worlds)) == len({world.hash for world in worlds})
     assert len({file_name(str(world)) for world in worlds}) == len(set(worlds))
@@ -101,6 +101,7 @@ def test_a_canonical_name_says_its_world_and_only_it():
     [
         ("arrows:slip=1e-1,cubes=5", "arrows:cubes=5,slip=0.1"),
         ("arrows:cubes=3,coupling=none,fickle=1", "arrows:fickle=1.0"),
+        ("arrows:goal_change=0.5", "arrows:fickle=0.5"),
         ("arrows:horizon=10", "arrow_puzzle"),
         ("arrows:forbid=equal+agent,horizon=10", "arrow_puzzle_hard"),
         ("arrow_puzzle:cubes=1,horizon=2", "arrow_puzzle_easy"),
@@ -137,14 +138,14 @@ def test_a_world_may_lie_in_a_file(tmp_path):
         ("cubes=2.0", "cubes is 2.0; give an integer"),
         ("slip=1.5", "slip is 1.5; give a number from 0 to 0.99"),
         ("slip=NaN", "slip is nan"),
-        ("fickle=x", "fickle is 'x'; give a number from 0 to 1"),
+        ("fickle=x", "goal_change is 'x'; give a number from 0 to 1"),
         ("gesture=never", "gesture is 'never'; give a number from 0 to 1, or always or first"),
         ("goal=0123", "Goal '0123' does not fit 3 cubes; give a pattern of 3 digits from 0 to 3"),
         ("goal=019", "Goal '019' does not fit"),
         ("goal=up", "No goal 'up'. Known: pointed, toward_agent, clockwise, all, a pattern of 3 digits"),
         ("forbid=equal+none", "contradicts or repeats itself"),
         ("cubes=4,forbid=equal", "forbid=equal leaves no legal turn with 4 cubes, for an arrow has only 4 directions"),
-        ("cubes=1,fickle=0.1", "fickle=0.1 needs another cube"),
+        ("cubes=1,fickle=0.1", "goal_change=0.1 needs another cube"),
         (
             "goal=all",
             "no start from which its goal can be reached: of 192 macrostates 72 are legal and 0 of them goals",
@@ -153,6 +154,7 @@ def test_a_world_may_lie_in_a_file(tmp_path):
         ("cubez=3", "No option of task arrows 'cubez'. Did you mean 'cubes'? Known: "),
         ("cubes", "'cubes' is not of the form name=value"),
         ("cubes=2,cubes=3", "names 'cubes' twice"),
+        ("fickle=0.1,goal_change=0.1", "goal_change and goal_change are one parameter; give it once"),
         ("", "'' is not of the form name=value"),
         ("@nowhere.json", "nowhere.json cannot be read"),
     ],
@@ -187,9 +189,7 @@ def test_turns_are_coupled_to_the_right_and_shuffled():
     assert set(spec.action_names) == set(named) and spec.action_names != named
 
 
-@pytest.mark.parametrize(
-    "world", [{"cubes": 5, "slip": 0.1}, {"cubes": 1}, {"horizon": 3}, {"cubes": 6, "goal": "pointed"}]
-)
+@pytest.mark.parametrize("world", [{"cubes": 5, "slip": 0.1}, {"horizon": 3}])
 def test_gymnasium_makes_worlds_that_end_at_their_horizon(world):
     spec = registry.task("arrows:" + ",".join(f"{name}={value}" for name, value in world.items()))
     one = gymnasium.make("imagine_bench/Arrows-v0", **world, execution="kinematic")

@@ -8,15 +8,13 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene
-from imagine_bench.tasks.arrows.spec import spec_of
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.rendering import Renderer, View
+from imagine_bench.tasks.rendering.cameras import agent_camera
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
-from imagine_bench.tasks.scenes.cameras import agent_camera
 from imagine_bench.tasks.scenes.layout import layout
 
-from imagine_bench.errors import UnknownNameError
 from imagine_bench.preprocessing import STRIP_WIDTH
 
 FIXED = appearance("clean").__class__(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
@@ -88,38 +86,7 @@ def test_models_are_one_s_own():
     assert not np.array_equal(first.mat_rgba, second.mat_rgba)
 
 
-@pytest.mark.parametrize("pointed", range(3))
-def test_the_gripper_passes_the_pointing_finger(world, pointed):
-    world.place((1, 2, 0, pointed), rng())
-    hand = world.model.geom("hand_skin").id
-    arm = np.flatnonzero(world.model.geom_group == c.ARM_GROUP)
-
-    def clearance_m():
-        gaps = [mujoco.mj_geomDistance(world.model, world.data, hand, int(geom), 1.0, None) for geom in arm]
-        return min(gaps)
-
-    result = world.execute(2 * pointed, (1, 2, 0, pointed), 20.0)
-    assert result.fault is None
-    closest = 1.0
-    for qpos in result.qpos:
-        world.data.qpos[:] = qpos
-        world.update()
-        closest = min(closest, clearance_m())
-    assert 0.0 < closest < 0.05  # near, so the check is not vacuous, and free
-
-
 # --- reading -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("level", LEVELS)
-def test_every_macrostate_is_read_back_at_every_level(level):
-    world, generator = ArrowWorld(appearance(level)), rng()
-    for state in spec_of().rules.states:
-        world.place(state, generator)
-        world.vary(generator)
-        reading = world.read()
-        assert reading.macrostate == state
-        assert reading.problem is None
 
 
 def _move(world, cube, *, x_m=0.0, yaw_deg=0.0, roll_deg=0.0):
@@ -170,7 +137,7 @@ def _strip_of_column(column):
     return [strip for strip, start in enumerate((0, 21, 42)) if start <= column < start + STRIP_WIDTH]
 
 
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("level", ["mild", "strong"])
 def test_each_strip_shows_its_own_cube_only(level):
     world, generator = ArrowWorld(appearance(level)), rng()
     camera = world.model.camera(c.AGENT_CAMERA)
@@ -232,80 +199,25 @@ def test_the_hand_is_at_the_top_its_finger_in_its_cube_s_strip(world, camera):
 # --- appearance --------------------------------------------------------------------------------------------------
 
 
-def test_levels_are_ordered_and_named():
-    assert tuple(LEVELS) == ("clean", "mild", "strong", "photo", "photo_held_out")
-    for weaker, stronger in (("clean", "mild"), ("mild", "strong")):
-        for field in ("object_offset_m", "object_yaw_rad", "light_fraction", "hand_offset_m"):
-            assert getattr(LEVELS[weaker], field) < getattr(LEVELS[stronger], field)
-    with pytest.raises(
-        UnknownNameError, match=r"No appearance 'mid'\. Did you mean 'mild'\? Known: clean, mild, strong"
-    ):
-        appearance("mid")
-
-
-def test_clean_frames_differ_by_cubes_alone_other_levels_by_more(camera):
-    changed = {}
-    for level in LEVELS:
-        world, generator = ArrowWorld(appearance(level)), rng()
-        own = agent_camera(world.model)
-        frames = []
-        for _ in range(2):
-            world.place((0, 1, 2, 1), generator)
-            world.vary(generator)
-            frames.append(own.frame(world.data))
-        own.close()
-        changed[level] = np.abs(frames[0].astype(int) - frames[1]).max(axis=2) > 0
-    assert not changed["clean"][:34].any()
-    assert changed["clean"][34:].any()
-    assert changed["mild"][:34].mean() > 0.5
-    assert changed["strong"][:34].mean() > 0.5
-
-
 def test_looks_vary_within_what_their_level_allows_and_cover_it():
     for level in (LEVELS["clean"], LEVELS["mild"], LEVELS["strong"]):
         world, generator = ArrowWorld(level), rng()
         model, camera = world.model, world.model.camera(c.AGENT_CAMERA).id
         colors, place_m, light = model.mat_rgba.copy(), model.cam_pos[camera].copy(), model.light_diffuse.copy()
         quat = model.cam_quat[camera].copy()
-        tint, shift_m, turn_rad, brightness = 0.0, 0.0, 0.0, 0.0
+        tint, shift_m, turn_rad, brightness, yaw_rad = 0.0, 0.0, 0.0, 0.0, 0.0
         for _ in range(200):
             world.vary(generator)
             tint = max(tint, np.abs(model.mat_rgba / np.where(colors > 0, colors, 1.0) - (colors > 0)).max())
             shift_m = max(shift_m, np.abs(model.cam_pos[camera] - place_m).max())
             turn_rad = max(turn_rad, 2.0 * math.acos(min(1.0, abs(model.cam_quat[camera] @ quat))))
             brightness = max(brightness, np.abs(model.light_diffuse - light).max() / light.max())
+            yaw_rad = max(yaw_rad, 2.0 * abs(math.atan2(world.data.mocap_quat[0, 3], world.data.mocap_quat[0, 0])))
         for found, most in (
             (tint, level.color_fraction),
             (shift_m, level.camera_offset_m),
             (turn_rad, math.sqrt(3.0) * level.camera_angle_rad),
             (brightness, level.light_fraction),
+            (yaw_rad, level.hand_yaw_rad),
         ):
             assert 0.75 * most <= found <= most + 1e-6
-
-
-def test_samples_of_looks_do_not_add_up():
-    """The hundredth sample is as near the nominal looks as the first, and one draw alone decides it."""
-    frames = []
-    for warm_up in (0, 100):
-        world = ArrowWorld(appearance("strong"))
-        own, warm, last = agent_camera(world.model), rng(), np.random.default_rng(7)
-        for _ in range(warm_up):
-            world.vary(warm)
-        world.place((0, 1, 2, 1), last)
-        world.vary(last)
-        frames.append(own.frame(world.data))
-        own.close()
-    assert np.array_equal(*frames)
-
-
-@pytest.mark.parametrize(("level", "most_deg"), [("clean", 0.0), ("mild", 4.0), ("strong", 8.0)])
-def test_the_hand_turns_as_far_as_its_level_says(level, most_deg):
-    varied, generator, yaw_deg = ArrowWorld(appearance(level)), rng(), []
-    varied.place((0, 0, 0, 1), generator)
-    for _ in range(60):
-        varied.vary(generator)
-        w, x, y, z = varied.data.mocap_quat[0]
-        assert (x, y) == (0.0, 0.0)
-        yaw_deg.append(2 * math.degrees(math.atan2(z, w)))
-    assert np.abs(yaw_deg).max() <= most_deg + 1e-9
-    assert min(yaw_deg) <= -0.8 * most_deg and max(yaw_deg) >= 0.8 * most_deg

@@ -13,19 +13,6 @@ def _world(level="clean", **fields):
     return ArrowWorld(appearance(level), Arrows(**fields))
 
 
-@pytest.mark.parametrize("level", ["clean", "strong"])
-@pytest.mark.parametrize("cubes", range(1, 7))
-def test_macrostates_are_read_back_for_any_number(cubes, level):
-    world, rng = _world(level, cubes=cubes), np.random.default_rng(cubes)
-    for _ in range(300):
-        state = (*rng.integers(4, size=cubes).tolist(), int(rng.integers(cubes)))
-        world.place(state, rng)
-        world.vary(rng)
-        reading = world.read()
-        assert reading.macrostate == state
-        assert reading.problem is None
-
-
 @pytest.mark.parametrize("cubes", range(1, 7))
 def test_a_turn_of_any_cube_moves_no_neighbour(cubes):
     world, rng = _world(cubes=cubes, forbid="none"), np.random.default_rng(cubes)
@@ -70,17 +57,7 @@ def test_a_cube_that_slips_stays_though_it_was_gripped(action):
     assert result.fault is None
     assert world.read().macrostate == state
     assert np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1).max() < 4e-3  # squared in the fingers
-    assert world.executor.executor.opening_m(result.qpos).min() < 0.0275  # the fingers did close on it
-
-
-def test_the_same_slip_gives_the_same_bits():
-    ends = []
-    for _ in range(2):
-        world = _world(cubes=6, forbid="none")
-        world.place((0, 1, 2, 3, 0, 1, 5), np.random.default_rng(3))
-        world.execute(7, (0, 1, 2, 3, 0, 1, 5), 0.0)
-        ends.append(world.data.qpos.copy())
-    np.testing.assert_array_equal(*ends)
+    assert world.executor.opening_m(result.qpos).min() < 0.0275  # the fingers did close on it
 
 
 def test_columns_of_cubes_are_apart_so_a_finger_is_clear():

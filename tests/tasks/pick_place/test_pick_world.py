@@ -9,18 +9,16 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.executor import finish
 from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, PICKED, WITHDRAWN
 from imagine_bench.tasks.pick_place.scene import PALM_M, TIMESTEP_S
 from imagine_bench.tasks.pick_place.spec import SPEC
 from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
-from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
+from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.scenes.objects import OBJECTS, standing_m
 
-from imagine_bench.errors import InvalidValueError
-from imagine_bench.tools.fidelity import measure_fidelity
+from imagine_bench.testing.fidelity import measure_fidelity
 
 FIXED = appearance("clean").__class__(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
 RULES = SPEC.rules
@@ -82,61 +80,40 @@ def test_tips_hand_table_objects_and_palm_touch(world):
 # --- reading -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_every_macrostate_is_read_back_at_every_level(level):
-    world, generator = PickWorld(appearance(level)), rng()
-    for state in RULES.states:
-        for _ in range(3):
-            world.place(state, generator)
-            world.vary(generator)
-            reading = world.read()
-            assert (reading.macrostate, reading.problem) == (state, None)
+def turn(world, index, axis, angle_deg):
+    """Turn an object about an axis, 0 for x to 2 for z, from how it stands upright."""
+    quat = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(quat, np.eye(3)[axis], math.radians(angle_deg))
+    world.data.qpos[world.object_qpos[index][3:]] = quat
 
 
 @pytest.mark.parametrize(
-    ("index", "yaw_deg", "problem"),
+    ("index", "moved_m", "axis", "angle_deg", "problem"),
     [
-        (0, 25, None),
-        (1, 25, "the car is turned by 25 degrees"),
-        (1, -15, None),
-        (2, -25, "the cup is turned by 25 deg"),
+        (0, (0.0, 0, 0), 2, 25, None),  # a ball has neither a heading nor a right way up
+        (0, (0.018, 0, 0), 0, 90, None),
+        (0, (0.021, 0, 0), 0, 0, "the ball stands 21 mm off its place"),
+        (1, (0, 0, 0), 2, 25, "the car is turned by 25 degrees"),
+        (1, (0, 0, 0), 2, -15, None),
+        (1, (0, 0, 0), 0, 12, "the car is tipped by 12 degrees"),
+        (2, (0, 0, 0), 2, -25, "the cup is turned by 25 degrees"),
+        (2, (0, 0, 0), 0, 8, None),
+        (2, (0, 0, 0.05), 0, 0, "the cup is neither on the table nor held nor in the palm"),
     ],
 )
-def test_an_object_turned_away_is_a_problem_unless_it_is_round(world, index, yaw_deg, problem):
+def test_an_object_off_its_place_is_a_problem(world, index, moved_m, axis, angle_deg, problem):
     world.place((0, 0, 0, 0), rng())
-    half_rad = math.radians(yaw_deg) / 2
-    world.data.qpos[world.object_qpos[index][3:]] = [math.cos(half_rad), 0, 0, math.sin(half_rad)]
-    found = world.read().problem
-    assert found is None if problem is None else found.startswith(problem)
-
-
-@pytest.mark.parametrize(
-    ("index", "moved_m", "tilt_deg", "problem"),
-    [
-        (0, (0.021, 0, 0), 0, "the ball stands 21 mm off its place"),
-        (0, (0.018, 0, 0), 90, None),  # a ball has no right way up
-        (1, (0, 0, 0), 12, "the car is tipped by 12 degrees"),
-        (2, (0, 0, 0), 8, None),
-        (2, (0, 0, 0.05), 0, "the cup is neither on the table nor held nor in the palm"),
-    ],
-)
-def test_an_object_off_its_place_is_a_problem(world, index, moved_m, tilt_deg, problem):
-    world.place((0, 0, 0, 0), rng())
-    row = world.object_qpos[index]
-    half_rad = math.radians(tilt_deg) / 2
-    world.data.qpos[row[:3]] += moved_m
-    world.data.qpos[row[3:]] = [math.cos(half_rad), math.sin(half_rad), 0, 0]
+    world.data.qpos[world.object_qpos[index][:3]] += moved_m
+    turn(world, index, axis, angle_deg)
     reading = world.read()
-    assert reading.problem == problem
-    assert reading.macrostate == (0, 0, 0, 0)
+    assert (reading.macrostate, reading.problem) == ((0, 0, 0, 0), problem)
 
 
 @pytest.mark.parametrize("index", [1, 2])
 def test_what_leans_too_far_is_not_picked(world, index):
     world.place((0, 0, 0, 0), rng())
-    half_rad = math.radians(14) / 2
-    world.data.qpos[world.object_qpos[index][3:]] = [math.cos(half_rad), 0, math.sin(half_rad), 0]
-    result = finish(world.executor.pick(world.data, index=index))
+    turn(world, index, 1, 14)
+    result = world.executor.pick(world.data, index=index)
     assert result.fault == f"the {OBJECTS[index].name} is tipped by 14 degrees" and result.sim_time_s == 0.0
 
 
@@ -159,23 +136,6 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
 
-@pytest.mark.parametrize("index", range(3))
-def test_gripper_and_object_pass_the_pointing_hand(world, index):
-    state = (0, 0, 0, index)
-    world.place(state, rng())
-    people = world.data.mocap_pos.copy()
-    motion = world.execute(index, RULES.outcomes(state, index)[0].macrostate, 20.0).qpos
-    model, hand = world.model, world.model.geom("hand_skin").id
-    parts = [each for each in range(model.ngeom) if model.geom(each).name.startswith(("finger_", OBJECTS[index].name))]
-    closest_m, data = 1.0, mujoco.MjData(model)
-    data.mocap_pos[:] = people
-    for qpos in motion:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        closest_m = min(closest_m, *(mujoco.mj_geomDistance(model, data, hand, part, 1.0, None) for part in parts))
-    assert 0.005 < closest_m < 0.05  # near, so the check is not vacuous, and free
-
-
 def ghost_tips(model):
     tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
     model.geom_contype[tips] = model.geom_conaffinity[tips] = 0
@@ -187,8 +147,9 @@ def slippery_tips(model):
     model.geom_friction[tips] = (0.02, 0.001, 0.0001)
 
 
-@pytest.mark.parametrize("spoil", [ghost_tips, slippery_tips])
-@pytest.mark.parametrize("index", range(3))
+@pytest.mark.parametrize(
+    ("spoil", "index"), [(ghost_tips, 1), (slippery_tips, 0), (slippery_tips, 1), (slippery_tips, 2)]
+)
 def test_only_friction_lifts(spoil, index):
     """No weld, no teleport: fingers that pass through or slip leave the object there, and the human withdraws."""
     world = PickWorld(FIXED)
@@ -200,25 +161,15 @@ def test_only_friction_lifts(spoil, index):
     assert world.read().macrostate[3] == WITHDRAWN
 
 
-def test_what_is_dropped_is_a_fault_and_ends_the_episode():
-    env = gymnasium.make(SPEC.env_id).unwrapped
-    env.reset(seed=0, options={"macrostate": (0, 1, 0, OPEN_PALM)})
-    slippery_tips(env.world.model)
-    _, reward, terminated, _, info = env.step(HAND_OVER)
-    env.close()
-    assert info["fault"]
-    assert "car" in info["fault_reason"] or "the scene reads" in info["fault_reason"]
-    assert (reward, terminated, info["success"]) == (-5.0, True, False)
-    assert info["macrostate"][3] == WITHDRAWN
-
-
-@pytest.mark.parametrize("index", range(3))
-def test_what_is_dropped_on_its_way_back_was_not_put_back(index):
+@pytest.mark.parametrize(
+    ("macrostate", "action"), [((0, 1, 0, OPEN_PALM), HAND_OVER), ((1, 0, 0, 1), 0), ((0, 0, 1, 0), 2)]
+)
+def test_what_is_dropped_is_a_fault_and_ends_the_episode(macrostate, action):
     """Wherever it lies then, the human does not take it for what they asked for."""
     env = gymnasium.make(SPEC.env_id).unwrapped
-    env.reset(seed=0, options={"macrostate": (*(int(each == index) for each in range(3)), (index + 1) % 3)})
+    env.reset(seed=0, options={"macrostate": macrostate})
     slippery_tips(env.world.model)
-    _, reward, terminated, _, info = env.step(index)
+    _, reward, terminated, _, info = env.step(action)
     env.close()
     assert info["fault"]
     assert (reward, terminated, info["success"]) == (-5.0, True, False)
@@ -231,7 +182,7 @@ def test_pushing_another_object_is_a_fault(world, monkeypatch):
     place = world.executor.place
 
     def clumsy(data, **arguments):
-        result = yield from place(data, **arguments)
+        result = place(data, **arguments)
         data.joint("cup_joint").qpos[0] += 0.007
         return result
 
@@ -267,7 +218,7 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
     mujoco.mj_kinematics(world.model, world.data)
     world.data.qpos[row[:3]] += world.data.site_xpos[tcp] - carried
     tilted = in_gripper()
-    world.executor.rest(world.data, 1)
+    world.executor.rest_holding(world.data, 1)
     after = in_gripper()
     np.testing.assert_allclose(after[0], tilted[0], atol=1e-12)
     np.testing.assert_allclose(after[1], tilted[1], atol=1e-12)
@@ -275,7 +226,7 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
     assert world.data.qpos[joint] == c.OBSERVATION_QPOS_RAD[1]
 
 
-@pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION[3:8:2])
+@pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION[3:6:2])
 def test_a_macro_action_is_a_function_of_positions_and_arguments(state, action, intended):
     """In another world, after other actions and with velocities left over: the same bits, an object held included."""
     one, other = PickWorld(FIXED), PickWorld(FIXED)
@@ -323,15 +274,8 @@ def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
     env.close()
 
 
-def test_unasked_render_arguments_are_refused():
-    with pytest.raises(
-        InvalidValueError, match=r"No macrostate \(1, 1, 0, 0\); give one of 19, such as \(0, 0, 0, 0\)"
-    ):
-        SPEC.render_macrostates(np.array([(1, 1, 0, 0)]), "clean", rng())
-
-
 def check_fidelity(actions):
-    found = measure_fidelity(SPEC, SPEC.targets, actions)
+    found = measure_fidelity(SPEC, actions)
     assert found.actions == actions
     assert found.as_ruled / actions >= SPEC.targets.as_ruled, found.faults
     assert found.other_objects_mm < SPEC.targets.other_objects_mm

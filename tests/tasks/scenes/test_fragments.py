@@ -122,22 +122,6 @@ def test_arrows_stay_readable():
         assert (np.max(match, axis=0).argmax(axis=1) == states[:, cube]).mean() >= 0.98
 
 
-def test_rules_and_rewards_are_those_of_clean_frames():
-    spec, walks = registry.task("arrow_puzzle"), []
-    for level in ("clean", "photo"):
-        env = gymnasium.make(spec.env_id, appearance=level, execution="kinematic").unwrapped
-        walk = []
-        for seed in range(20):
-            env.reset(seed=seed, options={"macrostate": spec.rules.start_states[seed]})
-            for action in range(3):
-                _, reward, ended, _, info = env.step(action)
-                walk.append((reward, ended, info["fault"], *info["macrostate"]))
-        env.close()
-        walks.append(walk)
-    assert walks[0] == walks[1]
-    assert not any(fault for _, _, fault, *_ in walks[1])
-
-
 def test_in_physics_cubes_stay_where_the_arm_left_them():
     spec = registry.task("arrow_puzzle")
     with closing(gymnasium.make(spec.env_id, appearance="photo", execution="physics")) as env:

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import goes_on, same
+from agent_states import same
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.count_table import CodeCountTableAgent
 from imagine_bench_controls.tabular.counts import CountTable
 from imagine_bench_controls.tabular.settings import HYPERPARAMETERS
-from small_runs import small
 
 from imagine_bench import registry, rules
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Observation, Transition
-from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.seeding import SeedTree
-from imagine_bench.store import encoders
 
 LENGTH, LEFT = 6, 0
 
@@ -116,14 +110,6 @@ def test_directed_exploration_ends_in_greedy_actions() -> None:
     assert fake_codes.success(learner) == 1.0
 
 
-@pytest.mark.parametrize("directed", [False, True])
-def test_a_restored_agent_goes_on_bit_for_bit(directed: bool) -> None:
-    learner, other = agent(directed=directed), agent(directed=directed, seed=5)
-    goes_on(learner, other, live, 60)
-    seen = Observation(frame=fake_codes.frame(fake_codes.starts()[0]))
-    assert learner.q_values(seen).tobytes() == other.q_values(seen).tobytes()
-
-
 def test_tests_change_nothing() -> None:
     learner = agent(directed=True)
     live(learner, 30)
@@ -147,13 +133,3 @@ def test_its_exploration_is_the_settings_of_the_dqn() -> None:
             own, theirs = (each.resolve(name, {}, group).controller for each in (HYPERPARAMETERS, dqn))
             for field in ("discount", "epsilon_min", "epsilon_max", "epsilon_decay"):
                 assert getattr(own, field) == getattr(theirs, field)
-
-
-@pytest.mark.parametrize("name", ["count_table", "count_table_directed"])
-def test_it_beats_chance_on_the_arrow_puzzle(tmp_path: Path, name: str) -> None:
-    task = registry.task("arrow_puzzle")
-    budget = small(agents=(name,), budgets=(150,), evaluation_episodes=40, hyperparameters="fast")
-    spec = RunSpec(protocol=budget, agent=name, seed=1000, encoder=encoders.resolve(task, "clean", kind="codes"))
-    (row,) = run_observed(spec, tmp_path / "run", lambda progress: None).checkpoints
-    assert row.success_rate > 4 * rules.facts(task.rules, task.horizon).chance_level
-    assert row.diagnostics["table/pairs"] > 100

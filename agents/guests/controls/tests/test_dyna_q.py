@@ -8,7 +8,7 @@ from typing import Any
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import goes_on, same
+from agent_states import same
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
 from imagine_bench_controls.tabular.counts import CountTable
@@ -95,7 +95,7 @@ def steps_to_exact(planning: int, seed: int) -> int:
 
 
 def test_planning_needs_a_third_of_the_real_steps() -> None:
-    planned, real = ([steps_to_exact(steps, seed) for seed in range(3)] for steps in (50, 0))
+    planned, real = ([steps_to_exact(steps, seed) for seed in range(2)] for steps in (50, 0))
     assert max(real) < 20_000, "both end at value iteration's values"
     assert 3 * np.mean(planned) <= np.mean(real)
 
@@ -123,19 +123,6 @@ def test_exploration_draws_among_equals_and_only_those() -> None:
         share = (1 - epsilon) / sum(best) * np.array(best) + epsilon / 4
         np.testing.assert_allclose(taken, share, atol=0.05)
         assert learner.act(seen, explore=False) == np.argmax(best)
-
-
-@pytest.mark.parametrize("planning", [0, 5])
-def test_a_restored_agent_goes_on_bit_for_bit(planning: int) -> None:
-    learner, other = agent(planning), agent(planning, seed=5)
-    other.restore(learner.state())
-    saved = goes_on(learner, other, live, 60)
-    assert learner.state().values["steps"] == 120
-    learner.restore(saved)
-    assert same(learner.state(), saved) and learner.steps == 60
-    assert not same(learner.state(), other.state())
-    live(learner, 60, seed=3)
-    assert same(learner.state(), other.state())
 
 
 def test_tests_change_nothing() -> None:

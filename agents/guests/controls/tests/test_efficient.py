@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from agent_states import same
 from fake_latents import CODES, context, frame, live, transition
 from imagine_bench.agents.dqn import td_target
 from imagine_bench_controls.efficient import EfficientDQN, EpisodicMemory, make
@@ -107,15 +106,3 @@ def test_where_an_episode_ends_is_remembered(monkeypatch: pytest.MonkeyPatch) ->
         learner.observe(transition(0, 0, 0.0, 1, **how), episode=0)
     assert learner.real.arrays()["last"].tolist() == [False, True, True, False]
     assert torch.equal(learner.perceive(frame(3)), CODES[3])
-
-
-def test_a_restored_agent_goes_on_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = {"reuse__reset_every": 12, "controller__updates_per_step": 2, "controller__target_rate": 0.1}
-    learner, other = (agent(monkeypatch, **settings) for _ in range(2))
-    live(learner, range(5), np.random.default_rng(0))
-    live(other, range(2), np.random.default_rng(4))
-    other.restore(learner.state())
-    assert same(learner.state(), other.state())
-    for each in (learner, other):
-        live(each, range(5, 9), np.random.default_rng(1))
-    assert same(learner.state(), other.state())

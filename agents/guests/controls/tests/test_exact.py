@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from agent_states import goes_on
 from fake_latents import ACTIONS, CODES, FakeEncoder, context, frame, transition
 from imagine_bench.agents.imagination.rollouts import Imagined
 from imagine_bench_controls import exact
@@ -123,11 +122,6 @@ def test_looks_do_not_depend_on_the_order_of_asking(monkeypatch: pytest.MonkeyPa
     )
     assert torch.equal(*same_state) and torch.equal(*other) and not torch.equal(same_state[0], other[0])
     assert len(drawn) == 4, f"{LOOKS} looks of each are rendered once"
-
-
-def test_a_restored_agent_goes_on_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    agent, other = knowing(monkeypatch), knowing(monkeypatch)
-    goes_on(agent, other, live, 20)
 
 
 def test_the_exact_filter_keeps_what_is_right(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import goes_on, same
+from agent_states import same
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
 from imagine_bench_controls.tabular.counts import CountTable
@@ -58,7 +58,7 @@ def test_the_posterior_is_the_dirichlet_of_the_counts(concentration: float) -> N
     for reward in (1.0, 1.0, 1.0, 0.0):
         table.add(0, 0, 0, reward, True)
     rng = np.random.default_rng(0)
-    drawn = np.array([table.sampled_values(0.9, concentration, rng)[0][0] for _ in range(4_000)])
+    drawn = np.array([table.sampled_values(0.9, concentration, rng)[0][0] for _ in range(2_000)])
     # p + w b with (p, 1 - p - w, w) ~ Dirichlet(3, 1, c), b ~ Bernoulli(1/2): given b, Beta(3 + c b, 1 + c (1 - b))
     total = 4.0 + concentration
     first = {b: (3.0 + concentration * b) / total for b in (0, 1)}
@@ -117,21 +117,14 @@ def test_it_explores_deeply() -> None:
                 found, state = found + (then == length - 1), then
         return found
 
-    assert np.mean([reached(seed, by_chance=False) for seed in range(4)]) > 10
-    assert np.mean([reached(seed, by_chance=True) for seed in range(4)]) < 1
+    assert np.mean([reached(seed, by_chance=False) for seed in range(2)]) > 10
+    assert np.mean([reached(seed, by_chance=True) for seed in range(2)]) < 1
 
 
 def test_it_learns_the_tiny_world_and_ends_greedy() -> None:
     learner = agent()
     live(learner, 300)
     assert fake_codes.success(learner) == 1.0  # type: ignore[arg-type]
-
-
-def test_a_restored_agent_goes_on_bit_for_bit() -> None:
-    learner, other = agent(), agent(seed=5)
-    other.restore(learner.state())
-    saved = goes_on(learner, other, live, 62)
-    assert saved.values["drawn"], "it was taken in the midst of an episode"
 
 
 def test_tests_change_nothing() -> None:

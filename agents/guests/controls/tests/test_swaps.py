@@ -9,7 +9,6 @@ import fake_codes
 import numpy as np
 import pytest
 import torch
-from agent_states import goes_on
 from fake_codes import SIZES
 from imagine_bench.agents.encoders.perception import Perception
 from imagine_bench.agents.replay import Batch
@@ -18,7 +17,7 @@ from imagine_bench_controls.settings import SWAPPING
 from imagine_bench_controls.swaps import SwappingDQN
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, Observation
+from imagine_bench.interfaces import AgentContext
 from imagine_bench.seeding import SeedTree
 
 CPU = torch.device("cpu")
@@ -104,14 +103,6 @@ def test_no_share_is_the_dqn() -> None:
     codes = {(row, action) for row, action in live(learner, 30, seed=1)}
     batch = learner.draw_batch(learner.real)
     assert set(zip(read(batch.z), batch.action.tolist(), strict=True)) <= codes
-
-
-def test_a_restored_agent_goes_on_bit_for_bit() -> None:
-    learner, other = agent(), agent(seed=5)
-    goes_on(learner, other, live, 40)
-    assert other.outcomes == learner.outcomes
-    seen = Observation(frame=fake_codes.frame((0, 1, 0)))
-    assert learner.q_values(seen).tobytes() == other.q_values(seen).tobytes()
 
 
 def test_latents_have_no_parts_to_swap(monkeypatch: pytest.MonkeyPatch) -> None:

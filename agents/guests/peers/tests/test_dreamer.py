@@ -78,15 +78,13 @@ def test_it_sees_latents_where_there_is_an_encoder() -> None:
     assert "replay/rgb" not in rows and not any("conv" in name for name in rows)
     wanted = Encoder.load(file).latents(seen(2).frame)
     assert np.array_equal(rows["replay/latents"][2], wanted) and agent.updates == 1
-    twin = learner(seed=1, encoder=file, learning_starts=2)
-    twin.restore(agent.state())
-    assert episode(agent, 1) == episode(twin, 1)
 
 
 def test_tests_change_nothing_and_the_global_generator_is_left_alone() -> None:
-    agent = learner(learning_starts=2, replay_ratio=1.0)
+    agent = learner(learning_starts=2, replay_ratio=0.7)
     before = torch.get_rng_state()
     episode(agent, 0)
+    episode(agent, 1, length=1)
     state = agent.state()
     acted = []
     for _ in range(2):
@@ -95,7 +93,9 @@ def test_tests_change_nothing_and_the_global_generator_is_left_alone() -> None:
     after = agent.state()
     assert acted[0] == acted[1]
     assert all(np.array_equal(state.arrays[name], after.arrays[name]) for name in state.arrays)
-    assert torch.equal(before, torch.get_rng_state()) and agent.updates == 2
+    assert torch.equal(before, torch.get_rng_state()) and agent.updates == 2, "0.7 a step, from the second of four"
+    with pytest.raises(ArtefactError, match="replay_ratio"):
+        learner().restore(state)
 
 
 @pytest.mark.parametrize("validated", [True, False])
@@ -119,28 +119,3 @@ def test_a_memory_of_the_episode_decides_its_beliefs() -> None:
     agent.begin_episode()
     agent.act(seen(0), explore=False)
     assert torch.equal(fresh, agent._player.recurrent_state)
-
-
-def test_restored_it_goes_on_to_the_bit() -> None:
-    agent = learner(learning_starts=4, replay_ratio=0.7)
-    for number in range(3):
-        episode(agent, number)
-    state = agent.state()
-    twin = learner(seed=1, learning_starts=4, replay_ratio=0.7)
-    twin.restore(state)
-    assert [episode(agent, n) for n in (3, 4)] == [episode(twin, n) for n in (3, 4)]
-    ours, theirs = agent.state(), twin.state()
-    assert agent.updates == twin.updates == 8
-    assert all(np.array_equal(ours.arrays[name], theirs.arrays[name]) for name in ours.arrays)
-    with pytest.raises(ArtefactError, match="replay_ratio"):
-        learner().restore(state)
-
-
-def test_its_model_learns_what_it_is_shown() -> None:
-    agent = learner(learning_starts=30, model_learning_rate=3e-3, replay_ratio=2.0)
-    losses = []
-    for number in range(30):
-        episode(agent, number % 2)
-        losses.append(agent.diagnostics().get("loss/world_model"))
-    first, *_, last = [loss for loss in losses if loss is not None]
-    assert last < 0.5 * first

@@ -37,7 +37,7 @@ IMAGINING = ("sb3_dqn_imagined", "sb3_ppo_imagined")
 
 def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> RunResult:
     own = tuple(sorted(registry.own_settings(agent, FEW).items()))
-    few = {"agents": (agent,), "budgets": (6, 12), "evaluation_episodes": 4, "overrides": own}
+    few = {"agents": (agent,), "budgets": (4, 8), "evaluation_episodes": 2, "overrides": own}
     path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
     spec = RunSpec(protocol=small(**{**few, **changes}), agent=agent, seed=seed, encoder=path)
     result = run_observed(spec, folder, lambda progress: None)
@@ -45,16 +45,28 @@ def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> Run
     return result
 
 
-@pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS, "sb3_ppo_latents", *IMAGINING])
-def test_its_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: str) -> None:
+@pytest.mark.parametrize(
+    "agent",
+    [
+        "sb3_qrdqn", LATENTS, "sb3_ppo_latents", IMAGINING[0],
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("sb3_dqn", IMAGINING[1])),
+    ],
+)  # fmt: skip
+def test_its_loop_is_counted_and_tested_and_leaves_no_temporary_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
     result = do(tmp_path / "run", agent)
+    assert not list(temporary.iterdir())
     first, last = result.checkpoints
     assert [row.env_steps for row in result.checkpoints] == [
-        result.training_length[:6].sum(),
+        result.training_length[:4].sum(),
         result.training_length.sum(),
     ]
-    assert result.training_length.shape == (12,) and result.training_length.max() <= 10
-    assert (first.test_episodes, last.test_episodes) == (4, 4)
+    assert result.training_length.shape == (8,) and result.training_length.max() <= 10
+    assert (first.test_episodes, last.test_episodes) == (2, 2)
     if "ppo" not in agent:
         assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
     if agent == "sb3_ppo_latents":  # ten epochs of two batches for each 8 macro-actions
@@ -67,18 +79,10 @@ def test_its_loop_is_counted_and_tested_at_every_budget(tmp_path: Path, agent: s
 def test_exploration_does_not_depend_on_the_last_budget(tmp_path: Path) -> None:
     """Fewer possible steps than exploration takes, and more: one run gives all budgets."""
     eighty = tuple(sorted({**registry.own_settings(LATENTS, FEW), "sb3.exploration_steps": 80}.items()))
-    short = do(tmp_path / "short", budgets=(6,), overrides=eighty)
+    short = do(tmp_path / "short", budgets=(4,), overrides=eighty)
     longer = do(tmp_path / "longer", overrides=eighty)
     first, same = short.checkpoints[0], longer.checkpoints[0]
     assert (first.env_steps, first.diagnostics["epsilon"]) == (same.env_steps, same.diagnostics["epsilon"])
-
-
-def test_a_run_leaves_nothing_among_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(temporary))
-    do(tmp_path / "run")
-    assert not list(temporary.iterdir())
 
 
 @pytest.mark.parametrize("agent", [LATENTS, *(pytest.param(name, marks=pytest.mark.slow) for name in IMAGINING)])
@@ -101,8 +105,6 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(
     assert measured(whole) == measured(again)
     assert whole.training_length.tolist() == again.training_length.tolist()
     assert whole.training_success.tolist() == again.training_success.tolist()
-    other = do(tmp_path / "other", agent, seed=1)
-    assert whole.training_length.tolist() != other.training_length.tolist()
 
 
 def test_the_registry_knows_agents_with_a_loop_of_their_own() -> None:
@@ -201,10 +203,3 @@ def test_bad_settings_are_refused(overrides: dict[str, Any], error: type[Excepti
 def spec(agent: str) -> RunSpec:
     path = encoders.resolve(registry.task("arrow_puzzle"), "clean") if registry.agents()[agent].needs_encoder else None
     return RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0, encoder=path)
-
-
-@pytest.mark.slow
-def test_it_learns_far_above_chance(tmp_path: Path) -> None:
-    result = do(tmp_path / "run", budgets=(1500,), evaluation_episodes=100, overrides=())
-    chance = registry.task("arrow_puzzle").facts().chance_level
-    assert result.checkpoints[-1].success_rate > 10 * chance

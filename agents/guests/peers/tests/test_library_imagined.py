@@ -78,16 +78,6 @@ def test_dqn_that_only_imagines_the_true_rules_solves_the_task() -> None:
     assert untrained < 0.2 and success_rate(model) > 10 * TASK.facts().chance_level
 
 
-@pytest.mark.slow
-def test_ppo_that_only_imagines_the_true_rules_learns_the_task() -> None:
-    model = sb3.PPO(
-        "MlpPolicy", puzzle(), learning_rate=3e-3, n_steps=1024, batch_size=128, gamma=0.95, ent_coef=0.5,
-        vf_coef=0.05, max_grad_norm=5.0, seed=0, device="cpu",
-    )  # fmt: skip
-    model.learn(12_000)
-    assert success_rate(model) > 5 * TASK.facts().chance_level
-
-
 @pytest.mark.parametrize("algorithm", ["DQN", "PPO"])
 def test_the_same_seed_learns_the_same_in_imagination(algorithm: str) -> None:
     few = {"learning_starts": 8, "buffer_size": 100} if algorithm == "DQN" else {"n_steps": 16, "batch_size": 16}

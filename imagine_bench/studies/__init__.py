@@ -1,1 +1,0 @@
-"""Studies: one comparison, one factor changed at a time."""

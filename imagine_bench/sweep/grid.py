@@ -1,0 +1,216 @@
+"""The two kinds of grid, and how they are read from TOML or JSON files.
+
+A study compares variants of agents on one task. It chooses settings, so it runs on tuning seeds, which are tested on
+starts of their own; an ordinary bench on other seeds then confirms its findings. A suite scores agents in experiments,
+each of which changes one world parameter over a few levels (after bsuite, Osband et al. 2020).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import digest, require_types
+from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
+
+BASE = "base"
+"""Name of the factor of a variant that others are compared with."""
+SUITE_AGENTS = ("dqn", "imagination_uncertainty", "factored:given")
+"""The agents that a suite compares unless others are named."""
+MEASURES = ("success", "auroc")
+"""``"success"`` of test episodes, between a level's exact chance and optimum; or ``"auroc"``, with which epistemic
+uncertainty tells wrong imagined transitions from right ones, between 0.5 and 1."""
+_STUDY_SETS = {"task", "preset", "agents", "seeds", "budgets", "evaluation_episodes", "overrides", "settings_digest"}
+_VARIED = sorted({each.name for each in dataclasses.fields(Protocol)} - _STUDY_SETS - {"codes"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One line of a study."""
+
+    name: str  #: Unique within the study
+    factor: str = BASE  #: The factor that it varies, :data:`BASE` for a reference
+    agent: str  #: Registered agent
+    against: str | None = None  #: Name of the variant whose success its own is compared with, or None
+    settings: Mapping[str, Any] = field(default_factory=dict)  #: Agent settings, by dotted name
+    #: Fields of the protocol that differ from the study's: appearance, execution, physics, queries, ...
+    world: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require_types(self)
+        for name in self.world:
+            require_known("field that a variant may change", name, _VARIED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """A study. Raises InvalidValueError: a name given twice, a comparison with nothing, or a seed of reported runs."""
+
+    name: str  #: Its name on the command line
+    question: str  #: One sentence for the reader of its page
+    budgets: tuple[int, ...]  #: Real training episodes, ascending
+    seeds: tuple[int, ...] = (1000, 1001, 1002)  #: Tuning seeds
+    evaluation_episodes: int = 300  #: Test episodes at each budget
+    appearance: str = "clean"  #: Appearance level
+    execution: str = "kinematic"  #: ``"physics"`` or ``"kinematic"``
+    variants: tuple[Variant, ...]  #: The lines that are compared
+    preset: str = "quick"  #: Preset whose settings the variants change
+
+    def __post_init__(self) -> None:
+        require_types(self)
+        names = _require_names(self.name, "variants", self.variants)
+        for variant in self.variants:
+            if variant.against not in (None, *names):
+                raise InvalidValueError(
+                    f"Variant {variant.name!r} is compared with {variant.against!r}, which the study lacks: {names}."
+                )
+        reported = [seed for seed in self.seeds if not is_tuning_seed(seed)]
+        if reported or not self.seeds:
+            raise InvalidValueError(
+                f"Study {self.name!r} chooses settings on seeds {self.seeds}; give seeds from {TUNING_SEEDS} on, which "
+                "are tested on starts of their own."
+            )
+
+    def only(self, names: Sequence[str]) -> Study:
+        """The study with the named variants, or all, and those they are compared with. Raises UnknownNameError."""
+        known = {variant.name: variant for variant in self.variants}
+        queue = [require_known("variant", name, known) for name in names] or list(known)
+        wanted = set(queue)
+        while queue:
+            against = known[queue.pop()].against
+            if against is not None and against not in wanted:
+                wanted.add(against)
+                queue.append(against)
+        return replace(self, variants=tuple(variant for variant in self.variants if variant.name in wanted))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """One value of an experiment's world parameter."""
+
+    name: str  #: The value, for axes and tables
+    task: str  #: Canonical name of the world
+    episodes: int = 250  #: Real training episodes, on this task
+    protocol: Mapping[str, Any] = field(default_factory=dict)  #: More fields of the protocol that differ
+
+    def __post_init__(self) -> None:
+        require_types(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """One capability, and the world parameter that asks for more and more of it."""
+
+    name: str
+    dial: str  #: The world parameter, in words
+    question: str  #: For a reader of the report
+    levels: tuple[Level, ...]
+    measure: str = "success"  #: One of :data:`MEASURES`
+
+    def __post_init__(self) -> None:
+        require_types(self)
+        require_known("measure", self.measure, MEASURES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """Experiments, and the protocol fields that all of them share. Raises InvalidValueError: a name given twice."""
+
+    name: str
+    experiments: tuple[Experiment, ...]
+    seeds: tuple[int, ...] = (0, 1)
+    evaluation_episodes: int = 100
+    execution: str = "kinematic"
+    hyperparameters: str = "fast"
+
+    def __post_init__(self) -> None:
+        require_types(self)
+        _require_names(self.name, "experiments", self.experiments)
+        for each in self.experiments:
+            _require_names(self.name, f"levels of {each.name}", each.levels)
+
+    @property
+    def hash(self) -> str:
+        """12 hex digits that change when anything in any level does; seeds and tests count, too."""
+        return digest(dataclasses.asdict(self))
+
+    def only(self, names: Sequence[str]) -> Suite:
+        """The suite with some of its experiments, or all if none are named. Raises UnknownNameError."""
+        known = {each.name: each for each in self.experiments}
+        wanted = {require_known("experiment", name, known) for name in names} or set(known)
+        return replace(self, experiments=tuple(each for each in self.experiments if each.name in wanted))
+
+
+def _require_names(grid: str, what: str, members: Sequence[Variant | Experiment | Level]) -> list[str]:
+    """The names of members. Raises InvalidValueError: one is given twice, there is none, or the grid's is no name."""
+    if not re.fullmatch(r"[\w.-]{1,60}", grid):
+        raise InvalidValueError(f"Study {brief(grid)}: a name is 1 to 60 letters, digits, '_', '-' or '.'.")
+    names = [each.name for each in members]
+    if not names or len(set(names)) < len(names):
+        raise InvalidValueError(f"{grid} has the {what} {names}; give at least one, each name once.")
+    return names
+
+
+def read_grid(path: Path) -> Study | Suite:
+    """A suite if the TOML or JSON file has ``experiments``, else a study; keys are the fields of the classes above.
+
+    The name of the file is the default of ``name``. Settings may be nested; ``"none"`` as a setting is None, which
+    TOML cannot say.
+
+    Raises:
+        InvalidValueError: It cannot be read, or a field is missing, unknown or of another type.
+    """
+    try:
+        text = path.read_text()
+        data = _with_tuples(json.loads(text) if path.suffix == ".json" else tomllib.loads(text))
+        named = {"name": path.stem, **data}
+        return _suite(named) if "experiments" in named else _study(named)
+    except ImagineBenchError as error:
+        raise InvalidValueError(f"{path}: {error}") from error
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InvalidValueError(
+            f"{path} is no study: {type(error).__name__}: {error}. Give {', '.join(Study.__annotations__)} and "
+            f"[[variants]] with {', '.join(Variant.__annotations__)}, as TOML or JSON; or, for a suite, "
+            f"{', '.join(Suite.__annotations__)}."
+        ) from error
+
+
+def _study(data: dict[str, Any]) -> Study:
+    variants = [Variant(**{**each, "settings": _dotted(each.get("settings", {}))}) for each in data["variants"]]
+    return Study(**{**data, "variants": tuple(variants)})
+
+
+def _suite(data: dict[str, Any]) -> Suite:
+    experiments = []
+    for each in data["experiments"]:
+        levels = tuple(Level(**level) for level in each["levels"])
+        experiments.append(Experiment(**{**each, "levels": levels}))
+    return Suite(**{**data, "experiments": tuple(experiments)})
+
+
+def _dotted(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Settings, nested or not, by dotted name."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            found |= _dotted(value, f"{before}{name}.")
+        else:
+            found[before + name] = None if value == "none" else value
+    return found
+
+
+def _with_tuples(value: Any) -> Any:
+    """A value of a file with tuples for its lists."""
+    if isinstance(value, list):
+        return tuple(_with_tuples(each) for each in value)
+    if isinstance(value, dict):
+        return {name: _with_tuples(each) for name, each in value.items()}
+    return value

@@ -1,0 +1,117 @@
+"""The parameters of a world, and its name in one line: ``pick_place:slip=0.1``."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self
+
+from imagine_bench.errors import InvalidValueError, UnknownNameError, brief
+from imagine_bench.interfaces import State
+
+from .gesture import GestureObservation
+
+GESTURES = ("always", "first")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldParameters:
+    """A world by its parameters; ``str`` gives its canonical name, which tells every value but the defaults.
+
+    Raises:
+        InvalidValueError: A value of the wrong type or out of its range in ``RANGES``.
+    """
+
+    slip: float = 0.0  #: probability, up to 0.99, that a macro-action leaves all as it is
+    goal_change: float = 0.0  #: probability that the human wants something else after a macro-action that ends nothing
+    gesture: str | float = "always"  #: which frames show it: all, only the ``"first"``, or each with a probability
+    lag: int = 0  #: macro-actions that a frame is old, 0 to 10
+    distractors: int = 0  #: of no consequence, in view, 0 to 4: a screen of noise, the others balls that roll about
+
+    FAMILY: ClassVar[str]
+    RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
+        "slip": (0.0, 0.99),
+        "goal_change": (0.0, 1.0),
+        "gesture": (0.0, 1.0),
+        "lag": (0, 10),
+        "distractors": (0, 4),
+    }
+    """Lowest and highest value of each number; integers where these are."""
+    NAMED: ClassVar[Mapping[str, str]] = {"goal_change": "fickle"}
+    """Parameters that canonical names spell as before, so that kept results keep their worlds; both are read."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in self.RANGES.items():
+            if getattr(self, name) is not getattr(type(self), name) and not (name == "gesture" and self._named_gesture):
+                object.__setattr__(self, name, self._in_range(name, low, high))
+
+    @property
+    def _named_gesture(self) -> bool:
+        return isinstance(self.gesture, str) and self.gesture in GESTURES
+
+    def _in_range(self, name: str, low: float, high: float) -> float:
+        value = getattr(self, name)
+        kind = type(low)
+        right = isinstance(value, int if kind is int else (int, float)) and not isinstance(value, bool)
+        if not right or not low <= value <= high:
+            words = f"an integer from {low} to {high}" if kind is int else f"a number from {low:g} to {high:g}"
+            also = f", or {' or '.join(GESTURES)}" if name == "gesture" else ""
+            raise InvalidValueError(f"{name} is {brief(value)}; give {words}{also}.")
+        return kind(value)
+
+    def _usual(self, name: str) -> Any:
+        """The value that the canonical name leaves out."""
+        return getattr(type(self), name)
+
+    def __str__(self) -> str:
+        common = WorldParameters.__annotations__
+        own_first = sorted((each.name for each in fields(self)), key=lambda name: name in common)
+        unusual = [name for name in own_first if getattr(self, name) != self._usual(name)]
+        values = [f"{self.NAMED.get(name, name)}={getattr(self, name)}" for name in unusual]
+        return f"{self.FAMILY}:{','.join(values)}" if values else self.FAMILY
+
+    @property
+    def hash(self) -> str:
+        """Eight hexadecimal digits of the canonical name."""
+        return hashlib.sha256(str(self).encode()).hexdigest()[:8]
+
+    @classmethod
+    def spellings(cls) -> dict[str, str]:
+        """Every name that a parameter may be given by, and the field that it means."""
+        names = {each.name: each.name for each in fields(cls)}
+        return names | {old: new for new, old in cls.NAMED.items()}
+
+    @classmethod
+    def taken_from(cls, options: dict[str, Any], others: Iterable[str] = ()) -> Self:
+        """The world that keyword arguments say, taken out of them.
+
+        Raises:
+            UnknownNameError: An argument that is neither a parameter nor one of the others.
+            InvalidValueError: A parameter given twice, by both of its names.
+        """
+        spellings = cls.spellings()
+        given: dict[str, Any] = {}
+        for name in list(options):
+            if name not in (*spellings, *others):
+                raise UnknownNameError("keyword argument", name, (*spellings, *others))
+            if name not in spellings:
+                continue
+            if spellings[name] in given:
+                raise InvalidValueError(f"{name} and {spellings[name]} are one parameter; give it once.")
+            given[spellings[name]] = options.pop(name)
+        return cls(**given)
+
+    @property
+    def encoder_suffix(self) -> str:
+        """The end of an encoder's name: what parameters change in frames."""
+        hidden = "" if self.gesture in ("always", 1.0) else "_hidden"
+        return hidden + (f"_distractors{self.distractors}" if self.distractors else "")
+
+    def observation_model(
+        self, always_shown: Callable[[State], bool] = lambda macrostate: False
+    ) -> GestureObservation | None:
+        """What frames show; None where that is all, at once. For macrostates ``always_shown`` nothing is hidden."""
+        if self.gesture in ("always", 1.0) and not self.lag:
+            return None
+        return GestureObservation(gesture=self.gesture, lag=self.lag, always_shown=always_shown)

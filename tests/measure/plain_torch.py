@@ -1,0 +1,164 @@
+"""CPU seconds of code of the agents (``"ours"``) beside the plain torch that an expert would write (``"plain"``)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import torch
+from imagine_bench.agents.encoders.perception import prepare_torch
+from imagine_bench.agents.imagination import mixture as mdn
+from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, WorldModelSettings
+from imagine_bench.agents.imagination.world_model import WorldModel, log_cosh
+from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
+from imagine_bench.agents.networks.precision import settle
+from imagine_bench.agents.networks.weight_samples import sample_outputs
+from imagine_bench.agents.regressors.bayesian_mdn import BayesianMDN
+from imagine_bench.agents.regressors.settings import MDNSettings
+from imagine_bench.agents.replay import Batch
+from torch import Tensor, nn
+from torch.nn import functional
+
+LATENTS, ACTIONS = 24, 6
+"""Those of the arrow puzzle's bundled encoders."""
+_SIZES = (2, 256, 256, 256, mdn.output_size(10, 3))
+"""Those of a regressor of chapter 4."""
+_DROPOUT = 0.2
+
+
+def least_cpu_s(actions: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Least CPU seconds of each action, taken in turn: noise on a shared machine only ever adds."""
+    least = dict.fromkeys(actions, float("inf"))
+    for _ in range(rounds):
+        for name, action in actions.items():
+            start = time.process_time()
+            action()
+            least[name] = min(least[name], time.process_time() - start)
+    return least
+
+
+class _PlainMLP(nn.Module):
+    """E ReLU networks as one ``baddbmm`` a layer, with a Bernoulli draw a unit for dropout."""
+
+    def __init__(self, sizes: tuple[int, ...], members: int, dropout: float, draws: torch.Generator) -> None:
+        super().__init__()
+        self.dropout, self.draws = dropout, draws
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for n_in, n_out in pairwise(sizes):
+            self.weights.append(torch.randn(members, n_in, n_out, generator=draws) * math.sqrt(2.0 / (n_in + n_out)))
+            self.biases.append(torch.zeros(members, 1, n_out))
+
+    def forward(self, x: Tensor) -> Tensor:
+        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            x = torch.baddbmm(bias, x, weight)
+            if layer < len(self.weights) - 1:
+                x = x.relu()
+                if self.dropout > 0.0:
+                    kept = torch.empty_like(x).bernoulli_(1.0 - self.dropout, generator=self.draws)
+                    x = x * kept.div_(1.0 - self.dropout)
+        return x
+
+
+class PlainWorldModel:
+    """The world model in the plain torch that an expert would write: autograd, a member axis, fused Adam, float32.
+
+    The reward and termination networks must read the next state, and share no layers.
+    """
+
+    def __init__(self, latents: int, actions: int, settings: WorldModelSettings, draws: torch.Generator) -> None:
+        self.latents, self.actions, self.settings = latents, actions, settings
+        outputs = mdn.output_size(settings.components, latents)
+        shapes = [
+            ((latents + actions, *settings.dynamics_hidden, outputs), settings.members),
+            ((latents, *settings.reward_hidden, 1), 1),
+            ((latents, *settings.termination_hidden, 1), 1),
+        ]
+        self.networks = [_PlainMLP(sizes, members, settings.dropout, draws) for sizes, members in shapes]
+        self._adam = torch.optim.Adam(nn.ModuleList(self.networks).parameters(), settings.learning_rate, fused=True)
+
+    def losses(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        """Losses of the dynamics (summed over members), reward and termination on a batch."""
+        settings, (dynamics, reward, termination) = self.settings, self.networks
+        inputs = torch.cat([batch.z, functional.one_hot(batch.action, self.actions).float()], dim=-1)
+        outputs = dynamics(inputs.expand(settings.members, -1, -1))
+        mixture = mdn.from_outputs(outputs, settings.components, self.latents, math.log(settings.sigma_floor))
+        if settings.predict_change:
+            mixture = replace(mixture, means=mixture.means + batch.z.unsqueeze(1))
+        r, logit = (network(batch.next_z.unsqueeze(0))[0, :, 0] for network in (reward, termination))
+        return (
+            -mdn.log_likelihood(mixture, batch.next_z).mean(dim=1).sum(),
+            log_cosh(r - batch.reward / settings.reward_scale).mean(),
+            functional.binary_cross_entropy_with_logits(logit, batch.terminated),
+        )
+
+    def update(self, batch: Batch) -> None:
+        """One step of Adam on all networks, then the max-norm constraint."""
+        self._adam.zero_grad()
+        torch.stack(self.losses(batch)).sum().backward()
+        for network in self.networks:
+            if self.settings.gradient_clip is not None:
+                nn.utils.clip_grad_norm_(network.parameters(), self.settings.gradient_clip)
+        self._adam.step()
+        with torch.no_grad():
+            for weight in [weight for network in self.networks for weight in network.weights]:
+                if self.settings.max_norm is not None:
+                    norm = weight.norm(dim=1, keepdim=True).clamp_min(1e-12)
+                    weight.mul_((self.settings.max_norm / norm).clamp_max(1.0))
+
+
+def model_update(hyperparameters: str, rounds: int = 25) -> dict[str, float]:
+    """One update of the world model with a set of hyperparameters of chapter 5, on one thread."""
+    prepare_torch("cpu")
+    settings = HYPERPARAMETERS.resolve(hyperparameters, {}, "chapter_5").model
+    draws = torch.Generator().manual_seed(0)
+    rows = settings.batch_size
+    batch = Batch(
+        z=torch.randn(rows, LATENTS, generator=draws),
+        action=torch.randint(ACTIONS, (rows,), generator=draws),
+        reward=torch.randn(rows, generator=draws),
+        next_z=torch.randn(rows, LATENTS, generator=draws),
+        terminated=(torch.rand(rows, generator=draws) < 0.3).float(),
+    )
+    plain = PlainWorldModel(LATENTS, ACTIONS, settings, draws)
+    own = WorldModel(LATENTS, ACTIONS, settings, draws)
+    return least_cpu_s({"plain": lambda: plain.update(batch), "ours": lambda: own.update(batch, draws)}, rounds)
+
+
+def weight_samples(rows: int, samples: int, rounds: int) -> dict[str, float]:
+    """T weight samples of a regressor for N rows: in one pass, and in a loop of forward passes."""
+    prepare_torch("cpu")
+    draws = torch.Generator().manual_seed(0)
+    network = MemberMLP(_SIZES, members=1, dropout=_DROPOUT, generator=draws)
+    x = torch.randn(rows, _SIZES[0], generator=draws)
+    masks = [dropout_mask((samples, units), _DROPOUT, draws) for units in _SIZES[1:-1]]
+
+    @torch.no_grad()
+    def loop() -> None:
+        outputs = x.new_empty(samples, rows, _SIZES[-1])
+        for t in range(samples):
+            outputs[t] = network(x[None], tuple(mask[t].view(1, 1, -1) for mask in masks))[0]
+
+    return least_cpu_s({"ours": lambda: sample_outputs(network, x, masks), "plain": loop}, rounds)
+
+
+def training(networks: int, rows: int, updates: int, rounds: int) -> dict[str, float]:
+    """A number of updates of E regressors: as one batch, and one network after another."""
+    prepare_torch("cpu")
+    settings = MDNSettings(precision=settle("auto", "cpu"))
+    draws = [torch.Generator().manual_seed(index) for index in range(networks)]
+    together, alone = BayesianMDN(2, 3, settings, draws), [BayesianMDN(2, 3, settings, [one]) for one in draws]
+    x, y = (torch.randn(networks, rows, size, generator=draws[0]) for size in (2, 3))
+
+    def as_one() -> None:
+        for _ in range(updates):
+            together.update(x, y)
+
+    def one_by_one() -> None:
+        for index, model in enumerate(alone):
+            for _ in range(updates):
+                model.update(x[index : index + 1], y[index : index + 1])
+
+    return least_cpu_s({"ours": as_one, "plain": one_by_one}, rounds)

@@ -1,0 +1,283 @@
+"""``make speed``: how fast this suite is, as ratios to plain code that is timed in the same run.
+
+Ratios are judged, for they hold on slow and on fast machines; absolute figures are printed beside the machine's name.
+CPU time is quoted wherever wall time would measure the neighbours on a shared machine. Fidelity to the rules is
+measured by ``imagine-bench check TASK --physics``.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+import timeit
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from hashlib import sha256
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import plain_torch
+from plain_torch import least_cpu_s
+
+from imagine_bench import registry
+from imagine_bench.errors import SetupError
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.registry.machine import describe_environment, gl_renderer
+from imagine_bench.running.evaluation import EpisodeRecord
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store.files import require_writable, write_json
+from imagine_bench.testing.physics import HEAD, Figure, figure_of
+
+OUT = Path("runs/speed.json")
+TASKS = ("arrow_puzzle", "pick_place")
+"""One task of each scene."""
+LANES = (1, 4, 16, 64)
+_BATCHES = (1, 16, 256, 4096)
+_OURS = """
+import json, resource, sys, time
+start = time.process_time()
+import gymnasium, imagine_bench
+imported_s = time.process_time() - start
+env = gymnasium.make(sys.argv[1])
+env.reset(seed=0)
+reset_s = time.process_time() - start
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for seed in range(int(sys.argv[3])): env.reset(seed=seed)
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(json.dumps([imported_s, reset_s, before, after]))
+"""
+_PLAIN = """
+import json, resource, sys, time
+start = time.process_time()
+import gymnasium
+imported_s = time.process_time() - start
+import mujoco
+model = mujoco.MjModel.from_binary_path(sys.argv[2])
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = mujoco.Renderer(model, 64, 64)
+renderer.update_scene(data)
+renderer.render()
+reset_s = time.process_time() - start
+print(json.dumps([imported_s, reset_s, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, 0]))
+"""
+"""An expert's script: the compiled scene, and one frame of it."""
+
+
+def measure() -> Iterator[Figure]:
+    """Measure everything, cheapest first."""
+    yield from fresh_interpreters(TASKS[0])
+    yield from torch_ratios()
+    for task in TASKS:
+        yield from drawing(registry.task(task))
+        yield from physics(registry.task(task))
+        yield from vector(registry.task(task))
+
+
+def fresh_interpreters(task: str) -> Iterator[Figure]:
+    """Import, first reset and memory in a fresh process, beside an expert's script that draws the same scene."""
+    env_id = registry.task_entry(task).env_id
+    env = gymnasium.make(env_id)
+    with tempfile.TemporaryDirectory() as folder:
+        scene = str(Path(folder) / "scene.mjb")
+        mujoco.mj_saveModel(env.unwrapped.model, scene)
+        ours = [_child(_OURS, env_id, scene, "0") for _ in range(3)]
+        plain = [_child(_PLAIN, env_id, scene) for _ in range(3)]
+    grown = _child(_OURS, env_id, "", "2000")
+    env.close()
+    imported_s, reset_s, rss, _ = np.min(ours, axis=0)
+    plain_imported_s, plain_reset_s, plain_rss, _ = np.min(plain, axis=0)
+    yield _ratio("import imagine_bench, times import gymnasium", imported_s, plain_imported_s, "<=", 2.5, "s")
+    yield _ratio("import, make, first reset, times an expert's script", reset_s, plain_reset_s, "<=", 2.5, "s")
+    unit = 1.0 if sys.platform == "darwin" else 1024.0  # getrusage counts bytes on macOS, KiB on Linux
+    mib = unit / 2**20
+    yield _ratio("memory of one environment, times that of the script", mib * rss, mib * plain_rss, "<=", 1.5, "MiB")
+    growth = grown[3] / grown[2] - 1.0
+    yield figure_of("growth of its memory over 2,000 resets", growth, ".1%", "<=", 0.02)
+
+
+def _child(code: str, *arguments: str) -> list[float]:
+    """The numbers that ``code`` prints in a fresh interpreter."""
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise SetupError(f"A fresh interpreter could not be measured: {done.stderr.strip().splitlines()[-1]}")
+    numbers: list[float] = json.loads(done.stdout.splitlines()[-1])
+    return numbers
+
+
+def torch_ratios() -> Iterator[Figure]:
+    """Batched code of the agents against the same work in a loop, and the world model's update against plain torch."""
+    for rows in _BATCHES:
+        found = plain_torch.weight_samples(rows, 50, 5)
+        what = f"50 weight samples in one pass, batch of {rows:,}, share of a loop"
+        yield figure_of(what, found["ours"] / found["plain"], ".2f", "<=", 1.0)
+    found = plain_torch.training(10, 250, 3, 4)
+    what = "training 10 networks of chapter 4 as one batch, times as fast as in turn"
+    yield figure_of(what, found["plain"] / found["ours"], ".2f", ">=", 1.2)
+    for hyperparameters, least in (("published", 1.2), ("fast", 0.9)):
+        found = plain_torch.model_update(hyperparameters)
+        what = f"a model update ({hyperparameters} settings), times as fast as plain torch"
+        more = f" ({1e3 * found['ours']:.1f} against {1e3 * found['plain']:.1f} CPU ms)"
+        yield figure_of(what, found["plain"] / found["ours"], ".2f", ">=", least, more)
+
+
+def drawing(spec: TaskSpec) -> Iterator[Figure]:
+    """A frame, and a kinematic macro-action with its frame, beside MuJoCo's drawing of the same scene alone."""
+    env = gymnasium.make(spec.env_id, execution="kinematic")
+    env.reset(seed=0)
+    scene = env.unwrapped
+    scene.agent_view()
+    actions = SeedTree(0).child("speed", "kinematic").generator().integers(spec.n_actions, size=300).tolist()
+
+    def steps() -> None:
+        for action in actions:  # ends by rule are ignored, only the time limit resets
+            *_, truncated, _ = env.step(action)
+            if truncated:
+                env.reset()
+
+    played = EpisodeRecord.begun(env, env.reset(seed=0)[1])
+    info = env.step(0)[-1]
+    least = least_cpu_s(
+        {
+            "mjr": _repeat(_mjr_alone(scene), len(actions)),
+            "frame": _repeat(scene.agent_view, len(actions)),
+            "steps": steps,
+            "kept": lambda: [played.add(action, 0.0, info) for action in actions],
+        },
+        9,
+    )
+    env.close()
+    per_action = {name: 1e3 * seconds / len(actions) for name, seconds in least.items()}
+    name = spec.id
+    yield _ratio(
+        f"{name}: a frame, times MuJoCo's drawing alone", per_action["frame"], per_action["mjr"], "<=", 1.8, "CPU ms"
+    )
+    what = f"{name}: a kinematic macro-action with frame, times MuJoCo's drawing alone"
+    yield _ratio(what, per_action["steps"], per_action["mjr"], "<=", 4.0, "CPU ms")
+    share = per_action["kept"] / per_action["steps"]
+    yield figure_of(f"{name}: keeping test episodes, share of a kinematic macro-action", share, ".1%", "<=", 0.05)
+
+
+def _mjr_alone(scene: gymnasium.Env) -> Callable[[], object]:
+    """MuJoCo's drawing and reading of the pixels of the latest frame, with nothing of this suite around it."""
+    camera = scene._agent_camera
+    pixels = np.empty((camera.view.height, camera.view.width, 3), dtype=np.uint8)
+
+    def draw() -> None:
+        mujoco.mjr_render(camera._rect, camera._scene, camera._canvas.mjr)
+        mujoco.mjr_readPixels(pixels, None, camera._rect, camera._canvas.mjr)
+
+    return draw
+
+
+def physics(spec: TaskSpec) -> Iterator[Figure]:
+    """A macro-action with planning, contact physics and frame, beside ``mj_step`` alone for as much simulated time."""
+    env = gymnasium.make(spec.env_id)
+    env.reset(seed=0)
+    model = env.unwrapped.model
+    data = mujoco.MjData(model)
+    rng = SeedTree(0).child("speed", "physics").generator()
+    simulated_s = []
+
+    def steps() -> None:
+        for action in rng.integers(spec.n_actions, size=25).tolist():
+            *_, terminated, truncated, info = env.step(action)
+            simulated_s.append(float(info["sim_time_s"]))
+            if terminated or truncated:
+                env.reset()
+
+    steps()
+    simulated_s.clear()
+    least = least_cpu_s({"steps": steps, "mj_step": lambda: [mujoco.mj_step(model, data) for _ in range(2_000)]}, 5)
+    env.close()
+    alone_s = least["mj_step"] / 2_000 * float(np.mean(simulated_s)) / model.opt.timestep
+    what = f"{spec.id}: a macro-action in physics, times mj_step alone for as long"
+    yield _ratio(what, 1e3 * least["steps"] / 25, 1e3 * alone_s, "<=", 3.0, "CPU ms")
+
+
+def vector(spec: TaskSpec) -> Iterator[Figure]:
+    """Lanes beside one environment, by wall time; in physics the gain is judged beside that of plain threads."""
+    for execution, turns in (("physics", 64), ("kinematic", 1024)):
+        gains = {lanes: lanes_gain(spec, execution, lanes, turns, blocks=3) for lanes in LANES}
+        curve = ", ".join(f"{gain:.2f} at {lanes}" for lanes, (gain, _) in gains.items())
+        gain, threads_gain = gains[LANES[2]]
+        what = f"{spec.id}: gain of {LANES[2]} lanes over one environment, {execution}"
+        if execution == "kinematic":  # all lanes are drawn by one context
+            yield figure_of(what, gain, ".2f", ">=", 0.9, f" ({curve})")
+        else:
+            more = f" ({curve}; threads {threads_gain:.2f})"
+            yield figure_of(f"{what}, share of two threads' gain", gain / threads_gain, ".2f", ">=", 0.6, more)
+
+
+def lanes_gain(spec: TaskSpec, execution: str, lanes: int, turns: int, *, blocks: int) -> tuple[float, float]:
+    """How many times as fast as one environment so many lanes are, at random actions, and two threads as one.
+
+    Args:
+        spec: The task.
+        execution: ``"physics"`` or ``"kinematic"``.
+        lanes: Of the vector environment.
+        turns: Macro-actions of a block, at least.
+        blocks: Rounds of all four blocks in turn; the medians of their ratios are returned.
+    """
+    one = gymnasium.make(spec.env_id, execution=execution)
+    many = gymnasium.make_vec(registry.vector_id(spec.env_id), num_envs=lanes, execution=execution)
+    rng = SeedTree(0).child("speed", "lanes").generator()
+    rounds = -(-turns // lanes)
+    data = bytes(50_000_000)
+    one.reset(seed=0)
+    many.reset(seed=0)
+
+    def alone() -> None:
+        for action in rng.integers(spec.n_actions, size=rounds * lanes).tolist():
+            *_, terminated, truncated, _ = one.step(action)
+            if terminated or truncated:
+                one.reset()
+
+    def together() -> None:
+        for _ in range(rounds):
+            many.step(rng.integers(spec.n_actions, size=lanes))
+
+    together()  # warms up
+    gains = []
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(blocks):
+            gain = timeit.timeit(alone, number=1) / timeit.timeit(together, number=1)
+            in_turn_s = timeit.timeit(lambda: [sha256(data) for _ in range(4)], number=1)
+            at_once_s = timeit.timeit(lambda: list(pool.map(sha256, [data] * 4)), number=1)
+            gains.append((gain, in_turn_s / at_once_s))
+    one.close()
+    many.close()
+    gain, threads_gain = np.median(gains, axis=0)
+    return float(gain), float(threads_gain)
+
+
+def _repeat(action: Callable[[], object], times: int) -> Callable[[], object]:
+    return lambda: [action() for _ in range(times)]
+
+
+def _ratio(what: str, ours: float, plain: float, sign: str, target: float, unit: str) -> Figure:
+    """A ratio that is judged, with both absolute values behind it."""
+    return figure_of(what, ours / plain, ".2f", sign, target, f" ({ours:.3g} against {plain:.3g} {unit})")
+
+
+def main() -> int:
+    """Measure, print a Markdown table line by line, keep the figures; 1 if a target is missed."""
+    require_writable(OUT.parent)
+    gl_renderer()  # fails here, in one sentence, rather than in a child
+    facts = describe_environment()
+    print(f"{facts['machine']['cpu']}, {facts['machine']['cores']} cores, {facts['gl_renderer']}\n\n{HEAD}")
+    figures = []
+    for figure in measure():
+        figures.append(figure)
+        print(figure.row, flush=True)
+    write_json(OUT, {"environment": facts, "figures": [asdict(figure) for figure in figures]})
+    return int(not all(figure.met for figure in figures))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

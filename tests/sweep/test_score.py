@@ -1,0 +1,88 @@
+"""The score: 0 at chance, 1 at the optimum, linear between, and intervals that know of seeds and of tests."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imagine_bench import statistics
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.store.results import OpenLoop
+from imagine_bench.sweep.score import Scale, auroc, score
+
+SCALES = (Scale(chance=0.1, optimum=0.9), Scale(chance=0.5, optimum=1.0))
+
+
+def _row(share):
+    """What an agent reaches that is so far on its way in every level."""
+    return [scale.chance + share * (scale.optimum - scale.chance) for scale in SCALES]
+
+
+@pytest.mark.parametrize("share", [-0.1, 0.0, 0.25, 1.0])
+def test_chance_is_zero_and_the_optimum_one(share):
+    found = score(np.array([_row(share)] * 3), SCALES)
+    assert found[:3] == pytest.approx((share, share, share), abs=1e-12)
+
+
+def test_the_interval_over_seeds_is_students_on_their_means():
+    rows = np.array([_row(0.2), _row(0.4), _row(0.9)])
+    found = score(rows, SCALES)
+    assert found.value == pytest.approx(0.5)
+    assert (found.low, found.high) == pytest.approx(statistics.interval([0.2, 0.4, 0.9], trim=0.0))
+
+
+def test_tests_alone_make_an_interval_that_covers():
+    """Of one seed: 95 % of intervals hold the true score, within four standard errors."""
+    rng, trials, share, runs = np.random.default_rng(0), 50, 0.6, 2_000
+    p = np.array(_row(share))
+    covered = 0
+    for _ in range(runs):
+        found = score(rng.binomial(trials, p)[None] / trials, SCALES, trials=trials)
+        covered += found.low <= share <= found.high
+    assert abs(covered / runs - 0.95) < 4 * math.sqrt(0.95 * 0.05 / runs) + 0.01
+
+
+def test_a_level_without_values_is_left_out():
+    rows = np.array([_row(0.3), _row(0.5)])
+    rows[:, 1] = math.nan
+    assert score(rows, SCALES).value == pytest.approx(0.4)
+    assert math.isnan(score(np.full((2, 2), math.nan), SCALES).value)
+
+
+def test_a_level_in_which_nothing_can_be_learned_is_refused():
+    with pytest.raises(InvalidValueError, match="nothing can be learned"):
+        Scale(chance=0.5, optimum=0.5)
+
+
+def _open_loop(auroc_by_depth, judged):
+    ones = np.ones(len(judged))
+    fields = dict.fromkeys(OpenLoop.__dataclass_fields__, ones)
+    return OpenLoop(**{**fields, "auroc_epistemic": np.array(auroc_by_depth), "judged": np.array(judged)})
+
+
+def test_depths_count_by_what_could_be_wrong_there():
+    assert auroc(_open_loop([0.9, 0.6, math.nan], [30.0, 10.0, 5.0])) == pytest.approx((0.9 * 30 + 0.6 * 10) / 40)
+    assert math.isnan(auroc(_open_loop([math.nan], [9.0])))
+    assert auroc(None) == 0.5
+
+
+def test_the_kept_scores_follow_from_the_kept_levels():
+    folder = Path(__file__).parents[2] / "docs" / "results" / "suite"
+    levels, scores = (
+        list(csv.DictReader((folder / name).read_text().splitlines())) for name in ("levels.csv", "scores.csv")
+    )
+    trials = json.loads((folder / "suite.json").read_text())["suite"]["evaluation_episodes"]
+    for kept in scores:
+        rows = [row for row in levels if (row["experiment"], row["agent"]) == (kept["experiment"], kept["agent"])]
+        names = list(dict.fromkeys(row["level"] for row in rows))
+        values = np.array([[float(row["value"] or "nan") for row in rows if row["level"] == name] for name in names]).T
+        ends = {row["level"]: Scale(chance=float(row["chance"]), optimum=float(row["optimum"])) for row in rows}
+        found = score(values, list(ends.values()), trials=None if kept["experiment"] == "uncertainty" else trials)
+        assert found[:3] == pytest.approx(
+            [float(kept[name] or "nan") for name in ("score", "low_95", "high_95")], nan_ok=True
+        )

@@ -1,0 +1,284 @@
+"""Studies: one factor at a time on tuning seeds, which no reported result may use."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import bench_fakes  # noqa: F401 - registers its agents
+import numpy as np
+import pytest
+from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
+from imagine_bench.agents.settings import flatten
+from numpy.typing import NDArray
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.cli.observers import run_observed
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes
+from imagine_bench.judge.causes import true_model
+from imagine_bench.protocols.data import digest
+from imagine_bench.protocols.runs import OnProgress
+from imagine_bench.report.study import study_table, write_study
+from imagine_bench.rules import states_of
+from imagine_bench.running.launchers.jobs import Failure, Job
+from imagine_bench.store.results import Beliefs
+from imagine_bench.sweep.catalogue import STUDIES
+from imagine_bench.sweep.grid import BASE, Study, Variant, read_grid
+from imagine_bench.sweep.run import Line, imagined_right, run_study
+
+STUDY = Study(
+    name="fakes",
+    question="Is a table better than a table?",
+    budgets=(3, 6),
+    seeds=(1000, 1001),
+    evaluation_episodes=4,
+    appearance="clean",
+    execution="kinematic",
+    variants=(
+        Variant(name="table", factor=BASE, agent="table"),
+        Variant(name="mild", factor="appearance", agent="table", against="table", world={"appearance": "mild"}),
+        Variant(name="imaginer", factor="agent", agent="imaginer", against="mild"),
+    ),
+)
+
+
+class Here:
+    """Carries out jobs in this process, one after the other, and counts them."""
+
+    def __init__(self) -> None:
+        self.done: list[Job] = []
+
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+        for job in jobs:
+            run_observed(job.spec, job.folder, on_progress)
+            self.done.append(job)
+        return ()
+
+
+def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
+    launcher = Here()
+    lines = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
+    assert [(line.variant.name, line.success.shape) for line in lines] == [
+        ("table", (2, 2)), ("mild", (2, 2)), ("imaginer", (2, 2)),
+    ]  # fmt: skip
+    assert {job.spec.protocol.appearance for job in launcher.done[2:4]} == {"mild"}
+    assert lines[0].difference is None
+    for line, base in ((lines[1], lines[0]), (lines[2], lines[1])):
+        assert line.difference is not None
+        expected = line.success.mean(axis=0) - base.success.mean(axis=0)
+        assert [one.value for one in line.difference] == pytest.approx(expected.tolist())
+    again = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
+    assert len(launcher.done) == 6, "what is done is not run again"
+    assert all(np.array_equal(one.success, other.success) for one, other in zip(lines, again, strict=True))
+    write_study(tmp_path / "out", STUDY, lines)
+    rows = list(csv.DictReader((tmp_path / "out" / "seeds.csv").read_text().splitlines()))
+    assert len(rows) == 3 * 2 * 2 and {row["seed"] for row in rows} == {"1000", "1001"}
+    origins = json.loads((tmp_path / "out" / "runs.json").read_text())
+    assert [origin["variant"] for origin in origins] == ["table", "mild", "imaginer"]
+    assert all(origin["versions"] and origin["machine"] for origin in origins)
+    assert (tmp_path / "out" / "study.png").stat().st_size > 5_000
+    assert "| appearance | mild | table |" in (tmp_path / "out" / "study.md").read_text()
+
+
+def test_a_study_that_compares_nothing_has_no_picture(tmp_path: Path) -> None:
+    alone = dataclasses.replace(STUDY, variants=STUDY.variants[:1])
+    write_study(tmp_path / "out", alone, run_study(alone, "arrow_puzzle", root=tmp_path, launcher=Here()))
+    assert not (tmp_path / "out" / "study.png").exists()
+    assert "study.png" not in (tmp_path / "out" / "study.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seeds": (0, 1)}, r"chooses settings on seeds \(0, 1\); give seeds from 1000 on"),
+        ({"seeds": (1000, 3)}, "chooses settings on seeds"),
+        ({"variants": STUDY.variants[:1] * 2}, "each name once"),
+        ({"variants": STUDY.variants[1:]}, "'mild' is compared with 'table', which the study lacks"),
+    ],
+)
+def test_a_study_that_would_deceive_is_refused(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        dataclasses.replace(STUDY, **changes)  # type: ignore[arg-type]
+
+
+_FILE = """
+question = "Does a world that looks or feels otherwise matter?"
+preset = "smoke"
+budgets = [2]
+seeds = [1000]
+evaluation_episodes = 2
+
+[[variants]]
+name = "table"
+agent = "table"
+
+[[variants]]
+name = "other looks"
+factor = "appearance"
+agent = "table"
+against = "table"
+world = { test_appearance = "strong", open_loop_starts = 5 }
+
+[[variants]]
+name = "slippery"
+factor = "physics"
+agent = "table"
+against = "table"
+world.execution = "physics"
+world.physics = { pad_friction = 0.1 }
+"""
+
+
+def test_a_study_from_a_file_changes_the_world_too(tmp_path: Path) -> None:
+    path, launcher = tmp_path / "mine.toml", Here()
+    path.write_text(_FILE)
+    study = read_grid(path)
+    assert (study.name, study.execution, study.variants[0].factor) == ("mine", "kinematic", BASE)
+    lines = run_study(study, "arrow_puzzle", root=tmp_path, launcher=launcher)
+    worlds = [(job.spec.protocol.looks, job.spec.protocol.world) for job in launcher.done]
+    assert worlds == [
+        ("clean", {"execution": "kinematic"}), ("clean, tested at strong", {"execution": "kinematic"}),
+        ("clean", {"execution": "physics", "physics": {"pad_friction": 0.1}}),
+    ]  # fmt: skip
+    assert [line.difference is None for line in lines] == [True, False, False]
+    text = json.dumps(tomllib.loads(_FILE))
+    (tmp_path / "mine.json").write_text(text)
+    assert read_grid(tmp_path / "mine.json") == study
+
+
+def test_settings_in_a_file_may_be_nested(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(_FILE + '[[variants]]\nname = "slow"\nagent = "dqn"\n'
+                    'settings = { controller.discount = 0.9, "controller.hidden" = [8, 8] }\n')  # fmt: skip
+    assert read_grid(path).variants[-1].settings == {"controller.discount": 0.9, "controller.hidden": (8, 8)}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("budgets = [2]", "budgets = 2", "budgets was given 2; it takes tuple"),
+        ("budgets = [2]", "", "missing 1 required keyword-only argument: 'budgets'. Give name, question, budgets, "),
+        ("question", "questions", "unexpected keyword argument 'questions'"),
+        ("budgets = [2]", "budgets = [", "is no study: TOMLDecodeError"),
+        ("test_appearance", "looks", "No field that a variant may change 'looks'"),
+        ("[1000]", "[0]", "chooses settings on seeds"),
+        ('preset = "smoke"', 'name = "a/b"', "a name is 1 to 60 letters"),
+        ('agent = "table"', 'agent = 5', "agent was given 5; it takes str"),
+        ('[[variants]]', '[[variant]]', "KeyError: 'variants'"),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_no_study_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, sentence: str
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(_FILE.replace(old, new))
+    assert main(["sweep", "arrow_puzzle", "--name", str(path)]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert sentence in said and str(path) in said
+
+
+def test_chosen_variants_bring_what_they_are_compared_with() -> None:
+    assert [variant.name for variant in STUDY.only(("imaginer",)).variants] == ["table", "mild", "imaginer"]
+    assert [variant.name for variant in STUDY.only(("mild",)).variants] == ["table", "mild"]
+    assert STUDY.only(()) == STUDY
+    with pytest.raises(UnknownNameError, match="No variant 'milld'"):
+        STUDY.only(("milld",))
+
+
+DIGESTS = {
+    "factors": "783723911a58", "deviations": "9448576e1c0c", "ladder": "16c2e21e0136", "controller": "a461c222ed4c",
+    "curiosity": "f24530419bb3", "uncertainty": "286a80f9b84c", "remarks": "234d3c347058", "smoke": "4d5a5ddbd8cc",
+}  # fmt: skip
+"""Of every study that kept results may name: what it compared when they were made."""
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_a_study_is_that_of_kept_results_and_its_settings_exist(name: str) -> None:
+    assert digest(dataclasses.asdict(STUDIES[name])) == DIGESTS[name]
+    for variant in STUDIES[name].variants:
+        settings = registry.load(registry.agent_entry(variant.agent).settings)
+        changed = settings.resolve("fast", variant.settings, "chapter_5")
+        assert (changed == settings.resolve("fast", {}, "chapter_5")) == (not variant.settings)
+
+
+def test_the_last_rung_of_the_ladder_is_quick_but_for_the_filter() -> None:
+    chapter_5 = HYPERPARAMETERS.groups["chapter_5"]
+    rung = STUDIES["ladder"].variants[-1].settings
+    for name, change in chapter_5.sets["fast"].items():
+        if name.startswith(("model.", "controller.")):
+            assert rung[name] == change.value
+
+
+def test_the_table_says_what_helps(tmp_path: Path) -> None:
+    success = {name: np.array([[value, 0.9], [value, 0.9]]) for name, value in (("table", 0.25), ("mild", 0.5))}
+    from imagine_bench.statistics import Estimate
+
+    lines = [
+        Line(
+            variant=STUDY.variants[0], success=success["table"], train_cpu_s=1.0, folder=Path("a-b"), environment={},
+            difference=None, imagined_right=np.full((2, 2), np.nan),
+        ),
+        Line(
+            variant=STUDY.variants[1], success=success["mild"], train_cpu_s=2.0, folder=Path("a-c"), environment={},
+            difference=(Estimate(0.25, 0.1, 0.4), Estimate(0.0, -0.1, 0.1)),
+            imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]),
+        ),
+    ]  # fmt: skip
+    without, with_model = study_table(STUDY, lines).splitlines()[-2:]
+    assert without.endswith("| – | 1 |")
+    assert "| mild | table | 50.0 | 90.0 | table | +25.0 [+10.0, +40.0] |" in with_model
+    assert with_model.endswith("| 30.0 | 2 |"), "right at the last budget, mean of seeds"
+    write_study(tmp_path, STUDY, lines)
+    rows = csv.DictReader((tmp_path / "seeds.csv").read_text().splitlines())
+    assert [row["imagined_right"] for row in rows] == [""] * 4 + ["0.1000", "0.2000", "0.3000", "0.4000"]
+
+
+def test_what_isimagined_right_is_what_the_rules_have_too() -> None:
+    task = registry.task("arrow_puzzle")
+    states, actions = states_of(task.rules), task.n_actions
+    truth = true_model(task.rules)
+    alive = [row for row, state in enumerate(states) if not task.rules.is_terminal(state)]
+    macrostates = np.array(states)[truth.following]
+    half = truth.p_continues.copy()
+    half[alive[: len(alive) // 2]] = 0.0  # of these it expects that every macro-action ends the episode
+    ends = truth.p_continues.sum(axis=2) == 0.0
+
+    def beliefs(shares: NDArray[np.float64]) -> Beliefs:
+        model = ExpectedOutcomes(macrostates=macrostates, p_continues=shares, reward=truth.reward)
+        return Beliefs(action=np.zeros(len(states), dtype=np.int16), model=model)
+
+    def run(*held: Beliefs | None) -> Any:
+        return SimpleNamespace(checkpoints=[SimpleNamespace(beliefs=each) for each in held])
+
+    runs = [run(None, beliefs(truth.p_continues)), run(beliefs(half), beliefs(np.zeros_like(half)))]
+    found = imagined_right(task.rules, runs)
+    right = ends[alive].copy()
+    assert 0.0 < right.mean() < 1.0
+    right[len(alive) // 2 :] = True
+    expected = [[np.nan, 1.0], [right.mean(), ends[alive].mean()]]
+    assert right.shape == (len(alive), actions) and np.allclose(found, expected, equal_nan=True)
+
+
+UNSTUDIED = {
+    "imagination.weight_samples": "nothing is sampled where nothing is dropped",
+    "imagination.end_episode": "after the last budget of a study",
+}
+
+
+def test_every_deviation_of_quick_is_undone_or_varied_by_a_study() -> None:
+    varied = {name for study in STUDIES.values() for variant in study.variants for name in variant.settings}
+    chapter_5 = HYPERPARAMETERS.groups["chapter_5"]
+    deviations = set(chapter_5.sets["fast"])
+    assert deviations - varied == UNSTUDIED.keys()
+    for variant in STUDIES["deviations"].variants:
+        for name, value in variant.settings.items():
+            if name != "model.precision":  # the thesis' is that of the machine
+                assert value == flatten(chapter_5.published)[name] != chapter_5.sets["fast"][name].value

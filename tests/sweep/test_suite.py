@@ -1,0 +1,167 @@
+"""A suite of small experiments: fixed by its hash, resumable, and open to agents of other packages."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_runs import Inline
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.exact.splits import split_of
+from imagine_bench.registry import AgentEntry
+from imagine_bench.report.suite import levels_csv, scores_csv, suite_table, write_suite
+from imagine_bench.sweep.catalogue import LADDER
+from imagine_bench.sweep.grid import Experiment, Level, Suite
+from imagine_bench.sweep.run import plan_level, plan_suite, run_suite
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+TINY = Suite(
+    name="tiny",
+    experiments=(
+        Experiment(
+            name="stochasticity", dial="slip", question="?",
+            levels=(Level(name="0", task="arrows", episodes=5), Level(name="0.3", task="arrows:slip=0.3", episodes=5)),
+        ),
+        Experiment(name="size", dial="cubes", question="?", levels=(Level(name="3", task="arrows", episodes=5),)),
+        Experiment(
+            name="transfer", dial="goal", question="?",
+            levels=(
+                Level(
+                    name="hard", task="arrow_puzzle_hard", episodes=5,
+                    protocol={"after": ("arrow_puzzle",), "after_episodes": 3},
+                ),
+            ),
+        ),
+        Experiment(
+            name="uncertainty", dial="real episodes", question="?", measure="auroc",
+            levels=(Level(name="5", task="arrows", episodes=5, protocol={"open_loop_starts": 4}),),
+        ),
+    ),
+    evaluation_episodes=10, hyperparameters="minimal",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    return run_suite(TINY, ("random", "oracle", "table"), root=tmp_path_factory.mktemp("runs"), launcher=Inline())
+
+
+def _without_times(text):
+    return [
+        {name: value for name, value in row.items() if name != "cpu_s"} for row in csv.DictReader(io.StringIO(text))
+    ]
+
+
+def test_the_oracle_scores_one_and_who_says_nothing_of_its_model_zero(result):
+    by_name = {each.name: each for each in TINY.experiments}
+    for name in ("size", "transfer"):  # nothing is random there
+        assert result.score(by_name[name], "oracle").value == 1.0
+    assert result.score(by_name["stochasticity"], "oracle").value == pytest.approx(1.0, abs=0.15)
+    random = result.score(by_name["stochasticity"], "random")
+    assert random.low <= 0.0 <= random.high
+    assert result.score(by_name["uncertainty"], "table").value == 0.0
+
+
+def test_experiments_share_a_level(result):
+    (size,) = result.levels["size", "table"]
+    stochasticity, _ = result.levels["stochasticity", "table"]
+    assert size.benches == stochasticity.benches and np.array_equal(size.values, stochasticity.values)
+    (uncertainty,) = result.levels["uncertainty", "table"]
+    assert set(uncertainty.benches).isdisjoint(size.benches)
+
+
+def test_an_interrupted_suite_ends_in_the_same_numbers(result, tmp_path):
+    suite, agents = TINY.only(["size", "transfer"]), ("oracle", "table")
+    with pytest.raises(KeyboardInterrupt):
+        run_suite(suite, agents, root=tmp_path, launcher=Inline(patience=3))
+    launcher = Inline()
+    again = run_suite(suite, agents, root=tmp_path, launcher=launcher)
+    assert len(launcher.order) == 2 * 2 * 2 - 3  # runs of two seeds, levels and agents
+    kept = [row for row in _without_times(levels_csv(result)) if row["agent"] in agents]
+    assert _without_times(levels_csv(again)) == [row for row in kept if row["experiment"] in ("size", "transfer")]
+    launcher = Inline()
+    first = run_suite(dataclasses.replace(suite, seeds=(1,)), agents, root=tmp_path, launcher=launcher)
+    assert first.levels["size", "table"][0].values == again.levels["size", "table"][0].values[1]
+    assert scores_csv(run_suite(suite, agents, root=tmp_path, launcher=launcher)) == scores_csv(again)
+    assert launcher.order == []
+
+
+def test_a_failing_agent_costs_the_others_nothing(tmp_path):
+    suite = TINY.only(["size"])
+    found = run_suite(suite, ("failing", "oracle"), root=tmp_path, launcher=Inline())
+    assert ["failing seed 1 in arrows: this agent breaks on purpose" in each for each in found.failures] == [True]
+    assert np.isnan(found.score(suite.experiments[0], "failing").value)
+    assert found.score(suite.experiments[0], "oracle").value == 1.0
+    assert "–" in suite_table(found) and "breaks on purpose" in suite_table(found)
+
+
+def test_the_page_opens_with_the_radar(result, tmp_path):
+    page = write_suite(result, tmp_path).read_text()
+    assert page.index("Radar chart") < page.index('id="suite"') < page.index('id="levels"')
+    assert (tmp_path / "suite" / f"tiny-{TINY.hash}" / "report" / "radar.png").stat().st_size > 10_000
+    assert TINY.hash in page
+
+
+def test_an_agent_of_another_package_takes_part(tmp_path, monkeypatch):
+    """Its entry is offered by an entry point, as an installed package's; nothing of the suite names it."""
+    entry = AgentEntry(make="bench_fakes:TableAgent", needs_encoder=False, settings=registry.AGENTS["table"].settings)
+    offers = registry.offers
+    theirs = {registry.AGENT_GROUP: {"guest": entry}}
+    monkeypatch.setattr(registry, "offers", lambda group: {**offers(group), **theirs.get(group, {})})
+    suite = dataclasses.replace(TINY.only(["size"]), seeds=(0,))
+    guest, own = run_suite(suite, ("guest", "table"), root=tmp_path, launcher=Inline()).levels.values()
+    assert np.array_equal(guest[0].values, own[0].values)
+
+
+def test_planned_by_several_processes_it_is_the_same():
+    suite = TINY.only(["size", "transfer"])
+    assert plan_suite(suite, ("random", "oracle"), 2) == plan_suite(suite, ("random", "oracle"), 1)
+    with pytest.raises(UnknownNameError, match="No agent 'nobody'"):
+        plan_suite(suite, ("nobody",), 2)
+
+
+def test_the_suite_is_that_of_all_kept_scores():
+    kept = json.loads((RESULTS / "suite" / "suite.json").read_text())
+    assert LADDER.hash == kept["hash"] == "95bb5d4a0450" and len(LADDER.experiments) == 12
+
+
+def test_any_change_of_any_level_changes_the_hash():
+    first, *others = LADDER.experiments
+    hashes = {LADDER.hash}
+    for change in ({"name": "other"}, {"task": "pick_place"}, {"episodes": 7}, {"protocol": {"queries": 1}}):
+        levels = (*first.levels[:-1], dataclasses.replace(first.levels[-1], **change))
+        changed = dataclasses.replace(first, levels=levels)
+        hashes.add(dataclasses.replace(LADDER, experiments=(changed, *others)).hash)
+    for change in ({"seeds": (5,)}, {"evaluation_episodes": 7}, {"execution": "physics"}):
+        hashes.add(dataclasses.replace(LADDER, **change).hash)
+    assert len(hashes) == 8
+
+
+def test_every_level_is_a_world_in_which_something_can_be_learned():
+    for each in LADDER.experiments:
+        assert 3 <= len(each.levels) <= 5
+        for level in each.levels:
+            assert registry.task_name(level.task) == level.task
+            if (split := level.protocol.get("split")) is not None:
+                assert split_of(registry.task(level.task).rules, split).test
+
+
+def test_names_that_do_not_exist_are_named():
+    with pytest.raises(UnknownNameError, match="No experiment 'memry'"):
+        LADDER.only(["memry"])
+    with pytest.raises(InvalidValueError, match="each name once"):
+        dataclasses.replace(TINY, experiments=TINY.experiments * 2)
+
+
+def test_who_cannot_carry_over_starts_anew():
+    level = TINY.experiments[2].levels[0]
+    (alone, *_), _ = plan_level(TINY, level, "table")
+    (carried, *_), _ = plan_level(TINY, level, "factored:given")
+    assert (alone.after, carried.after) == ((), ("arrow_puzzle",))

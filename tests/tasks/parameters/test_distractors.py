@@ -1,0 +1,144 @@
+"""Distractors: where they are seen, that they hide nothing that matters, and that nothing else notices."""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.tasks.parameters import distractors
+from imagine_bench.tasks.scenes import constants as c
+from imagine_bench.tasks.scenes.appearance import LEVELS
+from imagine_bench.tasks.scenes.layout import layout
+
+from imagine_bench import registry
+
+ARROWS, PICK_PLACE = "imagine_bench/Arrows", "imagine_bench/PickPlace"
+IDS = {ARROWS: "arrows", PICK_PLACE: "pick_place"}
+WITHDRAWN = (0, 0, 0, 4)
+
+
+def make(id_, **options):
+    return gymnasium.make(f"{id_}-v0", **{"execution": "kinematic", "disable_env_checker": True, **options}).unwrapped
+
+
+def on_the_screen(env):
+    """Which pixels look at the screen or what rolls on it: by the pinhole camera, not by drawing. Shape (64, 64)."""
+    camera = env.model.camera("wrist").id
+    place_m, turn = env.data.cam_xpos[camera], env.data.cam_xmat[camera].reshape(3, 3)
+    across = (np.arange(64) + 0.5) / 32 - 1
+    right, up = np.meshgrid(across, -across)
+    tangent = np.tan(np.radians(env.model.cam_fovy[camera]) / 2)
+    rays = np.stack([right * tangent, up * tangent, -np.ones_like(right)], axis=-1) @ turn.T  # [64, 64, 3]
+    depth = (place_m[2] - env.data.geom_xpos[env.model.geom("screen_0").id, 2]) / -rays[..., 2]
+    hit_m = place_m[:2] + depth[..., None] * rays[..., :2]
+    wide_m = 2 * distractors._RADIUS_M  # a ball, and how much further away it seems for its height
+    low_m, high_m = np.array(distractors._LOW_M) - wide_m, np.array(distractors._HIGH_M) + wide_m
+    return ((hit_m > low_m) & (hit_m < high_m)).all(axis=-1)
+
+
+@pytest.mark.parametrize(
+    ("id_", "options", "states"),
+    [
+        *((ARROWS, {"cubes": n}, [(*(0, 1, 2, 3, 0, 1)[:n], each) for each in range(n)]) for n in range(1, 7)),
+        (PICK_PLACE, {}, [(0, 0, 0, 0), (0, 0, 0, 2), (0, 1, 0, 0), (0, 0, 1, 3), (2, 0, 0, 3)]),
+    ],
+)
+def test_frames_differ_only_where_distractors_are_and_nothing_that_matters_is_hidden(id_, options, states):
+    plain, hidden, noisy = make(id_, **options), make(id_, gesture=0.0, **options), make(id_, distractors=4, **options)
+    screen = on_the_screen(noisy)
+    for state in states:
+        usual, _ = plain.reset(seed=3, options={"macrostate": state})
+        elsewhere = {"macrostate": WITHDRAWN if id_ == PICK_PLACE else state}
+        without_hand, _ = hidden.reset(seed=3, options=elsewhere)
+        hand = (usual != without_hand).any(axis=-1)
+        assert hand.sum() > 40
+        seen = [noisy.reset(seed=3, options={"macrostate": state})[0]]
+        for _ in range(4):
+            noisy.world.vary(noisy.np_random)
+            seen.append(noisy.agent_view())
+        for frame in seen:
+            changed = (frame != usual).any(axis=-1)
+            assert changed.sum() > 200 and not changed[~screen].any()
+            assert not changed[hand].any()
+        for one, other in itertools.pairwise(seen):
+            assert 150 < (one != other).any(axis=-1).sum() <= screen.sum()
+
+
+@pytest.mark.parametrize("id_", IDS)
+def test_neither_rules_nor_physics_notice(id_):
+    named = f"{IDS[id_]}:distractors=4"
+    rules, plain = registry.task(named).rules, registry.task(IDS[id_]).rules
+    assert rules.start_states == plain.start_states and registry.task(named).id == named
+    actions = range(rules.n_actions)
+    assert all(rules.outcomes(s, a) == plain.outcomes(s, a) for s in plain.start_states for a in actions)
+    scenes = [make(id_, execution="physics", distractors=count) for count in (0, 4)]
+    start = plain.start_states[0]
+    for env in scenes:
+        env.reset(seed=1, options={"macrostate": start})
+    model = scenes[1].model
+    drawn = [index for index in range(model.ngeom) if model.geom(index).name.startswith(("screen_", "distractor_"))]
+    assert len(drawn) == 35 and not (model.geom_contype[drawn] | model.geom_conaffinity[drawn]).any()
+    for action in (0, 1, 3):
+        steps = [env.step(action) for env in scenes]
+        assert steps[0][1:4] == steps[1][1:4] and not steps[0][4]["fault"]
+        for name in ("qpos", "qvel", "ctrl"):
+            np.testing.assert_array_equal(*(getattr(env.data, name) for env in scenes))
+
+
+@pytest.mark.parametrize(("id_", "appearance"), [(ARROWS, "photo"), (PICK_PLACE, "strong")])
+def test_a_state_and_a_macrostate_bring_them_back(id_, appearance):
+    first, second = (make(id_, distractors=3, appearance=appearance) for _ in range(2))
+    first.reset(seed=0)
+    first.step(0)
+    state = pickle.loads(pickle.dumps(first.get_state()))
+    second.reset(seed=9)
+    second.set_state(state)
+    np.testing.assert_array_equal(first.agent_view(), second.agent_view())
+    for action in (1, 0, 2, 1):
+        np.testing.assert_array_equal(first.step(action)[0], second.step(action)[0])
+    start = tuple(first.reset(seed=5)[1]["macrostate"].tolist())
+    frame, other = (first.frame_of(start, np.random.default_rng(seed)) for seed in (4, 5))
+    assert not np.array_equal(frame, other)
+    again = registry.task(f"{IDS[id_]}:distractors=3").render_macrostates
+    np.testing.assert_array_equal(again(np.array([start]), appearance, np.random.default_rng(4))[0], frame)
+
+
+def test_balls_are_anywhere_at_first_and_later_and_screens_show_every_shade():
+    """Their places are uniform: within 4 standard deviations, in eight cells, at the start and after rolling."""
+    env, rng = make(ARROWS, distractors=4), np.random.default_rng(0)
+    distraction, data = env.world._distraction, env.data
+    low, high = distractors._ON_SCREEN_M
+    for rolls in (0, 25):
+        found, shades = [], []
+        for _ in range(300):
+            env.world.place((0, 1, 2, 0), rng)
+            for _ in range(rolls):
+                before = data.mocap_pos[distraction._balls].copy()
+                distraction.vary(data, rng)
+                assert (np.abs(data.mocap_pos[distraction._balls] - before) <= distractors._ROLL_M).all()
+            found.append((data.mocap_pos[distraction._balls, :2] - low) / (high - low))
+            shades.append(env.model.mat_rgba[distraction._tiles, :3].copy())
+        places = np.concatenate(found)
+        assert (places >= 0).all() and (places <= 1).all()
+        counts = np.histogramdd(places, bins=(2, 4), range=((0, 1), (0, 1)))[0]
+        assert (np.abs(counts - len(places) / 8) <= 4 * np.sqrt(len(places) * 7 / 64)).all()
+    assert abs(np.mean(shades) - 0.5) < 0.01 and np.ptp(shades) > 0.99
+
+
+def test_nothing_stands_where_distractors_are():
+    """However it is placed at the strong level."""
+    strong = LEVELS["strong"]
+    corner_m = c.CUBE_EDGE_M / 2 * (np.cos(strong.object_yaw_rad) + np.sin(strong.object_yaw_rad))
+    for cubes in range(1, 7):
+        furthest_m = max(x_m for x_m, _ in layout(cubes).slots_xy_m)
+        assert furthest_m + corner_m + strong.object_offset_m < distractors._LOW_M[0]
+
+
+def test_encoders_of_distracted_worlds_are_others():
+    names = [registry.task(f"arrows{said}").encoder for said in ("", ":distractors=1", ":distractors=2,gesture=first")]
+    assert names == ["arrow_puzzle", "arrow_puzzle_distractors1", "arrow_puzzle_hidden_distractors2"]
+    with pytest.raises(ValueError, match="distractors is 5; give an integer from 0 to 4"):
+        registry.task("arrows:distractors=5")

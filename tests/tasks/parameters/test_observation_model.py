@@ -1,0 +1,179 @@
+"""What the world parameters gesture and lag leave to be seen: of every world, alone, in lanes, and as macrostates."""
+
+from __future__ import annotations
+
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.agents.encoders.training import classes_of, draw_frames, shown_states
+from imagine_bench.tasks.motion import orientation
+from imagine_bench.tasks.scenes.objects import standing_m
+
+from imagine_bench import registry
+
+KINEMATIC = {"execution": "kinematic"}
+NAMES = {"imagine_bench/Arrows": "arrows", "imagine_bench/PickPlace": "pick_place"}
+IDS = tuple(NAMES)
+
+
+def make(id_, **options):
+    return gymnasium.make(f"{id_}-v0", **{**KINEMATIC, **options}).unwrapped
+
+
+def walk(env, steps, seed=0):
+    """Observations, macrostates and generator states of an episode of random macro-actions, ends ignored."""
+    observation, info = env.reset(seed=seed)
+    seen, actions = [(observation, info["macrostate"])], np.random.default_rng(seed)
+    for _ in range(steps):
+        observation, _, _, _, info = env.step(int(actions.integers(env.action_space.n)))
+        seen.append((observation, info["macrostate"]))
+    return seen
+
+
+@pytest.mark.parametrize("appearance", ["clean", "strong", "photo"])
+def test_frames_tell_nothing_of_a_hidden_gesture(appearance):
+    """Of pictures of everything else alike, both the agent's and people's are equal to the bit."""
+    seen = []
+    for pointed in range(3):
+        env = make(IDS[0], gesture=0.0, appearance=appearance, observation="frame,human,state", size=96)
+        seen.append(env.reset(seed=3, options={"macrostate": (0, 1, 2, pointed)}))
+    for observation, info in seen[1:]:
+        assert info["macrostate"][-1] != seen[0][1]["macrostate"][-1]
+        for name, picture in observation.items():
+            np.testing.assert_array_equal(picture, seen[0][0][name])
+    shown, _ = make(IDS[0], appearance=appearance).reset(seed=3, options={"macrostate": (0, 1, 2, 0)})
+    hidden, _ = make(IDS[0], appearance=appearance, gesture=0.0).reset(seed=3, options={"macrostate": (0, 1, 2, 0)})
+    assert (shown != hidden).any(axis=-1).sum() > 50
+
+
+def test_people_see_a_hidden_hand_in_the_scene():
+    """A recording's shapes are those of the first frame, for all times."""
+    shapes = {hidden: make(IDS[0], gesture=0.0 if hidden else "always") for hidden in (True, False)}
+    for env in shapes.values():
+        env.reset(seed=0)
+    for one, other in zip(*(env.shapes() for env in shapes.values()), strict=True):
+        assert one.name == other.name and one.rgba.tolist() == other.rgba.tolist() and one.rgba[3] == 1.0
+
+
+@pytest.mark.parametrize("id_", IDS)
+def test_a_gesture_is_seen_as_often_as_said(id_):
+    """By the one-hot gesture: always, at first only, or within 3.5 standard deviations of a probability."""
+    n_gestures = len(registry.task(NAMES[id_]).macrostate_values[-1])
+    for gesture in ("always", "first", 0.3):
+        env = make(id_, gesture=gesture, observation="state")
+        walks = [walk(env, 8, seed) for seed in range(60 if gesture == 0.3 else 20)]
+        seen = np.array([[state[-n_gestures:].any() for state, _ in each] for each in walks])
+        assert all(len(truth) - 1 + state[-n_gestures:].any() == state.sum() for each in walks for state, truth in each)
+        carried = np.array([[id_ == IDS[1] and 2 in state[:-1] for _, state in each] for each in walks])
+        if gesture == 0.3:
+            free = seen[~carried]
+            assert abs(free.mean() - 0.3) <= 3.5 * np.sqrt(0.3 * 0.7 / free.size) and seen[carried].all()
+        else:
+            expected = np.ones_like(seen) if gesture == "always" else np.arange(9)[None] == carried * np.arange(9)
+            np.testing.assert_array_equal(seen, expected)
+
+
+@pytest.mark.parametrize("execution", ["kinematic", "physics"])
+@pytest.mark.parametrize(("id_", "parameters"), [(IDS[0], {"gesture": 0.5}), (IDS[1], {"lag": 1})])
+def test_what_was_moved_stands_as_if_it_never_was(id_, parameters, execution):
+    """Its pose is spread as after a reset, else frames would tell what memory should; a turn's yaw is off by 1 degree.
+
+    Where nothing is hidden it stands on its place.
+    """
+    index, start, actions = (0, (0, 1, 2, 0), (0,)) if id_ == IDS[0] else (1, (0, 0, 0, 1), (1, 1))
+    spread = []
+    for env, seeds in ((make(id_, execution=execution, **parameters), 60), (make(id_, execution=execution), 6)):
+        found = []
+        for seed in range(seeds):
+            env.reset(seed=seed, options={"macrostate": start})
+            before = offsets(env)[index]
+            for action in actions:
+                *_, info = env.step(action)
+            assert not info["fault"]
+            found.append([before, offsets(env)[index]])
+        spread.append(np.transpose(found))  # [x y yaw, before after, seeds]
+    for before, after in spread[0]:
+        assert abs(before.mean()) < 0.3 and 0.8 < 3**0.5 * before.std() < 1.2  # uniform over -1 to 1
+        assert abs(after.mean()) < 0.5 and 0.8 < 3**0.5 * after.std() < 1.2
+        assert abs(np.corrcoef(before, after)[0, 1]) < 0.45
+    assert np.abs(spread[1][:, 1]).max() < 0.4
+
+
+def offsets(env):
+    """How far objects stand off their places, as shares of what the appearance allows: x, y, yaw. Shape (N, 3)."""
+    poses, level = env.world.object_poses(), env.world._level
+    if hasattr(env.world, "_layout"):
+        places_m = np.array(env.world._layout.slots_xy_m)
+    else:
+        places_m = np.array([standing_m(index)[:2] for index in range(len(poses))])
+    yaw_rad = np.array([orientation.yaw_rad(*pose[3:]) for pose in poses])
+    yaw_rad -= np.round(yaw_rad / (np.pi / 2)) * np.pi / 2
+    off = (poses[:, :2] - places_m) / level.object_offset_m, yaw_rad[:, None] / level.object_yaw_rad
+    return np.concatenate(off, axis=1)
+
+
+@pytest.mark.parametrize("id_", IDS)
+def test_lag_shows_the_frame_of_so_many_macro_actions_ago(id_):
+    lagging, prompt = make(id_, lag=3), make(id_)
+    walk(lagging, 2, seed=8)  # nothing of an earlier episode is seen
+    prompt._sight = lagging._sight  # has objects put down alike
+    now, late = walk(prompt, 7), walk(lagging, 7)
+    for step, (frame, macrostate) in enumerate(late):
+        np.testing.assert_array_equal(frame, now[max(0, step - 3)][0])
+        np.testing.assert_array_equal(macrostate, now[step][1])
+
+
+def test_a_state_holds_old_frames_and_what_is_hidden():
+    first, second = (make(IDS[0], gesture=0.5, lag=2, fickle=0.4) for _ in range(2))
+    walk(first, 4)
+    state = pickle.loads(pickle.dumps(first.get_state()))
+    second.reset(seed=9)
+    second.set_state(state)
+    for action in (0, 3, 1, 5, 2, 2):
+        np.testing.assert_array_equal(first.step(action)[0], second.step(action)[0])
+    assert first.get_state().steps == second.get_state().steps == 10
+
+
+def test_parameters_at_rest_change_and_draw_nothing():
+    for id_ in IDS:
+        plain, at_rest = make(id_), make(id_, gesture=1.0, lag=0)
+        for (frame, _), (other, _) in zip(walk(plain, 5), walk(at_rest, 5), strict=True):
+            np.testing.assert_array_equal(frame, other)
+        assert plain.np_random.bit_generator.state == at_rest.np_random.bit_generator.state
+
+
+def test_frames_of_macrostates_hide_what_the_environment_hides():
+    """A palm that carries is seen, any other gesture may be hidden; both look as in the environment."""
+    for name, id_ in (("arrows:gesture=first", IDS[0]), ("pick_place:gesture=first", IDS[1])):
+        spec, env = registry.task(name), make(id_, gesture=0.0)
+        states = shown_states(spec)
+        hidden = states[states[:, -1] == -1]
+        assert len(hidden) and set(map(tuple, hidden)) == {
+            (*state[:-1], -1) for state in spec.rules.states if 2 not in state[:-1] or name.startswith("arrows")
+        }
+        classes = classes_of(spec)
+        assert (
+            classes[-1] == len(spec.macrostate_values[-1]) + 1
+            and classes[:-1] == classes_of(registry.task(NAMES[id_]))[:-1]
+        )
+        like = next(state for state in spec.rules.states if state[:-1] == tuple(hidden[0][:-1]))
+        frame = spec.render_macrostates(hidden[:1], "clean", np.random.default_rng(2))[0]
+        env.reset(options={"macrostate": like})
+        env.world.place(like, np.random.default_rng(2))
+        np.testing.assert_array_equal(env.agent_view(), frame)
+        again = spec.render_macrostates(np.array([like]), "clean", np.random.default_rng(2))[0]
+        assert not np.array_equal(again, frame)
+        labels = draw_frames(spec, "clean", 50, np.random.default_rng(0))[1]
+        assert (labels >= 0).all() and labels[:, -1].max() == len(spec.macrostate_values[-1])
+        assert spec.value_names(labels[labels[:, -1].argmax()])[-1] == "not seen"
+        assert spec.value_names(hidden[0])[-1] == "not seen" and spec.encoder.endswith("_hidden")
+
+
+def test_a_hidden_palm_still_takes_what_is_handed_over():
+    env = make(IDS[1], gesture=0.0, execution="physics")
+    env.reset(seed=0, options={"macrostate": (1, 0, 0, 3)})
+    _, reward, terminated, _, info = env.step(3)
+    assert terminated and info["is_success"] and not info["fault"] and reward == 5.0
+    assert tuple(info["macrostate"]) == (2, 0, 0, 3) and env.world.shown((2, 0, 0, 3)) == (2, 0, 0, 3)

@@ -1,0 +1,104 @@
+"""World parameters: what the rules say of them by hand, and that environments do as often as they say."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.tasks.parameters.goal_change import changing_goal
+from imagine_bench.tasks.parameters.slip import slipping
+
+from imagine_bench import registry
+from imagine_bench.interfaces import Outcome
+
+STAY, WIN, MOVE = (
+    Outcome(1.0, (0,), -1.0, terminated=False, success=False),
+    Outcome(1.0, (1,), 5.0, terminated=True, success=True),
+    Outcome(1.0, (2,), -1.0, terminated=False, success=False),
+)
+
+
+def chances(outcomes):
+    return {each.macrostate: each.probability for each in outcomes}
+
+
+def test_outcomes_of_parameters_by_hand():
+    assert chances(slipping((MOVE,), STAY, 0.25)) == {(2,): 0.75, (0,): 0.25}
+    turned = changing_goal((MOVE,), lambda outcome: [STAY, WIN], 0.5)
+    assert chances(turned) == {(2,): 0.5, (0,): 0.25, (1,): 0.25} and turned[2].success
+    assert changing_goal((WIN,), lambda outcome: [STAY], 0.5) == (WIN,)  # what is over is over
+    assert changing_goal((MOVE,), lambda outcome: [], 0.5) == (MOVE,)
+    assert chances(changing_goal((MOVE,), lambda outcome: [STAY], 1.0)) == {(0,): 1.0}
+    both = changing_goal(
+        slipping((MOVE,), STAY, 0.5), lambda outcome: [STAY if outcome.macrostate == (2,) else MOVE], 0.2
+    )
+    assert chances(both) == pytest.approx({(2,): 0.5, (0,): 0.5})
+
+
+def test_parameters_of_pick_and_place_by_hand():
+    rules = registry.task("pick_place:slip=0.2,fickle=0.4").rules
+    table, held, wrong = (0, 0, 0, 1), (0, 1, 0, 3), (1, 0, 0, 4)
+    assert chances(rules.outcomes(table, 0)) == pytest.approx(
+        {wrong: 0.8, table: 0.12, (0, 0, 0, 0): 0.04, (0, 0, 0, 2): 0.04}
+    )
+    assert chances(rules.outcomes(table, 1)) == pytest.approx({
+        (0, 1, 0, 0): 0.8 / 3, (0, 1, 0, 2): 0.8 / 3, (0, 1, 0, 3): 0.8 / 3,  # each wish as likely as the others
+        table: 0.12, (0, 0, 0, 0): 0.04, (0, 0, 0, 2): 0.04,
+    })  # fmt: skip
+    given = rules.outcomes(held, 3)
+    assert chances(given)[0, 2, 0, 3] == pytest.approx(0.8) and sum(each.success for each in given) == 1
+    assert {each.reward for each in given} == {5.0, 0.0}
+    for state in rules.states:
+        for action in range(4):
+            found = rules.outcomes(state, action)
+            assert sum(each.probability for each in found) == pytest.approx(1.0) and len(chances(found)) == len(found)
+            assert all(each.macrostate in rules.states for each in found)
+            assert all(rules.judge(state, action, each.macrostate) == each for each in found)
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+def test_a_parameter_at_0_changes_nothing(task):
+    plain, dialled = registry.task(task).rules, registry.task(f"{task}:slip=0,fickle=0.0").rules
+    assert dialled is plain
+    nearly = registry.task(f"{task}:slip=1e-12").rules
+    for state in plain.start_states:
+        for action in range(plain.n_actions):
+            expected, found = chances(plain.outcomes(state, action)), chances(nearly.outcomes(state, action))
+            assert {key: found[key] for key in expected} == pytest.approx(expected)
+
+
+def walk(name, execution, steps):
+    """Probability that the rules gave to what came, and to slips and to a human elsewhere, and how often these came."""
+    spec = registry.task(name)
+    env = gymnasium.make(spec.env_id, execution=execution, observation="state", disable_env_checker=True)
+    rng, found = np.random.default_rng(0), []
+    _, info = env.reset(seed=5)
+    for _ in range(steps):
+        before, action = tuple(info["macrostate"].tolist()), int(rng.integers(spec.n_actions))
+        _, reward, terminated, truncated, info = env.step(action)
+        after, outcomes = tuple(info["macrostate"].tolist()), spec.rules.outcomes(before, action)
+        (outcome,) = [each for each in outcomes if each.macrostate == after]
+        assert not info["fault"] and (reward, terminated) == (outcome.reward, outcome.terminated)
+        stays = sum(each.probability for each in outcomes if each.macrostate[:-1] == before[:-1])
+        answers = sum(each.probability for each in outcomes if each.macrostate[-1] != before[-1])
+        found.append((stays, after[:-1] == before[:-1], answers, after[-1] != before[-1]))
+        if terminated or truncated:
+            _, info = env.reset()
+    env.close()
+    return np.array(found, dtype=float)
+
+
+@pytest.mark.parametrize(
+    ("name", "execution", "steps"),
+    [
+        ("arrows:slip=0.2,goal_change=0.3", "kinematic", 600),
+        ("pick_place:slip=0.2,goal_change=0.3", "kinematic", 600),
+        ("arrows:cubes=2,coupling=neighbour,forbid=none,shuffle=1,slip=0.4,fickle=0.3", "physics", 30),
+        ("pick_place:slip=0.4,fickle=0.3", "physics", 30),
+    ],
+)
+def test_what_happens_is_as_often_as_the_rules_say(name, execution, steps):
+    """Within 3.5 standard deviations; in physics whatever slips stays, and nothing is a fault."""
+    for said, came in walk(name, execution, steps).reshape(steps, 2, 2).transpose(1, 2, 0):
+        assert abs(came.sum() - said.sum()) <= 3.5 * np.sqrt((said * (1 - said)).sum())
+        assert 0 < came.sum() < steps

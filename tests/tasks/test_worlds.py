@@ -1,0 +1,64 @@
+"""Worlds: what is put into a scene is read back from it, however it looks."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrows.world import ArrowWorld
+from imagine_bench.tasks.pick_place.world import PickWorld
+from imagine_bench.tasks.scenes.appearance import LEVELS, Appearance
+from imagine_bench.tasks.scenes.constants import ARM_GROUP
+from imagine_bench.tasks.scenes.objects import OBJECTS
+
+from imagine_bench import registry
+
+FIXED = Appearance(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
+NAMES = ["pick_place", *(f"arrows:cubes={cubes}" for cubes in range(1, 7))]
+
+
+def world_of(name, look):
+    return PickWorld(look) if name == "pick_place" else ArrowWorld(look, registry.task(name).rules.world)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("name", NAMES)
+def test_macrostates_are_read_back_at_every_level(name, level):
+    rules = registry.task(name).rules
+    world = world_of(name, LEVELS[level])
+    rng = np.random.default_rng(0)
+    for index in rng.integers(len(rules.states), size=100):
+        state = rules.states[index]
+        world.place(state, rng)
+        world.vary(rng)
+        reading = world.read()
+        assert (reading.macrostate, reading.problem) == (state, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "action"),
+    [
+        *(("pick_place", (0, 0, 0, index), index) for index in range(3)),
+        *(("arrows:forbid=none", (1, 2, 0, pointed), 2 * pointed) for pointed in range(3)),
+    ],
+)
+def test_the_gripper_passes_the_pointing_hand(name, state, action):
+    """With what it holds."""
+    world = world_of(name, FIXED)
+    world.place(state, np.random.default_rng(0))
+    people = world.data.mocap_pos.copy()
+    result = world.execute(action, registry.task(name).rules.outcomes(state, action)[0].macrostate, 20.0)
+    assert result.fault is None
+    model = world.model
+    hand = model.geom("hand_skin").id
+    parts = [index for index in range(model.ngeom) if model.geom_group[index] == ARM_GROUP]
+    if name == "pick_place":
+        parts += [index for index in range(model.ngeom) if model.geom(index).name.startswith(OBJECTS[action].name)]
+    data = mujoco.MjData(model)
+    data.mocap_pos[:] = people
+    closest_m = 1.0
+    for qpos in result.qpos:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        closest_m = min(closest_m, *(mujoco.mj_geomDistance(model, data, hand, part, 1.0, None) for part in parts))
+    assert 0.0 < closest_m < 0.05  # near, so the check is not vacuous, and free

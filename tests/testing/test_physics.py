@@ -1,0 +1,85 @@
+"""``check --physics``: fidelity and margins of any task, and what is refused."""
+
+import json
+
+import pytest
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.testing import margins
+from imagine_bench.testing.fidelity import Fidelity, measure_fidelity
+from imagine_bench.testing.physics import check_physics, fidelity_figures, figure_of, slips
+
+SLIPPERY = margins.PhysicsSettings.of({"pad_friction": 0.01})
+
+
+def test_fidelity_and_margins_are_measured_and_kept(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(margins, "SWEEPS", {"pad_friction": (1.2, 0.01)})
+    monkeypatch.setattr(margins, "_WALKS", 2)
+    monkeypatch.setattr(margins, "_WALK_ACTIONS", 3)
+    out = tmp_path / "deep" / "margins.json"
+    words = ["check", "--physics", "pick_place", "--turns", "4", "--trials", "4", "--out", str(out)]
+    assert main(words) == 0
+    kept = json.loads(out.read_text())
+    first, last = kept["curves"]["pad_friction"]
+    assert (first["value"], first["as_ruled"], first["trials"], first["high"]) == (1.2, 4, 4, 1.0)
+    assert (last["as_ruled"], last["low"]) == (0, 0.0)
+    walks = [(each["sense"], each["actions"], each["lengths"]) for each in kept["walks"]]
+    assert walks == [("true", 6, [3, 3]), ("nominal", 6, [3, 3])]
+    assert kept["built"]["pad_friction"] == 1.2 and kept["environment"]["commit"]
+    assert kept["figures"][0]["required"] == ">= 99.5%" and kept["figures"][0]["met"]
+    assert "| pad_friction | 0.01 | 0 of 4 | 0.000 to " in capsys.readouterr().out
+
+
+def test_a_walk_ends_with_its_first_fault(monkeypatch):
+    monkeypatch.setattr(margins, "_WALKS", 2)
+    make = margins._env
+    monkeypatch.setattr(margins, "_env", lambda spec, _: make(spec, SLIPPERY))
+    found = margins.walk(registry.task("pick_place"), "true")
+    assert (found["lengths"], found["as_ruled"], len(found["faults"])) == ([1, 1], 0, 2)
+
+
+@pytest.mark.parametrize("name", margins.SWEEPS)
+def test_every_sweep_begins_as_the_scene_is_built(name):
+    assert margins.SWEEPS[name][0] == getattr(margins.PhysicsSettings(), name)
+
+
+def test_fidelity_of_any_world_counts_what_slips():
+    found = measure_fidelity(registry.task("arrows:cubes=5,coupling=neighbour,slip=0.3"), 20, "strong")
+    assert found.as_ruled == found.actions == len(found.slips) == 20, found.faults
+    assert [said for _, said in found.slips] == pytest.approx([0.3] * 20)
+    assert 0 < found.slipped_mm < 4 and found.other_objects_mm < 1
+    turned = sum(not slipped for slipped, _ in found.slips)
+    assert 8 < turned < 20
+    assert turned < len(found.error_deg) < 2 * turned  # all but turns of the last cube turn two
+
+
+def test_a_task_without_targets_is_only_measured():
+    (figure,) = fidelity_figures(registry.task("arrow_puzzle_hard"), 2)
+    assert (figure.required, figure.measured, figure.met) == ("–", "100.00%", True)
+
+
+def test_a_rate_is_judged_by_its_binomial_interval():
+    for slipped, met in ((0, False), (20, True), (40, False)):
+        found = Fidelity(slips=[(each < slipped, 0.2) for each in range(100)], slipped_mm=0.1)
+        rate, moved = slips("w", found)
+        assert (rate.required, rate.met, moved.met) == ("10.0% to 31.0%", met, True)
+
+
+@pytest.mark.parametrize(
+    ("sign", "met"), [(">=", (False, True, True)), ("<=", (True, True, False)), ("<", (True, False, False))]
+)
+def test_a_figure_meets_its_target_or_not(sign, met):
+    found = [figure_of("what", value, ".2f", sign, 0.5) for value in (0.4, 0.5, 0.6)]
+    assert tuple(figure.met for figure in found) == met
+    assert (found[0].required, found[0].measured) == (f"{sign} 0.5", "0.40")
+
+
+def test_wrong_numbers_and_names_are_refused(tmp_path):
+    with pytest.raises(InvalidValueError, match="give at least 1 macro-action"):
+        check_physics("pick_place", tmp_path / "x.json", turns=0, trials=0)
+    with pytest.raises(InvalidValueError, match=r"is a folder; give the JSON file to write\."):
+        check_physics("pick_place", tmp_path)
+    with pytest.raises(UnknownNameError, match="No appearance 'dark'"):
+        check_physics("pick_place", tmp_path / "x.json", appearances=("dark",))
