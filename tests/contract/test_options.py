@@ -18,13 +18,18 @@ from imagine_bench.testing.of_options import (
 )
 
 TASK = "arrow_puzzle:horizon=3"
+AGENTS = [
+    *sorted(registry.AGENTS),
+    *(pytest.param(name, marks=pytest.mark.slow) for name in sorted(registry.agents().keys() - registry.AGENTS.keys())),
+]
+"""Packages' agents may load a library for longer than a fast test may last."""
 
 
 def test_every_field_of_a_protocol_has_a_row_or_a_reason() -> None:
     require_every_field()
 
 
-@pytest.mark.parametrize("agent", sorted(registry.agents()))
+@pytest.mark.parametrize("agent", AGENTS)
 def test_every_option_has_an_effect_or_is_refused(agent: str) -> None:
     options, refused = CheckedOptions(agent, TASK), set()
     for option in OPTION_ROWS:
@@ -35,7 +40,7 @@ def test_every_option_has_an_effect_or_is_refused(agent: str) -> None:
     assert not refused & {"split", "physics", "appearance", "gesture", "lag"}, "what the world is like is for all"
 
 
-@pytest.mark.parametrize("agent", sorted(registry.agents()))
+@pytest.mark.parametrize("agent", AGENTS)
 def test_watching_episodes_teaches_as_living_them(agent: str) -> None:
     try:
         watching_teaches_as_living(checked_agent(agent, TASK))
