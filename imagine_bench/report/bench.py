@@ -101,9 +101,9 @@ def _against_dqn(data: ReportData, agent: str) -> str:
         return f"“{agent_title(agent)}” against DQN: {clearest}. One seed does not show which is better."
     shown = {"better": 1, "worse": -1}
     budgets = {word: [f"{b:,}" for b, each in rows.items() if each.shown == sign] for word, sign in shown.items()}
-    words = [f"{word} after {' and '.join(each)} real episodes" for word, each in budgets.items() if each]
+    words = [f"{word} after {', '.join(each)} real episodes" for word, each in budgets.items() if each]
     return (
-        f"“{agent_title(agent)}” against DQN: {', '.join(words) or 'no difference is shown'} ({len(rows)} tests). "
+        f"“{agent_title(agent)}” against DQN: {', '.join(words) or 'no difference is shown'} ({len(rows)} budgets). "
         f"Clearest {clearest} (95 % interval; {p_value(rows[budget].p_adjusted)}, Holm-corrected)."
     )
 

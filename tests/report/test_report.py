@@ -163,9 +163,9 @@ def shifted(result: BenchResult, agent: str, shares: list[int]) -> BenchResult:
 @pytest.mark.parametrize(
     ("successes", "sentence"),
     [
-        ([150, 152, 154], "better after 250 and 2,000 and 6,000 real episodes (3 tests)"),
-        ([50, 52, 54], "worse after 250 and 2,000 and 6,000 real episodes (3 tests)"),
-        ([80, 100, 140], "no difference is shown (3 tests)"),
+        ([150, 152, 154], "better after 250, 2,000, 6,000 real episodes (3 budgets)"),
+        ([50, 52, 54], "worse after 250, 2,000, 6,000 real episodes (3 budgets)"),
+        ([80, 100, 140], "no difference is shown (3 budgets)"),
     ],
 )
 def test_the_verdict_says_which_way_it_went(result: BenchResult, successes: list[int], sentence: str) -> None:
