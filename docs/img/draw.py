@@ -17,7 +17,6 @@ from imagine_bench.exact.certificate import certificate
 from imagine_bench.registry.old_names import label_today
 from imagine_bench.report import figures
 from imagine_bench.report.data import collect
-from imagine_bench.report.radar import radar_figure
 from imagine_bench.store.archive import load_archive
 
 mpl.use("agg")
@@ -82,7 +81,7 @@ def peers() -> None:
     figure, axes = plt.subplots(figsize=(9, 0.9 + 0.28 * len(rows)), layout="constrained")
     columns = {1.14: "frames\nbefore", 1.28: "updates", 1.40: "CPU s"}
     for height, (data, agent) in enumerate(rows):
-        color, area, price = figures.color(agent), data.areas[agent][500], data.prices[agent][500]
+        color, area, price = figures.color(agent), data.areas[agent][500], data.prices(agent)[500]
         shares = statistics.running_means(data.budgets, data.result.success_rates(agent), data.facts.chance_level)
         seeds = 100 * shares[:, data.budgets.index(500)]
         axes.plot([100 * area.low, 100 * area.high], [height] * 2, color=color, linewidth=6, alpha=0.3)
@@ -127,7 +126,7 @@ def ladder() -> None:
     floor = certificate(registry.task("arrow_puzzle")).floor
     last = max(max(table) for table in tested.values())
     figure = figures.image(
-        "ladder", lambda: figures.ladder_figure(reached, last, floor and floor.episodes), alt="", caption="", dpi=110
+        "ladder", lambda: figures.ladder_figure(reached, last, floor and floor.episodes), "", dpi=110
     )
     (HERE / "ladder.png").write_bytes(figure.draw()[0])
 
@@ -235,7 +234,7 @@ def radar() -> None:
                 values = (float(row[name] or "nan") for name in ("score", "low_95", "high_95"))
                 scores.setdefault(label_today(row["agent"]), {})[row["experiment"]] = statistics.Estimate(*values)
     spokes = list(dict.fromkeys(name for found in scores.values() for name in found))
-    figure = radar_figure(spokes, {agent: [found[name] for name in spokes] for agent, found in scores.items()})
+    figure = figures.radar_figure(spokes, {agent: [found[name] for name in spokes] for agent, found in scores.items()})
     figure.savefig(HERE / "radar.png", dpi=90, facecolor="white")
 
 

@@ -17,7 +17,8 @@ import numpy as np
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, brief
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report.page import report_page, texts
+from imagine_bench.report.bench import bench_page
+from imagine_bench.report.page import texts
 from imagine_bench.running.evaluation import Env, EpisodeRecord, EvaluationCounts, replay
 from imagine_bench.running.progress import counted
 from imagine_bench.running.run_state import environments
@@ -32,8 +33,8 @@ _CLAIMS = {
     "fingerprints": "fingerprint",
 }  # fmt: skip
 """What is kept of a test episode beside its actions, and what it is called."""
-_LINES = {"report.md": r"^[|-].*$", "index.html": r"<tr>[\s\S]*?</tr>|<li>.*?</li>"}
-"""What is compared of a report's pages: tables and answers; of other files it is every line."""
+_LINES = {"report.md": r"^\|.*$", "index.html": r"<t[dh][^>]*>(.*?)</t[dh]>"}
+"""What is compared of a report's pages: the cells of their tables; of other files it is every line."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -147,7 +148,7 @@ def _verify_test(row: Checkpoint, count: int, purpose: Purpose, replays: Replays
 
 def _report_complaint(folder: Path) -> str:
     """The first line of the report's tables that does not follow from the runs; empty if all do."""
-    page = report_page(load_so_far(folder))
+    page = bench_page(load_so_far(folder))
     bare = dataclasses.replace(page, sections=[dataclasses.replace(each, images=()) for each in page.sections])
     for name, text in texts(bare).items():
         path, pattern = folder / "report" / name, re.compile(_LINES.get(name, "^.*$"), re.MULTILINE)

@@ -14,10 +14,9 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.judge.causes import Attribution, FailedEpisode, frames_to_ask_with, misread
-from imagine_bench.report.analysis import chosen, markdown, provenance
-from imagine_bench.report.page import write_report
-from imagine_bench.report.sections.causes import HEAD, causes_table, failures
-from imagine_bench.report.text import origin
+from imagine_bench.report import write_report
+from imagine_bench.report.analysis import chosen, origin, provenance
+from imagine_bench.report.exact import HEAD, causes_table, failures
 from imagine_bench.rules import states_of
 from imagine_bench.running.evaluation import Env
 from imagine_bench.running.progress import counted
@@ -66,7 +65,7 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
                 facts = (*head.values(), each.episodes, each.tests)
                 rows += [(*facts, test, cause) for test, cause in each.causes.items() or [("", "")]]
         table, made = causes_table(failures(rows)), {**provenance(protocol.hash), "appearance": appearance}
-        text = "\n".join([*markdown(table.header, table.rows), "", table.remark])
+        text = f"{table.markdown}\n\n{table.remark}"
         make_folder(where)
         write_bytes(where / "causes.csv", csv_text([HEAD, *rows]).encode())
         write_json(where / "summary.json", {**made, "frames": "kinematic", "runs": runs})

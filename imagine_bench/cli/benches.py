@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -36,6 +36,9 @@ from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.merge import merge
 from imagine_bench.store.results import BenchResult
 from imagine_bench.sweep.grid import SUITE_AGENTS, Study, Suite
+
+if TYPE_CHECKING:
+    from imagine_bench.report.tables import Page
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +225,7 @@ class Sweep:
             self._suite(replace(suite, seeds=tuple(sorted(self.seeds))) if self.seeds else suite)
 
     def _study(self, study: Study) -> None:
-        from imagine_bench.report import study as pages  # noqa: PLC0415 - matplotlib loads slowly
+        from imagine_bench.report.sweep import study_page  # noqa: PLC0415 - matplotlib loads slowly
         from imagine_bench.sweep.run import run_study  # noqa: PLC0415 - as above
 
         if self.task is None:
@@ -230,29 +233,36 @@ class Sweep:
         lines = run_study(study, self.task, root=self.launch.out, launcher=self.launch.chosen())
         runs = digest(sorted({line.folder.name for line in lines}))  # other runs overwrite no study
         folder = self.launch.out / file_name(registry.task_name(self.task)) / f"study-{study.name}-{runs}"
-        pages.write_study(folder, study, lines)
-        print(pages.study_table(study, lines))
-        print(f"\nStudy:      {folder / 'study.md'}")
+        _write(study_page(study, lines), folder)
 
     def _suite(self, suite: Suite) -> None:
-        from imagine_bench.report import suite as pages  # noqa: PLC0415 - matplotlib loads slowly
+        from imagine_bench.report.sweep import suite_page  # noqa: PLC0415 - matplotlib loads slowly
         from imagine_bench.sweep.run import run_suite  # noqa: PLC0415 - as above
 
         launcher = self.launch.chosen()
         agents = self.agents or SUITE_AGENTS
         result = run_suite(suite, agents, root=self.launch.out, launcher=launcher, planners=self.launch.workers)
-        print(pages.suite_table(result))
-        print(f"\nReport:     {pages.write_suite(result, self.launch.out)}")
+        _write(suite_page(result), self.launch.out / "suite" / f"{suite.name}-{suite.hash}" / "report")
         if result.failures:
             raise RunFailedError(f"{len(result.failures)} runs failed; the same command tries them again.")
 
 
+_PAGES = {"control": "imagine_bench.report:bench_page", "regression": "imagine_bench.regression.report:report_page"}
+"""Functions that make the page of a bench of each type of task."""
+
+
 def _show(result: Result) -> None:
-    """Write a bench's report, and print its table and where everything lies."""
-    report = "imagine_bench.report" if isinstance(result, BenchResult) else "imagine_bench.regression.report"
-    print(registry.load(f"{report}:summary_table")(result))  # first, as it needs no place to write
-    page = registry.load(f"{report}:write_report")(result)
-    print(f"\nReport:     {page}")
+    """Report a bench, and say where its recordings lie."""
+    page = registry.load(_PAGES["control" if isinstance(result, BenchResult) else "regression"])(result)
+    _write(page, result.folder / "report")
     recordings = [run.recording for run in result.runs if run.recording is not None]
     if recordings:
         print(f"Recordings: {len(recordings)}, such as {recordings[-1]} (imagine-bench view opens the newest)")
+
+
+def _write(page: Page, folder: Path) -> None:
+    """Print the tables and the verdict of a page, write it, and say where it lies."""
+    from imagine_bench.report.page import write_page  # noqa: PLC0415 - matplotlib loads slowly
+
+    print(page.summary)  # first, as it needs no place to write
+    print(f"\nReport:     {write_page(folder, page)}")

@@ -15,10 +15,9 @@ from imagine_bench.regression import report_robot_ik, report_toy_regression
 from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.results import RegressionResult
 from imagine_bench.report.figures import image
-from imagine_bench.report.page import aligned, made, write_page
+from imagine_bench.report.page import made, write_page
 from imagine_bench.report.tables import Image, Page, Section, Table, mean_std, number
 from imagine_bench.store.codec import table_text
-from imagine_bench.store.files import csv_text
 
 SECTIONS: dict[str, Callable[[RegressionResult], list[Section]]] = {
     "toy_regression": report_toy_regression.sections,
@@ -39,38 +38,37 @@ _COMPARED = (
 )
 
 
+def report_page(result: RegressionResult) -> Page:
+    """The page, with results.csv and a CSV a table beside it."""
+    spec = registry.regression(result.protocol.task)
+    protocol = result.protocol
+    own = _of_task(result)
+    sections = [*own, _calibration(result), _costs(result)]
+    rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
+    files = {"results.csv": table_text(rows)}
+    for section in sections:
+        files |= {f"{table.name}.csv": table.csv for table in section.tables}
+    answers = [answer for section in sections for answer in section.answers]
+    tables = [table.text for section in own[:1] for table in section.tables[:1]]
+    return Page(
+        title=f"{spec.title}: does the model know what it does not know?",
+        subtitle=f"Preset {protocol.preset} · networks a dataset: {protocol.networks} · protocol {protocol.hash}",
+        question=spec.description,
+        answers=answers,
+        sections=[_compared(result), *sections],
+        files=files,
+        summary="\n\n".join([*(section.title for section in own[:1]), *tables, "\n".join(answers)]),
+        **made(result, {agent: result.title(agent) for agent in protocol.agents}),
+    )
+
+
 def write_report(result: RegressionResult) -> Path:
     """Write index.html, report.md, results.csv, a CSV a table, the figures below ``report``; the path of index.html.
 
     Raises:
         SetupError: The folder cannot be written.
     """
-    spec = registry.regression(result.protocol.task)
-    protocol = result.protocol
-    sections = [*_of_task(result), _calibration(result), _costs(result)]
-    rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
-    files = {"results.csv": table_text(rows)}
-    for section in sections:
-        files |= {f"{table.name}.csv": csv_text([table.header, *table.rows]) for table in section.tables}
-    page = Page(
-        title=f"{spec.title}: does the model know what it does not know?",
-        subtitle=f"Preset {protocol.preset} · networks a dataset: {protocol.networks} · protocol {protocol.hash}",
-        question=spec.description,
-        answers=[answer for section in sections for answer in section.answers],
-        sections=[_compared(result), *sections],
-        files=files,
-        **made(result, {agent: result.title(agent) for agent in protocol.agents}),
-    )
-    return write_page(result.folder / "report", page)
-
-
-def summary_table(result: RegressionResult) -> str:
-    """The task's first table, if there is one, and the verdict, as plain text."""
-    own = _of_task(result)
-    lines = [section.title for section in own[:1]]
-    for table in [table for section in own[:1] for table in section.tables][:1]:
-        lines += ["", *aligned([list(table.header), *(list(map(str, row)) for row in table.rows)]), ""]
-    return "\n".join([*lines, *(answer for section in own for answer in section.answers)])
+    return write_page(result.folder / "report", report_page(result))
 
 
 def _of_task(result: RegressionResult) -> list[Section]:

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.running.task_types import task_type
 from imagine_bench.running.trained import require_control
 from imagine_bench.store.bench_folder import newest_bench, require_either
-
-
-def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
-    """The lines of a table."""
-    first, *others = (f"| {' | '.join(map(str, row))} |" for row in (head, *rows))
-    return [first, f"|{'---|' * len(head)}", *others]
 
 
 def chosen(given: Path | None, root: Path, task: str | None) -> Path:
@@ -32,7 +25,12 @@ def chosen(given: Path | None, root: Path, task: str | None) -> Path:
     return given or newest_bench(root, tuple(registry.tasks()) if task is None else (task,))
 
 
-def provenance(protocol_hash: str) -> dict[str, Any]:
+def provenance(protocol_hash: str) -> dict[str, object]:
     """Protocol, commit and command of a figure."""
     environment = describe_environment()
-    return {"protocol_hash": protocol_hash, **{name: environment.get(name) for name in ("commit", "command")}}
+    return {"protocol_hash": protocol_hash, "commit": environment.get("commit"), "command": environment.get("command")}
+
+
+def origin(facts: Mapping[str, object]) -> str:
+    """Where the figures of a page come from: ``protocol hash 6bf1d791349c; commit c9d5ec664788.`` and so on."""
+    return "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in facts.items()) + "."

@@ -1,15 +1,16 @@
-"""What a judgement found: a table, futures beside the truth, what models know of their errors, and where those are."""
+"""The report of a judgement: scores by question, futures beside the truth, and what models know of their errors."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,12 +26,11 @@ from imagine_bench.judge.models.study import Judgement, kept, prepare, shown
 from imagine_bench.judge.models.trained import model_entry, runs_of
 from imagine_bench.judge.models.truth import shares
 from imagine_bench.registry.entries import file_name
-from imagine_bench.report.figures import image
-from imagine_bench.report.page import aligned, flat, write_page
-from imagine_bench.report.tables import DASH, Image, Page, Section, Table, number
-from imagine_bench.report.tables import Cell as TableCell
+from imagine_bench.report import figures
+from imagine_bench.report.page import flat, write_page
+from imagine_bench.report.tables import DASH, Cell, Image, Page, Section, Table, estimate, number, p_value
 from imagine_bench.rules import fewest_actions
-from imagine_bench.statistics import difference, holm, interval, iqm
+from imagine_bench.statistics import Estimate, difference, holm, interval, iqm
 from imagine_bench.store.files import csv_text, read_json
 
 QUESTIONS = {
@@ -85,7 +85,6 @@ _WORDS = {
     "What does it cost?": "On one core. What was spent on an encoder beforehand is in frames.",
 }
 SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "auroc_wrong", "notice_slip", "counterfactual", "fit_s")
-_COLORS = ("#8c8c8c", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#661100", "#000000")
 _SHARES = {
     *("total_variation", "tv_3", "tv_5", "tv_10", "after_the_end", "nothing"),
     *("outcome_ece", "reward_ece", "end_error", "end_ece"),
@@ -93,370 +92,355 @@ _SHARES = {
     *(name for name in COLUMNS if name.startswith("auroc")),
 }
 _WHY_DASH = "not offered by the model, or nothing to tell apart"
-_WHOLE = 1_000  # from here on no decimals are shown
 _TELLING = 0.1  # total variation
-Cells = Mapping[tuple[str, int], Sequence[dict[str, Any]]]
-"""Kept cells, one a seed, by model and transitions."""
-Pictures = Mapping[str, dict[str, Any]]
-"""What :func:`.judge.models.study.shown` gives."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A judgement and what is kept of it."""
+
+    folder: Path
+    judgement: Judgement
+
+    @cached_property
+    def cells(self) -> dict[tuple[str, int], list[dict[str, Any]]]:
+        """Kept cells, one a seed, by model and transitions."""
+        grouped: dict[tuple[str, int], list[dict[str, Any]]] = {}
+        for cell in kept(self.folder, self.judgement):
+            grouped.setdefault((cell["model"], cell["transitions"]), []).append(cell)
+        return grouped
+
+    @property
+    def spec(self) -> TaskSpec:
+        """The task."""
+        return registry.task(self.judgement.task)
+
+    @property
+    def last(self) -> int:
+        """The most transitions that models learned from."""
+        return self.judgement.sizes[-1]
+
+    @property
+    def models(self) -> list[str]:
+        """The models that are judged at the most transitions."""
+        return [model for model in self.judgement.models if (model, self.last) in self.cells]
+
+    @property
+    def after(self) -> str:
+        """What models had learned from; nothing where all are trained agents, which learned in their benches."""
+        return f" after {self.last:,} transitions" if self.judgement.learning else ""
+
+    @cached_property
+    def images(self) -> dict[str, dict[str, Any]]:
+        """Arrays of the images that are kept, by model."""
+        return shown(self.folder, self.judgement)
+
+    def scores(self, model: str, size: int, name: str) -> list[float]:
+        """A score of each seed, by name; ``tv_5`` is the total variation at depth 5. NaN where there is none."""
+        return [score(cell, name) for cell in self.cells.get((model, size), [])]
+
+
+def score(cell: Mapping[str, Any], name: str) -> float:
+    """A score of a cell."""
+    value = cell["tv_by_depth"][int(name[3:]) - 1] if name.startswith("tv_") else cell[name]
+    digits = 3 if name.endswith("_s") else 9  # a time of less than a millisecond is none
+    return math.nan if value is None else round(float(value), digits)
 
 
 def judgement_report(folder: Path, judgement: Judgement) -> str:
     """Write ``folder / "report"`` and return the short table and where everything lies."""
-    cells = by_model(kept(folder, judgement))
-    page = write_page(folder / "report", _page(folder, judgement, cells))
-    head = ["world model", "transitions", *(COLUMNS[name] for name in SHORT)]
-    rows = [[title, size, *map(str, row)] for title, size, *row in _rows(judgement, cells, SHORT, judgement.sizes)]
-    return "\n".join([*aligned([head, *rows]), "", f"Report: {page}"])
+    page = judgement_page(Judged(folder, judgement))
+    return f"{page.summary}\n\nReport: {write_page(folder / 'report', page)}"
 
 
-def by_model(found: Sequence[dict[str, Any]]) -> Cells:
-    """Cells by model and transitions."""
-    grouped: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    for cell in found:
-        grouped.setdefault((cell["model"], cell["transitions"]), []).append(cell)
-    return grouped
+def judgement_page(found: Judged) -> Page:
+    """The page of a judgement."""
+    judgement = found.judgement
+    short = _scores_table(found, "short", SHORT, judgement.sizes)
+    data = f"Data: {judgement.policy} policy, kinematic" if judgement.learning else "Trained agents"
+    sections = [section(found) for section in SECTIONS]
+    return Page(
+        title=f"{found.spec.title}: world models against the exact truth",
+        subtitle=f"{data} · appearance “{judgement.appearance}” · {judgement.samples} futures a question",
+        question="Which model imagines what really happens, how sure is it, and what do its mistakes cost?",
+        answers=[answer for section in sections if section for answer in section.answers],
+        sections=[section for section in sections if section],
+        files={"scores.csv": _csv(found)},
+        facts=flat("", read_json(found.folder / "judgement.json", "a judgement")),
+        protocol=flat("", dataclasses.asdict(judgement)),
+        summary=short.text,
+    )
 
 
-def scores(cells: Sequence[dict[str, Any]], name: str) -> list[float]:
-    """A score of each cell, by name; ``tv_5`` is the total variation at depth 5. NaN where there is none."""
-    digits = 3 if name.endswith("_s") else 9  # what takes less than a millisecond takes nothing
-    values = [cell["tv_by_depth"][int(name[3:]) - 1] if name.startswith("tv_") else cell[name] for cell in cells]
-    return [math.nan if value is None else round(float(value), digits) for value in values]
+def _csv(found: Judged) -> str:
+    rows: list[list[object]] = [["model", "transitions", "seed", *COLUMNS]]
+    for (model, size), cells in found.cells.items():
+        for cell in cells:
+            values = [score(cell, name) for name in COLUMNS]
+            rows.append([model, size, cell["seed"], *("" if math.isnan(v) else f"{v:.6g}" for v in values)])
+    return csv_text(rows)
 
 
-def mean_cell(values: Sequence[float], *, share: bool = False) -> TableCell:
+# Scores ------------------------------------------------------------------------------------------------------------
+
+
+def mean_cell(values: Sequence[float], *, share: bool = False) -> Cell:
     """Interquartile mean over seeds with its 95 % interval, of a ``share`` in [0, 1]; a dash for no number."""
     there = [value for value in values if not math.isnan(value)]
     if not there:
-        return TableCell(text=DASH)
+        return Cell(DASH)
     low, high = interval(there, share=share)
-    shown = "" if math.isnan(low) or low == high else f"[{number(low)}, {number(high)}]"
-    value = iqm(there)
-    return TableCell(text=f"{value:,.0f}" if value >= _WHOLE else number(value), interval=shown)
+    return estimate(Estimate(iqm(there), math.nan if low == high else low, high), _number)
 
 
-def _size(model: str, size: int) -> str:
-    """The transitions that it learned from here; a trained agent's own are its bench's to say."""
-    return DASH if runs_of(model) else f"{size:,}"
+def _number(value: float) -> str:
+    return f"{value:,.0f}" if value >= 1_000 else number(value)
 
 
 def _title(model: str) -> str:
     return model_entry(model).title
 
 
-def _after(judgement: Judgement, size: int) -> str:
-    """Words for what models had learned from; none where all are trained agents, which learned in their benches."""
-    return f" after {size:,} transitions" if judgement.learning else ""
+def _heads(found: Judged, model: str, size: int) -> list[str | Cell]:
+    """The model and its transitions; those of a trained agent are its bench's to say."""
+    return [_title(model), DASH if runs_of(model) else f"{size:,}"]
 
 
-def _rows(judgement: Judgement, cells: Cells, names: Sequence[str], sizes: Sequence[int]) -> list[list[Any]]:
-    return [
-        [
-            _title(model),
-            _size(model, size),
-            *(mean_cell(scores(cells[model, size], name), share=name in _SHARES) for name in names),
-        ]
-        for model, size in itertools.product(judgement.models, sizes)
-        if (model, size) in cells
-    ]
+def _scores_table(found: Judged, name: str, names: Iterable[str], sizes: Sequence[int], folded: str = "") -> Table:
+    names = list(names)
+    rows = []
+    for model, size in itertools.product(found.judgement.models, sizes):
+        if (model, size) in found.cells:
+            cells = [mean_cell(found.scores(model, size, each), share=each in _SHARES) for each in names]
+            rows.append([*_heads(found, model, size), *cells])
+    header = ["world model", "transitions", *(COLUMNS[each] for each in names)]
+    caption = "Interquartile means over seeds or runs, with 95 % intervals. 0 is best in every error; value loss is in "
+    return Table(name, header, rows, f"{caption}units of reward.", _WHY_DASH, folded)
 
 
-def _page(folder: Path, judgement: Judgement, cells: Cells) -> Page:
-    spec = registry.task(judgement.task)
-    made = read_json(folder / "judgement.json", "a judgement")
-    pictures, last = shown(folder, judgement), judgement.sizes[-1:]
-    largest = [model for model in judgement.models if (model, *last) in cells]
-    short = Table(
-        name="short", header=["world model", "transitions", *(COLUMNS[name] for name in SHORT)], why_dash=_WHY_DASH,
-        rows=_rows(judgement, cells, SHORT, last),
-        caption=f"Interquartile means over {_seeds(judgement)}, with 95 % intervals. 0 is best in every error; value "
-        "loss is in units of reward.",
-    )  # fmt: skip
-    images = [*_futures(judgement, pictures), *_risk_images(judgement, cells, largest)]
-    by_question = {title: _question_section(title, judgement, cells) for title in QUESTIONS}
-    outcomes, rewards, costs, *others = by_question.values()
-    sections = [
-        Section(title="In short", words=[_reader_words(folder)], tables=[short]),
-        Section(title="One future, and the errors of the surest answers", images=images),
-        *(
-            [Section(title="How much data does it need?", images=[_curve_image(judgement, cells)])]
-            if judgement.learning
-            else []
-        ),
-        replace(outcomes, images=[_depth_image(folder, judgement, cells, largest)]),
-        rewards,
-        replace(costs, tables=[*costs.tables, _by_start(spec, judgement, cells)]),
-        _where_section(spec, judgement, cells, largest, pictures),
-        *others,
-        Section(title="Against each other", tables=[_compared(judgement, cells, largest)]),
-    ]
-    data = f"Data: {judgement.policy} policy, kinematic" if judgement.learning else "Trained agents"
-    return Page(
-        title=f"{spec.title}: world models against the exact truth",
-        subtitle=f"{data} · appearance “{judgement.appearance}” · {judgement.samples} futures a question",
-        question="Which model imagines what really happens, how sure is it, and what do its mistakes cost?",
-        answers=_answers(judgement, cells, largest), sections=sections,
-        facts=flat("", made), settings={}, protocol=flat("", dataclasses.asdict(judgement)), recordings=[],
-        files={"scores.csv": _csv(cells)},
-    )  # fmt: skip
-
-
-def _seeds(judgement: Judgement) -> str:
-    """What an interval is over."""
-    kinds = [f"{len(judgement.seeds)} seeds of data and model"] if judgement.learning else []
-    if len(judgement.learning) < len(judgement.models):
-        kinds.append("the runs of each trained agent")
-    return " or ".join(kinds)
-
-
-def _reader_words(folder: Path) -> str:
-    errors = read_json(folder / "reader.json", "a reader's errors")
-    return (
-        f"The reader takes {errors['misread']:.2%} of fresh real frames for another macrostate and refuses "
-        f"{errors['refused']:.2%}; it reads {errors['blends_read']:.1%} of blends of two frames, "
-        f"{errors['noise_read']:.1%} of noise, and {'some' if errors['gray_read'] + errors['black_read'] else 'no'} "
-        "fog as something."
+def in_short(found: Judged) -> Section:
+    """The main scores at the most transitions, and the reader's own errors."""
+    errors = {name: f"{share:.2%}" for name, share in read_json(found.folder / "reader.json", "errors").items()}
+    reader = Table("reader", list(errors), [list(errors.values())], "What the reader of images gets wrong itself.")
+    words = (
+        "A reader that was trained apart turns imagined images into macrostates. Of real frames, it misreads some or "
+        "refuses to read them; fog, noise and blends of two frames should not be read."
     )
+    return Section("In short", [words], tables=[_scores_table(found, "short", SHORT, [found.last]), reader])
 
 
-def _question_section(title: str, judgement: Judgement, cells: Cells) -> Section:
+def question(found: Judged, title: str) -> Section:
     """The scores that answer one question, after every number of transitions."""
-    names = tuple(QUESTIONS[title])
-    table = Table(
-        name=title.lower().strip("?").replace(" ", "_").replace(",", ""), why_dash=_WHY_DASH,
-        header=["world model", "transitions", *QUESTIONS[title].values()],
-        rows=_rows(judgement, cells, names, judgement.sizes), folded="After every number of transitions",
-    )  # fmt: skip
-    return Section(title=title, words=[_WORDS[title]], tables=[table])
+    name = title.lower().strip("?").replace(" ", "_").replace(",", "")
+    table = _scores_table(found, name, QUESTIONS[title], found.judgement.sizes, "After every number of transitions")
+    return Section(title, [_WORDS[title]], tables=[table])
 
 
-def _by_start(spec: TaskSpec, judgement: Judgement, cells: Cells) -> Table:
-    """Value loss by the fewest macro-actions that a start needs, after every number of transitions."""
-    needs = [fewest_actions(spec.rules, state) for state in spec.rules.start_states]
-    rows: list[list[str | TableCell]] = []
-    for (model, size), each in cells.items():
-        losses = np.array([cell["value_loss_by_start"] for cell in each])  # [seeds, starts]
+def by_start(found: Judged) -> Section:
+    """Value loss by the fewest macro-actions that a start needs."""
+    rules = found.spec.rules
+    needs = np.array([fewest_actions(rules, state) for state in rules.start_states])
+    rows = []
+    for (model, size), cells in found.cells.items():
+        losses = np.array([cell["value_loss_by_start"] for cell in cells])  # [seeds, starts]
         if losses.size:
-            groups = [losses[:, [need == n for need in needs]].mean(axis=1).tolist() for n in sorted(set(needs))]
-            rows.append([_title(model), _size(model, size), *map(mean_cell, groups)])
-    return Table(
-        name="value_loss_by_start", folded="By start", rows=rows,
-        header=["world model", "transitions", *(f"{n} ({needs.count(n)} starts)" for n in sorted(set(needs)))],
-        caption="Mean value loss from starts by the fewest macro-actions to a success.",
-    )  # fmt: skip
+            groups = [losses[:, needs == need].mean(axis=1).tolist() for need in np.unique(needs)]
+            rows.append([*_heads(found, model, size), *map(mean_cell, groups)])
+    columns = [f"{need} ({(needs == need).sum()} starts)" for need in np.unique(needs)]
+    caption = "Mean value loss from starts by the fewest macro-actions to a success."
+    header = ["world model", "transitions", *columns]
+    return Section("Value loss by start", tables=[Table("value_loss_by_start", header, rows, caption)])
 
 
-def _answers(judgement: Judgement, cells: Cells, models: Sequence[str]) -> list[str]:
-    """The best model that is given no rules, at the largest size."""
-    last = judgement.sizes[-1]
-    learned = [model for model in models if not model_entry(model).privileged]
-    if not learned:
-        return []
-    found = []
-    for name, words in (("total_variation", "total variation"), ("value_loss", "value loss")):
-        scored = {
-            model: iqm(values) for model in learned if not np.isnan(values := scores(cells[model, last], name)).any()
-        }
-        if scored:
-            best = min(scored, key=lambda model: scored[model])
-            when = "" if runs_of(best) else _after(judgement, last)
-            found.append(f"{_title(best)} has the smallest {words}{when}: {number(scored[best])}.")
-    return found
+def compared(found: Judged) -> Section:
+    """Each pair's difference in total variation at the most transitions, and a line on the two best."""
+    pairs = list(itertools.combinations(found.models, 2))
+    values = {model: found.scores(model, found.last, "total_variation") for model in found.models}
+    differences = [difference(values[a], values[b]) for a, b in pairs]
+    adjusted = holm([each.p for each in differences])
+    rows: list[list[str | Cell]] = []
+    answers = []
+    learned = [model for model in found.models if not model_entry(model).privileged]
+    best = sorted(learned, key=lambda model: iqm(values[model]))[:2]
+    for (a, b), each, p in zip(pairs, differences, adjusted, strict=True):
+        cell = estimate(each, number)
+        rows.append([_title(a), _title(b), cell, number(p)])
+        if {a, b} == set(best):
+            first, second = (f"{_title(model)} ({number(iqm(values[model]))})" for model in best)
+            shown = f"{p_value(p)}, Holm-corrected: {'no difference is shown' if p >= 0.05 else 'it is better'}"
+            verdict = "one seed does not show which is better" if math.isnan(p) else f"difference {cell}, {shown}"
+            answers.append(f"Smallest total variation{found.after}: {first}, then {second}; {verdict}.")
+    header = ["model", "against", "difference of total variation", "p"]
+    caption = f"Total variation of one step{found.after}; Yuen's test over seeds, p by Holm."
+    table = Table("differences", header, rows, caption, "one seed says nothing", "Every pair")
+    return Section("Against each other", tables=[table], answers=answers)
 
 
-def _csv(cells: Cells) -> str:
-    names = ["model", "transitions", "seed", *COLUMNS]
-    rows = [
-        [model, size, cell["seed"], *(_plain(scores([cell], name)[0]) for name in COLUMNS)]
-        for (model, size), each in cells.items()
-        for cell in each
-    ]
-    return csv_text([names, *rows])
+# Figures -----------------------------------------------------------------------------------------------------------
 
 
-def _plain(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.6g}"
-
-
-def _compared(judgement: Judgement, cells: Cells, models: Sequence[str]) -> Table:
-    """Each pair's difference in total variation at the largest size."""
-    last = judgement.sizes[-1]
-    pairs = list(itertools.combinations(models, 2))
-    found = [difference(*(scores(cells[model, last], "total_variation") for model in pair)) for pair in pairs]
-    adjusted = holm([one.p for one in found])
-    rows: list[list[str | TableCell]] = [
-        [_title(a), _title(b), TableCell(text=number(one.value), interval=f"[{number(one.low)}, {number(one.high)}]"),
-         number(p)]
-        for (a, b), one, p in zip(pairs, found, adjusted, strict=True)
-    ]  # fmt: skip
-    return Table(
-        name="differences", header=["model", "against", "difference of total variation", "p"], rows=rows,
-        caption=f"Total variation of one step{_after(judgement, last)}; Yuen's test over seeds, p by Holm.",
-        why_dash="one seed says nothing", folded="Every pair",
-    )  # fmt: skip
-
-
-def _lines(x: Sequence[float], series: Mapping[str, Sequence[float]], xlabel: str, ylabel: str) -> Figure:
-    figure = Figure(figsize=(9.2, 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    _draw(axes, series, x, ylim=(-0.03, 1.05), xlabel=xlabel, ylabel=ylabel)
-    axes.legend(fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return figure
-
-
-def _draw(axes: Axes, series: Mapping[str, Sequence[float]], x: Sequence[float], **settings: Any) -> None:
+def _draw(axes: Axes, x: Sequence[float], series: Mapping[str, Sequence[float]], **settings: Any) -> None:
     """A line a model, each in the color that it has in every figure."""
-    places = {name: place for place, name in enumerate(registry.world_models())}
     for model, values in series.items():
-        color = _COLORS[places.get(model, crc32(model.encode())) % len(_COLORS)]
-        axes.plot(x, values, color=color, marker="o", markersize=3.5, label=_title(model))
+        color = figures.color(model, registry.world_models())
+        figures.curve(axes, dict(zip(x, values, strict=True)), color=color, label=_title(model))
     axes.set(**settings)
 
 
-def _curve_image(judgement: Judgement, cells: Cells) -> Image:
+def _lines(x: Sequence[float], series: Mapping[str, Sequence[float]], **settings: Any) -> tuple[Figure, Axes]:
+    figure, axes = figures.panel()
+    _draw(axes, x, series, ylim=(-0.03, 1.05), **settings)
+    figures.names_right(figure, axes)
+    return figure, axes
+
+
+def curve(found: Judged) -> Section | None:
     """Two scores by the transitions that models learned from."""
-    shown_, sizes = {"total_variation": "total variation, 1 step", "value_loss": "value loss"}, list(judgement.sizes)
+    sizes = found.judgement.sizes
 
     def draw() -> Figure:
-        figure = Figure(figsize=(9.2, 4.0), layout="constrained")
-        for axes, (name, label) in zip(figure.subplots(1, 2), shown_.items(), strict=True):
-            series = {
-                model: [float(np.mean(scores(cells[model, size], name))) if (model, size) in cells else math.nan
-                        for size in sizes]
-                for model in judgement.learning
-            }  # fmt: skip
-            _draw(axes, series, sizes, xscale="log", xlabel="transitions of the same data", ylabel=label)
-            axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
-            axes.minorticks_off()
-        figure.legend(*axes.get_legend_handles_labels(), fontsize=9, ncols=4, loc="outside lower center")
+        figure, panels = figures.small_multiples(2, 2, width=4.2, height=3.3)
+        names = {"total_variation": "total variation, 1 step", "value_loss": "value loss"}
+        for axes, (name, label) in zip(panels, names.items(), strict=True):
+            series = {}
+            for model in found.judgement.learning:
+                series[model] = [float(np.mean(found.scores(model, size, name) or math.nan)) for size in sizes]
+            _draw(axes, sizes, series, ylabel=label)
+            figures.log_axis(axes, sizes, "transitions of the same data")
+        figure.legend(*panels[0].get_legend_handles_labels(), ncols=4, loc="outside lower center")
         return figure
 
-    return image(
-        "curve", draw, svg=True, alt="Total variation and value loss by the number of transitions learned from",
-        caption="Mean over seeds. Every model learns from the same transitions.",
-    )  # fmt: skip
+    if not found.judgement.learning:
+        return None
+    caption = "Total variation and value loss by transitions; mean over seeds. Every model learns from the same ones."
+    return Section("How much data does it need?", images=[figures.plot("curve", draw, caption)])
 
 
-def _risk_images(judgement: Judgement, cells: Cells, models: Sequence[str]) -> list[Image]:
-    """One figure, or none where no model is uncertain of anything."""
-    size = _telling_size(judgement, cells, models)
-    series = _risks(cells, models, size)
-    shares = [100.0 * share for share in COVERAGES]
-    if not series:
-        return []
-    when = f"{_after(judgement, size)}, where most of them still err" if judgement.learning else ""
-    one = image(
-        "risk_coverage",
-        lambda: _lines(shares, series, "questions answered, the surest first (%)", "total variation of those answered"),
-        alt="Risk against coverage of each model that offers an epistemic uncertainty", svg=True,
-        caption="A model that knows what it does not know has a curve that is low on the left. Models without an "
-        f"uncertainty are not here. Mean over seeds{when}.",
-    )  # fmt: skip
-    return [one]
+def depth(found: Judged) -> Section:
+    """Total variation by imagined depth."""
+    samples = found.judgement.samples
+    truth = prepare(found.judgement, found.folder).rollouts.truth
+    noise = [[sampling_noise_floor(shares(outcomes), samples) for outcomes in steps] for steps in truth]
+    series = {}
+    for model in found.models:
+        series[model] = np.mean([cell["tv_by_depth"] for cell in found.cells[model, found.last]], axis=0).tolist()
+    steps = range(1, 1 + len(noise[0]))
+
+    def draw() -> Figure:
+        figure, axes = _lines(steps, series, xlabel="imagined macro-actions", ylabel="total variation")
+        axes.plot(steps, np.mean(noise, axis=0), ":", color=figures.GRAY)
+        return figure
+
+    caption = (
+        f"Total variation to the exact distribution by depth{found.after}; dotted: the part that comes from drawing "
+        f"only {samples} samples."
+    )
+    return Section("How far ahead?", images=[figures.plot("depth", draw, caption)])
 
 
-def _risks(cells: Cells, models: Sequence[str], size: int) -> dict[str, list[float]]:
+def risk(found: Judged) -> Section | None:
+    """Risk against coverage, where more than one model errs in a tenth of all; nothing where none is uncertain."""
+    risks = {size: _risks(found, size) for size in found.judgement.sizes}
+    telling = [size for size, each in risks.items() if sum(curve[-1] > _TELLING for curve in each.values()) > 1]
+    known = [size for size, each in risks.items() if each]
+    if not known:
+        return None
+    size = telling[-1] if telling else known[0]
+    percentages = [100.0 * share for share in COVERAGES]
+    labels = {"xlabel": "questions answered, the surest first (%)", "ylabel": "total variation of those answered"}
+    caption = (
+        "A model that knows its errors has a curve that is low on the left. Models without an uncertainty are not "
+        f"here. Mean over seeds, {size:,} transitions."
+    )
+    image = figures.plot("risk_coverage", lambda: _lines(percentages, risks[size], **labels)[0], caption)
+    return Section("The errors of the surest answers", images=[image])
+
+
+def _risks(found: Judged, size: int) -> dict[str, list[float]]:
     """Mean risk by coverage of each model that learned and says how sure it is."""
-    own = {model: cells.get((model, size), ()) for model in models if not model_entry(model).privileged}
-    curves = {model: [cell["risk"] for cell in each if cell["risk"]] for model, each in own.items()}
-    return {model: np.mean(each, axis=0).tolist() for model, each in curves.items() if each}
+    curves = {}
+    for model in found.models:
+        own = [cell["risk"] for cell in found.cells.get((model, size), []) if cell["risk"]]
+        if own and not model_entry(model).privileged:
+            curves[model] = np.mean(own, axis=0).tolist()
+    return curves
 
 
-def _telling_size(judgement: Judgement, cells: Cells, models: Sequence[str]) -> int:
-    """The most transitions after which more than one model is wrong in a tenth of all; else the fewest."""
-    for size in judgement.sizes[::-1]:
-        if sum(curve[-1] > _TELLING for curve in _risks(cells, models, size).values()) > 1:
-            return size
-    return next((size for size in judgement.sizes if _risks(cells, models, size)), judgement.sizes[0])
+# Images ------------------------------------------------------------------------------------------------------------
 
 
-def _depth_image(folder: Path, judgement: Judgement, cells: Cells, models: Sequence[str]) -> Image:
-    last, truth = judgement.sizes[-1], prepare(judgement, folder).rollouts.truth
-    floor = [[sampling_noise_floor(shares(outcomes), judgement.samples) for outcomes in steps] for steps in truth]
-    series = {model: np.mean([cell["tv_by_depth"] for cell in cells[model, last]], axis=0).tolist() for model in models}
-    steps = range(1, 1 + len(next(iter(series.values()), [])))
-
-    def draw() -> Figure:
-        figure = _lines(list(steps), series, "imagined macro-actions", "total variation")
-        figure.axes[0].plot(range(1, 1 + len(floor[0])), np.mean(floor, axis=0), ":", color=_COLORS[0], linewidth=1.2)
-        return figure
-
-    return image(
-        "depth", draw, svg=True, alt="Total variation to the exact distribution by imagined depth",
-        caption=f"Total variation to the exact distribution by depth{_after(judgement, last)}; dotted: what "
-        f"{judgement.samples} samples of the exact distribution itself would show.",
-    )  # fmt: skip
+def _sheet(name: str, caption: str, titles: Sequence[str], rows: Sequence[tuple[str, Any, Any]]) -> Image:
+    """Rows of images below titles: a name, the images, and whether each may happen (None: it is real)."""
+    return Image.of(name, png(transition_sheet(titles, list(rows))), caption)
 
 
-def _futures(judgement: Judgement, found: Pictures) -> list[Image]:
+def _rgb(images: Any) -> list[Any]:
+    return [each if each.ndim == 3 else np.repeat(each[:, :, None], 3, axis=2) for each in images]
+
+
+def futures(found: Judged) -> Section | None:
     """One rollout, real and as each model imagines it."""
-    names = registry.task(judgement.task).action_names
-    if not found:
-        return []
-    one = next(iter(found.values()))
-    titles = ["start", *(f"{step}. {names[action]}" for step, action in enumerate(one["futures_actions"][0], start=1))]
+    if not found.images:
+        return None
+    names = found.spec.action_names
+    one = next(iter(found.images.values()))
     start = one["futures_before"][0]
+    titles = ["start", *(f"{step}. {names[action]}" for step, action in enumerate(one["futures_actions"][0], 1))]
     rows: list[tuple[str, Any, Any]] = [("real", [start, *one["futures_real"][0]], None)]
-    for model, arrays in found.items():
-        rows.append((_title(model), [start, *map(_rgb, arrays["futures_imagined"][0])],
-                     [True, *arrays["futures_right"][0].tolist()]))  # fmt: skip
+    for model, arrays in found.images.items():
+        imagined = [start, *_rgb(arrays["futures_imagined"][0])]
+        rows.append((_title(model), imagined, [True, *arrays["futures_right"][0].tolist()]))
     caption = "One real start and the same macro-actions, real and as each model imagines them."
-    return [_sheet("futures", titles, rows, "One future, real and imagined by every model", caption)]
+    return Section("One future", images=[_sheet("futures", caption, titles, rows)])
 
 
-def _after_the_end(spec: TaskSpec, found: Pictures) -> list[Image]:
-    """A few transitions that no training contains, real and as each model imagines them (thesis' figure 5.9)."""
-    there = {model: arrays for model, arrays in found.items() if "after_before" in arrays}
-    if not there:
-        return []
-    one = next(iter(there.values()))
-    rows: list[tuple[str, Any, Any]] = [
-        ("before", list(one["after_before"]), None), ("real", list(one["after_real"][:, 0]), None)
-    ]  # fmt: skip
-    for model, arrays in there.items():
-        rows.append(
-            (_title(model), list(map(_rgb, arrays["after_imagined"][:, 0])), arrays["after_right"][:, 0].tolist())
-        )
-    titles = [spec.action_names[action] for action in one["after_actions"][:, 0]]
-    caption = "Macro-actions after the end of an episode, which no data contains."
-    return [_sheet("after_the_end", titles, rows, "Transitions after the end, real and imagined", caption)]
-
-
-def _sheet(name: str, titles: Sequence[str], rows: list[tuple[str, Any, Any]], alt: str, caption: str) -> Image:
-    return Image.of(png(transition_sheet(titles, rows)), name=name, alt=alt, caption=caption)
-
-
-def _where_section(
-    spec: TaskSpec, judgement: Judgement, cells: Cells, models: Sequence[str], pictures: Pictures
-) -> Section:
-    """Total variation by what may make it hard, and the worst ten transitions of each model."""
-    last = judgement.sizes[-1]
-    groups: dict[tuple[str, str], dict[str, TableCell]] = {}
-    for model in models:
-        wheres = [cell["where"] for cell in cells[model, last]]
-        for kind, name in {(kind, name): None for where in wheres for kind, each in where.items() for name in each}:
-            values = [where[kind][name] for where in wheres if name in where[kind]]
-            groups.setdefault((kind, name), {})[model] = mean_cell(values, share=True)
-    rows: list[list[str | TableCell]] = [
-        [kind, name, *(found.get(model, DASH) for model in models)] for (kind, name), found in groups.items()
+def where(found: Judged) -> Section:
+    """Total variation by what may make it hard, the worst ten transitions of each model, and those after the end."""
+    groups: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for model in found.models:
+        for cell in found.cells[model, found.last]:
+            for kind, each in cell["where"].items():
+                for name, value in each.items():
+                    groups.setdefault((kind, name), {}).setdefault(model, []).append(value)
+    rows: list[list[str | Cell]] = [
+        [kind, name, *(mean_cell(values.get(model, []), share=True) for model in found.models)]
+        for (kind, name), values in groups.items()
     ]
-    table = Table(
-        name="where", header=["by", "which", *map(_title, models)], rows=rows, why_dash="no such transition",
-        caption=f"Total variation of one step{_after(judgement, last)}; of a coordinate, that of it alone.",
-    )  # fmt: skip
+    header = ["by", "which", *map(_title, found.models)]
+    caption = f"Total variation of one step{found.after}; of a coordinate, that of it alone."
+    table = Table("where", header, rows, caption, "no such transition")
     images = []
-    for model, arrays in pictures.items():
+    for model, arrays in found.images.items():
         if not arrays["worst_right"].all():
-            titles = [spec.action_names[action] for action in arrays["worst_actions"][:, 0]]
-            strips: list[tuple[str, Any, Any]] = [
-                ("before", list(arrays["worst_before"]), None), ("real", list(arrays["worst_real"][:, 0]), None),
-                ("imagined", list(map(_rgb, arrays["worst_imagined"][:, 0])), arrays["worst_right"][:, 0].tolist()),
-            ]  # fmt: skip
             caption = f"The ten worst transitions of {_title(model)}."
-            images.append(_sheet(f"worst_{file_name(model)}", titles, strips, f"Worst of {_title(model)}", caption))
-    return Section(title="Where it fails", tables=[table], images=[*images, *_after_the_end(spec, pictures)])
+            images.append(_transitions(found, f"worst_{file_name(model)}", caption, "worst", {"imagined": arrays}))
+    ended = {_title(model): arrays for model, arrays in found.images.items() if "after_before" in arrays}
+    if ended:  # the thesis' figure 5.9
+        caption = "Macro-actions after the end of an episode, which no data contains."
+        images.append(_transitions(found, "after_the_end", caption, "after", ended))
+    return Section("Where it fails", tables=[table], images=images)
 
 
-def _rgb(picture: Any) -> Any:
-    return picture if picture.ndim == 3 else np.repeat(picture[:, :, None], 3, axis=2)
+def _transitions(found: Judged, name: str, caption: str, kind: str, imagined: Mapping[str, dict[str, Any]]) -> Image:
+    """Transitions of a kind before and after, real and imagined."""
+    one = next(iter(imagined.values()))
+    titles = [found.spec.action_names[action] for action in one[f"{kind}_actions"][:, 0]]
+    rows: list[tuple[str, Any, Any]] = [("before", list(one[f"{kind}_before"]), None)]
+    rows.append(("real", list(one[f"{kind}_real"][:, 0]), None))
+    for title, arrays in imagined.items():
+        rows.append((title, _rgb(arrays[f"{kind}_imagined"][:, 0]), arrays[f"{kind}_right"][:, 0].tolist()))
+    return _sheet(name, caption, titles, rows)
+
+
+SECTIONS: tuple[Callable[[Judged], Section | None], ...] = (
+    in_short,
+    futures,
+    risk,
+    curve,
+    depth,
+    *(functools.partial(question, title=title) for title in QUESTIONS),
+    by_start,
+    where,
+    compared,
+)
+"""The sections of the page, in their order. A new one is a function and a line here."""

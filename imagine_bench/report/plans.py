@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +15,11 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.filmstrips import filmstrip, png
 from imagine_bench.judge.plans import Plan, make_plans, require_threshold
-from imagine_bench.report.analysis import chosen, markdown, provenance
-from imagine_bench.report.text import percent
+from imagine_bench.report.analysis import chosen, provenance
+from imagine_bench.report.tables import DASH, Table, percent
 from imagine_bench.running.progress import counted
 from imagine_bench.running.task_types import load_bench
-from imagine_bench.running.trained import Trained, best_run, load_trained, protocol_of_agents
+from imagine_bench.running.trained import best_run, load_trained, protocol_of_agents
 from imagine_bench.store.files import csv_text, lock, make_folder, with_null, write_bytes, write_json, writing
 
 _COLUMNS = (
@@ -44,7 +42,7 @@ def plan_report(
     ``run`` is a run's folder, or a bench's, whose best imagining run is taken; None is the newest bench of ``task``,
     or of any. ``max_epistemic`` is as in :func:`imagine_bench.judge.plans.make_plans`, ``encoder`` as in
     :func:`imagine_bench.running.trained.load_trained`. The first ``recorded`` plans go to ``record``.
-    Returns what to print.
+    Returns the text to print.
 
     Raises:
         ImagineBenchError: Nothing to plan with, or a value out of range; nothing was written.
@@ -61,34 +59,30 @@ def plan_report(
     execution = trained.task.execution(execution)
     name = f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"
     folder = make_folder(run / "plans" / name)
-    how: dict[str, Any] = {"execution": execution, "max_epistemic": max_epistemic}
+    spec = trained.spec
     with lock(folder / ".lock", f"The folder {folder}"):
-        plans = list(counted(make_plans(trained, count=count, **how), "plans", total=count))
-        lines = _write(trained, plans, folder, how)
+        made = make_plans(trained, count=count, execution=execution, max_epistemic=max_epistemic)
+        plans = list(counted(made, "plans", total=count))
+        origin: dict[str, object] = {
+            **provenance(spec.protocol.hash), "agent": spec.agent, "seed": spec.seed, "episodes": trained.episodes,
+            "appearance": spec.protocol.appearance, "execution": execution, "max_epistemic": max_epistemic,
+        }  # fmt: skip
+        summary = write_plans(folder, plans, trained.task, origin, filmstrips=_FILMSTRIPS)
+        lines = [
+            f"{trained.task.title}: {spec.agent}, seed {spec.seed}, after {trained.episodes:,} real episodes, "
+            f"{spec.protocol.appearance}, {execution}\n",
+            f"{plan_table(summary, trained.task).markdown}\n",
+            *_failed(plans),
+            f"Filmstrips: {folder / 'plans.png'}",
+        ]
         if record is not None and recorded:
-            path = record(trained, count=min(recorded, count), **how, path=folder / RECORDING)
+            shown = {"count": min(recorded, count), "execution": execution, "max_epistemic": max_epistemic}
+            path = record(trained, **shown, path=folder / RECORDING)
             lines.append(f"Recording:  {path} (imagine-bench view opens it)")
     return "\n".join(lines)
 
 
-def _write(trained: Trained, plans: Sequence[Plan], folder: Path, how: dict[str, Any]) -> list[str]:
-    """Keep the plans of a trained agent, and say what became of them."""
-    spec, task = trained.spec, trained.task
-    run = {"agent": spec.agent, "seed": spec.seed, "episodes": trained.episodes}
-    origin = {**provenance(spec.protocol.hash), **run, "appearance": spec.protocol.appearance, **how}
-    summary = write_plans(folder, plans, task, origin, filmstrips=_FILMSTRIPS)
-    return [
-        f"{task.title}: {spec.agent}, seed {spec.seed}, after {trained.episodes:,} real episodes, "
-        f"{spec.protocol.appearance}, {how['execution']}",
-        "",
-        plan_table(summary, task),
-        "",
-        *(f"plan {plan.number} from {plan.start}: {plan.outcome}" for plan in plans if not plan.solved),
-        f"Filmstrips: {folder / 'plans.png'}",
-    ]
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PlanSummary:
     """Counts over plans, and macro-actions of the solved ones (0 and NaN where none was).
 
@@ -125,32 +119,31 @@ def summarise(plans: Sequence[Plan]) -> PlanSummary:
     )
 
 
-def plan_table(summary: PlanSummary, task: TaskSpec) -> str:
-    """The counts as Markdown, the thesis' beside them where it has any."""
+def plan_table(found: PlanSummary, task: TaskSpec) -> Table:
+    """The counts, the thesis' beside them where it has any."""
     thesis = {} if task.reference is None else reference.load(task.reference).get("plans", {})
-    low, high = statistics.wilson(summary.solved, summary.attempted)
-    share = f"{summary.solved} = {percent(summary.solved / summary.attempted)} % [{percent(low)}, {percent(high)}]"
-    lengths = f"{summary.shortest} to {summary.longest}, mean {summary.mean_length:.2f}" if summary.solved else "–"
+    low, high = statistics.wilson(found.solved, found.attempted)
+    share = f"{percent(found.solved / found.attempted)} % [{percent(low)}, {percent(high)}]"
+    lengths = f"{found.shortest} to {found.longest}, mean {found.mean_length:.2f}" if found.solved else DASH
     rows = [
-        ("plans", f"{summary.attempted}", thesis.get("attempted")),
-        ("solved", share, thesis.get("solved")),
-        ("of these optimal", f"{summary.optimal}", thesis.get("optimal_among_solved")),
-        ("refused as too uncertain", f"{summary.refused}", None),
-        ("macro-actions of a solved plan", lengths, f"{thesis['shortest']} to {thesis['longest']}" if thesis else None),
-        ("macro-actions that led where imagined", f"{summary.steps_as_imagined} of {summary.steps}", None),
-        ("faults of the physics", f"{summary.faults}", None),
+        ["plans", f"{found.attempted}", f"{thesis.get('attempted', DASH)}"],
+        ["solved", f"{found.solved} = {share}", f"{thesis.get('solved', DASH)}"],
+        ["of these optimal", f"{found.optimal}", f"{thesis.get('optimal_among_solved', DASH)}"],
+        ["refused as too uncertain", f"{found.refused}", DASH],
+        ["macro-actions of a solved plan", lengths, f"{thesis['shortest']} to {thesis['longest']}" if thesis else DASH],
+        ["macro-actions that led where imagined", f"{found.steps_as_imagined} of {found.steps}", DASH],
+        ["faults of the physics", f"{found.faults}", DASH],
     ]
-    shown = [(name, here, "–" if there is None else there) for name, here, there in rows]
-    return "\n".join(markdown(["open-loop plans, carried out blindly", "here", "thesis"], shown))
+    return Table("plans", ["open-loop plans, carried out blindly", "here", "thesis"], rows)
 
 
 def write_plans(
-    folder: Path, plans: Sequence[Plan], task: TaskSpec, provenance: dict[str, Any], *, filmstrips: int
+    folder: Path, plans: Sequence[Plan], task: TaskSpec, origin: Mapping[str, object], *, filmstrips: int
 ) -> PlanSummary:
     """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and filmstrips of the first plans that failed.
 
-    What an earlier call left there, its recording included, goes. ``plans.png`` shows as many ``filmstrips``, of plans
-    of different lengths; ``summary.json`` says the ``provenance`` too.
+    The files of an earlier call, its recording included, go. ``plans.png`` shows as many ``filmstrips``, of plans of
+    different lengths; ``summary.json`` holds the ``origin`` too.
 
     Raises:
         SetupError: The folder cannot be written.
@@ -160,44 +153,37 @@ def write_plans(
         for earlier in (*folder.glob("failed_*.png"), folder / RECORDING):
             earlier.unlink(missing_ok=True)
     summary = summarise(plans)
-    write_bytes(folder / "plans.csv", _csv(plans).encode())
-    write_json(folder / "summary.json", {**provenance, **with_null(dataclasses.asdict(summary))})
-    failures = [plan for plan in plans if not plan.solved]
-    write_bytes(folder / "plans.md", _page(summary, failures, task).encode())
+    write_bytes(folder / "plans.csv", csv_text([_COLUMNS, *map(_row, plans)]).encode())
+    write_json(folder / "summary.json", {**origin, **with_null(dataclasses.asdict(summary))})
+    picture = "![Plans: real images above, imagined ones below](plans.png)"
+    failed = "\n".join(f"- {line}" for line in _failed(plans))
+    heading = f"# {task.title}: plans imagined from one frame"
+    text = f"{heading}\n\n{plan_table(summary, task).markdown}\n\n{picture}\n\n{failed}\n"
+    write_bytes(folder / "plans.md", text.encode())
     write_bytes(folder / "plans.png", png(_stack(_varied(plans, filmstrips), task)))
-    for plan in failures[:_SHOWN_FAILURES]:
+    for plan in [plan for plan in plans if not plan.solved][:_SHOWN_FAILURES]:
         write_bytes(folder / f"failed_{plan.number:03d}.png", png(_stack([plan], task)))
     return summary
 
 
-def _page(summary: PlanSummary, failures: Sequence[Plan], task: TaskSpec) -> str:
-    lines = [f"# {task.title}: plans imagined from one frame", "", plan_table(summary, task), ""]
-    lines += ["![Plans: what the camera saw above, what was imagined below](plans.png)", ""]
-    lines += [f"- plan {plan.number} from {plan.start}: {plan.outcome}" for plan in failures]
-    return "\n".join(lines) + "\n"
+def _failed(plans: Sequence[Plan]) -> list[str]:
+    return [f"plan {plan.number} from {plan.start}: {plan.outcome}" for plan in plans if not plan.solved]
 
 
-def _csv(plans: Sequence[Plan]) -> str:
-    rows = [
-        [
-            plan.number, " ".join(map(str, plan.start)), plan.shortest, plan.length, plan.done, int(plan.solved),
-            int(plan.optimal), plan.refused, int(plan.as_imagined.sum()), plan.faults,
-            f"{float(plan.compared.rollout.epistemic.max()):.6g}",
-            " ".join(str(int(action)) for action in plan.compared.rollout.actions),
-        ]
-        for plan in plans
-    ]  # fmt: skip
-    return csv_text([_COLUMNS, *rows])
+def _row(plan: Plan) -> list[object]:
+    """A row of plans.csv."""
+    rollout = plan.compared.rollout
+    start, actions = (" ".join(map(str, each)) for each in (plan.start, rollout.actions.tolist()))
+    counts = [plan.shortest, plan.length, plan.done, int(plan.solved), int(plan.optimal), plan.refused]
+    as_imagined = int(plan.as_imagined.sum())
+    return [plan.number, start, *counts, as_imagined, plan.faults, f"{float(rollout.epistemic.max()):.6g}", actions]
 
 
 def _varied(plans: Sequence[Plan], count: int) -> list[Plan]:
     """The first plan of each length, shortest first, then others in order, up to ``count``."""
-    first: dict[int, Plan] = {}
-    for plan in plans:
-        first.setdefault(plan.length, plan)
-    chosen = list(first.values())[:count]
-    chosen += [plan for plan in plans if plan not in chosen][: count - len(chosen)]
-    return sorted(chosen, key=lambda plan: (plan.length, plan.number))
+    first = {plan.length: plan for plan in reversed(plans)}
+    ranked = sorted(plans, key=lambda plan: first[plan.length] is not plan)
+    return sorted(ranked[:count], key=lambda plan: (plan.length, plan.number))
 
 
 def _stack(plans: Sequence[Plan], task: TaskSpec) -> NDArray[np.uint8]:

@@ -1,32 +1,88 @@
-"""What a report is made of: a page of sections with text, figures and tables; and how its numbers are printed."""
+"""What every report is made of: cells, tables, images, sections and the page; and how numbers are printed."""
 
 from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench import statistics
+from imagine_bench.store.files import csv_text
+
 DASH = "–"  # printed where there is no number; the table's caption says why
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table: a value, its interval in brackets, and a second value to compare it with."""
+
+    text: str
+    interval: str = ""
+    note: str = ""
+
+    def __str__(self) -> str:
+        """The cell in one line, as terminal, Markdown and CSV have it."""
+        value = f"{self.text} {self.interval}".strip()
+        return f"{value}; {self.note}" if self.note else value
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of finished texts; one type for pages, Markdown, CSV and the terminal."""
+
+    name: str  # its id in the page, and the name of its CSV file where it has one
+    header: Sequence[str]  # names of the columns
+    rows: Sequence[Sequence[str | Cell]]  # as many cells each
+    caption: str = ""  # the text below it
+    why_dash: str = ""  # why a cell may hold a dash instead of a number; shown where one does
+    folded: str = ""  # words to unfold it by; empty for a table that is always shown
+    prose: bool = False  # whether its cells hold sentences, which are aligned to the left
+
+    @property
+    def cells(self) -> list[list[Cell]]:
+        """The rows, every cell in full."""
+        return [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in self.rows]
+
+    @property
+    def remark(self) -> str:
+        """The caption, and the meaning of a dash where there is one."""
+        dash = any(cell.text == DASH for row in self.cells for cell in row)
+        return f"{self.caption} {DASH}: {self.why_dash}.".strip() if dash and self.why_dash else self.caption
+
+    @property
+    def text(self) -> str:
+        """The table for a terminal."""
+        return "\n".join(aligned([list(self.header), *([str(cell) for cell in row] for row in self.rows)]))
+
+    @property
+    def csv(self) -> str:
+        """The table as a CSV file."""
+        return csv_text([self.header, *self.rows])
+
+    @property
+    def markdown(self) -> str:
+        """The table as Markdown."""
+        return "\n".join(markdown(self.header, self.rows))
+
+
+@dataclass(frozen=True)
 class Image:
     """An image or figure, drawn when it is first asked for: a table on a terminal needs none."""
 
     name: str  # file name without ending
     draw: Callable[[], tuple[bytes, str]]  # draws ``png`` and ``svg``
-    alt: str  # what a reader who does not see it should know
     caption: str  # the text below it
+    alt: str = ""  # what it shows, for a reader who does not see it
 
     @classmethod
-    def of(cls, png: bytes, *, name: str, alt: str, caption: str) -> Image:
-        """A finished image."""
-        return cls(name=name, draw=lambda: (png, ""), alt=alt, caption=caption)
+    def of(cls, name: str, png: bytes, caption: str) -> Image:
+        """Wrap a finished image."""
+        return cls(name, lambda: (png, ""), caption)
 
     @cached_property
     def _drawn(self) -> tuple[bytes, str]:
@@ -48,47 +104,7 @@ class Image:
         return base64.b64encode(self.png).decode()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """A cell of a table."""
-
-    text: str  # its value
-    interval: str = ""  # an interval, in brackets
-    note: str = ""  # a second value to compare with
-    # names and values of ``data-`` attributes in the page, for whoever reads it by program
-    data: Mapping[str, object] = field(default_factory=dict)
-
-    def __str__(self) -> str:
-        """In one line, as Markdown and CSV have it."""
-        return "; ".join(part for part in (f"{self.text} {self.interval}".strip(), self.note) if part)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """A table of finished texts."""
-
-    name: str  # its id in the page, and the name of its CSV file where it has one
-    header: Sequence[str]  # names of the columns
-    rows: Sequence[Sequence[str | Cell]]  # as many cells each
-    caption: str = ""  # the text below it
-    notes: Sequence[str] = ()  # sentences below that, a line each
-    why_dash: str = ""  # why a cell may hold a dash instead of a number; shown where one does
-    folded: str = ""  # words to unfold it by; empty for a table that is always shown
-    prose: bool = False  # whether its cells hold sentences, which are aligned to the left
-
-    @property
-    def cells(self) -> list[list[Cell]]:
-        """The rows, every cell in full."""
-        return [[cell if isinstance(cell, Cell) else Cell(text=cell) for cell in row] for row in self.rows]
-
-    @property
-    def remark(self) -> str:
-        """The caption, and what a dash means where there is one."""
-        dash = any(cell.text == DASH for row in self.cells for cell in row)
-        return f"{self.caption} {DASH}: {self.why_dash}.".strip() if dash and self.why_dash else self.caption
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Section:
     """A part of a report."""
 
@@ -96,7 +112,7 @@ class Section:
     words: Sequence[str] = ()  # paragraphs
     images: Sequence[Image] = ()  # in their order
     tables: Sequence[Table] = ()  # in their order
-    answers: Sequence[str] = ()  # sentences of it that belong into the short answer at the top
+    answers: Sequence[str] = ()  # its lines of the verdict at the top
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,14 +122,15 @@ class Page:
     title: str  # its heading
     subtitle: str  # preset, execution and the like, in one line
     question: str  # what was asked
-    answers: Sequence[str]  # the short answer, a sentence each
+    answers: Sequence[str]  # the verdict, one line a finding
     sections: Sequence[Section]  # in their order
-    facts: Sequence[tuple[str, str]]  # how it was made: name and value
-    settings: Mapping[str, Sequence[tuple[str, str]]]  # settings of each learner as run, by title: name and value
-    protocol: Sequence[tuple[str, str]]  # the complete protocol: name and value
-    recordings: Sequence[str]  # paths of the recordings, below the bench
     files: Mapping[str, str]  # the CSV files beside the page, by name
+    facts: Sequence[tuple[str, str]] = ()  # how it was made: name and value
+    settings: Mapping[str, Sequence[tuple[str, str]]] = field(default_factory=dict)  # each learner's, by title
+    protocol: Sequence[tuple[str, str]] = ()  # the complete protocol: name and value
+    recordings: Sequence[str] = ()  # paths of the recordings, below the bench
     colors: Mapping[str, str] = field(default_factory=dict)  # colors of the learners, by title
+    summary: str = ""  # the report on a terminal
 
 
 def seconds(value: float) -> str:
@@ -121,18 +138,59 @@ def seconds(value: float) -> str:
     return DASH if math.isnan(value) else f"{value:,.1f}"
 
 
+def count(value: float) -> str:
+    """``1,234``; not a number as a dash."""
+    return DASH if math.isnan(value) else f"{value:,.0f}"
+
+
+def decimals(value: float) -> str:
+    """``2.36``; not a number as a dash."""
+    return DASH if math.isnan(value) else f"{value:.2f}"
+
+
 def number(value: float, digits: int = 3) -> str:
     """A number with so many significant digits from 1 on, and so many decimals below; not a number as a dash.
 
     In powers of ten from 100,000 on, and where those decimals would show nothing.
     """
-    if not math.isfinite(value):
-        return DASH if math.isnan(value) else "\u221e".rjust(1 + (value < 0), "\u2212")
+    if math.isnan(value):
+        return DASH
+    if math.isinf(value):
+        return "∞" if value > 0 else "\u2212∞"
     if value and (abs(value) >= 10**5 or abs(value) < 10.0**-digits):
         return f"{value:.{digits - 1}e}".replace("-", "\u2212")
     rounded = float(f"{abs(value):.{digits - 1}e}")  # 9.999 is printed as 10.0
     whole = len(str(int(rounded))) if rounded >= 1 else 0
     return f"{value:.{max(0, digits - whole)}f}".replace("-", "\u2212")
+
+
+def percent(share: float) -> str:
+    """A share as a percentage with one decimal: ``0.6125`` as ``61.3``; not a number as a dash."""
+    return DASH if math.isnan(share) else f"{100.0 * share:.1f}"
+
+
+def signed_percent(share: float) -> str:
+    """Like :func:`percent` with a sign, the minus a true one."""
+    return DASH if math.isnan(share) else f"{100.0 * share:+.1f}".replace("-", "\u2212")
+
+
+def p_value(p: float) -> str:
+    """``p = 0.012``."""
+    return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
+
+
+def estimate(found: statistics.Estimate, words: Callable[[float], str] = percent, note: str = "") -> Cell:
+    """``61.3`` with ``[55.0, 67.2]``, or without the brackets where there is no interval."""
+    interval = "" if math.isnan(found.low) else f"[{words(found.low)}, {words(found.high)}]"
+    return Cell(words(found.value), interval, note)
+
+
+def mean_text(values: Sequence[float], words: Callable[[float], str] = percent) -> str:
+    """Mean of a few runs with its 95 % interval; of one run the value alone, and a dash where one has none (NaN)."""
+    if any(math.isnan(value) for value in values):
+        return DASH
+    low, high = statistics.interval(values, trim=0.0, share=words is percent)
+    return str(estimate(statistics.Estimate(float(np.mean(values)), low, high), words))
 
 
 def mean_std(values: Sequence[float] | NDArray[np.float64]) -> str:
@@ -141,3 +199,20 @@ def mean_std(values: Sequence[float] | NDArray[np.float64]) -> str:
     if math.isnan(mean):
         return DASH
     return f"{mean:.2f}" if len(values) < 2 else f"{mean:.2f} ({np.std(values, ddof=1):.2f})"
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """The lines of a table in Markdown."""
+    first, *others = (f"| {' | '.join(map(str, row))} |" for row in (head, *rows))
+    return [first, f"|{'---|' * len(head)}", *others]
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Columns padded to the width of their widest cell, the first to the left and the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)]
+        cells[0] = row[0].ljust(widths[0])
+        lines.append("  ".join(cells).rstrip())
+    return [lines[0], "-" * max(map(len, lines)), *lines[1:]]

@@ -13,12 +13,14 @@ import gymnasium
 import numpy as np
 import pytest
 from forger import FORGERIES
+from report_pages import without_images
 from small_runs import Inline, context, do, small
 
 from imagine_bench.audit.verify import Replays, _verify_test, price, verdicts, verify
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import protocol
-from imagine_bench.report.page import report_page, texts
+from imagine_bench.report import bench_page
+from imagine_bench.report.page import texts
 from imagine_bench.running.bench import bench
 from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode, replay
 from imagine_bench.running.run_state import environments
@@ -32,7 +34,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     wanted = small(agents=("table", "random"), evaluation_episodes=8)
     result = bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
     (result.folder / "report").mkdir()
-    for name, text in texts(report_page(result)).items():  # type: ignore[arg-type] # without images, which are slow
+    for name, text in texts(without_images(bench_page(result))).items():  # type: ignore[arg-type]
         (result.folder / "report" / name).write_text(text)
     return result.folder
 

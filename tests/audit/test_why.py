@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from report_pages import without_images
 from small_runs import Inline, small
 
 from imagine_bench import registry
@@ -15,8 +16,9 @@ from imagine_bench.audit.verify import verify
 from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
-from imagine_bench.report.page import report_page, texts
-from imagine_bench.report.sections.causes import causes_table, read_failures
+from imagine_bench.report import bench_page
+from imagine_bench.report.exact import causes_table, read_failures
+from imagine_bench.report.page import texts
 from imagine_bench.rules import states_of
 from imagine_bench.running.bench import bench
 from imagine_bench.running.task_types import load_bench
@@ -30,7 +32,7 @@ SPEC = registry.task("arrow_puzzle")
 
 def write_texts(result: BenchResult) -> None:
     """A report without images, which are slow to draw."""
-    for name, text in texts(report_page(result)).items():
+    for name, text in texts(without_images(bench_page(result))).items():
         write_bytes(make_folder(result.folder / "report") / name, text.encode())
 
 

@@ -19,7 +19,7 @@ from small_runs import Inline
 from imagine_bench import registry, rules
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.report.page import summary_table
+from imagine_bench.report import summary_table
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.trained import learners, load_trained
 from imagine_bench.store import encoders
@@ -105,8 +105,9 @@ def test_results_are_read_without_the_package(guest: Path, tmp_path: Path, capsy
     for folder in (kept, result.folder):
         assert main(["report", str(folder)]) == 0
         said = capsys.readouterr().out
-        assert "Not installed here: task lights_out. Not shown therefore: areas, imagined futures" in said
-        assert re.search(r"^5 +36.7 .*100.0 .* 100.0$", said, re.MULTILINE), "the bench keeps chance and optimum"
+        assert "Not installed here: task lights_out." in said
+        assert re.search(r"^chance level +36.7$", said, re.MULTILINE), "the bench keeps chance and optimum"
+        assert re.search(r"^optimum +100.0$", said, re.MULTILINE)
         assert "nan" not in (folder / "report" / "report.md").read_text()
     assert main(["report", "--task", "lights_out", "--out", str(tmp_path)]) == 2
     assert main(["bench", "--task", "lights_out"]) == 2

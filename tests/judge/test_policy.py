@@ -22,7 +22,7 @@ from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.judge.policy import Terminations, optimal_length, terminations
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.data import collect
-from imagine_bench.report.sections.policy import followed, policies
+from imagine_bench.report.exact import policies
 from imagine_bench.rules import fewest_actions, greedy, states_of
 from imagine_bench.running import bench as benches
 from imagine_bench.running.trained import learners, load_trained
@@ -183,7 +183,8 @@ def test_a_report_follows_what_was_held_from_every_start(tmp_path: Path) -> None
 
     runs = [holding(run, astray if (run.agent, run.seed) == ("imaginer", 1) else optimal) for run in result.runs]
     data = collect(dataclasses.replace(result, runs=tuple(runs)))
-    section = policies(data, followed(data))
+    section = policies(data)
+    assert section is not None
     whole, by_length, missed = section.tables
     bad = ends_of(HARD, other_way)
     assert "from all 66 starts" in whole.caption and whole.header[-1] == "macro-actions (optimal: 3.27)"
@@ -194,10 +195,11 @@ def test_a_report_follows_what_was_held_from_every_start(tmp_path: Path) -> None
     assert f"{(bad.success < 1).sum()} starts are not always solved" in missed.caption and len(missed.rows) == 12
     assert all(row[2:] == ["100.0", "50.0"] for row in missed.rows)
     alone = dataclasses.replace(result, runs=tuple(holding(run, optimal) for run in result.runs))
-    assert len(policies(collect(alone), followed(collect(alone))).tables) == 2, "none is missed"
+    section = policies(collect(alone))
+    assert section is not None and len(section.tables) == 2, "none is missed"
     rows = [tuple(dataclasses.replace(row, beliefs=None) for row in run.checkpoints) for run in result.runs]
     runs = [dataclasses.replace(run, checkpoints=row) for run, row in zip(result.runs, rows, strict=True)]
-    assert followed(collect(dataclasses.replace(result, runs=tuple(runs)))) == {}
+    assert policies(collect(dataclasses.replace(result, runs=tuple(runs)))) is None
 
 
 def test_starts_of_tests_alone_are_followed() -> None:

@@ -1,85 +1,72 @@
-"""Reports: the same numbers in page, Markdown, tables and terminal; self-contained; honest whichever way they fall."""
+"""A bench's report: its tables are its CSV files, its verdict follows the corrected p-values, its page stands alone."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
 import html
-import math
+import io
 import re
-from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_results import bench_result, compared_rollout
+from fake_results import LEVELS, bench_result
+from report_pages import addresses, check_texts, narrowest_px, read_tables, without_images
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.judge import filmstrips
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry import AGENTS, AgentEntry
-from imagine_bench.report import figures, summary_table, write_report
-from imagine_bench.report import text as words
-from imagine_bench.report.data import collect
-from imagine_bench.report.sections.imagination import encoder_views
-from imagine_bench.report.sections.success import gain
-from imagine_bench.report.text import percent, signed_percent
+from imagine_bench.report import bench_page, figures, write_report
+from imagine_bench.report.bench import verdict
+from imagine_bench.report.data import ReportData, agent_title, collect
+from imagine_bench.report.imagination import encoder_readers
+from imagine_bench.report.page import markdown_code, markdown_text, texts
+from imagine_bench.report.tables import DASH, Cell, Page, Table, percent, signed_percent
 from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import BenchResult
 
-
-class Cells(HTMLParser):
-    """Every table cell with data attributes, its text; and every address the page would load."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.cells: list[tuple[dict[str, str | None], str]] = []
-        self.addresses: list[str] = []
-        self._open: dict[str, str | None] | None = None
-        self._text = ""
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        found = dict(attrs)
-        self.addresses += [str(value) for name, value in attrs if name in {"src", "href", "xlink:href", "data"}]
-        if tag == "td":
-            self._open, self._text = found, ""
-
-    def handle_data(self, data: str) -> None:
-        self._text += data
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag == "td" and self._open is not None:
-            self.cells.append((self._open, self._text.strip()))
-            self._open = None
+WIDE = Protocol(task="arrow_puzzle", preset="thesis", budgets=(250, 2000, 6000), seeds=(0, 1, 7))
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
-    protocol = Protocol(task="arrow_puzzle", preset="thesis", budgets=(250, 2000, 6000), seeds=(0, 1, 7))
-    return bench_result(tmp_path_factory.mktemp("bench"), protocol=protocol)
+    return bench_result(tmp_path_factory.mktemp("bench"), protocol=WIDE)
+
+
+@pytest.fixture(scope="module")
+def page(result: BenchResult) -> Page:
+    return bench_page(result)
 
 
 @pytest.fixture(scope="module")
 def folder(result: BenchResult) -> Path:
+    """The report, written with all its figures."""
     return write_report(result).parent
 
 
-@pytest.fixture(scope="module")
-def page(folder: Path) -> Cells:
-    parser = Cells()
-    parser.feed((folder / "index.html").read_text(encoding="utf-8"))
-    return parser
+def text_of(page: Page) -> dict[str, str]:
+    """The texts of a page, without its figures."""
+    return texts(without_images(page))
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+def table(page: Page, name: str) -> Table:
+    """A table of a page."""
+    (found,) = (each for section in page.sections for each in section.tables if each.name == name)
+    return found
 
 
-def test_results_csv_is_the_result(result: BenchResult, folder: Path) -> None:
-    found = rows(folder / "results.csv")
+def records(page: Page, name: str) -> list[dict[str, str]]:
+    """A CSV file of a page."""
+    return list(csv.DictReader(io.StringIO(page.files[name])))
+
+
+# The same numbers everywhere ---------------------------------------------------------------------------------------
+
+
+def test_results_csv_is_the_result(result: BenchResult, page: Page) -> None:
+    found = records(page, "results.csv")
     assert len(found) == sum(len(run.checkpoints) for run in result.runs)
     for row in found:
         (run,) = (run for run in result.runs if (run.agent, str(run.seed)) == (row["agent"], row["seed"]))
@@ -89,30 +76,45 @@ def test_results_csv_is_the_result(result: BenchResult, folder: Path) -> None:
         for name in ("success_rate", "mean_return", "mean_length", "train_cpu_s", "eval_cpu_s"):
             assert float(row[name]) == getattr(checkpoint, name)
         assert float(row["wilson_low"]) <= checkpoint.success_rate <= float(row["wilson_high"])
-        for name, value in checkpoint.diagnostics.items():
-            assert float(row[name]) == value
+        assert {name: float(row[name]) for name in checkpoint.diagnostics} == checkpoint.diagnostics
 
 
-def test_every_seed_in_the_page_is_the_one_in_the_csv(folder: Path, page: Cells) -> None:
-    shown = {
-        (data["data-agent"], data["data-seed"], data["data-episodes"]): text
-        for data, text in page.cells
-        if "data-seed" in data
-    }
-    expected = {
-        (row["agent"], row["seed"], row["episodes"]): percent(float(row["success_rate"]))
-        for row in rows(folder / "results.csv")
-    }
-    assert shown == expected
-    assert len(set(shown.values())) > 10  # not all alike, so that a mix-up would show
+@pytest.mark.parametrize(
+    ("name", "columns", "words"),
+    [
+        ("scores", ("success_iqm", "low_95", "high_95"), percent),
+        ("differences", ("difference_to_dqn", "difference_low_95", "difference_high_95"), signed_percent),
+        ("gains", ("gain", "gain_low_95", "gain_high_95"), signed_percent),
+        ("areas", ("area", "area_low_95", "area_high_95"), percent),
+    ],
+)
+def test_tables_show_the_columns_of_the_summary(page: Page, name: str, columns: tuple[str, ...], words) -> None:
+    summary = {(agent_title(row["agent"]), row["episodes"]): row for row in records(page, "summary.csv")}
+    found = table(page, name)
+    checked = 0
+    for title, *cells in found.cells:
+        for budget, cell in zip(found.header[1:], cells, strict=True):
+            row = summary.get((title.text, budget.replace(",", "")))
+            if row is not None:
+                value, low, high = (words(float(row[column])) for column in columns)
+                assert (cell.text, cell.interval) == (value, f"[{low}, {high}]")
+                checked += 1
+    assert checked == sum(row[columns[0]] != "" for row in summary.values()) > 5
 
 
-def test_open_loop_csv_has_every_depth_of_every_budget(result: BenchResult, folder: Path) -> None:
-    found = rows(folder / "open_loop.csv")
+def test_every_seed_is_the_one_of_the_csv(result: BenchResult, page: Page) -> None:
+    shares = {}
+    for row in records(page, "results.csv"):
+        shares.setdefault((agent_title(row["agent"]), row["seed"]), []).append(percent(float(row["success_rate"])))
+    assert {(row[0], row[1]): row[2:] for row in table(page, "seeds").rows} == shares
+    assert len({cell for row in shares.values() for cell in row}) > 10, "a mix-up would show"
+
+
+def test_open_loop_csv_has_every_depth_of_every_budget(result: BenchResult, page: Page) -> None:
+    found = records(page, "open_loop.csv")
     loops = {
         (run.agent, str(run.seed), str(point.episodes)): point.open_loop
-        for run in result.runs
-        for point in run.checkpoints
+        for run, point in result.rows
         if point.open_loop is not None
     }
     assert loops and len(found) == sum(len(loop.count) for loop in loops.values())
@@ -122,179 +124,28 @@ def test_open_loop_csv_has_every_depth_of_every_budget(result: BenchResult, fold
         assert float(row["correct"]) == loop.correct[index]
 
 
-def test_scores_in_the_page_are_those_in_the_summary(folder: Path, page: Cells) -> None:
-    expected = {
-        (row["agent"], row["episodes"]): [percent(float(row[name])) for name in ("success_iqm", "low_95", "high_95")]
-        for row in rows(folder / "summary.csv")
-    }
-    shown = {
-        (data["data-agent"], data["data-episodes"]): re.findall(r"\d+\.\d", text)[:3]
-        for data, text in page.cells
-        if "data-episodes" in data and "data-seed" not in data
-    }
-    assert shown == expected
-
-
-def test_differences_and_gains_are_those_in_the_summary(folder: Path, page: Cells) -> None:
-    checked = 0
-    for row in rows(folder / "summary.csv"):
-        for kind, attribute in (("difference_to_dqn", "data-difference"), ("gain", "data-gain")):
-            if not row[kind]:
-                continue
-            stem = kind.removesuffix("_to_dqn")
-            numbers = [signed_percent(float(row[name])) for name in (kind, f"{stem}_low_95", f"{stem}_high_95")]
-            (text,) = (
-                text
-                for data, text in page.cells
-                if data.get("data-agent") == row["agent"] and data.get(attribute) == row["episodes"]
-            )
-            assert re.findall("[+\u2212]\\d+\\.\\d", text)[:3] == numbers
-            checked += 1
-    assert checked == 2 * 2 * 3
-
-
-def test_the_gain_s_plot_draws_the_table_and_the_thesis(result: BenchResult, folder: Path, tmp_path: Path) -> None:
-    data = collect(result)
-    assert set(data.thesis_gains) == {"imagination", "imagination_uncertainty"} < set(result.protocol.agents)
-    drawn = [list(zip(*line.get_data(), strict=True)) for line in figures.gain_figure(data).axes[0].get_lines()]
-    for agent, printed in data.thesis_gains.items():
-        assert [(budget, 100.0 * gain) for budget, gain in printed.items()] in drawn
-        assert [(budget, 100.0 * row.gain.value) for budget, row in data.comparisons[agent].items()] in drawn
-    assert (folder / "gain.png").is_file() and "](gain.png)" in (folder / "report.md").read_text(encoding="utf-8")
-    without = Protocol(task="arrow_puzzle", preset="thesis", agents=("imagination",), budgets=(2000,), seeds=(0,))
-    assert not (write_report(bench_result(tmp_path, protocol=without)).parent / "gain.png").exists()
-
-
-def test_areas_agree_in_page_summary_and_markdown(folder: Path, page: Cells) -> None:
-    summary = {(row["agent"], row["episodes"]): row for row in rows(folder / "summary.csv") if row["area"]}
-    shown = {
-        (data["data-agent"], data["data-area"]): re.findall(r"\d+\.\d", text)
-        for data, text in page.cells
-        if "data-area" in data
-    }
-    assert {agent for agent, _ in shown} == {"dqn", "imagination", "imagination_uncertainty"}
-    assert shown == {
-        key: [percent(float(row[name])) for name in ("area", "area_low_95", "area_high_95")]
-        for key, row in summary.items()
-    }
-    markdown = (folder / "report.md").read_text(encoding="utf-8")
-    for value, low, high in shown.values():
-        assert f"{value} [{low}, {high}]" in markdown
-
-
-def test_areas_that_are_alike_are_not_ranked(result: BenchResult) -> None:
-    data = collect(result)
-    one = data.areas["dqn"]
-    assert re.search(r"highest for “.*” \(.*\); next is “", " ".join(words.answers(data)))
-    tied = dataclasses.replace(data, areas={"dqn": one, "imagination": one, "imagination_uncertainty": one})
-    alike = r"highest for “DQN” \([^)]*\), “imagination” \([^)]*\) and “imagination \+ uncertainty” \([^)]*\) alike\."
-    assert re.search(alike, " ".join(words.answers(tied)))
-
-
-def test_the_thesis_stands_beside_ours(folder: Path, page: Cells) -> None:
-    by_cell = {
-        (data["data-agent"], data["data-episodes"]): text
-        for data, text in page.cells
-        if "data-episodes" in data and "data-seed" not in data
-    }
-    assert "thesis 42.2 (6.0)" in by_cell["dqn", "2000"]
-    assert "thesis 97.0 (2.1)" in by_cell["imagination_uncertainty", "6000"]
-    assert "thesis" not in by_cell["dqn", "250"] + by_cell["oracle", "2000"]
-    text = " ".join(text for _, text in page.cells)
+def test_the_thesis_stands_beside_ours(page: Page) -> None:
+    notes = {row[0].text: [cell.note for cell in row[1:]] for row in table(page, "scores").cells}
+    assert notes["DQN"] == ["", "thesis 42.2 (6.0)", "thesis 92.2 (2.6)"]
+    assert notes["imagination + uncertainty"][2] == "thesis 97.0 (2.1)" and not any(notes["oracle"])
+    shown = " ".join(str(cell) for name in ("scores", "thesis") for row in table(page, name).cells for cell in row)
     for agent in ("dqn", "imagination", "imagination_uncertainty"):
-        for mean, _ in reference.success("arrow_puzzle", agent).values():
-            assert percent(mean) in text
-    assert "thesis +47.4" in text
-    summary = {(row["agent"], row["episodes"]): row for row in rows(folder / "summary.csv")}
-    assert float(summary["dqn", "2000"]["thesis_mean"]) == pytest.approx(0.4218)
+        assert all(percent(mean) in shown for mean, _ in reference.success("arrow_puzzle", agent).values())
+    assert "thesis +47.4" in [cell.note for row in table(page, "gains").cells for cell in row]
 
 
-def test_titles_are_those_of_the_registry_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert words.agent_words("dqn").title == "DQN"
-    monkeypatch.setitem(AGENTS, "my_agent", AgentEntry(make="x:make"))
-    assert words.agent_words("my_agent") == words.AgentWords("my agent", "A registered agent.")
-    monkeypatch.setitem(AGENTS, "my_agent", AgentEntry(make="x:make", title="Mine", description="Learns."))
-    assert words.agent_words("my_agent") == words.AgentWords("Mine", "Learns.")
-    assert words.agent_words("of_another_time").title == "of another time"
+def test_the_terminal_has_the_scores_and_the_verdict(result: BenchResult, page: Page) -> None:
+    lines = page.summary.splitlines()
+    (line,) = (line for line in lines if line.startswith("DQN ") and "[" in line)
+    for share in result.success_rates("dqn").mean(axis=0):
+        assert percent(share) in line
+    assert lines[-len(page.answers) :] == list(page.answers)
+    assert not any(line != line.rstrip() for line in lines)
+    chance = next(line for line in lines if line.startswith("chance level"))
+    assert chance.split()[2:] == ["4.6"] * 3
 
 
-def test_markdown_agrees_with_the_tables(result: BenchResult, folder: Path) -> None:
-    markdown = (folder / "report.md").read_text(encoding="utf-8")
-    table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in markdown.splitlines() if line.startswith("|")]
-    titles = {agent: words.agent_words(agent).title for agent in result.protocol.agents}
-    seeds = {(row[0], row[1]): row[2:] for row in table if len(row) == 5 and row[1].isdigit()}
-    for agent, title in titles.items():
-        for index, seed in enumerate(result.protocol.seeds):
-            assert seeds[title, str(seed)] == [percent(share) for share in result.success_rates(agent)[index]]
-    header = next(row for row in table if row[0] == "solved (%) after")
-    first = table.index(header)
-    scores = {row[0]: dict(zip(header, row, strict=True)) for row in table[first : first + 2 + len(titles)]}
-    for row in rows(folder / "summary.csv"):
-        cell = scores[titles[row["agent"]]][f"{int(row['episodes']):,}"]
-        assert cell.startswith(percent(float(row["success_iqm"])))
-    for picture in re.findall(r"!\[.*?\]\((.*?)\)", markdown):
-        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_page_loads_nothing(page: Cells, folder: Path) -> None:
-    for address in page.addresses:
-        assert address.startswith(("data:image/png;base64,", "#")) or (folder / address).is_file(), address[:80]
-    assert any(address.startswith("data:") for address in page.addresses)
-    text = (folder / "index.html").read_text(encoding="utf-8")
-    assert not re.search(r"@import|url\((?!#)|<script|<link", text)
-
-
-def test_text_from_outside_is_escaped(folder: Path) -> None:
-    text = (folder / "index.html").read_text(encoding="utf-8")
-    assert "a <processor>" not in text
-    assert html.escape("a <processor> & more") in text
-
-
-def test_how_it_was_made_is_complete(result: BenchResult, folder: Path) -> None:
-    text = (folder / "index.html").read_text(encoding="utf-8")
-    command = str(result.environment["command"])
-    for fact in (command, result.protocol.hash, "3.17.0", f"git checkout 0123456789ab &amp;&amp; {command}"):
-        assert fact in text
-
-
-def test_plots_take_the_pages_color_and_do_not_share_ids(folder: Path) -> None:
-    text = (folder / "index.html").read_text(encoding="utf-8")
-    assert text.count("<svg") == 5  # success, ladder, gain, acceptance, open loop
-    assert "currentColor" in text
-    assert "#2b2b2f" not in text
-    ids = re.findall(r'\bid="([^"]+)"', text)
-    assert len(ids) == len(set(ids))
-
-
-def test_writing_again_gives_the_same_files(result: BenchResult, folder: Path) -> None:
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    write_report(result)
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_missing_and_doubled_runs_are_refused(result: BenchResult) -> None:
-    with pytest.raises(ArtefactError, match=r"missing: \[\('imagination_uncertainty', 7\)\]"):
-        dataclasses.replace(result, runs=result.runs[:-1])
-    with pytest.raises(ArtefactError, match="holds 16"):
-        dataclasses.replace(result, runs=(*result.runs, result.runs[0]))
-
-
-def test_one_seed_gets_an_interval_over_episodes_and_no_verdict(tmp_path: Path) -> None:
-    result = bench_result(
-        tmp_path, protocol=Protocol(task="arrow_puzzle", preset="smoke", seeds=(0,), budgets=(10, 20))
-    )
-    data = collect(result)
-    assert all(score.over == "episodes" for scores in data.scores.values() for score in scores.values())
-    assert all(math.isnan(row.gain.low) for budgets in data.comparisons.values() for row in budgets.values())
-    assert "one seed says nothing about how much of that is luck" in " ".join(words.answers(data))
-    write_report(result)
-
-
-def test_agents_alone_and_without_imagination(tmp_path: Path) -> None:
-    protocol = Protocol(task="arrow_puzzle_hard", preset="quick", agents=("random", "oracle"), budgets=(5,))
-    page = write_report(bench_result(tmp_path, protocol=protocol)).read_text(encoding="utf-8")
-    assert "needs dqn and an imagining agent side by side" in page
-    assert page.count("<svg") == 1
+# The verdict -------------------------------------------------------------------------------------------------------
 
 
 def shifted(result: BenchResult, agent: str, shares: list[int]) -> BenchResult:
@@ -312,67 +163,106 @@ def shifted(result: BenchResult, agent: str, shares: list[int]) -> BenchResult:
 @pytest.mark.parametrize(
     ("successes", "sentence"),
     [
-        ([150, 152, 154], "corrected): at this budget it is ahead."),
-        ([50, 52, 54], "corrected): at this budget it is behind."),
-        ([80, 100, 140], "corrected): at this budget no difference is shown."),
+        ([150, 152, 154], "better after 250, 2,000, 6,000 real episodes (3 budgets)"),
+        ([50, 52, 54], "worse after 250, 2,000, 6,000 real episodes (3 budgets)"),
+        ([80, 100, 140], "no difference is shown (3 budgets)"),
     ],
 )
-def test_the_answer_says_which_way_it_went(result: BenchResult, successes: list[int], sentence: str) -> None:
+def test_the_verdict_says_which_way_it_went(result: BenchResult, successes: list[int], sentence: str) -> None:
     changed = shifted(shifted(result, "dqn", [100, 102, 104]), "imagination", successes)
-    answers = words.answers(collect(changed))
-    (verdict,) = (answer for answer in answers if answer.startswith("“imagination” "))
-    assert sentence in verdict
-    difference = signed_percent((sum(successes) / 3 - 102) / 200).lstrip("+\u2212")
-    assert f"{difference} percentage points" in verdict
+    (line,) = (line for line in verdict(collect(changed)) if line.startswith("“imagination” "))
+    assert sentence in line
+    assert f"difference {signed_percent((sum(successes) / 3 - 102) / 200)} [" in line
 
 
-def test_summary_table_for_the_terminal(result: BenchResult) -> None:
-    lines = summary_table(result).splitlines()
-    (at_2000,) = (line for line in lines if line.startswith("2,000"))
-    assert at_2000.split()[1] == "4.6"
-    assert at_2000.split()[-1] == "100.0"
-    for agent in result.protocol.agents:
-        assert percent(np.mean(result.success_rates(agent)[:, 1])) in at_2000
-    thesis = lines[lines.index(at_2000) + 1]
-    assert thesis.split() == ["thesis", "42.2", "(6.0)", "57.3", "(6.4)", "62.2", "(4.4)"]
-    assert not any(line != line.rstrip() for line in lines)
+def test_the_verdict_takes_the_budget_of_the_smallest_corrected_p(result: BenchResult) -> None:
+    data = collect(result)
+    rows = data.comparisons["imagination_uncertainty"]
+    best = min(rows, key=lambda budget: rows[budget].p_adjusted)
+    (line,) = (line for line in verdict(data) if line.startswith("“imagination + uncertainty” "))
+    assert f"after {best:,} episodes {percent(data.scores['imagination_uncertainty'][best].success.value)} %" in line
 
 
-def test_every_encoder_stands_with_those_who_see_through_it(result: BenchResult) -> None:
-    both = dataclasses.replace(
-        result.protocol, agents=("random", "dqn", "factored:given"), encoder="a@0123456789ab", codes="b@0123456789ab"
-    )
-    views = encoder_views(SimpleNamespace(protocol=both))  # type: ignore[arg-type]
-    assert [(view.identity, view.agents) for view in views] == [
-        ("a@0123456789ab", ("dqn",)), ("b@0123456789ab", ("factored:given",)),
+def test_a_difference_is_shown_only_after_holms_correction(result: BenchResult) -> None:
+    changed = shifted(shifted(result, "dqn", [90, 100, 110]), "imagination", [116, 126, 136])
+    data = collect(changed)
+    one = data.comparisons["imagination"][2000]
+    cells = len(data.budgets) * len(data.comparisons)
+    assert one.difference.p < 0.05 < one.p_adjusted <= cells * one.difference.p and one.shown == 0
+    sizes = [each.detectable for rows in data.comparisons.values() for each in rows.values()]
+    caption = table(bench_page(changed), "differences").caption
+    assert f"{percent(min(sizes))} to {percent(max(sizes))} points" in caption and f"for {cells} cells" in caption
+
+
+def test_a_p_value_of_just_5_percent_shows_no_difference(result: BenchResult) -> None:
+    one = collect(result).comparisons["imagination"][2000]
+    for value in (0.2, -0.2):
+        difference = Estimate(value, value - 0.1, value + 0.1)
+        assert dataclasses.replace(one, difference=difference, p_adjusted=1.0 - statistics.LEVEL).shown == 0
+        assert dataclasses.replace(one, difference=difference, p_adjusted=0.049).shown == np.sign(value)
+
+
+def test_one_seed_gets_an_interval_over_episodes_and_no_verdict(tmp_path: Path) -> None:
+    protocol = Protocol(task="arrow_puzzle", preset="smoke", seeds=(0,), budgets=(10, 20))
+    page = bench_page(bench_result(tmp_path, protocol=protocol))
+    assert {row["interval_over"] for row in records(page, "summary.csv")} == {"episodes"}
+    assert all(row["gain_low_95"] in ("", "nan") for row in records(page, "summary.csv"))
+    assert all(line.endswith("One seed does not show which is better.") for line in page.answers)
+    check_texts(text_of(page))
+
+
+def test_agents_that_do_not_learn_are_not_compared(tmp_path: Path) -> None:
+    protocol = Protocol(task="arrow_puzzle_hard", preset="quick", agents=("random", "oracle"), budgets=(5,))
+    page = bench_page(bench_result(tmp_path, protocol=protocol))
+    assert page.answers == ["Nothing is compared: that needs dqn and another learner side by side."]
+    assert [section.title for section in page.sections] == [
+        "What was compared", "Success against real experience", "What it cost, and what went wrong",
     ]  # fmt: skip
 
 
-def test_a_difference_is_shown_only_after_holm_s_correction(result: BenchResult) -> None:
-    """The same difference counts less among more comparisons, and what could have been shown stands below the table."""
-    changed = shifted(shifted(result, "dqn", [90, 100, 110]), "imagination", [116, 126, 136])
-    data = collect(changed)
-    one, budgets = data.comparisons["imagination"][2000], len(data.budgets)
-    assert (
-        one.difference.p < 0.05 < one.p_adjusted <= budgets * len(data.comparisons) * one.difference.p
-        and one.shown == 0
-    )
-    assert "no difference is shown" in "".join(words.answers(data))
-    said = words.detectable_words(data.comparisons)
-    sizes = [each.detectable for by_budget in data.comparisons.values() for each in by_budget.values()]
-    assert f"{percent(min(sizes))} to {percent(max(sizes))} points" in said
-    assert f"all {len(sizes)} comparisons" in said
-    assert said in " ".join(table.caption for table in gain(data).tables)
+def test_missing_and_doubled_runs_are_refused(result: BenchResult) -> None:
+    with pytest.raises(ArtefactError, match=r"missing: \[\('imagination_uncertainty', 7\)\]"):
+        dataclasses.replace(result, runs=result.runs[:-1])
+    with pytest.raises(ArtefactError, match="holds 16"):
+        dataclasses.replace(result, runs=(*result.runs, result.runs[0]))
 
 
-def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(result: BenchResult) -> None:
-    data = collect(result)
-    loop = data.open_loop["imagination"]
-    none = dataclasses.replace(loop, aleatoric=np.zeros_like(loop.aleatoric))
-    panels = figures.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": loop})).axes
-    fewer = figures.open_loop_figure(dataclasses.replace(data, open_loop={"imagination": none})).axes
-    assert len(panels[3].lines) == len(fewer[3].lines) + 1
-    assert panels[3].get_yscale() == fewer[3].get_yscale() == "log"
+# The page ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_loads_nothing_and_its_figures_share_no_ids(folder: Path) -> None:
+    text = (folder / "index.html").read_text(encoding="utf-8")
+    found = addresses(text)
+    for address in found:
+        assert address.startswith(("data:image/png;base64,", "#")) or (folder / address).is_file(), address[:80]
+    assert any(address.startswith("data:") for address in found)
+    assert not re.search(r"@import|url\((?!#)|<script|<link", text)
+    assert text.count("<svg") == 5  # success, gain, acceptance, open loop, ladder
+    assert "currentColor" in text and figures.INK not in text
+    ids = re.findall(r'\bid="([^"]+)"', text)
+    assert len(ids) == len(set(ids))
+
+
+def test_the_report_can_be_read_and_holds_every_figure(folder: Path) -> None:
+    written = {path.name: path.read_text(encoding="utf-8") for path in folder.iterdir() if path.suffix != ".png"}
+    check_texts(written)
+    for picture in re.findall(r"!\[.*?\]\((.*?)\)", written["report.md"]):
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+
+
+def test_how_it_was_made_is_complete_and_escaped(result: BenchResult, page: Page) -> None:
+    text = text_of(page)["index.html"]
+    command = str(result.environment["command"])
+    for fact in (command, result.protocol.hash, "3.17.0", f"git checkout 0123456789ab &amp;&amp; {command}"):
+        assert fact in text
+    assert "a <processor>" not in text and html.escape("a <processor> & more") in text
+
+
+def test_the_same_result_gives_the_same_page(result: BenchResult, page: Page) -> None:
+    again = bench_page(result)
+    assert text_of(again) == text_of(page)
+    first, second = (next(each for section in one.sections for each in section.images) for one in (page, again))
+    assert (first.png, first.svg) == (second.png, second.svg)
 
 
 def test_unwritable_folder_is_one_sentence(result: BenchResult, tmp_path: Path) -> None:
@@ -381,41 +271,50 @@ def test_unwritable_folder_is_one_sentence(result: BenchResult, tmp_path: Path) 
         write_report(dataclasses.replace(result, folder=tmp_path / "file"))
 
 
-def test_strip_marks_cut_error_and_end() -> None:
-    names = tuple(f"turn cube {index}" for index in range(6))
-    cut, whole = (filmstrips.filmstrip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None))
-    assert cut.shape == whole.shape
-    assert (cut == filmstrips._CUT).all(axis=2).sum() > 500  # the line
-    assert not (whole == filmstrips._CUT).all(axis=2).any()
-    for color in (filmstrips.RIGHT, filmstrips.WRONG):
-        assert (whole == color).all(axis=2).sum() > 500  # frames in both colors
-    narrow = filmstrips.filmstrip(compared_rollout(np.random.default_rng(0)), names, columns=2)
-    assert narrow.shape[1] < whole.shape[1]
+def test_the_widest_report_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    others = ("tabular_long_name", "imagination_only_uncertainty", "factored:given")
+    for agent in others:
+        monkeypatch.setitem(LEVELS, agent, (0.1, 0.9))
+    agents = (*(name for name in LEVELS if name not in others), *others)
+    budgets = (20, 40, 60, 80, 100, 250, 500, 1000, 2000, 6000)
+    protocol = dataclasses.replace(WIDE, agents=tuple(a for a in agents if a in AGENTS), budgets=budgets)
+    written = text_of(bench_page(bench_result(tmp_path, protocol=protocol)))
+    check_texts(written)
+    widest = max(read_tables(written["index.html"]), key=lambda found: len(found[0]))
+    assert len(widest[0]) == 12 and narrowest_px(widest) > 700  # ten budgets, a name and a seed: not vacuous
 
 
-def test_real_frames_are_shown_unaltered_and_upright() -> None:
-    compared = compared_rollout(np.random.default_rng(0), cut=None)
-    strip = filmstrips.filmstrip(compared, tuple("abcdef"))
-    left, top = filmstrips.left_px(0), filmstrips.HEADER_PX
-    shown = strip[top : top + 128 : 2, left : left + 128 : 2]
-    np.testing.assert_array_equal(shown, compared.start_frame)
+def test_names_are_escaped_in_markdown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = AgentEntry(make="x:make", title="my_agent | <b>", description="Has *stars*\nand lines.")
+    monkeypatch.setitem(AGENTS, "imagination_only", entry)
+    protocol = dataclasses.replace(WIDE, agents=("dqn", "imagination_only"), budgets=(5, 10))
+    written = text_of(bench_page(bench_result(tmp_path, protocol=protocol)))
+    assert r"| my\_agent \| \<b\> | Has \*stars\* and lines. |" in written["report.md"]
+    assert "my_agent |" not in written["report.md"] and "<b>" not in written["report.md"]
+    check_texts(written)
+    assert markdown_text("[a](b) `c` d_e") == r"[a]\(b) \`c\` d\_e"
+    assert markdown_text("# a & <b>") == r"\# a \& \<b\>"
+    assert markdown_code("a`b``c\nd") == "``` a`b``c d ```" and markdown_code("a") == "`a`"
 
 
-def test_episodes_to_success_use_the_threshold_of_the_task(
-    result: BenchResult, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spec = collect(result).spec
-    assert f"Real episodes to {100 * spec.success_threshold:g}\u00a0%" in (folder / "index.html").read_text(
-        encoding="utf-8"
-    )
-    agent = result.protocol.agents[-1]
-    lowest = min(row.success_rate for run in result.of(agent) for row in run.checkpoints)
-    assert 0.0 < lowest < 1.0
-    first, seeds = result.protocol.budgets[0], len(result.protocol.seeds)
-    for success_threshold, reached in ((lowest, (first,) * seeds), (1.0, (None,) * seeds)):
-        demanding = dataclasses.replace(spec, success_threshold=success_threshold)
-        monkeypatch.setattr("imagine_bench.report.missing.registry.task", lambda _, spec=demanding: spec)
-        assert collect(result).reached[agent] == reached
+def test_a_dash_is_explained_only_where_there_is_one() -> None:
+    found = Table("t", ["a", "b"], [["x", "1"]], "Numbers.", "not measured")
+    assert found.remark == "Numbers."
+    assert dataclasses.replace(found, rows=[["x", DASH]]).remark == "Numbers. –: not measured."
+    assert str(Cell("61.3", "[55.0, 67.2]", "thesis 60.0")) == "61.3 [55.0, 67.2]; thesis 60.0"
+    assert found.text.splitlines() == ["a  b", "----", "x  1"]
+    assert found.markdown.splitlines() == ["| a | b |", "|---|---|", "| x | 1 |"]
+
+
+# Agents and encoders -----------------------------------------------------------------------------------------------
+
+
+def test_titles_are_those_of_the_registry_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert agent_title("dqn") == "DQN" and agent_title("of_another_time") == "of another time"
+    monkeypatch.setitem(AGENTS, "my_agent", AgentEntry(make="x:make"))
+    assert agent_title("my_agent") == "my agent"
+    monkeypatch.setitem(AGENTS, "my_agent", AgentEntry(make="x:make", title="Mine"))
+    assert agent_title("my_agent") == "Mine"
 
 
 def test_no_two_registered_agents_share_a_color() -> None:
@@ -425,19 +324,19 @@ def test_no_two_registered_agents_share_a_color() -> None:
     assert figures.color("an agent that nobody registered").startswith("#")
 
 
-def test_a_p_value_of_just_5_percent_shows_no_difference(result: BenchResult) -> None:
-    def say(value: float, p_adjusted: float) -> str:
-        data = collect(result)
-        rows = data.comparisons["imagination"]
-        row = dataclasses.replace(
-            rows[data.decisive_budget], difference=Estimate(value, value - 0.1, value + 0.1), p_adjusted=p_adjusted
-        )
-        changed = {**data.comparisons, "imagination": dict.fromkeys(rows, row)}
-        answers = words.answers(dataclasses.replace(data, comparisons=changed))
-        return next(answer for answer in answers if answer.startswith("“imagination” "))
+def test_every_encoder_stands_with_its_readers(result: BenchResult) -> None:
+    both = dataclasses.replace(
+        result.protocol, agents=("random", "dqn", "factored:given"), encoder="a@0123456789ab", codes="b@0123456789ab"
+    )
+    assert encoder_readers(both) == {"a@0123456789ab": ["dqn"], "b@0123456789ab": ["factored:given"]}
 
-    for value in (0.2, -0.2):
-        said = say(value, 1.0 - statistics.LEVEL)
-        assert said.count("no difference is shown") == 1 and "is a difference shown" in said
-        assert "ahead" not in said and "behind" not in said
-    assert say(0.2, 0.049).count("ahead") == 2 and say(-0.2, 0.049).count("behind") == 2
+
+def test_episodes_to_success_use_the_threshold_of_the_task(result: BenchResult) -> None:
+    agent = result.protocol.agents[-1]
+    lowest = min(row.success_rate for run in result.of(agent) for row in run.checkpoints)
+    assert 0.0 < lowest < 1.0
+    first, seeds = result.protocol.budgets[0], len(result.protocol.seeds)
+    for success_threshold, reached in ((lowest, (first,) * seeds), (1.0, (None,) * seeds)):
+        data = ReportData(result)
+        vars(data)["spec"] = dataclasses.replace(data.spec, success_threshold=success_threshold)
+        assert data.reached[agent] == reached

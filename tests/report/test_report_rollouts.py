@@ -12,9 +12,10 @@ from fake_results import bench_result, compared_rollout
 from PIL import Image
 
 from imagine_bench import registry
+from imagine_bench.judge import filmstrips
 from imagine_bench.judge.filmstrips import changes, sampled_filmstrips
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report import write_report
+from imagine_bench.report import bench_page, write_report
 from imagine_bench.store.results import BenchResult, RunResult
 
 
@@ -74,6 +75,25 @@ def test_chapter_3_is_quoted_without_a_standard_deviation(folder: Path) -> None:
     assert "mean of 10 runs, 100 test episodes each" in page
 
 
-def test_a_bench_without_chance_says_nothing_of_it(tmp_path: Path) -> None:
-    plain = write_report(bench_result(tmp_path)).parent
-    assert "several futures" not in (plain / "index.html").read_text()
+def test_a_bench_without_chance_shows_no_futures(tmp_path: Path) -> None:
+    assert "One start, several futures" not in [each.title for each in bench_page(bench_result(tmp_path)).sections]
+
+
+def test_strip_marks_cut_error_and_end() -> None:
+    names = tuple(f"turn cube {index}" for index in range(6))
+    cut, whole = (filmstrips.filmstrip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None))
+    assert cut.shape == whole.shape
+    assert (cut == filmstrips._CUT).all(axis=2).sum() > 500  # the line
+    assert not (whole == filmstrips._CUT).all(axis=2).any()
+    for color in (filmstrips.RIGHT, filmstrips.WRONG):
+        assert (whole == color).all(axis=2).sum() > 500  # frames in both colors
+    narrow = filmstrips.filmstrip(compared_rollout(np.random.default_rng(0)), names, columns=2)
+    assert narrow.shape[1] < whole.shape[1]
+
+
+def test_real_frames_are_shown_unaltered_and_upright() -> None:
+    compared = compared_rollout(np.random.default_rng(0), cut=None)
+    strip = filmstrips.filmstrip(compared, tuple("abcdef"))
+    left, top = filmstrips.left_px(0), filmstrips.HEADER_PX
+    shown = strip[top : top + 128 : 2, left : left + 128 : 2]
+    np.testing.assert_array_equal(shown, compared.start_frame)

@@ -1,10 +1,9 @@
-"""Agents are compared start by start, in plain words below the table; every figure again by its definition."""
+"""Agents are compared start by start; every figure again by its definition, from the tests themselves."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import html
 import itertools
 import math
 from pathlib import Path
@@ -12,15 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_results import bench_result
-from scipy import stats
-from scipy.optimize import brentq
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Rules
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report import summary_table, write_report
-from imagine_bench.report.data import collect
-from imagine_bench.report.text import percent
+from imagine_bench.report import bench_page
+from imagine_bench.report.data import agent_title
+from imagine_bench.report.tables import DASH, Cell, p_value, percent
 from imagine_bench.store.results import BenchResult, Checkpoint, KeptEpisodes
 
 
@@ -58,19 +55,31 @@ def shortest(rules: Rules, start: tuple[int, ...]) -> int:
     raise AssertionError("no plan")
 
 
+def cells(result: BenchResult, name: str) -> dict[tuple[str, str], Cell]:
+    """The cells of a table of the report by agent's title and budget."""
+    tables = [each for section in bench_page(result).sections for each in section.tables if each.name == name]
+    return {
+        (row[0].text, budget): cell
+        for table in tables
+        for row in table.cells
+        for budget, cell in zip(table.header[1:], row[1:], strict=True)
+    }
+
+
 @pytest.mark.parametrize("seeds", [(0,), (0, 1, 7)])
-def test_the_same_starts_are_compared_in_plain_words(seeds: tuple[int, ...], tmp_path: Path) -> None:
-    """In page, Markdown and terminal; every figure again by its definition, from the tests themselves."""
+def test_the_same_starts_are_compared(seeds: tuple[int, ...], tmp_path: Path) -> None:
     protocol = Protocol(task="arrow_puzzle", preset="smoke", seeds=seeds, budgets=(10, 20), evaluation_episodes=60)
-    result = kept(bench_result(tmp_path, protocol=protocol))
-    data, rules = collect(result), registry.task("arrow_puzzle").rules
+    plain = bench_result(tmp_path, protocol=protocol)
+    result = kept(plain)
+    rules = registry.task("arrow_puzzle").rules
     told = {
         (run.agent, row.episodes, run.seed): [each == "1" for each in row.solved or ""]
         for run in result.runs
         for row in run.checkpoints
     }
     found = {}
-    for agent, budget in itertools.product(data.comparisons, protocol.budgets):
+    learners = [agent for agent in protocol.agents if agent.startswith("imagination")]
+    for agent, budget in itertools.product(learners, protocol.budgets):
         pairs = [
             pair for seed in seeds for pair in zip(told[agent, budget, seed], told["dqn", budget, seed], strict=True)
         ]
@@ -78,28 +87,18 @@ def test_the_same_starts_are_compared_in_plain_words(seeds: tuple[int, ...], tmp
         tail = sum(math.comb(alone + dqn_alone, k) for k in range(min(alone, dqn_alone) + 1))
         found[agent, budget] = (alone, dqn_alone, min(1.0, tail * 2 / 2 ** (alone + dqn_alone)))
     ordered = sorted(found, key=lambda cell: found[cell][2])
-    corrected = {
-        cell: min(1.0, max((len(ordered) - i) * found[each][2] for i, each in enumerate(ordered[: place + 1])))
-        for place, cell in enumerate(ordered)
-    }
-    budget = data.decisive_budget
-    said = [line for line in summary_table(result).splitlines() if line.startswith("From the same starts")]
-    assert len(said) == len(data.comparisons) >= 2
-    for agent, line in zip(data.comparisons, said, strict=True):
+    shown = cells(result, "paired")
+    assert len(shown) == len(found) >= 4
+    for place, (agent, budget) in enumerate(ordered):
         alone, dqn_alone, _ = found[agent, budget]
-        assert f"alone solves {alone} tests and DQN alone {dqn_alone} (" in line
-        p = corrected[agent, budget]
-        assert (f"(p = {p:.3f}, McNemar" if p >= 0.001 else "(p < 0.001, McNemar") in line
-        assert ("is not shown" in line) == (p >= 0.05) and ("are better" in line) == (p < 0.05 and alone > dqn_alone)
-        z = stats.norm.isf(0.025 / len(found)) + stats.norm.ppf(0.8)
-        pairs, apart = 60 * len(seeds), (alone + dqn_alone) / (60 * len(seeds))
-        size = brentq(lambda d: pairs * d**2 - z**2 * (max(apart, d) - d**2), 1e-6, 1.0)  # noqa: B023 - called at once
-        assert f"a difference of {percent(size)} points" in line
+        holm = min(1.0, max((len(ordered) - i) * found[each][2] for i, each in enumerate(ordered[: place + 1])))
         scores = [[sum(told[name, budget, seed]) for seed in seeds] for name in (agent, "dqn")]
-        wins = [0.5 * (a == b) + (a > b) for a in scores[0] for b in scores[1]]
-        assert f"in {percent(np.mean(wins))} % of pairs" in line
-    (last,) = (line for line in summary_table(result).splitlines() if line.startswith("Macro-actions beyond"))
-    for agent in protocol.agents:
+        wins = np.mean([0.5 * (a == b) + (a > b) for a in scores[0] for b in scores[1]])
+        cell = shown[agent_title(agent), str(budget)]
+        assert (cell.text, cell.interval) == (f"{alone} : {dqn_alone}", f"({p_value(holm)})")
+        assert cell.note == f"ahead in {percent(wins)} % of pairs of runs"
+    excess = cells(result, "excess")
+    for agent, budget in itertools.product(protocol.agents, protocol.budgets):
         rows = [run.checkpoints[protocol.budgets.index(budget)].kept for run in result.of(agent)]
         beyond = [
             int(row.lengths[test]) - shortest(rules, tuple(row.starts[test].tolist()))
@@ -107,15 +106,11 @@ def test_the_same_starts_are_compared_in_plain_words(seeds: tuple[int, ...], tmp
             if row is not None
             for test in np.flatnonzero(row.success)
         ]
-        assert f" {np.mean(beyond):.2f}" in last
-    folder = write_report(result).parent
-    page, markdown = ((folder / name).read_text() for name in ("index.html", "report.md"))
-    for line in (*said, last):
-        assert f"<li>{html.escape(line).replace('&#x27;', '&#39;')}</li>" in page
-        assert line in markdown.replace("\\", "")
-    for of_dqn in (True, False):  # one that is not told leaves nothing to pair
-        mixed = [
-            plain if (plain.agent == "dqn") == of_dqn else run
-            for plain, run in zip(bench_result(tmp_path, protocol=protocol).runs, result.runs, strict=True)
+        assert excess[agent_title(agent), str(budget)].text == f"{np.mean(beyond):.2f}"
+    for of_dqn in (True, False):  # an agent whose tests are not known leaves nothing to pair
+        runs = [
+            known if (known.agent == "dqn") == of_dqn else unknown
+            for known, unknown in zip(result.runs, plain.runs, strict=True)
         ]
-        assert "McNemar" not in summary_table(dataclasses.replace(result, runs=tuple(mixed)))
+        mixed = cells(dataclasses.replace(result, runs=tuple(runs)), "paired")
+        assert {cell.text for cell in mixed.values()} == {DASH}

@@ -26,7 +26,8 @@ from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.causes import true_model
 from imagine_bench.protocols.data import digest
 from imagine_bench.protocols.runs import OnProgress
-from imagine_bench.report.study import study_table, write_study
+from imagine_bench.report.page import write_page
+from imagine_bench.report.sweep import study_page
 from imagine_bench.rules import states_of
 from imagine_bench.running.launchers.jobs import Failure, Job
 from imagine_bench.store.results import Beliefs
@@ -78,21 +79,20 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
     again = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
     assert len(launcher.done) == 6, "what is done is not run again"
     assert all(np.array_equal(one.success, other.success) for one, other in zip(lines, again, strict=True))
-    write_study(tmp_path / "out", STUDY, lines)
+    write_page(tmp_path / "out", study_page(STUDY, lines))
     rows = list(csv.DictReader((tmp_path / "out" / "seeds.csv").read_text().splitlines()))
     assert len(rows) == 3 * 2 * 2 and {row["seed"] for row in rows} == {"1000", "1001"}
     origins = json.loads((tmp_path / "out" / "runs.json").read_text())
     assert [origin["variant"] for origin in origins] == ["table", "mild", "imaginer"]
     assert all(origin["versions"] and origin["machine"] for origin in origins)
     assert (tmp_path / "out" / "study.png").stat().st_size > 5_000
-    assert "| appearance | mild | table |" in (tmp_path / "out" / "study.md").read_text()
+    assert "| appearance | mild | table |" in (tmp_path / "out" / "report.md").read_text()
 
 
 def test_a_study_that_compares_nothing_has_no_picture(tmp_path: Path) -> None:
     alone = dataclasses.replace(STUDY, variants=STUDY.variants[:1])
-    write_study(tmp_path / "out", alone, run_study(alone, "arrow_puzzle", root=tmp_path, launcher=Here()))
-    assert not (tmp_path / "out" / "study.png").exists()
-    assert "study.png" not in (tmp_path / "out" / "study.md").read_text()
+    page = study_page(alone, run_study(alone, "arrow_puzzle", root=tmp_path, launcher=Here()))
+    assert not [image for section in page.sections for image in section.images]
 
 
 @pytest.mark.parametrize(
@@ -232,12 +232,12 @@ def test_the_table_says_what_helps(tmp_path: Path) -> None:
             imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]),
         ),
     ]  # fmt: skip
-    without, with_model = study_table(STUDY, lines).splitlines()[-2:]
-    assert without.endswith("| – | 1 |")
-    assert "| mild | table | 50.0 | 90.0 | table | +25.0 [+10.0, +40.0] |" in with_model
-    assert with_model.endswith("| 30.0 | 2 |"), "right at the last budget, mean of seeds"
-    write_study(tmp_path, STUDY, lines)
-    rows = csv.DictReader((tmp_path / "seeds.csv").read_text().splitlines())
+    page = study_page(STUDY, lines)
+    without, with_model = page.sections[0].tables[0].cells
+    assert [cell.text for cell in without[-2:]] == ["–", "1"]
+    assert list(map(str, with_model[1:7])) == ["mild", "table", "50.0", "90.0", "table", "+25.0 [+10.0, +40.0]"]
+    assert [cell.text for cell in with_model[-2:]] == ["30.0", "2"], "right at the last budget, mean of seeds"
+    rows = csv.DictReader(page.files["seeds.csv"].splitlines())
     assert [row["imagined_right"] for row in rows] == [""] * 4 + ["0.1000", "0.2000", "0.3000", "0.4000"]
 
 

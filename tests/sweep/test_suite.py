@@ -16,7 +16,8 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.exact.splits import split_of
 from imagine_bench.registry import AgentEntry
-from imagine_bench.report.suite import levels_csv, scores_csv, suite_table, write_suite
+from imagine_bench.report.page import texts
+from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
 from imagine_bench.sweep.catalogue import LADDER
 from imagine_bench.sweep.grid import Experiment, Level, Suite
 from imagine_bench.sweep.run import plan_level, plan_suite, run_suite
@@ -99,14 +100,16 @@ def test_a_failing_agent_costs_the_others_nothing(tmp_path):
     assert ["failing seed 1 in arrows: this agent breaks on purpose" in each for each in found.failures] == [True]
     assert np.isnan(found.score(suite.experiments[0], "failing").value)
     assert found.score(suite.experiments[0], "oracle").value == 1.0
-    assert "–" in suite_table(found) and "breaks on purpose" in suite_table(found)
+    summary = suite_page(found).summary
+    assert "–" in summary and "breaks on purpose" in summary
 
 
-def test_the_page_opens_with_the_radar(result, tmp_path):
-    page = write_suite(result, tmp_path).read_text()
-    assert page.index("Radar chart") < page.index('id="suite"') < page.index('id="levels"')
-    assert (tmp_path / "suite" / f"tiny-{TINY.hash}" / "report" / "radar.png").stat().st_size > 10_000
-    assert TINY.hash in page
+def test_the_page_opens_with_the_radar(result):
+    page = suite_page(result)
+    assert [image.name for section in page.sections for image in section.images] == ["radar", "levels"]
+    assert [table.name for section in page.sections for table in section.tables] == ["suite", "levels", "prices"]
+    assert len(page.sections[0].images[0].png) > 10_000
+    assert TINY.hash in texts(page)["index.html"]
 
 
 def test_an_agent_of_another_package_takes_part(tmp_path, monkeypatch):

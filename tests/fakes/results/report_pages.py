@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from html.parser import HTMLParser
-from pathlib import Path
+
+from imagine_bench.report.tables import Page
 
 PAGE_PX = 1200 - 2 * 24  # the page's own margin
 CHARACTER_PX, PADDING_PX = 8.0, 19.2
@@ -38,9 +40,15 @@ class Tables(HTMLParser):
             self._text = None
 
 
-def check_report(folder: Path) -> None:
-    """Assert it of ``index.html`` and ``report.md``."""
-    page = (folder / "index.html").read_text(encoding="utf-8")
+def without_images(page: Page) -> Page:
+    """A page whose figures are not drawn, which is slow."""
+    sections = [dataclasses.replace(each, images=()) for each in page.sections]
+    return dataclasses.replace(page, sections=sections)
+
+
+def check_texts(written: dict[str, str]) -> None:
+    """Assert it of the texts of ``index.html`` and ``report.md``."""
+    page = written["index.html"]
     tables = read_tables(page)
     assert tables
     style = page[page.index("<style>") : page.index("</style>")]
@@ -51,11 +59,15 @@ def check_report(folder: Path) -> None:
         if len(table[0]) > 2:
             assert narrowest_px(table) <= PAGE_PX, table[0]
     text = re.sub(r"<(style|svg)\b.*?</\1>|<[^>]+>", " ", page, flags=re.DOTALL)
-    markdown = (folder / "report.md").read_text(encoding="utf-8")
-    for shown in (text, markdown):
+    for shown in (text, written["report.md"]):
         assert not re.search(r"\bnan\b", shown)
     check_dashes(page)
-    check_markdown(markdown)
+    check_markdown(written["report.md"])
+
+
+def addresses(page: str) -> list[str]:
+    """Every address that a page would load."""
+    return re.findall(r'\b(?:src|href|data)="([^"]*)"', page)
 
 
 def read_tables(page: str) -> list[list[list[str]]]:
