@@ -5,6 +5,9 @@ Shapes: ``S`` macrostates, ``A`` macro-actions.
 
 from __future__ import annotations
 
+import functools
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
 _SWEEPS = 10_000
 _VALUE_TOLERANCE = 1e-12
 _TIE_TOLERANCE = 1e-9
+Outcomes = dict[tuple[State, bool], tuple[float, float]]
+"""By macrostate and whether the episode is over: probability, and the reward expected of the action that led there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,3 +321,24 @@ def facts(rules: Rules, horizon: int) -> RuleFacts:
         optimal_return=float(optimal.returns[tables.starts].mean()),
         mean_plan_length=float(optimal.length[tables.starts].mean()),
     )
+
+
+def outcomes_by_depth(rules: Rules, state: State, actions: Sequence[int]) -> tuple[Outcomes, ...]:
+    """What may come of macro-actions from a macrostate, after each of them."""
+    start: Outcomes = {(state, False): (1.0, 0.0)}
+    reached = itertools.accumulate(actions, functools.partial(advance, rules), initial=start)
+    return tuple(reached)[1:]
+
+
+def advance(rules: Rules, outcomes: Outcomes, action: int) -> Outcomes:
+    """What may come of one more macro-action, the same whatever has come before.
+
+    Dynamics hold after the end of an episode, too; rewards stop there.
+    """
+    after: dict[tuple[State, bool], list[float]] = {}
+    for (before, over), (weight, _) in outcomes.items():
+        for outcome in rules.outcomes(before, int(action)):
+            sums = after.setdefault((outcome.macrostate, over or outcome.terminated), [0.0, 0.0])
+            sums[0] += weight * outcome.probability
+            sums[1] += weight * outcome.probability * (0.0 if over else outcome.reward)
+    return {key: (share, earned / share if share else 0.0) for key, (share, earned) in after.items()}

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy  # its parts load, slowly, when they are first used
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from imagine_bench.arrays import Floats
 from imagine_bench.errors import InvalidValueError
@@ -290,3 +290,22 @@ def _runs(scores: ArrayLike) -> Floats:
     if array.ndim != 1:
         raise InvalidValueError(f"scores must have shape (runs,), not {array.shape}.")
     return array
+
+
+def auroc(scores: NDArray[np.floating], wrong: NDArray[np.bool_]) -> float:
+    """Probability, 0.5 by chance, that a wrong prediction has a higher score than a right one, ties counting half.
+
+    Area under the receiver operating characteristic (Hanley & McNeil 1982). Both of shape (N,); NaN where all
+    predictions are right, or all wrong.
+
+    Raises:
+        InvalidValueError: Shapes differ, or a score is NaN.
+    """
+    if scores.shape != wrong.shape or np.isnan(scores).any():
+        raise InvalidValueError(f"AUROC needs one number a prediction, not {scores.shape} for {wrong.shape}, or NaN.")
+    n_wrong, n_right = int(wrong.sum()), int((~wrong).sum())
+    if not n_wrong or not n_right:
+        return math.nan
+    _, places, counts = np.unique(scores, return_inverse=True, return_counts=True)
+    ranks = (counts.cumsum() - (counts - 1) / 2)[places]  # equal scores share the mean of their ranks
+    return float((ranks[wrong].sum() - n_wrong * (n_wrong + 1) / 2) / (n_wrong * n_right))

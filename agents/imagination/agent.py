@@ -25,7 +25,7 @@ from ..networks.precision import settle
 from ..replay import Batch, Transitions
 from ..settings import Hyperparameters
 from .filter import weight_samples
-from .rollouts import TERMINAL, Imagination, Imagined, Weights
+from .rollouts import TERMINAL, Imagination, ImaginedStep, Weights
 from .settings import HYPERPARAMETERS, Settings
 from .uncertainty import decompose
 
@@ -175,7 +175,7 @@ class ImaginingAgent(DQN):
 
     def _unroll(
         self, z: Tensor, planned: list[int] | None, depth: int, rng: np.random.Generator
-    ) -> Iterator[tuple[Tensor, Tensor, Imagined]]:
+    ) -> Iterator[tuple[Tensor, Tensor, ImaginedStep]]:
         """Values before, action and result of each imagined step, one rollout."""
         generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
         weights = self.imagination.draw_weights(generator)
@@ -188,7 +188,7 @@ class ImaginingAgent(DQN):
                 return
             z = step.next_z
 
-    def _rollout(self, start: Tensor, steps: list[tuple[Tensor, Tensor, Imagined]]) -> ImaginedRollout:
+    def _rollout(self, start: Tensor, steps: list[tuple[Tensor, Tensor, ImaginedStep]]) -> ImaginedRollout:
         values, actions, imagined = zip(*steps, strict=True)
         encoder = self.perception.encoder
         imagination = self.imagination

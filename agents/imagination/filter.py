@@ -15,7 +15,7 @@ from imagine_bench.errors import InvalidValueError
 from ..replay import RealMemory
 from .settings import Settings
 from .uncertainty import decompose, reduction
-from .world_model import WorldModel
+from .world_model import EnvironmentModel
 
 _CALIBRATION = 64
 """Real transitions whose epistemic variance a moving threshold is read from."""
@@ -86,7 +86,7 @@ class EpistemicFilter:
         return keep
 
     def move_threshold(
-        self, model: WorldModel, real: RealMemory, weights: tuple[Tensor, ...] | None, generator: torch.Generator
+        self, model: EnvironmentModel, real: RealMemory, weights: tuple[Tensor, ...] | None, generator: torch.Generator
     ) -> None:
         """Where the settings want it, set the threshold to a quantile of the uncertainty about real transitions."""
         quantile = self.settings.threshold_quantile

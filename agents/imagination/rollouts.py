@@ -24,7 +24,7 @@ from .filter import EpistemicFilter
 from .mixture import Mixture
 from .settings import Settings
 from .uncertainty import decompose
-from .world_model import WorldModel
+from .world_model import EnvironmentModel
 
 TERMINAL = 0.5
 """Predicted probability above which a rollout ends."""
@@ -45,7 +45,7 @@ class Weights:
 
 
 @dataclass(frozen=True, slots=True)
-class Imagined:
+class ImaginedStep:
     """One imagined step of N rollouts, with predicted ``reward`` and probability of the end there, (N,) each."""
 
     next_z: Tensor  #: shape (N, Z), within +-1e6; where that is reached, the closed loop has run away
@@ -97,9 +97,9 @@ class Imagination:
         weighted = self.settings.confidence_scale is not None
         self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device, weighted=weighted)
 
-    def new_model(self, state_size: int, n_actions: int, settings: Settings) -> WorldModel:
+    def new_model(self, state_size: int, n_actions: int, settings: Settings) -> EnvironmentModel:
         """A world model that has learned nothing, of states of so many numbers."""
-        return WorldModel(state_size, n_actions, settings.model, self.generators["weights"])
+        return EnvironmentModel(state_size, n_actions, settings.model, self.generators["weights"])
 
     def reset_for_new_task(self) -> None:
         """Keep what predicts states; everything else begins anew, moments of the optimiser included."""
@@ -115,7 +115,7 @@ class Imagination:
         dynamics = self.model.draw_weights(count, generator)
         return Weights(dynamics, self.model.draw_reward_weights(count, generator) if self.filter.reads_reward else None)
 
-    def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> Imagined:
+    def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> ImaginedStep:
         """Imagine the result of ``action`` (N,) in ``z`` (N, Z): sample z' from what :attr:`settings` predict with.
 
         DivergedError if what the model predicts is NaN.
@@ -129,7 +129,7 @@ class Imagination:
         next_z = self.state_after(z, action, next_z)
         reward, p_terminated = model.predict_outcome(z, action, next_z)
         reward_std = None if weights.reward is None else model.reward_std(z, action, next_z, weights.reward)
-        return Imagined(next_z, reward, p_terminated, samples, reward_std)
+        return ImaginedStep(next_z, reward, p_terminated, samples, reward_std)
 
     def state_after(self, z: Tensor, action: Tensor, predicted: Tensor) -> Tensor:
         """The states that follow N states ``z`` after actions (N,), given what was predicted of them: all there is."""
@@ -158,11 +158,11 @@ class Imagination:
             samples = samples.map(lambda values: values.unflatten(0, (members, count))[:, chosen, rows])
         return mdn.average(samples, members)
 
-    def uncertainty(self, step: Imagined) -> Tensor:
+    def uncertainty(self, step: ImaginedStep) -> Tensor:
         """Epistemic variance of N imagined steps, reduced to one number each, in squared units of z. Shape (N,)."""
         return self.filter.score(decompose(step.samples).epistemic)
 
-    def keeps(self, step: Imagined, gathered: Tensor | float = 0.0) -> Tensor:
+    def keeps(self, step: ImaginedStep, gathered: Tensor | float = 0.0) -> Tensor:
         """Which transitions the filter lets pass; where there is none, all that have not run away. Shape (N,), bool.
 
         ``gathered`` is the uncertainty of each rollout before this step, where it counts, in squared units of z. A
@@ -173,14 +173,14 @@ class Imagination:
             return bounded
         return bounded & self.filter.passes(gathered + self.uncertainty(step), step.p_terminated, step.reward_std)
 
-    def confidence(self, step: Imagined, gathered: Tensor) -> Tensor | None:
+    def confidence(self, step: ImaginedStep, gathered: Tensor) -> Tensor | None:
         """What each of N transitions counts in updates, in (0, 1]; None where all count alike. Shape (N,)."""
         scale = self.settings.confidence_scale
         if scale is None:
             return None
         return 1.0 / (1.0 + (gathered + self.uncertainty(step)) / scale)
 
-    def gathered_with(self, step: Imagined, gathered: Tensor) -> Tensor:
+    def gathered_with(self, step: ImaginedStep, gathered: Tensor) -> Tensor:
         """The uncertainty of each rollout up to and with this step, where steps accumulate; else as before: (N,)."""
         return gathered + self.uncertainty(step) if self.settings.accumulates else gathered
 
@@ -191,7 +191,7 @@ class Imagination:
                 f"{reader} cannot weigh transitions by their confidence; leave imagination.confidence_scale out."
             )
 
-    def admits(self, z: Tensor, action: Tensor, step: Imagined, gathered: Tensor | float) -> Tensor:
+    def admits(self, z: Tensor, action: Tensor, step: ImaginedStep, gathered: Tensor | float) -> Tensor:
         """Which of N transitions a rollout keeps and goes on from: those of :meth:`keeps`. Shape (N,), bool."""
         del z, action
         return self.keeps(step, gathered)

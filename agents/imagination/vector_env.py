@@ -17,7 +17,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats, Frame
 
 from .agent import ImaginingAgent
-from .rollouts import LATENT_LIMIT, TERMINAL, Imagination, Imagined
+from .rollouts import LATENT_LIMIT, TERMINAL, Imagination, ImaginedStep
 from .uncertainty import decompose
 
 Latents = NDArray[np.float32]
@@ -115,7 +115,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         self._z = reached
         return self._z.copy(), reward, terminated, truncated, info
 
-    def _info(self, step: Imagined, accepted: Switches, reached: Latents, ended: Switches) -> dict[str, Any]:
+    def _info(self, step: ImaginedStep, accepted: Switches, reached: Latents, ended: Switches) -> dict[str, Any]:
         parts = decompose(step.samples)
         values = {"accepted": accepted} | {
             name: self.imagination.filter.score(getattr(parts, name)).cpu().numpy() for name in VERDICT[1:]

@@ -81,7 +81,7 @@ class RewardTerminationHead(nn.Module):
         return reward, logit
 
 
-class WorldModel(nn.Module):
+class EnvironmentModel(nn.Module):
     """Dynamics, reward and termination, trained together from batches of transitions.
 
     The generator draws the initial weights; its device is the model's. ``predicted`` says how many of the numbers of a
@@ -154,7 +154,7 @@ class WorldModel(nn.Module):
             return mixture
         return replace(mixture, means=mixture.means + z[..., : self.predicted].unsqueeze(-2))
 
-    def keep_dynamics_of(self, other: WorldModel) -> None:
+    def keep_dynamics_of(self, other: EnvironmentModel) -> None:
         """Take over what another model of the same shape knows of where actions lead."""
         self.dynamics.load_state_dict(other.dynamics.state_dict())
 

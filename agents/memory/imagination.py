@@ -17,7 +17,7 @@ from torch import Tensor
 from ..imagination.agent import ImaginingAgent, build
 from ..imagination.rollouts import Imagination
 from ..imagination.settings import Settings, WorldModelSettings
-from ..imagination.world_model import WorldModel
+from ..imagination.world_model import EnvironmentModel
 from ..networks.adam import Adam
 from ..replay import Batch
 from .agent import RememberingAgent
@@ -25,7 +25,7 @@ from .recurrence import Recurrence
 from .settings import IMAGINATION_MEMORY, RecurrentSettings
 
 
-class RecurrentWorldModel(WorldModel):
+class RecurrentEnvironmentModel(EnvironmentModel):
     """A world model of states (Z + H): what it remembers (H) decides with the latents (Z) what it predicts."""
 
     def __init__(
@@ -36,21 +36,21 @@ class RecurrentWorldModel(WorldModel):
         self.clipped = (*self.networks, self.recurrence)
         self.optimiser = Adam([(self.parameters(), 0.0)], settings.learning_rate)
 
-    def keep_dynamics_of(self, other: WorldModel) -> None:
+    def keep_dynamics_of(self, other: EnvironmentModel) -> None:
         """Take over what another model of the same shape knows of where actions lead, and how it remembers."""
         super().keep_dynamics_of(other)
-        self.recurrence.load_state_dict(cast(RecurrentWorldModel, other).recurrence.state_dict())
+        self.recurrence.load_state_dict(cast(RecurrentEnvironmentModel, other).recurrence.state_dict())
 
 
 class RecurrentImagination(Imagination):
     """Imagination whose rollouts carry what is remembered."""
 
-    model: RecurrentWorldModel
+    model: RecurrentEnvironmentModel
 
-    def new_model(self, state_size: int, n_actions: int, settings: Settings) -> RecurrentWorldModel:
+    def new_model(self, state_size: int, n_actions: int, settings: Settings) -> RecurrentEnvironmentModel:
         """A world model that has learned nothing, of states of so many numbers."""
         units = cast(RecurrentSettings, settings).recurrence.units
-        return RecurrentWorldModel(state_size, n_actions, settings.model, units, self.generators["weights"])
+        return RecurrentEnvironmentModel(state_size, n_actions, settings.model, units, self.generators["weights"])
 
     @torch.no_grad()
     def state_after(self, z: Tensor, action: Tensor, predicted: Tensor) -> Tensor:

@@ -19,7 +19,10 @@ from imagine_bench.interfaces.model import Imagined
 from ..encoders.perception import prepare_torch
 from ..networks.weights import initialise
 
-_STEPS, _BATCH, _RATE, _CHUNK = 1_200, 32, 2e-3, 256
+_STEPS = 1_200
+_BATCH = 32
+_RATE = 2e-3
+_CHUNK = 256
 _REWARD = 10.0  # units of reward that the network's output is in
 
 
@@ -57,12 +60,15 @@ class Convolutional:
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         initialise(self.network, generator)
         before = torch.from_numpy(dataset.rows[0])
-        frames, actions = torch.from_numpy(dataset.frames), torch.from_numpy(dataset.actions)
-        rewards, ended = torch.from_numpy(dataset.rewards).float(), torch.from_numpy(dataset.terminated).float()
+        frames = torch.from_numpy(dataset.frames)
+        actions = torch.from_numpy(dataset.actions)
+        rewards = torch.from_numpy(dataset.rewards).float()
+        ended = torch.from_numpy(dataset.terminated).float()
         optimiser = torch.optim.Adam(self.network.parameters(), lr=_RATE)
         for _ in range(_STEPS):
             rows = torch.randint(len(actions), (_BATCH,), generator=generator)
-            images, target = _images(frames[before[rows]]), _images(frames[before[rows] + 1])
+            images = _images(frames[before[rows]])
+            target = _images(frames[before[rows] + 1])
             drawn, reward, logit = self.network(images, actions[rows])
             loss = 50.0 * (drawn - target).square().mean() + (reward - rewards[rows] / _REWARD).square().mean()
             loss = loss + functional.binary_cross_entropy_with_logits(logit, ended[rows])
@@ -85,8 +91,11 @@ class Convolutional:
 
     def _roll(self, frames: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Pictures (N, D, 64, 64, 3), rewards and P(ended) (N, D) of one piece."""
-        images, alive = _images(frames), torch.ones(len(frames))
-        drawn, earned, over = [], [], []
+        images = _images(frames)
+        alive = torch.ones(len(frames))
+        drawn = []
+        earned = []
+        over = []
         for action in actions.unbind(dim=1):
             images, reward, logit = self.network(images, action)
             drawn.append(images.permute(0, 2, 3, 1))

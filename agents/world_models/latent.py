@@ -38,7 +38,8 @@ class LatentModel:
     """Encoder, environment model and decoder as a world model."""
 
     def __init__(self, encoder: Encoder, settings: Settings, context: AgentContext) -> None:
-        self.encoder, self.settings = encoder, settings
+        self.encoder = encoder
+        self.settings = settings
         self.compares = settings.model.members * weight_samples(settings) > 1
         """Whether there are several networks, whose disagreement is an epistemic uncertainty."""
         self.imagination = self.new_imagination(context)
@@ -46,7 +47,9 @@ class LatentModel:
 
     def new_imagination(self, context: AgentContext) -> Imagination:
         """What imagines, of which nothing is learned yet."""
-        size, seeds, device = self.encoder.latent_size, context.seeds, self.encoder.device
+        size = self.encoder.latent_size
+        seeds = context.seeds
+        device = self.encoder.device
         return Imagination(size, context.n_actions, self.settings, filtered=self.compares, seeds=seeds, device=device)
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
@@ -67,7 +70,8 @@ class LatentModel:
     ) -> Iterator[Batch]:
         """What is learned from: :data:`UPDATES` batches of transitions, whose columns are given."""
         del dataset
-        model, rows = self.settings.model, len(columns["action"])
+        model = self.settings.model
+        rows = len(columns["action"])
         memory = RealMemory(rows, self.encoder.latent_size, self.encoder.device)
         memory.load(columns, rows)
         for _ in range(UPDATES):
@@ -81,9 +85,11 @@ class LatentModel:
     @torch.no_grad()
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
         """Futures in closed loop through latents; see :class:`.interfaces.model.WorldModel`."""
-        generator, rows = self._generator(rng), len(frames)
+        generator = self._generator(rng)
+        rows = len(frames)
         z = self.states(frames, actions).repeat_interleave(samples, dim=0)  # [N S, Z]
-        weights, alive = self.imagination.draw_weights(generator), torch.ones(len(z))
+        weights = self.imagination.draw_weights(generator)
+        alive = torch.ones(len(z))
         kept = torch.ones(len(z), dtype=torch.bool)
         gathered = torch.zeros(len(z))
         steps: dict[str, list[Any]] = {
@@ -91,7 +97,8 @@ class LatentModel:
         }
         for action in torch.from_numpy(actions[:, frames.shape[1] - 1 :]).unbind(dim=1):
             step = self.imagination.step(z, action.repeat_interleave(samples), weights, generator)
-            z, spread = step.next_z, decompose(step.samples)
+            z = step.next_z
+            spread = decompose(step.samples)
             steps["pictures"].append(
                 (self.encoder.decode(z[:, : self.encoder.latent_size]) * 255.0).round().astype(np.uint8)
             )

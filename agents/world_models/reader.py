@@ -23,8 +23,12 @@ from imagine_bench.seeding import SeedTree
 from ..encoders.perception import prepare_torch
 from ..networks.weights import initialise
 
-FRAMES, HELD_OUT, STEPS, BATCH = 6_000, 2_000, 1_200, 64
-_SIZE, _CHUNK = 32, 512
+FRAMES = 6_000
+HELD_OUT = 2_000
+STEPS = 1_200
+BATCH = 64
+_SIZE = 32
+_CHUNK = 512
 _REFERENCES = 2_000  # real frames that a picture is compared with
 _CONTRAST = 0.2  # standard deviation of usual images
 _REFUSED = 0.001  # share of real frames that each check may refuse
@@ -71,7 +75,8 @@ class Reader:
     def load(self, path: Path) -> Reader:
         """Take up a file of :meth:`content`."""
         tensors = load_file(path)
-        self.references, self.limits = tensors.pop("references"), tensors.pop("limits")
+        self.references = tensors.pop("references")
+        self.limits = tensors.pop("limits")
         self.network.load_state_dict(tensors, assign=True)
         self.network.requires_grad_(False)
         return self
@@ -103,7 +108,8 @@ def train_reader(spec: TaskSpec, appearance: str, *, frames: int = FRAMES, steps
     """Train a reader for a task's looks, on frames of its own."""
     prepare_torch("cpu")
     seeds = SeedTree(0).child("encoder_probe", "judge", spec.id, appearance)
-    rng, generator = seeds.generator(), torch.Generator().manual_seed(seeds.child("torch").integer())
+    rng = seeds.generator()
+    generator = torch.Generator().manual_seed(seeds.child("torch").integer())
     reader = Reader(tuple(len(values) for values in spec.macrostate_values))
     initialise(reader.network, generator)
     states = states_of(spec.rules)
@@ -141,7 +147,8 @@ class _Partners:
     """Frames of other macrostates: often of one that differs in a single coordinate, since such blends are hardest."""
 
     def __init__(self, states: tuple[State, ...], shown: NDArray[np.int64]) -> None:
-        self._states, self._shown = np.array(states), shown
+        self._states = np.array(states)
+        self._shown = shown
         order = np.argsort(shown, kind="stable")
         self._rows = np.split(order, np.searchsorted(shown[order], np.arange(1, len(states))))
 

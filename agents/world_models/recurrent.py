@@ -31,7 +31,8 @@ class RecurrentLatentModel(latent.LatentModel):
 
     def new_imagination(self, context: AgentContext) -> RecurrentImagination:
         """What imagines, of which nothing is learned yet."""
-        size, device = self.encoder.latent_size + self.settings.recurrence.units, self.encoder.device
+        size = self.encoder.latent_size + self.settings.recurrence.units
+        device = self.encoder.device
         return RecurrentImagination(
             size, context.n_actions, self.settings, filtered=True, seeds=context.seeds, device=device
         )
@@ -40,7 +41,9 @@ class RecurrentLatentModel(latent.LatentModel):
         self, columns: dict[str, NDArray[Any]], dataset: Episodes, generator: torch.Generator
     ) -> Iterator[Batch]:
         """Batches of sequences, each with all that came before it in its episode."""
-        model, rows, units = self.settings.model, len(columns["action"]), self.settings.recurrence.units
+        model = self.settings.model
+        rows = len(columns["action"])
+        units = self.settings.recurrence.units
         step = np.concatenate([np.arange(length) for length in dataset.lengths])
         before = np.where(step == 0, START, np.roll(columns["action"], 1))
         recurrence = self.imagination.model.recurrence

@@ -25,14 +25,16 @@ class StructuredModel:
     def __init__(self, encoder: Encoder, context: AgentContext) -> None:
         if not encoder.card.code_sizes:
             raise InvalidValueError("The structured model reads codes; give an encoder of the recipe 'codes'.")
-        self.encoder, self.sizes = encoder, encoder.card.code_sizes
+        self.encoder = encoder
+        self.sizes = encoder.card.code_sizes
         settings = HYPERPARAMETERS.resolve(context.hyperparameters, {}, context.config_group)
         self.model = FactoredModel(self.sizes, context.n_actions, settings)
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Count every transition; nothing is random."""
         del rng
-        codes, before = list(map(tuple, self._codes(dataset.frames).tolist())), dataset.rows[0]
+        codes = list(map(tuple, self._codes(dataset.frames).tolist()))
+        before = dataset.rows[0]
         rows = zip(before, dataset.actions.tolist(), dataset.rewards.tolist(), dataset.terminated.tolist(), strict=True)
         for row, action, reward, terminated in rows:
             self.model.add(CodeTransition(codes[row], action, codes[row + 1], reward, terminated))
@@ -47,8 +49,13 @@ class StructuredModel:
         asked = actions[:, frames.shape[1] - 1 :]
         rows, depth = asked.shape
         shape = (rows, samples, depth)
-        codes, alive = np.repeat(self._codes(frames[:, -1]), samples, axis=0), np.ones(rows * samples)
-        drawn, rewards, ended, unknown, other = [], np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        codes = np.repeat(self._codes(frames[:, -1]), samples, axis=0)
+        alive = np.ones(rows * samples)
+        drawn = []
+        rewards = np.zeros(shape)
+        ended = np.zeros(shape)
+        unknown = np.zeros(shape)
+        other = np.zeros(shape)
         for step in range(depth):
             action = np.repeat(asked[:, step], samples)
             codes, reward, ends, untested, p_other = self._step(codes, action, rng)
@@ -67,14 +74,18 @@ class StructuredModel:
         self, codes: Codes, action: NDArray[np.int64], rng: np.random.Generator
     ) -> tuple[Codes, Floats, Floats, Floats, Floats]:
         """Next codes (R, P), and of each row reward, P(end), P(untested) and P(other), (R,)."""
-        following, known, likeliest = np.zeros_like(codes), np.ones(len(codes)), np.ones(len(codes))
+        following = np.zeros_like(codes)
+        known = np.ones(len(codes))
+        likeliest = np.ones(len(codes))
         for index, factor in enumerate(self.model.dynamics.factors):
             chance, unknown = factor.happens(codes, action)
             following[:, index] = (chance.cumsum(axis=1) < rng.random((len(codes), 1))).sum(axis=1)
-            known, likeliest = known * (1.0 - unknown), likeliest * chance.max(axis=1)
+            known = known * (1.0 - unknown)
+            likeliest = likeliest * chance.max(axis=1)
         following = np.minimum(following, np.array(self.sizes) - 1)
         outcomes, untested = self.model.outcomes.predict(codes, action, following)
-        reward, ends = outcomes @ self.model.outcomes.rewards, outcomes @ self.model.outcomes.ends
+        reward = outcomes @ self.model.outcomes.rewards
+        ends = outcomes @ self.model.outcomes.ends
         return following, reward, ends, 1.0 - known * (1.0 - untested), 1.0 - likeliest
 
     def _codes(self, frames: Frame) -> Codes:

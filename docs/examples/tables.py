@@ -20,7 +20,7 @@ from imagine_bench.agents.factored.given import GivenPerceptionAgent, make
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.interfaces import AgentContext, Frame, Observation, State, TaskSpec, Transition
-from imagine_bench.judge.models.outcomes import total_variation
+from imagine_bench.judge.truth import total_variation
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree

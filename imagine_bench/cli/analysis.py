@@ -90,7 +90,7 @@ class Judge:
 
     def __call__(self) -> None:
         """Judge and report."""
-        from imagine_bench.judge.models.study import Judgement, judge  # noqa: PLC0415 - as above
+        from imagine_bench.judge.judgement import Judgement, judge  # noqa: PLC0415 - as above
         from imagine_bench.recording.judgement import record_judgement  # noqa: PLC0415 - as above
         from imagine_bench.report.judge import judgement_report  # noqa: PLC0415 - as above
 
@@ -126,18 +126,20 @@ class Verify:
 
     def __call__(self) -> None:
         """Play and compare."""
-        from imagine_bench.audit import verify, why  # noqa: PLC0415 - as above
+        from imagine_bench.judge.verify import cost  # noqa: PLC0415 - as above
         from imagine_bench.report.analysis import chosen  # noqa: PLC0415 - as above
+        from imagine_bench.report.verify import verify  # noqa: PLC0415 - as above
+        from imagine_bench.report.why import why_report  # noqa: PLC0415 - as above
 
         given, task = path_or_task(self.folder, self.task)
         if self.causes:
-            print(why.why_report(given, root=self.out, task=task, encoder=self.encoder))
+            print(why_report(given, root=self.out, task=task, encoder=self.encoder))
             return
         if self.encoder is not None:
             raise InvalidValueError("--encoder goes with --causes; replaying episodes needs none.")
         folder = chosen(given, self.out, task)
         begun_s = time.process_time()
-        verdicts = verify.verify(folder)
-        print(*verdicts, verify.price(folder, verdicts, time.process_time() - begun_s), sep="\n")
+        verdicts = verify(folder)
+        print(*verdicts, cost(folder, verdicts, time.process_time() - begun_s), sep="\n")
         if any(verdict.complaint for verdict in verdicts):
             sys.exit(1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -125,9 +125,9 @@ class Bench:
     tests: Tests = field(default_factory=Tests)
     launch: Launch = field(default_factory=Launch)
 
-    def planned(self) -> tuple[ProtocolData, Encoders]:
-        """The protocol of the comparison, and the encoders, checked."""
-        given = {}
+    def asked(self) -> tuple[str, str, dict[str, Any]]:
+        """The task, the preset and the options that replace values of the preset, by name."""
+        given: dict[str, Any] = {}
         for section in (self.world, self.learner, self.budget, self.tests):
             for option in fields(section):
                 value = getattr(section, option.name)
@@ -142,7 +142,12 @@ class Bench:
             given["physics"] = physics
         if variants:
             given["variants"] = variants
-        return plan(self.task, self.preset, overrides=overrides, **given)
+        return self.task, self.preset, {"overrides": overrides, **given}
+
+    def planned(self) -> tuple[ProtocolData, Encoders]:
+        """The protocol of the comparison, and the encoders, checked."""
+        task, preset, options = self.asked()
+        return plan(task, preset, **options)
 
     def __call__(self) -> None:
         """Plan, run, report."""

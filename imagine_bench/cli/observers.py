@@ -10,14 +10,14 @@ from pathlib import Path
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.capabilities import Imaginer
 from imagine_bench.judge.causes import MOST_STATES, beliefs, frames_to_ask_with
-from imagine_bench.judge.imagination_quality import (
+from imagine_bench.judge.open_loop import (
     OPEN_LOOP_DEPTH,
-    OpenLoopStart,
     examples,
     imagine_sampled_rollouts,
     open_loop,
-    open_loop_starts,
+    surviving_actions,
 )
+from imagine_bench.judge.questions import EvalSet
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, RunSpec
 from imagine_bench.rules import states_of
@@ -34,24 +34,27 @@ class OpenLoopObserver(RunObserver):
     """Compares open-loop imagination with the rules at every budget."""
 
     def __init__(self) -> None:
-        self._starts: tuple[OpenLoopStart, ...] | None = None
+        self._begun = False
+        self._questions: EvalSet | None = None
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
         """``open_loop`` of an agent that imagines."""
         if not isinstance(run.agent, Imaginer) or not run.protocol.shows_frames_alone:
             return {}
-        if self._starts is None:  # the same at every budget
-            self._starts = open_loop_starts(
+        if not self._begun:  # the same at every budget
+            self._begun = True
+            self._questions = surviving_actions(
                 run.task,
                 starts=run.protocol.open_loop_starts,
                 depth=OPEN_LOOP_DEPTH,
                 appearance=run.protocol.appearance_in_tests,
                 purpose=evaluation_split(run.spec.seed),
             )
-        if not self._starts:
+        if self._questions is None:
             return {}
         run.tell("imagining", at_once=True)
-        return {"open_loop": open_loop(run.agent, self._starts, SeedTree(run.spec.seed).child("open_loop", budget))}
+        seeds = SeedTree(run.spec.seed).child("open_loop", budget)
+        return {"open_loop": open_loop(run.agent, self._questions, seeds)}
 
 
 class BeliefsObserver(RunObserver):
@@ -62,12 +65,14 @@ class BeliefsObserver(RunObserver):
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
         """``beliefs`` of an agent that learns, in a task of not too many macrostates, each of which frames show."""
-        task, entry = run.task, run.entry
+        task = run.task
+        entry = run.entry
         frames_tell_all = run.protocol.shows_frames_alone and task.sight is None
         if not entry.learns or not frames_tell_all or len(states_of(task.rules)) > MOST_STATES:
             return {}
         if self._frames is None:  # the same at every budget
-            appearance, purpose = run.protocol.appearance_in_tests, evaluation_split(run.spec.seed)
+            appearance = run.protocol.appearance_in_tests
+            purpose = evaluation_split(run.spec.seed)
             self._frames = frames_to_ask_with(run.agent, task, appearance=appearance, purpose=purpose)
         rng = SeedTree(run.spec.seed).child("beliefs", budget).generator()
         return {"beliefs": beliefs(run.agent, task.rules, self._frames, rng, privileged=entry.privileged)}
@@ -81,8 +86,12 @@ class ExamplesObserver(RunObserver):
         if not isinstance(run.agent, Imaginer) or not run.protocol.shows_frames_alone:
             return {}
         run.tell("imagining", at_once=True)
-        agent, task, appearance, seeds = run.agent, run.task, run.protocol.appearance_in_tests, SeedTree(run.spec.seed)
-        purpose, several = evaluation_split(run.spec.seed), seeds.child("sampled_rollouts")
+        agent = run.agent
+        task = run.task
+        appearance = run.protocol.appearance_in_tests
+        seeds = SeedTree(run.spec.seed)
+        purpose = evaluation_split(run.spec.seed)
+        several = seeds.child("sampled_rollouts")
         return {
             "imagined": examples(agent, task, appearance=appearance, seeds=seeds.child("examples"), purpose=purpose),
             "sampled_rollouts": imagine_sampled_rollouts(

@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 import scipy  # its parts load, slowly, when they are first used
-from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
@@ -53,7 +52,9 @@ def crps(mixtures: Mixtures, outcomes: Floats) -> Floats:
     Closed form for Gaussian mixtures (Grimit et al. 2006, equation 5): ``sum_k w_k A(y - m_k, s_k^2)
     - 1/2 sum_kl w_k w_l A(m_k - m_l, s_k^2 + s_l^2)`` with ``A(m, v) = E|N(m, v)|``. Shapes as above.
     """
-    weights, means, variances = mixtures.weights, mixtures.means, mixtures.sigmas**2
+    weights = mixtures.weights
+    means = mixtures.means
+    variances = mixtures.sigmas**2
     away = _mean_size(outcomes[..., None, :] - means, variances)  # [..., K, D]
     score: Floats = np.einsum("...k,...kd->...d", weights, away)
     step = max(1, _AT_ONCE // max(1, means.size))
@@ -71,24 +72,6 @@ def log_score(mixtures: Mixtures, outcomes: Floats) -> Floats:
     log_normal = (-0.5 * (scaled**2 + _LOG_2PI) - np.log(mixtures.sigmas)).sum(axis=-1)  # [..., K]
     with np.errstate(divide="ignore"):
         return np.asarray(-scipy.special.logsumexp(np.log(mixtures.weights) + log_normal, axis=-1))
-
-
-def auroc(scores: NDArray[np.floating], wrong: NDArray[np.bool_]) -> float:
-    """Probability, 0.5 by chance, that a wrong prediction has a higher score than a right one, ties counting half.
-
-    Area under the receiver operating characteristic (Hanley & McNeil 1982). Both of shape (N,); NaN where all
-    predictions are right, or all wrong.
-
-    Raises:
-        InvalidValueError: Shapes differ, or a score is NaN.
-    """
-    if scores.shape != wrong.shape or np.isnan(scores).any():
-        raise InvalidValueError(f"AUROC needs one number a prediction, not {scores.shape} for {wrong.shape}, or NaN.")
-    n_wrong, n_right = int(wrong.sum()), int((~wrong).sum())
-    if not n_wrong or not n_right:
-        return math.nan
-    ranks = scipy.stats.rankdata(scores)
-    return float((ranks[wrong].sum() - n_wrong * (n_wrong + 1) / 2) / (n_wrong * n_right))
 
 
 def _mean_size(mean: Floats, variance: Floats) -> Floats:

@@ -20,19 +20,25 @@ Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, Floats, Frame, Observation, Outcome, Rules, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
-from imagine_bench.judge.models.outcomes import total_variation
+from imagine_bench.judge.truth import total_variation
 from imagine_bench.rules import states_of
-from imagine_bench.seeding import Purpose, SeedTree
-from imagine_bench.store.results import Beliefs
+from imagine_bench.running.evaluation import Env
+from imagine_bench.running.run_state import make_env
+from imagine_bench.running.trained import Trained
+from imagine_bench.seeding import Purpose, SeedTree, episode_seed, evaluation_split
+from imagine_bench.store import run_folder
+from imagine_bench.store.results import KeptEpisodes, PolicyTable
 
 CAUSES = {
     "misread": "a frame was misread",
@@ -96,9 +102,10 @@ def misread(agent: Agent, frames: Frame, states: NDArray[np.int64]) -> NDArray[n
     return np.asarray((agent.read_frames(frames) != states).any(axis=1))
 
 
-def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator, *, privileged: bool) -> Beliefs:
+def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator, *, privileged: bool) -> PolicyTable:
     """What the agent would do, and what its model expects, in every macrostate, shown by ``frames``; see above."""
-    states, action = states_of(rules), np.zeros(len(frames), dtype=np.int16)
+    states = states_of(rules)
+    action = np.zeros(len(frames), dtype=np.int16)
     for row, state in enumerate(states):
         if not rules.is_terminal(state):
             seen = Observation(frame=frames[row], macrostate=np.array(state) if privileged else None)
@@ -109,7 +116,7 @@ def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator,
     if model is not None:
         small = {"macrostates": np.int16, "p_continues": np.float32, "reward": np.float32}
         model = ExpectedOutcomes(**{name: getattr(model, name).astype(kind) for name, kind in small.items()})
-    return Beliefs(action=action, model=model)
+    return PolicyTable(action=action, model=model)
 
 
 class Attribution:
@@ -122,8 +129,12 @@ class Attribution:
         readable: Macrostates of which it reads some frame right; those that end episodes do not matter. Shape (S,).
     """
 
-    def __init__(self, spec: TaskSpec, held: Beliefs, tried: NDArray[np.int64], readable: NDArray[np.bool_]) -> None:
-        self._rules, self._horizon, self._held = spec.rules, spec.horizon, held
+    def __init__(
+        self, spec: TaskSpec, held: PolicyTable, tried: NDArray[np.int64], readable: NDArray[np.bool_]
+    ) -> None:
+        self._rules = spec.rules
+        self._horizon = spec.horizon
+        self._held = held
         self._rows = {state: row for row, state in enumerate(states_of(spec.rules))}
         truth = true_model(spec.rules)
         known = np.zeros(truth.reward.shape, dtype=np.bool_)
@@ -170,7 +181,8 @@ class Attribution:
 
     def _plan(self, model: Model) -> NDArray[np.bool_]:
         """Which macro-actions have the largest return in those left, 1 to H of them. Shape (H, S, A)."""
-        value, best = np.zeros(len(model.reward) + 1), []  # the last one is of what is no macrostate
+        value = np.zeros(len(model.reward) + 1)  # the last one is of what is no macrostate
+        best = []
         for _ in range(self._horizon):
             q = model.reward + (model.p_continues * value[model.following]).sum(axis=2)
             value[:-1] = q.max(axis=1)
@@ -184,7 +196,8 @@ class Attribution:
         """
         state = episode.states[0]
         for step in range(self._horizon):
-            row, lived = self._rows.get(state, -1), step < len(episode.actions) and state == episode.states[step]
+            row = self._rows.get(state, -1)
+            lived = step < len(episode.actions) and state == episode.states[step]
             if row < 0:
                 return False
             action = int(episode.actions[step] if lived and not episode.misread[step] else self._held.action[row])
@@ -224,7 +237,9 @@ def true_model(rules: Rules) -> Model:
     rows = {state: row for row, state in enumerate(states)}
     every = [[rules.outcomes(state, action) for action in range(rules.n_actions)] for state in states]
     shape = (len(states), rules.n_actions, max(len(outcomes) for actions in every for outcomes in actions))
-    following, p_continues, reward = np.full(shape, -1), np.zeros(shape), np.zeros(shape[:2])
+    following = np.full(shape, -1)
+    p_continues = np.zeros(shape)
+    reward = np.zeros(shape[:2])
     for row, actions in enumerate(every):
         for action, outcomes in enumerate(actions):
             for branch, outcome in enumerate(outcomes):
@@ -234,7 +249,7 @@ def true_model(rules: Rules) -> Model:
     return Model(following, p_continues, reward)
 
 
-def expected_rightly(rules: Rules, held: Beliefs) -> float:
+def expected_rightly(rules: Rules, held: PolicyTable) -> float:
     """How much of what the rules have come of a macro-action a model expects too, in [0, 1]; NaN without a model.
 
     One less the total variation of where the episode goes on, or that it ends: the mean over every macro-action in
@@ -243,7 +258,8 @@ def expected_rightly(rules: Rules, held: Beliefs) -> float:
     if held.model is None:
         return math.nan
     states = states_of(rules)
-    own, shares = np.moveaxis(held.model.macrostates, 2, 0), np.moveaxis(held.model.p_continues, 2, 0)
+    own = np.moveaxis(held.model.macrostates, 2, 0)
+    shares = np.moveaxis(held.model.p_continues, 2, 0)
     found = []
     for row, state in enumerate(states):
         for action in range(0 if rules.is_terminal(state) else rules.n_actions):
@@ -272,3 +288,98 @@ def _mixed(where: NDArray[np.bool_], one: Model, other: Model) -> Model:
         np.where(where[..., None], wide(one.p_continues), wide(other.p_continues)),
         np.where(where, one.reward, other.reward),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tested:
+    """The causes of one test's failures."""
+
+    episodes: int  # real training episodes before
+    tests: int
+    causes: Mapping[int, str]  # by number of the test
+
+
+class WhyAnalysis:
+    """The causes of every failure."""
+
+    def __init__(self, spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> None:
+        if spec.sight is not None:
+            raise InvalidValueError(
+                f"Frames of {spec.id} hide something, or are old. What an agent should have done there depends on all "
+                "that it saw before, so its failures have no one cause; ask about a world without gesture and lag."
+            )
+        self.spec = spec
+        self._appearance = appearance
+        self._purpose = purpose
+        self._states = np.array(states_of(spec.rules), dtype=np.int64)
+
+    def measure(self, trained: Trained) -> tuple[Tested, ...]:
+        """Play its failed test episodes again and find their causes; it sees as at the end of training.
+
+        Raises:
+            ArtefactError: An unfinished run, or one that keeps no test episodes.
+            InvalidValueError: What it experienced is not known, or its task has too many macrostates.
+        """
+        protocol = trained.spec.protocol
+        found = []
+        if protocol.dataset or protocol.after:
+            raise InvalidValueError("What agents saw in a dataset or an earlier task is not kept; give another bench.")
+        if not protocol.shows_frames_alone:
+            raise InvalidValueError("These agents saw more than frames; give a bench of --observation frame.")
+        if not run_folder.is_done(trained.folder):
+            raise ArtefactError(f"{trained.folder} is not finished; give the bench command again to finish it.")
+        run = run_folder.load_run(trained.folder)
+        with closing(make_env(protocol, protocol.task, testing=True)) as env:
+            agent = trained.agent
+            episodes = _FailedEpisodes(env, agent, trained.spec.seed)
+            frames = frames_to_ask_with(agent, self.spec, appearance=self._appearance, purpose=self._purpose)
+            readable = ~misread(agent, frames, self._states)
+            for row in run.checkpoints:
+                if row.kept is None or run.tried is None:
+                    raise ArtefactError(f"{trained.folder} keeps no test episodes; run its bench anew, elsewhere.")
+                if row.beliefs is None:
+                    raise InvalidValueError(f"{self.spec.id} has too many macrostates to ask an agent about each.")
+                tried = run.tried[run.tried[:, -1] < row.episodes, :-1].astype(np.int64)
+                attribution = Attribution(self.spec, row.beliefs, tried, readable)
+                failed = np.flatnonzero(~row.kept.success).tolist()
+                causes = {test: attribution.cause(episodes.of(row.kept, test)) for test in failed}
+                found.append(Tested(episodes=row.episodes, tests=row.test_episodes, causes=causes))
+        return tuple(found)
+
+
+class _FailedEpisodes:
+    """Failed test episodes, played again to see what the agent misread; each once."""
+
+    def __init__(self, env: Env, agent: Agent, seed: int) -> None:
+        self._env = env
+        self._agent = agent
+        self._purpose = evaluation_split(seed)
+        self._known: dict[tuple[int, ...], FailedEpisode] = {}
+
+    def of(self, kept: KeptEpisodes, test: int) -> FailedEpisode:
+        """One of the episodes kept."""
+        actions = kept.actions_of(test)
+        seed = episode_seed(self._purpose, 0, test)
+        if (seed, *actions) not in self._known:
+            self._known[seed, *actions] = self._play(seed, actions)
+        return self._known[seed, *actions]
+
+    def _play(self, seed: int, actions: list[int]) -> FailedEpisode:
+        frame, info = self._env.reset(seed=seed)
+        frames = [frame]
+        infos = [info]
+        terminated = False
+        for action in actions:
+            frame, _, terminated, _, info = self._env.step(action)
+            frames.append(frame)
+            infos.append(info)
+        states = np.array([info["macrostate"] for info in infos], dtype=np.int64)
+        wrong = misread(self._agent, np.array(frames[:-1]), states[:-1])
+        return FailedEpisode(
+            states=[tuple(state) for state in states.tolist()],
+            actions=actions,
+            terminated=bool(terminated),
+            faults=[bool(info["fault"]) for info in infos[1:]],
+            misread=wrong.tolist(),
+            seed=seed,
+        )

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, State
-from imagine_bench.interfaces.capabilities import ImaginedRollout, begin_episode
-from imagine_bench.judge.imagination_quality import beside_reality
+from imagine_bench.interfaces.capabilities import ImaginedRollout
+from imagine_bench.judge.models import AgentModel
+from imagine_bench.judge.open_loop import beside_reality
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running import run_state
 from imagine_bench.running.trained import Trained
@@ -28,7 +29,7 @@ from imagine_bench.store.results import ComparedRollout
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class PlanResult:
     """One plan and what became of it."""
 
     number: int  # its start, from 0; the same for every agent
@@ -57,7 +58,8 @@ class Plan:
     @property
     def as_imagined(self) -> NDArray[np.bool_]:
         """Whether each macro-action that was carried out led where it was imagined to. Shape (done,)."""
-        read, real = self.compared.rollout.macrostates, self.compared.real_macrostates
+        read = self.compared.rollout.macrostates
+        real = self.compared.real_macrostates
         return np.asarray((read[: self.done] == real[: self.done]).all(axis=-1), dtype=np.bool_)
 
     @property
@@ -72,7 +74,9 @@ class Plan:
         return "over before anything was solved"
 
 
-def make_plans(trained: Trained, *, count: int, execution: str, max_epistemic: float | None = None) -> Iterator[Plan]:
+def make_plans(
+    trained: Trained, *, count: int, execution: str, max_epistemic: float | None = None
+) -> Iterator[PlanResult]:
     """Plan from ``count`` starts and carry each plan out.
 
     The starts have seeds of their own, the same for every agent: no run ever trained, tested or tuned on them.
@@ -103,28 +107,32 @@ def carry_out(
     max_epistemic: float | None = None,
     on_step: Callable[[int], None] | None = None,  # told after each macro-action how many of the plan are done
     on_plan: Callable[[Frame, ImaginedRollout], None] | None = None,
-) -> Plan:
+) -> PlanResult:
     """Imagine plan ``number`` from one frame and, unless it is refused, let the arm do it."""
     frame, info = env.reset(seed=episode_seed("planning", int(is_tuning_seed(trained.spec.seed)), number))
     start = _state(info)
     rng = SeedTree(trained.spec.seed).child("planning", number).generator()
-    begin_episode(trained.agent)
-    rollout = trained.imaginer.imagine(frame, actions=None, depth=trained.task.horizon, rng=rng)
+    model = AgentModel(trained.imaginer)
+    (rollout,) = model.rollouts([frame], [None], depth=trained.task.horizon, generators=[rng])
     refused = _refusal(rollout, max_epistemic)
     if on_plan is not None:
         on_plan(frame, rollout)
-    frames, real, faults, solved = [], [], 0, False
+    frames = []
+    real = []
+    faults = 0
+    solved = False
     for step, action in enumerate([] if refused else rollout.actions, start=1):
         seen, reward, terminated, truncated, info = env.step(int(action))
         frames.append(seen)
         shown = trained.task.as_observed(info.get("shown", info["macrostate"]))
         real.append((shown, float(reward), bool(terminated)))
-        faults, solved = faults + bool(info["fault"]), bool(info["is_success"])
+        faults += bool(info["fault"])
+        solved = bool(info["is_success"])
         if on_step is not None:
             on_step(step)
         if terminated or truncated:
             break
-    return Plan(
+    return PlanResult(
         number=number,
         start=start,
         compared=beside_reality(rollout, frame, start, frames, real),

@@ -13,8 +13,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from imagine_bench import registry
-from imagine_bench.judge.models.study import Judgement, shown
-from imagine_bench.judge.models.trained import model_entry
+from imagine_bench.judge.judgement import Judgement, shown
+from imagine_bench.judge.models import model_entry
 from imagine_bench.recording.stream import recording_file
 from imagine_bench.registry.entries import file_name
 

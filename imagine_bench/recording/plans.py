@@ -16,12 +16,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from imagine_bench.interfaces import SceneReader
-from imagine_bench.judge.filmstrips import filmstrip, rgb
-from imagine_bench.judge.plans import Plan, carry_out, make_env
+from imagine_bench.judge.plans import PlanResult, carry_out, make_env
 from imagine_bench.recording.blueprint import playing, scene_view
 from imagine_bench.recording.episodes import MOTION_HZ
 from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
 from imagine_bench.recording.stream import Recording, recording_file
+from imagine_bench.report.filmstrips import filmstrip, rgb
 from imagine_bench.running.trained import Trained
 from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
@@ -103,7 +103,7 @@ class _PlanRecorder:
             motion = scene.motion()
             log_motion(self._recording, motion, end_s=self._clock_s, sequences=sequences, only_moved=only_moved)
 
-    def _show(self, plan: Plan, done: int) -> None:
+    def _show(self, plan: PlanResult, done: int) -> None:
         """What was imagined, and what is real so far."""
         recording = self._recording
         compared = plan.compared
@@ -117,7 +117,7 @@ class _PlanRecorder:
         recording.sheet("/imagined/filmstrip", strip)
         recording.text("/real/text", self._words(plan, done))
 
-    def _words(self, plan: Plan, done: int) -> str:
+    def _words(self, plan: PlanResult, done: int) -> str:
         names = self._trained.task.action_names
         lines = [f"### Plan {plan.number} (of {self._count}, from 0), imagined from one frame", ""]
         for step, action in enumerate(plan.compared.rollout.actions, start=1):

@@ -10,7 +10,6 @@ from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import SCORES, RegressionSpec, Regressor
 from imagine_bench.judge.calibration import (
     LEVELS,
-    auroc,
     coverage,
     crps,
     log_score,
@@ -19,6 +18,7 @@ from imagine_bench.judge.calibration import (
 )
 from imagine_bench.regression.results import Row
 from imagine_bench.seeding import SeedTree
+from imagine_bench.statistics import auroc
 from imagine_bench.store.codec import Arrays
 
 CRPS_POINTS = 50

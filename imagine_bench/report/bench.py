@@ -278,11 +278,9 @@ def gain(data: ReportData) -> Section | None:
     found = data.comparisons
     if not found:
         return None
-    sizes = [each.detectable for by_budget in found.values() for each in by_budget.values()]
-    shown = "" if math.isnan(min(sizes)) else (
-        f"p-values are Holm-corrected for {len(sizes)} cells. The smallest difference that would be shown with "
-        f"probability 80 % is {percent(min(sizes))} to {percent(max(sizes))} points, by cell."
-    )  # fmt: skip
+    every = [each for by_budget in found.values() for each in by_budget.values()]
+    shown = _detectable([each.detectable for each in every])
+    told = _detectable([each.paired_detectable for each in every])
     words = (
         "Difference: percentage points of test episodes solved. Gain: the same relative to DQN, (agent − DQN) / DQN, "
         "the thesis' measure. One seed has no interval, nor has a gain over a DQN that may have solved nothing. "
@@ -295,10 +293,21 @@ def gain(data: ReportData) -> Section | None:
     tables = [
         _by_budget(data, "differences", "difference (points) after", found, _difference, shown),
         _by_budget(data, "gains", "gain (%) after", found, _gain, why_dash="DQN solved nothing to compare with"),
-        _by_budget(data, "paired", "solved alone : by DQN alone, after", found, _alone, why_dash=alone),
+        _by_budget(data, "paired", "solved alone : by DQN alone, after", found, _alone, told, alone),
     ]
     drawn = any(_near(data, printed) for printed in data.thesis_gains.values())
     return Section("Gain over DQN", [words], [image] if drawn else [], tables)
+
+
+def _detectable(sizes: Sequence[float]) -> str:
+    """How small a difference the cells of a table could have shown; empty where that is not known."""
+    known = [size for size in sizes if not math.isnan(size)]
+    if not known:
+        return ""
+    return (
+        f"p-values are Holm-corrected for {len(sizes)} cells. The smallest difference that would be shown with "
+        f"probability 80 % is {percent(min(known))} to {percent(max(known))} points, by cell."
+    )
 
 
 def _difference(versus: Comparison) -> Cell:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from imagine_bench.exact.certificate import certificate_rows
 from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.judge.causes import CAUSES
-from imagine_bench.judge.policy import Terminations, optimal_length, terminations
+from imagine_bench.judge.values import Terminations, optimal_length, terminations
 from imagine_bench.report import figures
 from imagine_bench.report.data import ReportData, agent_title
 from imagine_bench.report.tables import DASH, Section, Table, decimals, mean_text, percent

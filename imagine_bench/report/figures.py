@@ -22,7 +22,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from imagine_bench.judge.causes import CAUSES
-from imagine_bench.registry import AGENTS
+from imagine_bench.registry import AGENT_GROUP, AGENTS
+from imagine_bench.registry.guests import guests
 from imagine_bench.report.data import agent_title
 from imagine_bench.report.tables import Image
 from imagine_bench.statistics import Estimate
@@ -105,9 +106,13 @@ def _inline(svg: str, name: str, alt: str) -> str:
     return body.replace(INK, "currentColor")
 
 
-def color(agent: str, known: Iterable[str] = AGENTS) -> str:
-    """The color of an agent, or of another learner of these known ones, the same in every figure."""
-    names = list(known)
+def color(agent: str, known: Iterable[str] | None = None) -> str:
+    """The color of an agent, or of another learner of these known ones, the same in every figure.
+
+    A guest of this suite has its color also where its package is not installed.
+    """
+    of_guests = (name for guest in guests() for name in guest.names[AGENT_GROUP])
+    names = [*AGENTS, *of_guests] if known is None else list(known)
     bases = [name for name in names if re.match(rf"{re.escape(name)}([:,]|$)", agent)]
     base = max(bases, key=len, default=agent)
     place = names.index(base) if base in names else sum(base.encode())

@@ -18,15 +18,14 @@ from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.filmstrips import png, transition_sheet
-from imagine_bench.judge.models.change import FALSE_ALARMS, LENGTH, SLIP
-from imagine_bench.judge.models.outcomes import sampling_noise_floor
-from imagine_bench.judge.models.scores import COVERAGES
-from imagine_bench.judge.models.study import Judgement, kept, prepare, shown
-from imagine_bench.judge.models.trained import model_entry, runs_of
-from imagine_bench.judge.models.truth import shares
+from imagine_bench.judge.change import FALSE_ALARMS, LENGTH, SLIP
+from imagine_bench.judge.judgement import Judgement, kept, prepare, shown
+from imagine_bench.judge.models import model_entry, runs_of
+from imagine_bench.judge.scores import COVERAGES
+from imagine_bench.judge.truth import sampling_noise_floor, shares
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
+from imagine_bench.report.filmstrips import png, transition_sheet
 from imagine_bench.report.page import flat, write_page
 from imagine_bench.report.tables import DASH, Cell, Image, Page, Section, Table, estimate, number, p_value
 from imagine_bench.rules import fewest_actions

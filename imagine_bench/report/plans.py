@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from imagine_bench import reference, statistics
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.filmstrips import filmstrip, png
-from imagine_bench.judge.plans import Plan, make_plans, require_threshold
+from imagine_bench.judge.plans import PlanResult, make_plans, require_threshold
 from imagine_bench.report.analysis import chosen, provenance
+from imagine_bench.report.filmstrips import filmstrip, png
 from imagine_bench.report.tables import DASH, Table, percent
 from imagine_bench.running.progress import counted
 from imagine_bench.running.task_types import load_bench
@@ -37,7 +37,7 @@ def plan_report(
     run: Path | None, *, root: Path, task: str | None, count: int, execution: str | None, max_epistemic: float | None,
     encoder: str | None, recorded: int = 0, record: Record | None = None,
 ) -> str:  # fmt: skip
-    """Plan, carry out, and leave a table, filmstrips and a recording in the run's folder, below ``plans``.
+    """PlanResult, carry out, and leave a table, filmstrips and a recording in the run's folder, below ``plans``.
 
     ``run`` is a run's folder, or a bench's, whose best imagining run is taken; None is the newest bench of ``task``,
     or of any. ``max_epistemic`` is as in :func:`imagine_bench.judge.plans.make_plans`, ``encoder`` as in
@@ -102,7 +102,7 @@ class PlanSummary:
     faults: int
 
 
-def summarise(plans: Sequence[Plan]) -> PlanSummary:
+def summarise(plans: Sequence[PlanResult]) -> PlanSummary:
     """Count."""
     lengths = [plan.done for plan in plans if plan.solved]
     return PlanSummary(
@@ -138,7 +138,7 @@ def plan_table(found: PlanSummary, task: TaskSpec) -> Table:
 
 
 def write_plans(
-    folder: Path, plans: Sequence[Plan], task: TaskSpec, origin: Mapping[str, object], *, filmstrips: int
+    folder: Path, plans: Sequence[PlanResult], task: TaskSpec, origin: Mapping[str, object], *, filmstrips: int
 ) -> PlanSummary:
     """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and filmstrips of the first plans that failed.
 
@@ -166,11 +166,11 @@ def write_plans(
     return summary
 
 
-def _failed(plans: Sequence[Plan]) -> list[str]:
+def _failed(plans: Sequence[PlanResult]) -> list[str]:
     return [f"plan {plan.number} from {plan.start}: {plan.outcome}" for plan in plans if not plan.solved]
 
 
-def _row(plan: Plan) -> list[object]:
+def _row(plan: PlanResult) -> list[object]:
     """A row of plans.csv."""
     rollout = plan.compared.rollout
     start, actions = (" ".join(map(str, each)) for each in (plan.start, rollout.actions.tolist()))
@@ -179,14 +179,14 @@ def _row(plan: Plan) -> list[object]:
     return [plan.number, start, *counts, as_imagined, plan.faults, f"{float(rollout.epistemic.max()):.6g}", actions]
 
 
-def _varied(plans: Sequence[Plan], count: int) -> list[Plan]:
+def _varied(plans: Sequence[PlanResult], count: int) -> list[PlanResult]:
     """The first plan of each length, shortest first, then others in order, up to ``count``."""
     first = {plan.length: plan for plan in reversed(plans)}
     ranked = sorted(plans, key=lambda plan: first[plan.length] is not plan)
     return sorted(ranked[:count], key=lambda plan: (plan.length, plan.number))
 
 
-def _stack(plans: Sequence[Plan], task: TaskSpec) -> NDArray[np.uint8]:
+def _stack(plans: Sequence[PlanResult], task: TaskSpec) -> NDArray[np.uint8]:
     """The filmstrips of plans below one another. Shape (height, width, 3)."""
     columns = max(plan.length for plan in plans)
     return np.concatenate([filmstrip(plan.compared, task.action_names, columns=columns) for plan in plans])

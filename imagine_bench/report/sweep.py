@@ -155,9 +155,10 @@ def _two(value: float) -> str:
 
 
 def _scores(result: SuiteResult) -> Section:
-    found = {each: _score(result, each) for each in result.suite.experiments}
-    by_agent = dict(zip(result.agents, zip(*found.values(), strict=True), strict=True))
-    spokes = [each.name for each in found]
+    experiments = result.suite.experiments
+    found = [_score(result, each) for each in experiments]
+    by_agent = dict(zip(result.agents, zip(*found, strict=True), strict=True))
+    spokes = [each.name for each in experiments]
     caption = (
         "(success − chance) / (optimum − chance), mean over the levels of each experiment. The middle is blind choice, "
         "the rim is perfect play. Lines across: 95 % intervals."
@@ -165,7 +166,7 @@ def _scores(result: SuiteResult) -> Section:
     image = figures.plot("radar", lambda: figures.radar_figure(spokes, by_agent), caption)
     rows = [
         [f"{each.name}: {each.dial}", *(str(estimate(score, _two)) for score in scores)]
-        for each, scores in found.items()
+        for each, scores in zip(experiments, found, strict=True)
     ]
     words = (
         "Scores with 95 % intervals: Student's over seeds, and at least that of the tests. 0 is chance, 1 the exact "

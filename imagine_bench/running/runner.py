@@ -20,14 +20,14 @@ from imagine_bench.running import phases
 from imagine_bench.running.run_state import Run, environments
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import lock, make_folder
-from imagine_bench.store.results import Beliefs, Checkpoint, ComparedRollout, OpenLoop
+from imagine_bench.store.results import Checkpoint, ComparedRollout, OpenLoop, PolicyTable
 
 
 class AtBudget(TypedDict, total=False):
     """What observers measure at a budget: fields of :class:`.Checkpoint`."""
 
     open_loop: OpenLoop
-    beliefs: Beliefs
+    beliefs: PolicyTable
 
 
 class AtEnd(TypedDict, total=False):

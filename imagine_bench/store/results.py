@@ -61,7 +61,7 @@ class ComparedRollout:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Beliefs:
+class PolicyTable:
     """What an agent does, and what its model expects, in every macrostate of its task, S of them, in a frame of each.
 
     They are in the order of :func:`imagine_bench.rules.states_of`.
@@ -111,7 +111,7 @@ class Checkpoint:
     open_loop: OpenLoop | None = None  #: Imagination against the rules, for agents that imagine
     #: What the agent does and expects everywhere, for the causes of its failures; None for agents that do not learn,
     #: for tasks of too many macrostates, and in results of before 2026-11-24.
-    beliefs: Beliefs | None = field(default=None, compare=False)
+    beliefs: PolicyTable | None = field(default=None, compare=False)
     #: The test episodes themselves. None in results of before 2026-11-24.
     kept: KeptEpisodes | None = field(default=None, compare=False)
 

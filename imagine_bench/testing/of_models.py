@@ -14,9 +14,8 @@ from imagine_bench import registry
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import Episodes, content_hash
 from imagine_bench.interfaces.model import Imagined, WorldModel, require_imagined
-from imagine_bench.judge.models.asking import call
-from imagine_bench.judge.models.ends import Gallery
-from imagine_bench.judge.models.study import make
+from imagine_bench.judge.models import make
+from imagine_bench.judge.predictions import RenderedFrameIndex, call
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.testing.common import require
@@ -40,7 +39,7 @@ class CheckedModel(NamedTuple):
         """A new one."""
         spec = registry.task(self.task)
         seeds = SeedTree(_SEED).child("judge", self.task)
-        return make(self.name, spec, Gallery(spec, "clean"), "clean", seeds)[0]
+        return make(self.name, spec, RenderedFrameIndex(spec, "clean"), "clean", seeds)[0]
 
     def fitted(self) -> WorldModel:
         """A new one that has seen the episodes."""

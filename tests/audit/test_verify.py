@@ -16,11 +16,12 @@ from forger import FORGERIES
 from report_pages import without_images
 from small_runs import Inline, context, do, small
 
-from imagine_bench.audit.verify import Replays, _verify_test, price, verdicts, verify
 from imagine_bench.errors import ArtefactError
+from imagine_bench.judge.verify import Replays, _verify_test, cost, verdicts
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report import bench_page
 from imagine_bench.report.page import texts
+from imagine_bench.report.verify import verify, with_report
 from imagine_bench.running.bench import bench
 from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode, replay
 from imagine_bench.running.run_state import environments
@@ -50,10 +51,10 @@ def test_a_bench_that_was_not_touched_holds(finished: Path) -> None:
 def test_the_price_is_that_of_the_files(finished: Path) -> None:
     found = verify(finished)
     size = sum(len((finished / agent / "seed_0" / "episodes.npz").read_bytes()) for agent in ("table", "random"))
-    assert price(finished, found, 1.0) == (
+    assert cost(finished, found, 1.0) == (
         f"32 test episodes in {size / 1024:.1f} KiB, {size / 32:.1f} bytes each; checked in 1.0 CPU s."
     )
-    assert price(finished, [], 2.0).endswith("; checked in 2.0 CPU s.")
+    assert cost(finished, [], 2.0).endswith("; checked in 2.0 CPU s.")
 
 
 def test_two_hundred_forgeries_are_found(finished: Path, tmp_path: Path) -> None:
@@ -68,7 +69,7 @@ def test_two_hundred_forgeries_are_found(finished: Path, tmp_path: Path) -> None
             (forged,) = folder.parent.iterdir()
             tried[name] += 1
             try:
-                found = verdicts(forged, replays)
+                found = with_report(forged, verdicts(forged, replays))
             except ArtefactError:
                 continue
             if not any(each.complaint for each in found):

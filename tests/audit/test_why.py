@@ -11,14 +11,13 @@ from report_pages import without_images
 from small_runs import Inline, small
 
 from imagine_bench import registry
-from imagine_bench.audit import why
-from imagine_bench.audit.verify import verify
 from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
-from imagine_bench.report import bench_page
+from imagine_bench.report import bench_page, why
 from imagine_bench.report.exact import causes_table, read_failures
 from imagine_bench.report.page import texts
+from imagine_bench.report.verify import verify
 from imagine_bench.rules import states_of
 from imagine_bench.running.bench import bench
 from imagine_bench.running.task_types import load_bench

@@ -21,10 +21,10 @@ from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate
-from imagine_bench.judge.models.asking import one_step
-from imagine_bench.judge.models.ends import Gallery
-from imagine_bench.judge.models.study import make
-from imagine_bench.judge.models.truth import expected_reward
+from imagine_bench.judge.models import make
+from imagine_bench.judge.predictions import RenderedFrameIndex
+from imagine_bench.judge.questions import one_step
+from imagine_bench.judge.truth import expected_reward
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.collect import collect, policy_of
@@ -77,15 +77,15 @@ def test_the_task_keeps_the_contract(example: ModuleType, tmp_path: Path, capsys
 def test_the_world_model_keeps_the_contract_and_learns(example: ModuleType) -> None:
     assert report(checks(model="own_model")) == 0
     spec = registry.task("pick_place")
-    gallery, seeds = Gallery(spec, "clean"), SeedTree(0)
-    asked = one_step(spec, gallery)
+    index, seeds = RenderedFrameIndex(spec, "clean"), SeedTree(0)
+    asked = one_step(spec, index.render)
     truth = np.array([expected_reward(steps[0]) for steps in asked.truth])
     played, _, _ = collect(
         spec, policy_of("random", spec, 0), episodes=400, seed=0, execution="kinematic", appearance="clean"
     )
     away = []
     for transitions in (10, 300):
-        model, _ = make("own_model", spec, gallery, "clean", seeds)
+        model, _ = make("own_model", spec, index, "clean", seeds)
         model.fit(played.first(min(transitions, len(played.actions))), seeds.generator())
         imagined = model.imagine(asked.frames, asked.actions, 8, seeds.generator())
         assert imagined.rewards is not None and imagined.epistemic is not None

@@ -9,7 +9,8 @@ from scipy import integrate, stats
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.regression import Mixtures
 from imagine_bench.judge import calibration
-from imagine_bench.judge.calibration import auroc, coverage, crps, log_score, probability_transform, transform_distance
+from imagine_bench.judge.calibration import coverage, crps, log_score, probability_transform, transform_distance
+from imagine_bench.statistics import auroc
 
 
 def mixture(seed: int = 0, rows: int = 4, components: int = 3, size: int = 2) -> Mixtures:

@@ -15,7 +15,7 @@ from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, _at, _place
 from imagine_bench.rules import fewest_actions, states_of
-from imagine_bench.store.results import Beliefs
+from imagine_bench.store.results import PolicyTable
 
 SPEC = registry.task("arrow_puzzle")
 RULES = SPEC.rules
@@ -45,8 +45,8 @@ def model_of(spec: TaskSpec, wrong: Callable[[State, int], bool] = lambda state,
     return ExpectedOutcomes(**found)
 
 
-def does(choice: dict[State, int], model: ExpectedOutcomes | None, states: tuple[State, ...] = STATES) -> Beliefs:
-    return Beliefs(action=np.array([choice[state] for state in states], dtype=np.int16), model=model)
+def does(choice: dict[State, int], model: ExpectedOutcomes | None, states: tuple[State, ...] = STATES) -> PolicyTable:
+    return PolicyTable(action=np.array([choice[state] for state in states], dtype=np.int16), model=model)
 
 
 def episode(start: State, actions: list[int], **changes: Any) -> FailedEpisode:
@@ -61,11 +61,11 @@ def episode(start: State, actions: list[int], **changes: Any) -> FailedEpisode:
     return FailedEpisode(**{**known, "seed": 5, **changes})
 
 
-def cause(agent: Beliefs, tried: NDArray[np.int64], happened: FailedEpisode, spec: TaskSpec = SPEC) -> str:
+def cause(agent: PolicyTable, tried: NDArray[np.int64], happened: FailedEpisode, spec: TaskSpec = SPEC) -> str:
     return Attribution(spec, agent, tried, np.ones(len(agent.action), dtype=np.bool_)).cause(happened)
 
 
-@pytest.mark.parametrize("start", FAR[::4])
+@pytest.mark.parametrize("start", FAR[::12])
 @pytest.mark.parametrize("modelled", [True, False])
 def test_one_misread_frame_is_charged_to_the_eyes(start: State, modelled: bool) -> None:
     agent = does(OPTIMAL, model_of(SPEC) if modelled else None)
@@ -77,7 +77,7 @@ def test_one_misread_frame_is_charged_to_the_eyes(start: State, modelled: bool) 
     assert cause(agent, ALL, seeing) == ("planning" if modelled else "values"), "it was not the frame that was misread"
 
 
-@pytest.mark.parametrize("start", FAR[::8])
+@pytest.mark.parametrize("start", FAR[::24])
 def test_the_best_stands_for_what_an_agent_does_where_it_reads_nothing(start: State) -> None:
     """What its model says there, from frames that it misreads, is not held against the model."""
     readable = np.array([state != start for state in STATES])
@@ -89,7 +89,7 @@ def test_the_best_stands_for_what_an_agent_does_where_it_reads_nothing(start: St
     assert plays_badly.cause(blind) == plays_badly.cause(failed) == "planning"
 
 
-@pytest.mark.parametrize("start", FAR[::4])
+@pytest.mark.parametrize("start", FAR[::12])
 def test_what_was_never_experienced_is_charged_to_experience(start: State) -> None:
     """It knows every transition but those that solve a puzzle, and would do all others right."""
 
@@ -107,14 +107,14 @@ def test_what_was_never_experienced_is_charged_to_experience(start: State) -> No
     assert cause(does(dict.fromkeys(STATES, 0), model_of(SPEC)), NONE, failed) == "planning", "the model needs no more"
 
 
-@pytest.mark.parametrize("start", FAR[::4])
+@pytest.mark.parametrize("start", FAR[::12])
 def test_a_policy_not_greedy_in_its_right_model_is_planning(start: State) -> None:
     failed = episode(start, [ILLEGAL[start]])
     assert cause(does(ILLEGAL, model_of(SPEC)), ALL, failed) == "planning"
     assert cause(does(ILLEGAL, None), ALL, failed) == "values"
 
 
-@pytest.mark.parametrize("start", FAR[::4])
+@pytest.mark.parametrize("start", FAR[::12])
 def test_a_slip_of_physics_is_charged_to_physics(start: State) -> None:
     bad = RULES.outcomes(start, ILLEGAL[start])[0].macrostate
     slipped = episode(start, [OPTIMAL[start]], states=[start, bad], terminated=True, faults=[True])
@@ -143,10 +143,10 @@ def test_bad_luck_is_nobodys_fault() -> None:
     for model in (model_of(spec), None):
         agent = does({(0,): 0, (1,): 0, (2,): 0}, model, Coin.states)
         assert cause(agent, tried, FailedEpisode(actions=[0], seed=1, **quiet), spec) == "unlucky"
-        found = [cause(agent, tried, FailedEpisode(actions=[1], seed=seed, **quiet), spec) for seed in range(400)]
+        found = [cause(agent, tried, FailedEpisode(actions=[1], seed=seed, **quiet), spec) for seed in range(200)]
         wrong = "planning" if model else "values"
         assert set(found) == {wrong, "unlucky"}, "another action would have met the same chance"
-        assert abs(found.count(wrong) / 400 - 0.6) < 0.08
+        assert abs(found.count(wrong) / 200 - 0.6) < 0.11
 
 
 def test_a_start_from_which_no_plan_fits_is_unlucky() -> None:
@@ -161,7 +161,7 @@ def test_every_failure_has_exactly_one_cause() -> None:
     """Agents wrong in every way at once: none of their failures is without a cause, or charged where none can be."""
     rng = np.random.default_rng(3)
     counted = dict.fromkeys(CAUSES, 0)
-    for number in range(30):
+    for number in range(9):
         choice = {state: int(rng.integers(6)) for state in STATES}
         doubt = rng.random(2)
         model = None if number % 3 == 0 else model_of(SPEC, lambda state, action, p=doubt[0]: rng.random() < p)

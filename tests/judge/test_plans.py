@@ -22,7 +22,7 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame, PhysicsSettings, State
 from imagine_bench.interfaces.capabilities import ImaginedRollout
-from imagine_bench.judge.plans import Plan, carry_out, make_env, make_plans
+from imagine_bench.judge.plans import PlanResult, carry_out, make_env, make_plans
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.recording.plans import record_plans
@@ -78,28 +78,32 @@ def trained(dreamer: Any, seed: int = 0) -> Trained:
     return Trained(agent=dreamer, spec=spec, task=TASK, episodes=7, folder=Path("somewhere"))
 
 
-def carried_out(dreamer: Dreamer, count: int, execution: str = "kinematic", **options: Any) -> list[Plan]:
+def carried_out(dreamer: Dreamer, count: int, execution: str = "kinematic", **options: Any) -> list[PlanResult]:
     who = trained(dreamer)
     with closing(make_env(who, execution)) as env:
         dreamer.env = env
         return [carry_out(env, who, number, **options) for number in range(count)]
 
 
-@pytest.mark.parametrize(("execution", "count"), [("kinematic", 40), ("physics", 8)])
+@pytest.mark.parametrize(("execution", "count"), [("kinematic", 24), ("physics", 4)])
 def test_the_arm_solves_optimal_plans_without_a_second_look(execution: str, count: int) -> None:
     dreamer = Dreamer(choose=TASK.rules.optimal_action)
     done = carried_out(dreamer, count, execution)
     assert all(plan.solved and plan.optimal and plan.as_imagined.all() for plan in done)
     assert [plan.done for plan in done] == [plan.shortest for plan in done] == [plan.length for plan in done]
-    assert {plan.shortest for plan in done} >= {2, 3, 4}
+    assert len({plan.shortest for plan in done}) >= 2
     assert len(dreamer.frames) == count, "one look a plan"
 
 
-def test_a_wrong_plan_stops_where_the_episode_does() -> None:
-    done = carried_out(Dreamer(choose=lambda state: 0), 30)
-    summary = summarise(done)
-    assert summary.solved < 12
-    failed = next(plan for plan in done if not plan.solved)
+@pytest.fixture(scope="module")
+def wrong() -> list[PlanResult]:
+    """Plans that always turn the left cube."""
+    return carried_out(Dreamer(choose=lambda state: 0), 12)
+
+
+def test_a_wrong_plan_stops_where_the_episode_does(wrong: list[PlanResult]) -> None:
+    assert summarise(wrong).solved < 6
+    failed = next(plan for plan in wrong if not plan.solved)
     assert failed.done < failed.length and failed.compared.real_terminated[-1]
     assert failed.outcome == f"failed at macro-action {failed.done}"
 
@@ -125,18 +129,15 @@ def test_a_detour_is_solved_but_not_optimal() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dreamer", "options", "words"),
+    ("dreams", "options", "words"),
     [
-        (
-            Dreamer(choose=TASK.rules.optimal_action, uncertainty=0.9),
-            {"max_epistemic": 0.3},
-            r"0.9 at macro-action \d is above 0.3",
-        ),
-        (Dreamer(choose=TASK.rules.optimal_action, accepts=False), {}, r"the agent's filter discards macro-action \d"),
+        ({"uncertainty": 0.9}, {"max_epistemic": 0.3}, r"0.9 at macro-action \d is above 0.3"),
+        ({"accepts": False}, {}, r"the agent's filter discards macro-action \d"),
     ],
 )
-def test_an_uncertain_plan_is_refused_and_says_so(dreamer: Dreamer, options: dict[str, Any], words: str) -> None:
-    plan = next(plan for plan in carried_out(dreamer, 20, **options) if plan.length > 1)
+def test_an_uncertain_plan_is_refused_and_says_so(dreams: dict[str, Any], options: dict[str, Any], words: str) -> None:
+    dreamer = Dreamer(choose=TASK.rules.optimal_action, **dreams)
+    plan = next(plan for plan in carried_out(dreamer, 8, **options) if plan.length > 1)
     assert re.search(words, plan.refused) and not plan.solved and plan.done == 0
     assert plan.outcome.startswith("refused: ")
     assert summarise([plan]).refused == 1
@@ -154,7 +155,7 @@ def test_all_agents_have_the_same_starts_and_tuning_has_others() -> None:
         who = trained(dreamer, seed)
         with closing(make_env(who, "kinematic")) as env:
             dreamer.env = env
-            return [carry_out(env, who, number).start for number in range(12)]
+            return [carry_out(env, who, number).start for number in range(6)]
 
     assert starts(0) == starts(3) != starts(1000)
 
@@ -184,9 +185,8 @@ def test_no_agent_without_imagination_and_no_empty_series() -> None:
         next(make_plans(trained(object()), count=0, execution="kinematic"))
 
 
-def test_what_is_written_holds_every_plan(tmp_path: Path) -> None:
-    done = carried_out(Dreamer(choose=lambda state: 0), 12)
-    summary = write_plans(tmp_path / "plans", done, TASK, {"commit": "abc"}, filmstrips=3)
+def test_what_is_written_holds_every_plan(wrong: list[PlanResult], tmp_path: Path) -> None:
+    summary = write_plans(tmp_path / "plans", wrong, TASK, {"commit": "abc"}, filmstrips=3)
     rows = (tmp_path / "plans" / "plans.csv").read_text().splitlines()
     assert len(rows) == 13 and rows[0].startswith("plan,start,shortest,planned,done,solved,optimal,refused")
     kept = json.loads((tmp_path / "plans" / "summary.json").read_text())
@@ -204,9 +204,9 @@ def test_what_is_written_is_json_where_no_plan_was_solved(tmp_path: Path) -> Non
     assert json.loads(text, parse_constant=pytest.fail)["mean_length"] is None
 
 
-def test_new_plans_leave_nothing_of_the_old_ones(tmp_path: Path) -> None:
+def test_new_plans_leave_nothing_of_the_old_ones(wrong: list[PlanResult], tmp_path: Path) -> None:
     folder = tmp_path / "plans"
-    write_plans(folder, carried_out(Dreamer(choose=lambda state: 0), 12), TASK, {}, filmstrips=3)
+    write_plans(folder, wrong[:4], TASK, {}, filmstrips=3)
     (folder / "recording.rrd").write_text("old")
     assert list(folder.glob("failed_*.png"))
     write_plans(folder, carried_out(Dreamer(choose=TASK.rules.optimal_action), 3), TASK, {}, filmstrips=3)
@@ -275,21 +275,22 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
         seed=0,
         encoder=encoder,
     )  # fmt: skip
-    result = run(spec, tmp_path / "run", lambda progress: None)
-    who = load_trained(result.folder)
+    folder = tmp_path / "run"
+    run(spec, folder, lambda progress: None)
+    who = load_trained(folder)
     assert who.episodes == 3 and who.task.id == "arrow_puzzle"
-    left = load_newest(result.folder / "checkpoints")
+    left = load_newest(folder / "checkpoints")
     assert left is not None
     taken_up = who.agent.state().arrays
     assert set(taken_up) == set(left.agent.arrays)
     assert all(np.array_equal(array, taken_up[name]) for name, array in left.agent.arrays.items())
-    first, again = (next(make_plans(load_trained(result.folder), count=1, execution="kinematic")) for _ in range(2))
+    first, again = (next(make_plans(load_trained(folder), count=1, execution="kinematic")) for _ in range(2))
     assert np.array_equal(first.compared.rollout.actions, again.compared.rollout.actions)
     assert np.array_equal(first.compared.rollout.q_values, again.compared.rollout.q_values)
     with pytest.raises(ArtefactError, match=r"There is no .*config\.json, a run's configuration; give a run's folder"):
         load_trained(tmp_path)
     with pytest.raises(ArtefactError, match=r"saw through encoder arrow_puzzle-clean@.*give the right file"):
-        load_trained(result.folder, encoder="arrow_puzzle-mild")
+        load_trained(folder, encoder="arrow_puzzle-mild")
     other = dataclasses.replace(spec, encoder=encoders.resolve(TASK, "mild"))
     with pytest.raises(ArtefactError, match=r"is encoder arrow_puzzle-mild@.*, and this bench is of .*-clean@"):
         run(other, tmp_path / "another node", lambda progress: None)

@@ -12,7 +12,7 @@ import torch
 from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, WorldModelSettings
-from imagine_bench.agents.imagination.world_model import WorldModel, log_cosh
+from imagine_bench.agents.imagination.world_model import EnvironmentModel, log_cosh
 from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
 from imagine_bench.agents.networks.precision import settle
 from imagine_bench.agents.networks.weight_samples import sample_outputs
@@ -123,7 +123,7 @@ def model_update(hyperparameters: str, rounds: int = 25) -> dict[str, float]:
         terminated=(torch.rand(rows, generator=draws) < 0.3).float(),
     )
     plain = PlainWorldModel(LATENTS, ACTIONS, settings, draws)
-    own = WorldModel(LATENTS, ACTIONS, settings, draws)
+    own = EnvironmentModel(LATENTS, ACTIONS, settings, draws)
     return least_cpu_s({"plain": lambda: plain.update(batch), "ours": lambda: own.update(batch, draws)}, rounds)
 
 

@@ -22,7 +22,7 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
-from imagine_bench.judge.imagination_quality import compare_rollout
+from imagine_bench.judge.open_loop import compare_rollout
 from imagine_bench.recording import episodes, open_in_viewer, q_table, record_run, recording_file, stream
 from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, rotated
 

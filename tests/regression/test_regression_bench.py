@@ -14,7 +14,6 @@ from imagine_bench.agents.regressors import settings as regressor_settings
 from recordings import contents, times
 
 from imagine_bench import registry
-from imagine_bench.audit.why import why_report
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState
@@ -30,6 +29,7 @@ from imagine_bench.regression.results import RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.report.page import flat
 from imagine_bench.report.tables import number
+from imagine_bench.report.why import why_report
 from imagine_bench.running.bench import plan
 from imagine_bench.running.task_types import task_types
 from imagine_bench.running.trained import load_trained

@@ -318,7 +318,7 @@ def test_titles_are_those_of_the_registry_line(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_no_two_registered_agents_share_a_color() -> None:
-    own = [name for name, entry in registry.AGENTS.items() if entry.make.startswith("imagine_bench.")]  # no test's
+    own = [name for name, entry in registry.agents().items() if entry.make.startswith("imagine_bench")]  # no test's
     colors = [figures.color(agent) for agent in own]
     assert len(own) > 8 and len(set(colors)) == len(colors)
     assert figures.color("an agent that nobody registered").startswith("#")

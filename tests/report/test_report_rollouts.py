@@ -12,10 +12,9 @@ from fake_results import bench_result, compared_rollout
 from PIL import Image
 
 from imagine_bench import registry
-from imagine_bench.judge import filmstrips
-from imagine_bench.judge.filmstrips import changes, sampled_filmstrips
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report import bench_page, write_report
+from imagine_bench.report import bench_page, filmstrips, write_report
+from imagine_bench.report.filmstrips import changes, sampled_filmstrips
 from imagine_bench.store.results import BenchResult, RunResult
 
 

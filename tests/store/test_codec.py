@@ -15,9 +15,9 @@ import pytest
 from imagine_bench.running.evaluation import EvaluationCounts
 from imagine_bench.running.run_state import Counters
 from imagine_bench.store.codec import pack, unpack
-from imagine_bench.store.results import Beliefs, Checkpoint, ComparedRollout, KeptEpisodes, OpenLoop
+from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, OpenLoop, PolicyTable
 
-ARRAYS_ONLY = (OpenLoop, Beliefs, KeptEpisodes, ComparedRollout)
+ARRAYS_ONLY = (OpenLoop, PolicyTable, KeptEpisodes, ComparedRollout)
 """Classes whose arrays are kept without values beside them."""
 SCALARS: dict[Any, Any] = {int: 3, float: 0.1, str: "0110", bool: True, Any: 1.5}
 

@@ -30,7 +30,7 @@ from imagine_bench.report.page import write_page
 from imagine_bench.report.sweep import study_page
 from imagine_bench.rules import states_of
 from imagine_bench.running.launchers.jobs import Failure, Job
-from imagine_bench.store.results import Beliefs
+from imagine_bench.store.results import PolicyTable
 from imagine_bench.sweep.catalogue import STUDIES
 from imagine_bench.sweep.grid import BASE, Study, Variant, read_grid
 from imagine_bench.sweep.run import Line, imagined_right, run_study
@@ -251,11 +251,11 @@ def test_what_isimagined_right_is_what_the_rules_have_too() -> None:
     half[alive[: len(alive) // 2]] = 0.0  # of these it expects that every macro-action ends the episode
     ends = truth.p_continues.sum(axis=2) == 0.0
 
-    def beliefs(shares: NDArray[np.float64]) -> Beliefs:
+    def beliefs(shares: NDArray[np.float64]) -> PolicyTable:
         model = ExpectedOutcomes(macrostates=macrostates, p_continues=shares, reward=truth.reward)
-        return Beliefs(action=np.zeros(len(states), dtype=np.int16), model=model)
+        return PolicyTable(action=np.zeros(len(states), dtype=np.int16), model=model)
 
-    def run(*held: Beliefs | None) -> Any:
+    def run(*held: PolicyTable | None) -> Any:
         return SimpleNamespace(checkpoints=[SimpleNamespace(beliefs=each) for each in held])
 
     runs = [run(None, beliefs(truth.p_continues)), run(beliefs(half), beliefs(np.zeros_like(half)))]

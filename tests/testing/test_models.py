@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from imagine_bench.agents.world_models.limits import Copy
 
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces.model import Imagined
-from imagine_bench.judge.models.ends import Copy
 from imagine_bench.testing.contract import checks, report
 
 

@@ -17,8 +17,8 @@ from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.cli import main
-from imagine_bench.judge.models import study
-from imagine_bench.judge.models.study import Judgement, judge, kept
+from imagine_bench.judge import judgement as study
+from imagine_bench.judge.judgement import Judgement, judge, kept
 from imagine_bench.rules import facts
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.tools.new import new_package

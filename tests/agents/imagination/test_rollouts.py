@@ -13,7 +13,7 @@ from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.rollouts import LATENT_LIMIT, Imagination
 from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings, WorldModelSettings
-from imagine_bench.agents.imagination.world_model import WorldModel
+from imagine_bench.agents.imagination.world_model import EnvironmentModel
 from imagine_bench.agents.replay import Batch, RealMemory
 from imagine_bench.agents.snapshot import load_training, training_arrays
 
@@ -105,7 +105,7 @@ def test_a_closed_loop_that_runs_away_stays_a_number() -> None:
     """As thesis-style imagination did once: log sigmas of 4, 10, 19 and then infinity within five steps."""
     imagination, _ = make(filtered=False, model=CountingModel(), temperature=1.0)
     generator = torch.Generator().manual_seed(1)
-    imagination.model = WorldModel(2, 2, WorldModelSettings(), generator)
+    imagination.model = EnvironmentModel(2, 2, WorldModelSettings(), generator)
     with torch.no_grad():
         imagination.model.dynamics.weights[-1].mul_(30.0)
     z, action, kept = torch.ones(8, 2), torch.zeros(8, dtype=torch.int64), []
@@ -123,7 +123,10 @@ def test_what_is_kept_of_a_diverging_rollout_can_be_learned_from() -> None:
     With rewards as a reward network gives them there, which has learned too and grows with the latents as well.
     """
     draws = torch.Generator().manual_seed(1)
-    model, controller = WorldModel(24, 6, WorldModelSettings(), draws), Controller(24, 6, ControllerSettings(), draws)
+    model, controller = (
+        EnvironmentModel(24, 6, WorldModelSettings(), draws),
+        Controller(24, 6, ControllerSettings(), draws),
+    )
     memory = RealMemory(500, 24, CPU)
     for step in range(500):
         now, then = (torch.randn(24, generator=draws) for _ in range(2))

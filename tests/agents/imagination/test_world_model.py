@@ -11,7 +11,7 @@ import torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.settings import WorldModelSettings
 from imagine_bench.agents.imagination.uncertainty import decompose
-from imagine_bench.agents.imagination.world_model import WorldModel, log_cosh
+from imagine_bench.agents.imagination.world_model import EnvironmentModel, log_cosh
 from imagine_bench.agents.replay import Batch
 from plain_torch import PlainWorldModel
 
@@ -24,10 +24,10 @@ SETTINGS = WorldModelSettings(
 )
 
 
-def make(**changes: object) -> WorldModel:
+def make(**changes: object) -> EnvironmentModel:
     if changes.get("shared_hidden"):
         changes |= {"reward_hidden": (), "termination_hidden": ()}
-    return WorldModel(Z, A, dataclasses.replace(SETTINGS, **changes), torch.Generator().manual_seed(0))
+    return EnvironmentModel(Z, A, dataclasses.replace(SETTINGS, **changes), torch.Generator().manual_seed(0))
 
 
 def chain_batch(count: int, generator: torch.Generator) -> Batch:
@@ -39,7 +39,7 @@ def chain_batch(count: int, generator: torch.Generator) -> Batch:
     return Batch(CODES[state], action, 2.0 * top, CODES[following], top)
 
 
-def losses(model: WorldModel, batch: Batch, dropout: torch.Generator) -> torch.Tensor:
+def losses(model: EnvironmentModel, batch: Batch, dropout: torch.Generator) -> torch.Tensor:
     """Of dynamics, reward and termination. Shape (3,)."""
     return torch.stack(model.losses(batch, dropout))
 

@@ -12,7 +12,7 @@ from imagine_bench.tasks.scenes.appearance import LEVELS, appearance, between, l
 from imagine_bench import registry
 from imagine_bench.appearance import FACTORS, POINTS, appearance_name, factors_of
 from imagine_bench.errors import ImagineBenchError
-from imagine_bench.judge.models.study import Judgement
+from imagine_bench.judge.judgement import Judgement
 from imagine_bench.protocols.control import protocol
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.store import encoders

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from fake_latents import ACTIONS, CODES, FakeEncoder, context, frame, transition
-from imagine_bench.agents.imagination.rollouts import Imagined
+from imagine_bench.agents.imagination.rollouts import ImaginedStep
 from imagine_bench_controls import exact
 from imagine_bench_controls.exact import LOOKS, ExactFilterAgent, ExactImaginationAgent
 from small_runs import small
@@ -138,7 +138,7 @@ def test_the_exact_filter_keeps_what_is_right(monkeypatch: pytest.MonkeyPatch) -
         (HALF, 5, 7.0, 0.9, False),
     ]
     action, reached, reward, ends, right = (list(column) for column in zip(*rows, strict=True))
-    step = Imagined(CODES[reached] + 0.01, torch.tensor(reward), torch.tensor(ends), None, None)  # type: ignore[arg-type]
+    step = ImaginedStep(CODES[reached] + 0.01, torch.tensor(reward), torch.tensor(ends), None, None)  # type: ignore[arg-type]
     z = CODES[[4] * len(rows)] - 0.01
     assert agent.imagination.admits(z, torch.tensor(action), step, 0.0).tolist() == right
 

@@ -17,7 +17,7 @@ from imagine_bench.agents import snapshot
 from imagine_bench.agents.dqn import DQN, epsilon
 from imagine_bench.agents.encoders.perception import Perception, load_perception, prepare_torch
 from imagine_bench.agents.imagination.agent import ImaginingAgent
-from imagine_bench.agents.imagination.rollouts import TERMINAL, Imagination, Imagined
+from imagine_bench.agents.imagination.rollouts import TERMINAL, Imagination, ImaginedStep
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, Settings
 from imagine_bench.agents.replay import Batch, ImaginedMemory
 from torch import Tensor
@@ -148,7 +148,7 @@ class ExactFilterImagination(Imagination):
     rules: Rules
     perception: Perception
 
-    def admits(self, z: Tensor, action: Tensor, step: Imagined, gathered: Tensor | float) -> Tensor:
+    def admits(self, z: Tensor, action: Tensor, step: ImaginedStep, gathered: Tensor | float) -> Tensor:
         """Which of N transitions are right, macrostate, reward and end as one outcome of the rules. Shape (N,)."""
         read = self.perception.encoder.read_macrostate
         rows = zip(

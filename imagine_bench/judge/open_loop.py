@@ -8,46 +8,37 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, Sight, State, TaskSpec
-from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer, begin_episode
-from imagine_bench.judge.calibration import auroc
-from imagine_bench.judge.models.truth import Outcomes, advance, expected_reward, shares
-from imagine_bench.rules import is_random
+from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
+from imagine_bench.judge.models import AgentModel
+from imagine_bench.judge.questions import EvalSet
+from imagine_bench.judge.truth import Distribution, expected_reward, shares
+from imagine_bench.rules import Outcomes, advance, is_random
 from imagine_bench.seeding import Purpose, SeedTree
+from imagine_bench.statistics import auroc
 from imagine_bench.store.results import ComparedRollout, OpenLoop
 
 OPEN_LOOP_DEPTH = 10  # steps of the open-loop comparison, the thesis' I_D
 EXAMPLES = 5  # greedy imagined rollouts kept with each run, with their real counterparts
-SAMPLED_ROLLOUTS, SAMPLED_DEPTH = 4, 5
-"""Rollouts sampled from one start and kept with each run, and macro-actions of each."""
+SAMPLED_ROLLOUTS = 4  # rollouts sampled from one start and kept with each run
+SAMPLED_DEPTH = 5  # macro-actions of each of them
 
 Alive = Callable[[frozenset[State], int], bool]
 
 
-@dataclass(frozen=True, kw_only=True)
-class OpenLoopStart:
-    """A real start and macro-actions that the rules keep alive, with what the rules say about each of them."""
-
-    frame: Frame  # the real frame
-    actions: NDArray[np.int64]  # drawn uniformly among those that end no episode, now or by force later. Shape (D,).
-    #: Probabilities of what the agent's frame shows after each action, as :meth:`TaskSpec.as_observed` has it. In a
-    #: task without ``sight`` that is the macrostate. Length D.
-    beliefs: tuple[dict[State, float], ...]
-    rewards: Floats  # expected reward of each action. Shape (D,).
-
-
-def open_loop_starts(
+def surviving_actions(
     spec: TaskSpec, *, starts: int, depth: int, appearance: str, purpose: Purpose = "evaluation"
-) -> tuple[OpenLoopStart, ...]:
-    """The ``starts`` starts of the open-loop comparison: the same for every agent and seed; tuning has its own.
+) -> EvalSet | None:
+    """The questions of the open-loop comparison: the same for every agent and seed; tuning has its own.
 
-    Each is imagined for ``depth`` steps D, fewer where the rules cannot be kept alive as long. Frames are kinematic.
+    From each of N = ``starts`` starts, D macro-actions are drawn uniformly among those that end no episode, now or by
+    force later. D is ``depth``, or less where the rules cannot be kept alive as long. Frames are kinematic. The truth
+    is what the agent's frames show, as :meth:`TaskSpec.as_observed` has it; without ``sight`` that is the macrostate.
+    None where no episode can be kept alive, or no start is wanted.
     """
     rng = SeedTree(0).child(purpose, "open_loop", spec.id).generator()
     alive = _alive(spec)
@@ -58,11 +49,23 @@ def open_loop_starts(
         candidates = [state for state in looks if alive(frozenset(alike[looks[state]]), depth)]
         depth -= not candidates
     if not candidates or not starts:
-        return ()
-    shown = [looks[candidates[index]] for index in rng.integers(len(candidates), size=starts)]
-    frames = spec.render_macrostates(np.array(shown, dtype=np.int64), appearance, rng)
-    return tuple(
-        _start(spec, alive, alike[look], look, frame, depth, rng) for look, frame in zip(shown, frames, strict=True)
+        return None
+    chosen = [candidates[index] for index in rng.integers(len(candidates), size=starts)]
+    frames = spec.render_macrostates(np.array([looks[state] for state in chosen], dtype=np.int64), appearance, rng)
+    actions = []
+    truth = []
+    for state in chosen:
+        same_look = alike[looks[state]]
+        reached: list[Outcomes] = [{(each, False): (1.0 / len(same_look), 0.0) for each in same_look}]
+        row: list[int] = []
+        for step in range(depth):
+            safe = _safe_actions(spec, alive, shares(reached[-1]), depth - step)
+            row.append(int(rng.choice(safe)))
+            reached.append(advance(spec.rules, reached[-1], row[-1]))
+        actions.append(row)
+        truth.append(tuple(_observed(spec, reached, looks[state], step) for step in range(1, depth + 1)))
+    return EvalSet(
+        states=tuple(chosen), frames=frames[:, None], actions=np.array(actions, dtype=np.int64), truth=tuple(truth)
     )
 
 
@@ -73,32 +76,57 @@ def _clearest_look(sight: Sight | None, state: State) -> State:
     return min((what for _, what in sight.seen(state, 0)), key=lambda what: sum(value < 0 for value in what))
 
 
-def open_loop(agent: Imaginer, starts: tuple[OpenLoopStart, ...], seeds: SeedTree) -> OpenLoop:
+def _observed(spec: TaskSpec, reached: Sequence[Outcomes], look: State, step: int) -> Outcomes:
+    """The truth of a frame after ``step`` actions, and of the reward of the latest.
+
+    ``reached`` are the outcomes after each number of actions, and ``look`` is what the first frame shows.
+    """
+    if spec.sight is None:
+        return reached[step]
+    reward = expected_reward(reached[step])
+    taken = step - spec.sight.lag
+    if taken <= 0:
+        return {(spec.as_observed(look), False): (1.0, reward)}
+    found: Distribution = {}
+    for state, share in shares(reached[taken]).items():
+        for probability, shown in spec.sight.seen(state, taken):
+            read = spec.as_observed(shown)
+            found[read] = found.get(read, 0.0) + share * probability
+    return {(read, False): (share, reward) for read, share in found.items()}
+
+
+def open_loop(agent: Imaginer, questions: EvalSet, seeds: SeedTree) -> OpenLoop:
     """Imagine the macro-actions of every start in closed loop of the model and compare by depth.
 
     An imagined macrostate is correct if the agent's frame may show it after these actions; the reward is compared with
-    its expectation. The rules keep every rollout alive: any predicted termination is wrong. There is at least one
-    start, all have the same depth D; the agent, which draws from the generators of ``seeds``, learns nothing. Each
-    start is the first frame of an episode to it.
+    its expectation. The rules keep every rollout alive: any predicted termination is wrong. The agent, which draws
+    from the generators of ``seeds``, is not changed.
     """
-    begin_episode(agent)
-    rollouts = [
-        agent.imagine(start.frame, actions=start.actions, depth=len(start.actions), rng=seeds.child(index).generator())
-        for index, start in enumerate(starts)
-    ]
+    rollouts = AgentModel(agent).rollouts(
+        questions.frames[:, -1],
+        questions.asked,
+        depth=questions.depth,
+        generators=(seeds.child(index).generator() for index in range(len(questions.frames))),
+    )
 
     def stacked(name: str) -> Floats:  # [starts, D]
         return np.array([getattr(rollout, name) for rollout in rollouts], dtype=np.float64)
 
-    correct = np.array([
-        [tuple(row) in belief for row, belief in zip(rollout.macrostates.tolist(), start.beliefs, strict=True)]
-        for start, rollout in zip(starts, rollouts, strict=True)
-    ])  # fmt: skip  # [starts, D]
-    accepted, kept = stacked("accepted"), stacked("accepted").sum(axis=0)
-    rewards = np.array([start.rewards for start in starts])
+    correct = np.array(
+        [
+            [
+                tuple(read) in shares(outcomes)
+                for read, outcomes in zip(rollout.macrostates.tolist(), steps, strict=True)
+            ]
+            for rollout, steps in zip(rollouts, questions.truth, strict=True)
+        ]
+    )  # [starts, D]
+    accepted = stacked("accepted")
+    kept = accepted.sum(axis=0)
+    rewards = np.array([[expected_reward(outcomes) for outcomes in steps] for steps in questions.truth])
     causes = {cause: stacked(cause) for cause in ("epistemic", "aleatoric", "modal")}
     return OpenLoop(
-        count=np.full(correct.shape[1], len(starts), dtype=np.int64),
+        count=np.full(questions.depth, len(rollouts), dtype=np.int64),
         correct=correct.mean(axis=0),
         correct_accepted=np.where(kept > 0, (correct * accepted).sum(axis=0) / np.maximum(kept, 1), np.nan),
         accepted=accepted.mean(axis=0),
@@ -125,59 +153,83 @@ def examples(
     """A handful of rollouts that the greedy controller chooses, each from a start of its own, beside reality.
 
     The starts are the same for every agent and seed, the real frames kinematic. The agent, which draws from the
-    generators of ``seeds``, learns nothing; each start is the first frame of an episode to it.
+    generators of ``seeds``, is not changed.
     """
     starts = spec.rules.start_states
     rng = SeedTree(0).child(purpose, "examples", spec.id).generator()
-    picks = rng.choice(len(starts), size=EXAMPLES, replace=len(starts) < EXAMPLES)
-    states = np.array([starts[index] for index in picks], dtype=np.int64)
-    shown = np.array([_clearest_look(spec.sight, starts[index]) for index in picks], dtype=np.int64)
-    frames = spec.render_macrostates(shown, appearance, rng)
-    begin_episode(agent)
-    return _greedy_rollouts(agent, spec, frames, states, appearance, seeds, rng, depth=spec.horizon)
+    picks = [starts[index] for index in rng.choice(len(starts), size=EXAMPLES, replace=len(starts) < EXAMPLES)]
+    frames = _first_frames(spec, picks, appearance, rng)
+    rollouts = AgentModel(agent).rollouts(
+        frames,
+        [None] * EXAMPLES,
+        depth=spec.horizon,
+        generators=[seeds.child(index).generator() for index in range(EXAMPLES)],
+    )
+    return tuple(
+        compare_rollout(spec, frame=frame, macrostate=np.array(start), rollout=rollout, appearance=appearance, rng=rng)
+        for frame, start, rollout in zip(frames, picks, rollouts, strict=True)
+    )
+
+
+def _first_frames(spec: TaskSpec, starts: Sequence[State], appearance: str, rng: np.random.Generator) -> Frame:
+    """A frame of each of N starts, as an episode begins. Shape (N, 64, 64, 3)."""
+    looks = [_clearest_look(spec.sight, start) for start in starts]
+    return spec.render_macrostates(np.array(looks, dtype=np.int64), appearance, rng)
 
 
 def imagine_sampled_rollouts(
     agent: Imaginer, spec: TaskSpec, *, appearance: str, seeds: SeedTree, purpose: Purpose = "evaluation"
 ) -> tuple[ComparedRollout, ...]:
-    """Like :func:`examples`, with the same start several times; none where the rules leave nothing to chance."""
+    """Several rollouts from one start; none where the rules leave nothing to chance."""
     if not is_random(spec.rules):
         return ()
     rng = SeedTree(0).child(purpose, "sampled_rollouts", spec.id).generator()
     start = spec.rules.start_states[int(rng.integers(len(spec.rules.start_states)))]
-    shown = np.array([_clearest_look(spec.sight, start)], dtype=np.int64)
-    frame = spec.render_macrostates(shown, appearance, rng)[0]
-    begin_episode(agent)
-    macrostate = np.array(start, dtype=np.int64)
-    return sampled_rollouts_from(agent, spec, frame=frame, macrostate=macrostate, appearance=appearance, seeds=seeds)
+    frame = _first_frames(spec, [start], appearance, rng)[0]
+    return sampled_rollouts_from(
+        agent, spec, frame=frame, macrostate=np.array(start), appearance=appearance, seeds=seeds, begins=True
+    )
 
 
 def sampled_rollouts_from(
-    agent: Imaginer, spec: TaskSpec, *, frame: Frame, macrostate: Macrostate, appearance: str, seeds: SeedTree,
+    agent: Imaginer,
+    spec: TaskSpec,
+    *,
+    frame: Frame,
+    macrostate: Macrostate,
+    appearance: str,
+    seeds: SeedTree,
     before: Sequence[State] = (),
-) -> tuple[ComparedRollout, ...]:  # fmt: skip
-    """Imagine one start several times: the real ``frame``, seen in ``macrostate`` after those ``before``."""
-    frames, states = [frame] * SAMPLED_ROLLOUTS, [macrostate] * SAMPLED_ROLLOUTS
+    begins: bool = False,
+) -> tuple[ComparedRollout, ...]:
+    """Imagine one moment several times: the real ``frame``, seen in ``macrostate`` after those ``before``.
+
+    If it ``begins`` an episode, the agent is told so; otherwise it has seen the episode so far.
+    """
+    rollouts = AgentModel(agent).rollouts(
+        [frame] * SAMPLED_ROLLOUTS,
+        [None] * SAMPLED_ROLLOUTS,
+        depth=SAMPLED_DEPTH,
+        generators=[seeds.child(index).generator() for index in range(SAMPLED_ROLLOUTS)],
+        begins=begins,
+    )
     rng = seeds.child("reality").generator()
-    return _greedy_rollouts(agent, spec, frames, states, appearance, seeds, rng, depth=SAMPLED_DEPTH, before=before)
-
-
-def _greedy_rollouts(
-    agent: Imaginer, spec: TaskSpec, frames: Iterable[Frame], states: Iterable[Macrostate], appearance: str,
-    seeds: SeedTree, rng: np.random.Generator, *, depth: int, before: Sequence[State] = (),
-) -> tuple[ComparedRollout, ...]:  # fmt: skip
-    found = []
-    for index, (frame, state) in enumerate(zip(frames, states, strict=True)):
-        rollout = agent.imagine(frame, actions=None, depth=depth, rng=seeds.child(index).generator())
-        start: dict[str, Any] = {"frame": frame, "macrostate": state, "rollout": rollout}
-        found.append(compare_rollout(spec, **start, appearance=appearance, rng=rng, before=before))
-    return tuple(found)
+    compare = functools.partial(
+        compare_rollout, spec, frame=frame, macrostate=macrostate, appearance=appearance, rng=rng, before=before
+    )
+    return tuple(compare(rollout=rollout) for rollout in rollouts)
 
 
 def compare_rollout(
-    spec: TaskSpec, *, frame: Frame, macrostate: Macrostate, rollout: ImaginedRollout, appearance: str,
-    rng: np.random.Generator, before: Sequence[State] = (),
-) -> ComparedRollout:  # fmt: skip
+    spec: TaskSpec,
+    *,
+    frame: Frame,
+    macrostate: Macrostate,
+    rollout: ImaginedRollout,
+    appearance: str,
+    rng: np.random.Generator,
+    before: Sequence[State] = (),
+) -> ComparedRollout:
     """Put the truth beside a rollout imagined from ``frame``, which is seen in ``macrostate`` (M,).
 
     The rules give states and rewards, the kinematic mode gives frames: those that the agent would really see after the
@@ -194,7 +246,9 @@ def compare_rollout(
             possible = spec.rules.outcomes(state, action)
             alike = _as_imagined(spec, possible, rollout, step, len(before))
             outcome = alike[0] if len(alike) == 1 else _draw(alike or possible, rng)
-            state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
+            state = outcome.macrostate
+            reward = outcome.reward
+            over = outcome.terminated
         real.append((state, reward, over))
     seen = _in_frames(spec.sight, (*before, start, *(state for state, _, _ in real)), rng)[len(before) + 1 :]
     frames = spec.render_macrostates(np.array(seen), appearance, rng) if real else ()
@@ -214,9 +268,12 @@ def _in_frames(sight: Sight | None, states: Sequence[State], rng: np.random.Gene
 
 
 def beside_reality(
-    rollout: ImaginedRollout, frame: Frame, macrostate: Sequence[int] | Macrostate, frames: Sequence[Frame] | Frame,
+    rollout: ImaginedRollout,
+    frame: Frame,
+    macrostate: Sequence[int] | Macrostate,
+    frames: Sequence[Frame] | Frame,
     real: Sequence[tuple[State, float, bool]],
-) -> ComparedRollout:  # fmt: skip
+) -> ComparedRollout:
     """An imagined rollout from a ``frame`` that is seen in ``macrostate``, and what really came of it.
 
     ``frames`` and ``real`` (what they show, reward, whether the episode has ended) have an entry for each macro-action
@@ -279,39 +336,3 @@ def _safe_actions(spec: TaskSpec, alive: Alive, support: Iterable[State], steps:
         if not ended and alive(frozenset(outcome.macrostate for outcome in outcomes), steps - 1):
             safe.append(action)
     return safe
-
-
-def _start(
-    spec: TaskSpec, alive: Alive, alike: Sequence[State], look: State, frame: Frame, depth: int,
-    rng: np.random.Generator,
-) -> OpenLoopStart:  # fmt: skip
-    """A start of which ``frame`` shows ``look``, as it does of each of the equally likely macrostates ``alike``."""
-    outcomes: Outcomes = {(state, False): (1.0 / len(alike), 0.0) for state in alike}
-    actions, rewards = [], []
-    in_turn = [shares(outcomes)]
-    for step in range(depth):
-        actions.append(int(rng.choice(_safe_actions(spec, alive, in_turn[-1], depth - step))))
-        outcomes = advance(spec.rules, outcomes, actions[-1])
-        in_turn.append(shares(outcomes))
-        rewards.append(expected_reward(outcomes))
-    return OpenLoopStart(
-        frame=frame,
-        actions=np.array(actions, dtype=np.int64),
-        beliefs=tuple(_read_after(spec, in_turn, look, step) for step in range(1, depth + 1)),
-        rewards=np.array(rewards, dtype=np.float64),
-    )
-
-
-def _read_after(spec: TaskSpec, in_turn: Sequence[dict[State, float]], look: State, step: int) -> dict[State, float]:
-    """Probabilities of what the agent's frame shows after ``step`` actions, given those of macrostates in turn."""
-    if spec.sight is None:
-        return in_turn[step]
-    taken = step - spec.sight.lag
-    if taken <= 0:
-        return {spec.as_observed(look): 1.0}
-    found: dict[State, float] = {}
-    for state, share in in_turn[taken].items():
-        for probability, what in spec.sight.seen(state, taken):
-            read = spec.as_observed(what)
-            found[read] = found.get(read, 0.0) + share * probability
-    return found

@@ -1,10 +1,10 @@
 """Does a model notice that a rule changed, and does it know what another macro-action would have led to?
 
 A change is noticed by the model's surprise, the negative logarithm of the probability that it gives to what came, as
-its pictures are read. A CUSUM detector (Page, 1954) adds up how far surprise lies above its usual level and says so
+its images are read. A CUSUM detector (Page, 1954) adds up how far surprise lies above its usual level and says so
 above a threshold. Level and threshold come from streams of transitions of the unchanged world: of those, 1 % may raise
-an alarm. What a model says of a transition does not depend on the world, so the answers about single transitions do for
-every stream.
+an alarm. A model's prediction of a transition does not depend on the world, so the predictions of single transitions
+serve every stream.
 
 Shapes: ``R`` streams of ``T`` transitions, ``S`` macrostates, ``A`` macro-actions, ``B`` branches.
 """
@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats, Rules, State, TaskSpec
-from imagine_bench.judge.models.asking import FRAMES, Answers
-from imagine_bench.judge.models.truth import Questions
+from imagine_bench.judge.predictions import Predictions
+from imagine_bench.judge.questions import FRAMES, EvalSet
 from imagine_bench.seeding import SeedTree
 
-STREAMS, LENGTH = 1_000, 200
-"""Streams of random macro-actions of each world, and transitions of each."""
+STREAMS = 1_000  # streams of random macro-actions of each world
+LENGTH = 200  # transitions of each
 SLIP = 0.2  # probability that a macro-action does nothing in the world that slips
 FALSE_ALARMS = 0.01  # share of streams of the unchanged world that may raise an alarm
 _ALLOWANCE = 0.5  # standard deviations above its mean that surprise may have
@@ -80,12 +80,13 @@ def coupled(rules: Rules, states: Sequence[State]) -> Dynamics:
     return lambda state, action: both(state, one, other) if action == one else usual(state, action)
 
 
-def streams_of(spec: TaskSpec, questions: Questions) -> dict[str, Streams] | None:
+def streams_of(spec: TaskSpec, questions: EvalSet) -> dict[str, Streams] | None:
     """Streams of the usual world, and of those with one rule changed; None where not all of the world is asked about.
 
     The macro-actions are random, and so is the frame of each macrostate.
     """
-    rules, states = spec.rules, tuple(dict.fromkeys(questions.states))
+    rules = spec.rules
+    states = tuple(dict.fromkeys(questions.states))
     dynamics = {"usual": unchanged(rules), "slip": slipping(rules), "coupling": coupled(rules, states)}
     led_to = [o for state in states for action in range(spec.n_actions) for o in rules.outcomes(state, action)]
     if not {*rules.start_states, *(o.macrostate for o in led_to if not o.terminated)} <= set(states):
@@ -94,12 +95,15 @@ def streams_of(spec: TaskSpec, questions: Questions) -> dict[str, Streams] | Non
     return {name: _walked(spec, questions, each, seeds.child(name).generator()) for name, each in dynamics.items()}
 
 
-def _walked(spec: TaskSpec, questions: Questions, dynamics: Dynamics, rng: np.random.Generator) -> Streams:
-    states, n_actions = tuple(dict.fromkeys(questions.states)), spec.n_actions
+def _walked(spec: TaskSpec, questions: EvalSet, dynamics: Dynamics, rng: np.random.Generator) -> Streams:
+    states = tuple(dict.fromkeys(questions.states))
+    n_actions = spec.n_actions
     index = {state: row for row, state in enumerate(states)}
     effects = [[dynamics(state, action) for action in range(n_actions)] for state in states]
     shape = (len(states), n_actions, max(len(each) for row in effects for each in row))
-    upto, following, over = np.ones(shape), np.zeros(shape, dtype=np.int64), np.ones(shape, dtype=np.bool_)
+    upto = np.ones(shape)
+    following = np.zeros(shape, dtype=np.int64)
+    over = np.ones(shape, dtype=np.bool_)
     for row, action in itertools.product(range(len(states)), range(n_actions)):
         each = effects[row][action]
         upto[row, action, : len(each) - 1] = np.cumsum([share for share, _, _ in each])[:-1]
@@ -107,12 +111,13 @@ def _walked(spec: TaskSpec, questions: Questions, dynamics: Dynamics, rng: np.ra
             following[row, action, branch] = index.setdefault(after, len(index))
             over[row, action, branch] = ends or index[after] >= len(states)
     asked: dict[tuple[State, int], int] = {}
-    for row, pair in enumerate(zip(questions.states, questions.asked[:, 0].tolist(), strict=True)):
+    for row, pair in enumerate(zip(questions.states, questions.first_actions, strict=True)):
         asked.setdefault(pair, row)  # the frames of a pair stand one behind another
     first = np.array([[asked[state, action] for action in range(n_actions)] for state in states])
     starts = np.array([index[state] for state in spec.rules.start_states])
     rows, reached = (np.zeros((STREAMS, LENGTH), dtype=np.int64) for _ in range(2))
-    now, done = rng.choice(starts, STREAMS), np.zeros(STREAMS, dtype=np.int64)
+    now = rng.choice(starts, STREAMS)
+    done = np.zeros(STREAMS, dtype=np.int64)
     for step in range(LENGTH):
         chosen = rng.integers(n_actions, size=STREAMS)
         branch = (upto[now, chosen] <= rng.random((STREAMS, 1))).sum(axis=1)
@@ -120,29 +125,31 @@ def _walked(spec: TaskSpec, questions: Questions, dynamics: Dynamics, rng: np.ra
         reached[:, step] = following[now, chosen, branch]
         done += 1
         ended = over[now, chosen, branch] | (done == spec.horizon)
-        now, done = np.where(ended, rng.choice(starts, STREAMS), reached[:, step]), np.where(ended, 0, done)
+        now = np.where(ended, rng.choice(starts, STREAMS), reached[:, step])
+        done = np.where(ended, 0, done)
     return Streams(rows=rows, reached=reached, states=tuple(index))
 
 
-def noticing(streams: dict[str, Streams] | None, answers: Answers) -> dict[str, float]:
+def change_detection_delay(streams: dict[str, Streams] | None, predictions: Predictions) -> dict[str, float]:
     """Mean transitions until a change is noticed, :data:`LENGTH` of a stream in which it is not; NaN without streams.
 
     The world has changed from the first transition on.
     """
     if streams is None:
         return dict.fromkeys(("notice_slip", "notice_coupling"), math.nan)
-    _, *found = alarms([streams[name] for name in ("usual", "slip", "coupling")], answers)
+    _, *found = alarms([streams[name] for name in ("usual", "slip", "coupling")], predictions)
     means = [float(np.minimum(first, LENGTH).mean()) for first in found]
     return dict(zip(("notice_slip", "notice_coupling"), means, strict=True))
 
 
-def alarms(streams: Sequence[Streams], answers: Answers) -> list[NDArray[np.int64]]:
+def alarms(streams: Sequence[Streams], predictions: Predictions) -> list[NDArray[np.int64]]:
     """Transitions until the first alarm of each of R streams, more than :data:`LENGTH` where there is none. Each (R,).
 
     Level and threshold are those of the first of ``streams``.
     """
-    surprise = [_surprise(each, answers) for each in streams]
-    level, spread = float(surprise[0].mean()), max(float(surprise[0].std()), _LEAST)
+    surprise = [_surprise(each, predictions) for each in streams]
+    level = float(surprise[0].mean())
+    spread = max(float(surprise[0].std()), _LEAST)
     evidence = [np.zeros(each.shape) for each in surprise]
     for each, found in zip(surprise, evidence, strict=True):
         total = np.zeros(len(each))
@@ -154,17 +161,17 @@ def alarms(streams: Sequence[Streams], answers: Answers) -> list[NDArray[np.int6
     return [each.argmax(axis=1) + 1 for each in raised]
 
 
-def _surprise(streams: Streams, answers: Answers) -> Floats:
+def _surprise(streams: Streams, predictions: Predictions) -> Floats:
     """Of every transition, in nats. Shape (R, T)."""
     codes, inverse = np.unique(streams.rows * len(streams.states) + streams.reached, return_inverse=True)
     found = [
-        -math.log(max(answers.distribution(int(row), 0).get(streams.states[state], 0.0), _LEAST))
+        -math.log(max(predictions.distribution(int(row), 0).get(streams.states[state], 0.0), _LEAST))
         for row, state in zip(*np.divmod(codes, len(streams.states)), strict=True)
     ]
     return np.asarray(np.array(found)[inverse].reshape(streams.rows.shape))
 
 
-def counterfactual_error(asked: Sequence[Questions], answers: Sequence[Answers]) -> float:
+def counterfactual_error(asked: Sequence[EvalSet], predictions: Sequence[Predictions]) -> float:
     """How much of what a model imagines of one macro-action cannot be where it imagines what it does of another.
 
     ``asked`` has the same macrostates for each macro-action, and the model imagined each with equal draws. In the truth
@@ -175,14 +182,14 @@ def counterfactual_error(asked: Sequence[Questions], answers: Sequence[Answers])
         for row in range(len(asked[one].states)):
             both = [asked[index].truth[row][0] for index in (one, other)]
             possible = _together(*([(state, share) for (state, _), (share, _) in each.items()] for each in both))
-            imagined = _together(*(_futures(answers[index], row) for index in (one, other)))
+            imagined = _together(*(_futures(predictions[index], row) for index in (one, other)))
             wrong.append(sum(share for pair, share in imagined.items() if pair not in possible))
     return float(np.mean(wrong)) if wrong else math.nan
 
 
-def _futures(answers: Answers, row: int) -> list[tuple[State, float]]:
-    states = map(tuple, answers.states[row, :, 0].tolist())
-    return list(zip(states, answers.weights[row, :, 0].tolist(), strict=True))
+def _futures(predictions: Predictions, row: int) -> list[tuple[State, float]]:
+    states = map(tuple, predictions.states[row, :, 0].tolist())
+    return list(zip(states, predictions.weights[row, :, 0].tolist(), strict=True))
 
 
 def _together(
@@ -190,7 +197,10 @@ def _together(
 ) -> dict[tuple[State, State], float]:
     """Probabilities of pairs where one uniform number chooses from both distributions, each in its order."""
     found: dict[tuple[State, State], float] = {}
-    at, row, column, ends = 0.0, 0, 0, [one[0][1], other[0][1]]
+    at = 0.0
+    row = 0
+    column = 0
+    ends = [one[0][1], other[0][1]]
     while True:
         upto = min(ends)
         if upto - at > _SLIVER:

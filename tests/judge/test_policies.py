@@ -19,25 +19,30 @@ from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import State, TaskSpec
-from imagine_bench.judge.policy import Terminations, optimal_length, terminations
+from imagine_bench.judge.values import Terminations, optimal_length, terminations
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.data import collect
 from imagine_bench.report.exact import policies
 from imagine_bench.rules import fewest_actions, greedy, states_of
 from imagine_bench.running import bench as benches
 from imagine_bench.running.trained import learners, load_trained
-from imagine_bench.store import encoders
+from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.files import lock, sealed
-from imagine_bench.store.results import Beliefs, BenchResult, RunResult
+from imagine_bench.store.results import BenchResult, PolicyTable, RunResult
 
 HARD = registry.task("arrow_puzzle_hard")
 PICK = registry.task("pick_place")
 
 
-def bench(root: Path, launcher: Inline, **changes: Any) -> BenchResult:
-    wanted = small(**{"budgets": (2, 9), "agents": ("table", "imaginer"), "seeds": (0, 1), **changes})
-    result: BenchResult = benches.bench(wanted, {}, root=root, launcher=launcher)
-    return result
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
+    few: dict[str, Any] = {"budgets": (2,), "evaluation_episodes": 2, "open_loop_starts": 0, "recorded_episodes": 0}
+    wanted = protocol(
+        "arrow_puzzle_hard", "smoke", agents=("table", "imaginer"), seeds=(0, 1), execution="kinematic", **few
+    )
+    found = benches.bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
+    assert isinstance(found, BenchResult)
+    return found
 
 
 def ends_of(spec: TaskSpec, choose: Callable[[State], int]) -> Terminations:
@@ -48,10 +53,6 @@ def ends_of(spec: TaskSpec, choose: Callable[[State], int]) -> Terminations:
 def everywhere(spec: TaskSpec, choose: Callable[[State], int]) -> NDArray[np.int64]:
     """What it chooses in each macrostate; anything in terminal ones. Shape (S,)."""
     return np.array([0 if spec.rules.is_terminal(state) else choose(state) for state in states_of(spec.rules)])
-
-
-def means(ends: Terminations) -> tuple[float, float, float, float]:
-    return tuple(float(part.mean()) for part in (ends.success, ends.failure, ends.late_success, ends.endless))  # type: ignore[return-value]
 
 
 def legal(state: State) -> list[int]:
@@ -77,12 +78,11 @@ def walked(spec: TaskSpec, choose: Callable[[State], int], start: State, patienc
 
 
 def test_the_optimal_policy_misses_nothing() -> None:
+    starts = HARD.rules.start_states
     ends = ends_of(HARD, HARD.rules.optimal_action)
-    assert means(ends) == (1.0, 0.0, 0.0, 0.0)
-    assert np.array_equal(ends.length, optimal_length(HARD, HARD.rules.start_states))
-    assert optimal_length(HARD, HARD.rules.start_states).tolist() == [
-        fewest_actions(HARD.rules, state) for state in HARD.rules.start_states
-    ]
+    assert (ends.success == 1.0).all() and (ends.failure == 0.0).all() and (ends.endless == 0.0).all()
+    assert ends.length.tolist() == optimal_length(HARD, starts).tolist()
+    assert ends.length.tolist() == [fewest_actions(HARD.rules, state) for state in starts]
 
 
 def test_the_long_way_round_comes_late() -> None:
@@ -96,12 +96,8 @@ def test_the_long_way_round_comes_late() -> None:
         here, previous = turns[policy[here]], here
     ends = ends_of(HARD, policy.__getitem__)
     index = HARD.rules.start_states.index(astray)
-    assert (ends.success[index], ends.failure[index], ends.late_success[index], ends.length[index]) == (
-        0.0,
-        0.0,
-        1.0,
-        10.0,
-    )
+    assert (ends.success[index], ends.failure[index], ends.late_success[index]) == (0.0, 0.0, 1.0)
+    assert ends.length[index] == 10.0
     assert walked(HARD, policy.__getitem__, astray, 20) == (True, True, 11)
     assert ends.success.sum() == len(ends.success) - 1, "ten turns are still in time"
 
@@ -128,9 +124,8 @@ def test_late_failures_are_told_from_what_never_ends() -> None:
     assert mixed.late_failure[stuck] == pytest.approx(0.99**HARD.horizon, abs=1e-4)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_any_policy_ends_as_the_walk_does(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_any_policy_ends_as_the_walk_does() -> None:
+    rng = np.random.default_rng(0)
     policy = {state: int(rng.integers(6)) for state in HARD.rules.start_states}
     ends = ends_of(HARD, policy.__getitem__)
     for index, start in enumerate(HARD.rules.start_states):
@@ -153,32 +148,24 @@ def test_chance_in_the_rules_is_kept() -> None:
 def test_wavering_between_two_ways_is_a_walk_by_chance() -> None:
     """One legal turn half of the time and the other else: a fair walk on the ring, solved by hand."""
     ways = [everywhere(HARD, lambda state, way=way: legal(state)[way]) for way in (0, 1)]  # type: ignore[misc]
-    ends = terminations(HARD, np.mean([greedy(way, 6) for way in ways], axis=0), HARD.rules.start_states)
+    starts = HARD.rules.start_states
+    ends = terminations(HARD, np.mean([greedy(way, 6) for way in ways], axis=0), starts)
     ring = np.zeros(13)  # the goal is at 0 and at 12, one turn a step
     ring[[0, 12]] = 1.0
     for _ in range(HARD.horizon):
         ring[1:12] = (ring[:11] + ring[2:]) / 2
-    by_distance = {int(far): ring[int(far)] for far in optimal_length(HARD, HARD.rules.start_states)}
-    assert ends.success == pytest.approx(
-        np.array([by_distance[int(far)] for far in optimal_length(HARD, HARD.rules.start_states)])
-    )
-    assert ends.failure == pytest.approx(0.0) and ends.success + ends.late_success == pytest.approx(
-        np.ones(66), abs=1e-4
-    )
+    assert ends.success == pytest.approx(ring[optimal_length(HARD, starts).astype(int)])
+    assert ends.failure == pytest.approx(0.0)
+    assert ends.success + ends.late_success == pytest.approx(np.ones(66), abs=1e-4)
 
 
-def test_a_report_follows_what_was_held_from_every_start(tmp_path: Path) -> None:
+def test_a_report_follows_what_was_held_from_every_start(result: BenchResult) -> None:
     """A page of a bench whose agents held the optimal policy, and the wrong way round the ring."""
-    few: dict[str, Any] = {"budgets": (2,), "evaluation_episodes": 2, "open_loop_starts": 0, "recorded_episodes": 0}
-    wanted = protocol(
-        "arrow_puzzle_hard", "smoke", agents=("table", "imaginer"), seeds=(0, 1), execution="kinematic", **few
-    )
-    result: BenchResult = benches.bench(wanted, {}, root=tmp_path, launcher=Inline())
     optimal = everywhere(HARD, HARD.rules.optimal_action).astype(np.int16)
     astray = everywhere(HARD, other_way).astype(np.int16)
 
     def holding(run: RunResult, action: NDArray[np.int16]) -> RunResult:
-        row = dataclasses.replace(run.checkpoints[-1], beliefs=Beliefs(action=action, model=None))
+        row = dataclasses.replace(run.checkpoints[-1], beliefs=PolicyTable(action=action, model=None))
         return dataclasses.replace(run, checkpoints=(row,))
 
     runs = [holding(run, astray if (run.agent, run.seed) == ("imaginer", 1) else optimal) for run in result.runs]
@@ -208,16 +195,12 @@ def test_starts_of_tests_alone_are_followed() -> None:
     policy = greedy(everywhere(task, task.rules.optimal_action), task.n_actions)
     some = task.rules.start_states[::-2]
     found, every = terminations(task, policy, some), terminations(task, policy, task.rules.start_states)
-    assert (
-        np.array_equal(found.length, every.length[::-2])
-        and found.length.tolist() == optimal_length(task, some).tolist()
-    )
+    assert found.length.tolist() == every.length[::-2].tolist() == optimal_length(task, some).tolist()
 
 
-def test_an_analysis_is_made_by_one_process_at_a_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = bench(tmp_path, Inline(), agents=("table",), budgets=(2,), seeds=(0,)).folder
-    with lock(folder / ".why.lock", "This"):
-        assert main(["why", str(folder)]) == 2
+def test_an_analysis_is_made_by_one_process_at_a_time(result: BenchResult, capsys: pytest.CaptureFixture[str]) -> None:
+    with lock(result.folder / ".why.lock", "This"):
+        assert main(["why", str(result.folder)]) == 2
     assert "is in use by process" in capsys.readouterr().err
 
 
@@ -237,8 +220,7 @@ def test_folders_without_agents_are_named(
     assert complaint in capsys.readouterr().err
 
 
-def test_training_in_the_model_comes_before_an_analysis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = bench(tmp_path, Inline(), agents=("table",), budgets=(2,), seeds=(0,))
+def test_training_in_the_model_comes_before_an_analysis(result: BenchResult, monkeypatch: pytest.MonkeyPatch) -> None:
     left = [True, True, False]
     monkeypatch.setattr(TableAgent, "train_in_model", lambda agent: left.pop(0), raising=False)
     load_trained(result.runs[0].folder)
@@ -251,7 +233,7 @@ def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> N
     codes = encoders.resolve(HARD, "clean", kind="codes")
     names = {"encoder": encoders.identity(own), "codes": encoders.identity(codes)}
     wanted = protocol("arrow_puzzle_hard", "smoke", agents=("dqn", "factored:given"), **names)
-    config = {"protocol": wanted.as_dict(), "agent": "dqn", "seed": 0, "settings": {}}
+    config = {"format": run_folder.FORMAT, "protocol": wanted.as_dict(), "agent": "dqn", "seed": 0, "settings": {}}
     for agent, complaint in (("dqn", "has no checkpoint"), ("factored:given", "has no checkpoint")):
         (tmp_path / "config.json").write_text(json.dumps(sealed({**config, "agent": agent})))
         with pytest.raises(ArtefactError, match=complaint):  # the encoder was found
@@ -264,6 +246,6 @@ def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> N
 
 
 def test_a_bench_without_learners_says_so(tmp_path: Path) -> None:
-    result = bench(tmp_path, Inline(), agents=("random",), budgets=(2,), seeds=(0,))
+    wanted = small(agents=("random",), budgets=(2,), evaluation_episodes=1)
     with pytest.raises(ArtefactError, match="has a checkpoint of an agent that learns"):
-        learners(result.folder)
+        learners(benches.bench(wanted, {}, root=tmp_path, launcher=Inline()).folder)

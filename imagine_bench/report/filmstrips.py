@@ -17,14 +17,23 @@ from imagine_bench.rules import states_of
 from imagine_bench.store.results import ComparedRollout
 
 _CELL = 128  # pixels: a 64-pixel frame at 2x, nearest, so that no pixel is made up
-_GAP, _SHEET_GAP, _MARGIN = 12, 14, 12
+_GAP = 12
+_SHEET_GAP = 14
+_MARGIN = 12
 _LABELS = 108  # width of the column that names the rows
-HEADER_PX, _FOOTER, _ROW = 62, 92, _CELL + _GAP
+HEADER_PX = 62
+_FOOTER = 92
+_ROW = _CELL + _GAP
 _BOTTOM = HEADER_PX + 2 * _ROW
-_SHEET_HEADER, _SHEET_LINE = 36, 14
+_SHEET_HEADER = 36
+_SHEET_LINE = 14
 _LINE = 20  # characters
-INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
-RIGHT, WRONG, _CUT = (0, 114, 178), (213, 94, 0), (204, 30, 90)  # Okabe-Ito blue and vermilion: color-blind safe
+INK = (28, 30, 34)
+FAINT = (120, 124, 130)
+PAPER = (255, 255, 255)
+RIGHT = (0, 114, 178)  # Okabe-Ito blue and vermilion: color-blind safe
+WRONG = (213, 94, 0)
+_CUT = (204, 30, 90)
 
 
 def filmstrip(
@@ -139,7 +148,8 @@ def changes(before: Macrostate, now: Macrostate, spec: TaskSpec) -> str:
 
 def is_possible(rules: Rules, before: Macrostate, action: int, now: Macrostate) -> bool:
     """Whether the rules allow ``now`` after ``action`` in ``before``."""
-    state, reached = tuple(before.tolist()), tuple(now.tolist())
+    state = tuple(before.tolist())
+    reached = tuple(now.tolist())
     known = state in states_of(rules) and not rules.is_terminal(state)
     return known and any(outcome.macrostate == reached for outcome in rules.outcomes(state, action))
 
@@ -154,11 +164,15 @@ def font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
 def _column(
     canvas: Image.Image, draw: ImageDraw.ImageDraw, compared: ComparedRollout, index: int, names: tuple[str, ...]
 ) -> None:
-    rollout, left = compared.rollout, left_px(index + 1)
-    kept, happened = bool(rollout.accepted[index]), index < len(compared.real_frames)
+    rollout = compared.rollout
+    left = left_px(index + 1)
+    kept = bool(rollout.accepted[index])
+    happened = index < len(compared.real_frames)
     over = 0 < index <= len(compared.real_frames) and bool(compared.real_terminated[index - 1])
     right = happened and np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
-    ink, verdict, words = INK if kept else FAINT, RIGHT if right else WRONG, ""
+    ink = INK if kept else FAINT
+    verdict = RIGHT if right else WRONG
+    words = ""
     lines = textwrap.wrap(f"{index + 1}. {names[int(rollout.actions[index])]}", width=18)[:3]
     draw.multiline_text((left, 8), "\n".join(lines), font=font(12, bold=True), fill=ink, spacing=3)
     if happened:
@@ -169,11 +183,13 @@ def _column(
         draw.text(corner, "episode over", font=font(13, bold=True), fill=INK)
     _paste(canvas, rgb(rollout.frames[index]), (left, HEADER_PX + _ROW), pale=not kept)
     if happened and not over:
-        words, top = "as the rules say" if right else "not what happens", HEADER_PX + _ROW
+        words = "as the rules say" if right else "not what happens"
+        top = HEADER_PX + _ROW
         draw.rectangle([left - 3, top - 3, left + _CELL + 2, top + _CELL + 2], outline=verdict, width=3)
     truth = f" ({_signed(compared.real_rewards[index])})" if happened else ""
     draw.text((left, _BOTTOM), words, font=font(12, bold=True), fill=verdict)
-    reward, p_end = f"reward {_signed(rollout.rewards[index])}{truth}", f"P(end) {rollout.p_terminated[index]:.2f}"
+    reward = f"reward {_signed(rollout.rewards[index])}{truth}"
+    p_end = f"P(end) {rollout.p_terminated[index]:.2f}"
     for line, text in enumerate((reward, p_end, f"epistemic {rollout.epistemic[index]:.2g}"), start=1):
         draw.text((left, _BOTTOM + line * 19), text, font=font(12), fill=ink)
 
@@ -188,8 +204,11 @@ def _mark_cut(draw: ImageDraw.ImageDraw, x: int) -> None:
 def _sampled_cell(
     canvas: Image.Image, draw: ImageDraw.ImageDraw, compared: ComparedRollout, step: int, top: int, spec: TaskSpec
 ) -> None:
-    rollout, left = compared.rollout, _MARGIN + (step + 1) * (_CELL + _SHEET_GAP)
-    action, now, before = int(rollout.actions[step]), rollout.macrostates[step], _before(compared, step)
+    rollout = compared.rollout
+    left = _MARGIN + (step + 1) * (_CELL + _SHEET_GAP)
+    action = int(rollout.actions[step])
+    now = rollout.macrostates[step]
+    before = _before(compared, step)
     title = textwrap.wrap(spec.action_names[action], width=_LINE)[:2]
     draw.multiline_text((left, top - _SHEET_HEADER), "\n".join(title), font=font(11, bold=True), fill=INK, spacing=2)
     _paste(canvas, rgb(rollout.frames[step]), (left, top))

@@ -7,34 +7,30 @@ agents would choose these actions again.
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Sequence
-from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, brief
+from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report.bench import bench_page
-from imagine_bench.report.page import texts
 from imagine_bench.running.evaluation import Env, EpisodeRecord, EvaluationCounts, replay
 from imagine_bench.running.progress import counted
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
-from imagine_bench.store.merge import load_so_far
 from imagine_bench.store.results import Checkpoint
 
 _CLAIMS = {
-    "starts": "start", "returns": "return", "success": "success", "faults": "number of faults",
+    "starts": "start",
+    "returns": "return",
+    "success": "success",
+    "faults": "number of faults",
     "fingerprints": "fingerprint",
-}  # fmt: skip
+}
 """What is kept of a test episode beside its actions, and what it is called."""
-_LINES = {"report.md": r"^\|.*$", "index.html": r"<t[dh][^>]*>(.*?)</t[dh]>"}
-"""What is compared of a report's pages: the cells of their tables; of other files it is every line."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,8 +46,8 @@ class Verdict:
         return f"{self.what}: {self.complaint or holds}"
 
 
-def verify(folder: Path) -> list[Verdict]:
-    """One verdict a run of the bench in ``folder`` and, where all runs hold, one on its report.
+def verify_runs(folder: Path) -> list[Verdict]:
+    """One verdict a run of the bench in ``folder``.
 
     Raises:
         ArtefactError: It is no bench of agents with folders of their own, or its protocol is damaged.
@@ -65,22 +61,22 @@ def verify(folder: Path) -> list[Verdict]:
 
 
 def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
-    """As :func:`verify`, in environments of the bench's protocol."""
-    protocol, found = read_control(folder), list[Verdict]()
+    """As :func:`verify_runs`, in environments of the bench's protocol."""
+    protocol = read_control(folder)
+    found: list[Verdict] = []
     runs = [(agent, seed) for seed in protocol.seeds for agent in protocol.agents]
     for agent, seed in counted(runs, "runs", total=len(runs)):
-        name, run = f"{agent} seed {seed}", BenchStore(folder, protocol).run_folder(agent, seed)
+        name = f"{agent} seed {seed}"
+        run = BenchStore(folder, protocol).run_folder(agent, seed)
         try:
             run_folder.require_run_of(run, protocol, agent, seed)
             found.append(Verdict(what=name, episodes=_verify_run(run, protocol, seed, replays)))
         except ArtefactError as error:
             found.append(Verdict(what=name, complaint=str(error)))
-    if not any(each.complaint for each in found) and (folder / "report").is_dir():
-        found.append(Verdict(what="report", complaint=_report_complaint(folder)))
     return found
 
 
-def price(folder: Path, found: Sequence[Verdict], cpu_s: float) -> str:
+def cost(folder: Path, found: Sequence[Verdict], cpu_s: float) -> str:
     """What keeping test episodes costs in bytes, and playing them again in CPU seconds, in a sentence."""
     size = sum(path.stat().st_size for path in folder.glob("*/*/episodes.npz"))
     episodes = sum(each.episodes for each in found)
@@ -92,7 +88,8 @@ class Replays:
     """Episodes begun and played again in the protocol's own environments, each once."""
 
     def __init__(self, env: Env, test_env: Env) -> None:
-        self._env, self._test_env = env, test_env
+        self._env = env
+        self._test_env = test_env
         self._known: dict[tuple[int, ...], tuple[EpisodeRecord, bool]] = {}
 
     def start(self, seed: int) -> list[int]:
@@ -112,18 +109,21 @@ def _verify_run(folder: Path, protocol: Protocol, seed: int, replays: Replays) -
     if not run_folder.is_done(folder):
         raise ArtefactError("it is not finished.")
     run = run_folder.load_run(folder)
-    rows, starts = run.checkpoints, [] if run.training_starts is None else run.training_starts.tolist()
+    rows = run.checkpoints
+    starts = [] if run.training_starts is None else run.training_starts.tolist()
     if tuple(row.episodes for row in rows) != protocol.budgets:
         raise ArtefactError(f"it was not tested after {protocol.budgets} episodes, as its protocol says.")
     for episode, start in enumerate(starts, start=len(run.training_success) - len(starts)):
         if start != (found := replays.start(episode_seed("training", seed, episode))):
             raise ArtefactError(f"training episode {episode} of seed {seed} starts at {found}, and {start} was kept.")
-    count, purpose = protocol.evaluation_episodes, evaluation_split(seed)
-    return sum(_verify_test(row, count, purpose, replays) for row in rows)
+    purpose = evaluation_split(seed)
+    return sum(_verify_test(row, protocol.evaluation_episodes, purpose, replays) for row in rows)
 
 
 def _verify_test(row: Checkpoint, count: int, purpose: Purpose, replays: Replays) -> int:
-    where, kept, again = f"after {row.episodes:,} episodes", row.kept, EvaluationCounts()
+    where = f"after {row.episodes:,} episodes"
+    kept = row.kept
+    again = EvaluationCounts()
     if kept is None:
         raise ArtefactError("it keeps no test episodes, as no run of before 2026-11-24 does.")
     sizes = {len(kept.lengths), *(len(getattr(kept, name)) for name in _CLAIMS)}
@@ -135,7 +135,8 @@ def _verify_test(row: Checkpoint, count: int, purpose: Purpose, replays: Replays
             raise ArtefactError(f"{where}, test {test}: its actions do not end an episode, or go on after its end.")
         again.add(played)
     for name, word in _CLAIMS.items():
-        claimed, replayed = getattr(kept, name), getattr(again.kept(), name)
+        claimed = getattr(kept, name)
+        replayed = getattr(again.kept(), name)
         wrong = np.flatnonzero((claimed != replayed).reshape(count, -1).any(axis=1))
         if len(wrong):
             test = int(wrong[0])
@@ -144,16 +145,3 @@ def _verify_test(row: Checkpoint, count: int, purpose: Purpose, replays: Replays
         if getattr(row, name) != value:
             raise ArtefactError(f"{where}: {name} is {value} by the test episodes, and {getattr(row, name)} was kept.")
     return count
-
-
-def _report_complaint(folder: Path) -> str:
-    """The first line of the report's tables that does not follow from the runs; empty if all do."""
-    page = bench_page(load_so_far(folder))
-    bare = dataclasses.replace(page, sections=[dataclasses.replace(each, images=()) for each in page.sections])
-    for name, text in texts(bare).items():
-        path, pattern = folder / "report" / name, re.compile(_LINES.get(name, "^.*$"), re.MULTILINE)
-        there = pattern.findall(path.read_text()) if path.is_file() else []
-        for has, wanted in zip_longest(there, pattern.findall(text), fillvalue="nothing"):
-            if has != wanted:
-                return f"{name} has {brief(has)} where the runs give {brief(wanted)}."
-    return ""

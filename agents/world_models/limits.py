@@ -1,0 +1,99 @@
+"""The two ends of the scale: a model that says that nothing changes, and the rules themselves with the renderer."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import AgentContext, Frame, State, TaskSpec
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import Imagined
+from imagine_bench.rules import Outcomes, outcomes_by_depth
+
+
+class Renderer(Protocol):
+    """Frames of macrostates that the judge rendered."""
+
+    def frame(self, state: State) -> Frame:
+        """One frame (64, 64, 3) of a macrostate, always the same."""
+
+    def shows(self, image: NDArray[np.uint8]) -> State | None:
+        """The macrostate of a rendered frame; None for any other image."""
+
+
+class Copy:
+    """Says that nothing ever changes, is rewarded or ends."""
+
+    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
+        """Learn nothing."""
+        del dataset, rng
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        """The last frame, whatever is done; see :class:`imagine_bench.interfaces.model.WorldModel`."""
+        del samples, rng
+        rows = len(frames)
+        depth = actions.shape[1] - frames.shape[1] + 1
+        images = np.broadcast_to(frames[:, None, -1:], (rows, 1, depth, *frames.shape[2:]))
+        return Imagined(pictures=images, probabilities=np.ones((rows, 1, depth)))
+
+    def parameters(self) -> int:
+        """None."""
+        return 0
+
+
+class Exact:
+    """The rules, and a rendered frame of each outcome; it knows what each frame of the judge shows."""
+
+    def __init__(self, spec: TaskSpec, renderer: Renderer) -> None:
+        self._rules = spec.rules
+        self.renderer = renderer
+
+    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
+        """Learn nothing: it knows."""
+        del dataset, rng
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        """Every outcome with its probability; see :class:`imagine_bench.interfaces.model.WorldModel`."""
+        del samples, rng
+        depth = actions.shape[1] - frames.shape[1] + 1
+        found = [self._outcomes(history[-1], row[-depth:]) for history, row in zip(frames, actions, strict=True)]
+        futures = max(len(outcomes) for steps in found for outcomes in steps)
+        shape = (len(frames), futures, depth)
+        images = np.zeros((*shape, *frames.shape[2:]), dtype=np.uint8)
+        weights = np.zeros(shape)
+        rewards = np.zeros(shape)
+        ended = np.zeros(shape)
+        for row, steps in enumerate(found):
+            for step, outcomes in enumerate(steps):
+                for slot, ((state, over), (share, reward)) in enumerate(outcomes.items()):
+                    place = (row, slot, step)
+                    images[place] = self.renderer.frame(state)
+                    weights[place] = share
+                    rewards[place] = reward
+                    ended[place] = over
+        unknown = np.zeros((len(frames), depth))
+        return Imagined(pictures=images, probabilities=weights, rewards=rewards, p_ended=ended, epistemic=unknown)
+
+    def _outcomes(self, frame: Frame, actions: NDArray[np.int64]) -> tuple[Outcomes, ...]:
+        state = self.renderer.shows(frame)
+        if state is None:
+            raise InvalidValueError("The exact model was given a frame that the judge did not render.")
+        return outcomes_by_depth(self._rules, state, actions.tolist())
+
+    def parameters(self) -> int:
+        """None."""
+        return 0
+
+
+def make_copy(context: AgentContext) -> Copy:
+    """The model that says that nothing changes."""
+    del context
+    return Copy()
+
+
+def make_exact(spec: TaskSpec, renderer: Renderer) -> Exact:
+    """The rules and the renderer."""
+    return Exact(spec, renderer)

@@ -1,0 +1,138 @@
+"""A changed rule is noticed as soon as it shows; with equal draws another macro-action leads where it must."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+from imagine_bench.agents.world_models.limits import Copy, Exact
+from judged import judged_world
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces.model import Imagined
+from imagine_bench.judge.change import (
+    FALSE_ALARMS,
+    LENGTH,
+    SLIP,
+    STREAMS,
+    alarms,
+    change_detection_delay,
+    coupled,
+    slipping,
+    streams_of,
+    unchanged,
+)
+
+ARROWS, BOTH = "arrows:cubes=2", pytest.mark.parametrize("task", ["arrows:cubes=2", "pick_place"])
+
+
+@BOTH
+def test_streams_walk_as_the_rules_say(task: str) -> None:
+    there = judged_world(task)
+    streams = there.streams["usual"]
+    counts: dict[tuple[object, int], dict[object, int]] = {}
+    for row, reached in zip(streams.rows.ravel().tolist(), streams.reached.ravel().tolist(), strict=True):
+        found = counts.setdefault((there.one_step.states[row], there.one_step.first_actions[row]), {})
+        found[streams.states[reached]] = found.get(streams.states[reached], 0) + 1
+    for (state, action), found in counts.items():
+        exact = {o.macrostate: o.probability for o in there.spec.rules.outcomes(state, action)}  # type: ignore[arg-type]
+        total = sum(found.values())
+        for macrostate, count in found.items():
+            p = exact[macrostate]  # type: ignore[index]
+            assert abs(count / total - p) <= 5.0 * math.sqrt(p * (1.0 - p) / total) + 1e-12
+    assert {there.one_step.states[row] for row in streams.rows[:, 0]} == set(there.spec.rules.start_states)
+
+
+@BOTH
+def test_changed_rules_are_still_rules(task: str) -> None:
+    there = judged_world(task)
+    rules, states = there.spec.rules, tuple(dict.fromkeys(there.one_step.states))
+    usual, both = unchanged(rules), coupled(rules, states)
+    pairs = list(itertools.product(states, range(rules.n_actions)))
+    for dynamics in (slipping(rules), both):
+        for state, action in pairs:
+            assert sum(share for share, _, _ in dynamics(state, action)) == pytest.approx(1.0)
+    assert len({action for state, action in pairs if both(state, action) != usual(state, action)}) == 1
+    if task == ARROWS:
+        moved = {sum(a != b for a, b in zip(state, both(state, 0)[0][1], strict=True)) for state in states}
+        assert moved == {2}, "a coupled turn turns another cube too"
+
+
+def test_exact_notices_what_cannot_happen_at_once() -> None:
+    there = judged_world(ARROWS)
+    found = change_detection_delay(there.streams, there.predictions(there.exact, there.one_step))
+    # every macro-action turns a cube, so a slip shows; one macro-action is coupled
+    assert found["notice_slip"] == pytest.approx(1.0 / SLIP, rel=0.1)
+    assert found["notice_coupling"] == pytest.approx(there.spec.n_actions, rel=0.1)
+
+
+def test_a_model_that_is_always_surprised_notices_nothing() -> None:
+    there = judged_world(ARROWS)
+    answers = there.predictions(Copy(), there.one_step)
+    assert change_detection_delay(there.streams, answers) == {"notice_slip": LENGTH, "notice_coupling": LENGTH}
+    assert all(math.isnan(value) for value in change_detection_delay(None, answers).values())
+
+
+class Unsure(Exact):
+    """Exact, but that nothing changes is as likely to it as all else together; so surprise is never certain."""
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        right, still = super().imagine(frames, actions, samples, rng), Copy().imagine(frames, actions, samples, rng)
+        weights = [0.5 * np.asarray(each.probabilities) for each in (right, still)]
+        return Imagined(
+            pictures=np.concatenate([right.pictures, still.pictures], axis=1),
+            probabilities=np.concatenate(weights, axis=1),
+        )
+
+
+def test_false_alarms_are_as_rare_as_promised() -> None:
+    there = judged_world("pick_place")
+    answers = there.predictions(Unsure(there.spec, there.index), there.one_step)
+    other_seed = streams_of(dataclasses.replace(there.spec, id="with other streams"), there.one_step)
+    assert other_seed is not None
+    walks = [there.streams["usual"], other_seed["usual"], there.streams["coupling"]]
+    shares = [float((first <= LENGTH).mean()) for first in alarms(walks, answers)]
+    assert 0.0 < shares[0] <= FALSE_ALARMS
+    assert shares[1] <= FALSE_ALARMS + 4.0 * math.sqrt(FALSE_ALARMS / STREAMS)
+    assert shares[2] > 0.9
+
+
+@BOTH
+def test_exact_knows_every_counterfactual(task: str) -> None:
+    there = judged_world(task)
+    assert there.counterfactual_error(there.exact) == 0.0
+
+
+def test_copy_is_right_where_two_macro_actions_change_nothing() -> None:
+    there = judged_world("pick_place")
+    rules, states = there.spec.rules, there.counterfactuals[0].states
+    stays = [[rules.outcomes(state, a)[0].macrostate == state for a in range(rules.n_actions)] for state in states]
+    right = [a and b for row in stays for a, b in itertools.combinations(row, 2)]
+    assert there.counterfactual_error(Copy()) == pytest.approx(1.0 - np.mean(right))
+
+
+class Unlucky(Exact):
+    """Right of every macro-action alone, with other luck for odd ones: it draws in the opposite order."""
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        found = super().imagine(frames, actions, samples, rng)
+        assert found.probabilities is not None
+        odd = (actions[:, 0] % 2 == 1)[:, None]
+        return Imagined(
+            pictures=np.where(odd[..., None, None, None, None], found.pictures[:, ::-1], found.pictures),
+            probabilities=np.where(odd[..., None], found.probabilities[:, ::-1], found.probabilities),
+        )
+
+
+def test_other_draws_are_no_counterfactual() -> None:
+    there = judged_world("arrows:cubes=2,slip=0.3")
+    unlucky = Unlucky(there.spec, there.index)
+    answers = [there.predictions(model, there.one_step) for model in (there.exact, unlucky)]
+    for row in range(len(there.one_step.states)):
+        assert answers[0].distribution(row, 0) == pytest.approx(answers[1].distribution(row, 0))
+    assert there.counterfactual_error(there.exact) == 0.0
+    assert there.counterfactual_error(unlucky) > 0.1

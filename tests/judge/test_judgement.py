@@ -1,0 +1,294 @@
+"""Models of other packages, and trained agents, are judged without a change here; what is kept is not done again."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import re
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import pytest
+from doc_cells import ROOT
+from fake_reader import BlindReader
+from guest_packages import install
+from recordings import contents, times
+from small_runs import Inline, small
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
+from imagine_bench.judge import judgement, questions
+from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
+from imagine_bench.judge.models import load_model, make, model_entry
+from imagine_bench.judge.predictions import RenderedFrameIndex
+from imagine_bench.report.judge import judgement_report
+from imagine_bench.running import bench as benches
+from imagine_bench.seeding import SeedTree
+
+_PYPROJECT = """
+[project]
+name = "their_models"
+version = "1.0"
+[project.entry-points."imagine_bench.world_models"]
+nearest = "their_models:ENTRY"
+raises = "their_models:RAISES"
+late = "their_models:LATE"
+unmade = "their_models:UNMADE"
+"""
+_MORE = """
+class Raises(Nearest):
+    def fit(self, dataset, rng):
+        raise RuntimeError("out of luck")
+
+class Late(Nearest):
+    def imagine(self, frames, actions, samples, rng):
+        if actions.shape[1] > 1:
+            raise KeyError("depth")
+        return super().imagine(frames, actions, samples, rng)
+
+def raises(context):
+    return Raises()
+
+def late(context):
+    return Late()
+
+def unmade(context):
+    return context.nothing
+
+UNMADE = WorldModelEntry(make="their_models:unmade", title="unmade")
+RAISES = WorldModelEntry(make="their_models:raises", title="raises")
+LATE = WorldModelEntry(make="their_models:late", title="late")
+"""
+
+
+_OWN_READER = judgement._reader
+
+
+class Said(NamedTuple):
+    """A judgement by the command: where it is kept, its exit status and what it printed."""
+
+    folder: Path
+    status: int
+    out: str
+    err: str
+
+
+def _read_nothing(spec: object, appearance: str, folder: Path) -> BlindReader:
+    names = ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read")
+    (folder / "reader.json").write_text(json.dumps(dict.fromkeys(names, 0.0)))
+    return BlindReader(4)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _blind() -> Iterator[None]:
+    """A reader that costs nothing."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(judgement, "_reader", _read_nothing)
+        yield
+    judgement._prepared.cache_clear()
+    judgement._data.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def said(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Said]:
+    """The documentation's model, and three that fail, in a package, are judged beside the two ends of the scale."""
+    page = (ROOT / "docs" / "how_to" / "world_model.md").read_text()
+    code = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[0].replace("my_package", "their_models")
+    folder, root = tmp_path_factory.mktemp("package"), tmp_path_factory.mktemp("judge")
+    (folder / "pyproject.toml").write_text(_PYPROJECT)
+    (folder / "their_models.py").write_text(code + _MORE)
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.syspath_prepend(install(folder))
+        registry.offers.cache_clear()
+        words = ["judge", "--task", "pick_place", "--sizes", "20", "60", "--seeds", "1000", "--workers", "1"]
+        status = main([*words, "--out", str(root), "--models", "nearest", "raises", "late", "unmade", "copy", "exact"])
+        (made,) = (path.parent for path in root.glob("*/judgement.json"))
+        yield Said(made, status, out.getvalue(), err.getvalue())
+    sys.modules.pop("their_models", None)
+    registry.offers.cache_clear()
+
+
+def _of(*models: str) -> Judgement:
+    return Judgement(task="pick_place", models=models, sizes=(20, 60), seeds=(1000,))
+
+
+def test_what_models_do_wrong_is_a_sentence_each(said: Said) -> None:
+    assert said.status == 1
+    assert "World model raises: fit() failed (RuntimeError: out of luck)." in said.err
+    assert "World model late: imagine() failed (KeyError: 'depth')." in said.err
+    assert "World model unmade (their_models:unmade) cannot be used (AttributeError: " in said.err
+    assert not list(said.folder.glob("raises-*"))
+
+
+def test_a_model_of_theirs_is_judged(said: Said) -> None:
+    assert "nearest frame" in said.out and "exact" in said.out
+    assert len(list(said.folder.glob("nearest-seed*.json"))) == 2
+    page = (said.folder / "report" / "index.html").read_text()
+    assert all(words in page for words in ("nearest frame", "risk_coverage", "Where it fails"))
+    recorded = contents(said.folder / "judgement.rrd")
+    assert {"/action", "/real/frame", "/exact/frame", "/nearest/outcomes"} <= recorded.keys()
+    assert times(said.folder / "judgement.rrd", "/exact/frame", "depth") == set(range(11))
+    scored = {(cell["model"], cell["transitions"]): cell for cell in kept(said.folder, _of("copy", "exact"))}
+    assert scored["exact", 60]["value_loss"] == 0.0 < scored["copy", 60]["value_loss"]
+    futures = scored["exact", 60]["futures"]
+    assert [pytest.approx(each) for each in futures["real"]] == futures["imagined"]
+    assert scored["copy", 20]["data"] == scored["exact", 60]["data"]
+
+
+def test_what_is_kept_is_not_judged_again(said: Said) -> None:
+    before = {path: path.stat().st_mtime_ns for path in said.folder.glob("*-seed*.json")}
+    assert judge(_of("nearest", "copy", "exact"), said.folder.parent, workers=1) == (said.folder, [])
+    assert {path: path.stat().st_mtime_ns for path in said.folder.glob("*-seed*.json")} == before
+
+
+def test_the_same_seed_gives_the_same_scores(said: Said, tmp_path: Path) -> None:
+    judgement._data.cache_clear()
+    judgement._prepared.cache_clear()
+    again, _ = judgement.judge_cell(_of("nearest"), tmp_path, ModelFit("nearest", 1000, 20))
+    first = next(cell for cell in kept(said.folder, _of("nearest")) if cell["transitions"] == 20)
+    timed = ("fit_s", "imagine_s_per_1000")
+    assert {name: value for name, value in first.items() if name not in timed} == json.loads(
+        json.dumps(judgement.with_null({name: value for name, value in again.items() if name not in timed}))
+    )
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The run of seed 0 of each agent; that of seed 1 lies beside it."""
+    wanted = small(budgets=(2,), agents=("table", "imaginer"), seeds=(0, 1))
+    result = benches.bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
+    return {run.agent: run.folder for run in result.runs if run.seed == 0}
+
+
+@pytest.fixture
+def _few(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Few questions."""
+    monkeypatch.setattr(questions, "STATES", 10)
+    monkeypatch.setattr(questions, "AFTER_THE_END", 10)
+    monkeypatch.setattr(questions, "ROLLOUTS", 4)
+    judgement._prepared.cache_clear()
+    yield
+    judgement._prepared.cache_clear()
+
+
+def _judged(root: Path, *models: str, seeds: tuple[int, ...]) -> tuple[Path, Judgement]:
+    one = Judgement(task="arrow_puzzle", models=models, sizes=(20, 40), seeds=seeds, samples=1)
+    folder, failed = judge(one, root, workers=1)
+    assert failed == []
+    return folder, one
+
+
+@pytest.mark.usefixtures("_few")
+def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tmp_path: Path) -> None:
+    """What an agent says its own images show counts for nothing."""
+    run = str(runs["imaginer"])
+    folder, one = _judged(tmp_path, run, "copy", seeds=(1000, 1001))
+    (cell,) = (cell for cell in kept(folder, one) if cell["model"] == run)
+    assert (cell["seed"], cell["transitions"]) == (0, 40), "it learns nothing here: once"
+    assert cell["nothing"] == cell["total_variation"] == cell["after_the_end"] == 1.0
+    assert cell["fit_s"] is None and set(cell["where"]["in its data"]) <= {"seen", "never"}
+    assert "imaginer, seed 0  " in judgement_report(folder, one)
+    page = (folder / "report/report.md").read_text()
+    assert "imaginer, seed 0 has the smallest total variation: 1.00." in page
+    assert "by depth after 40 transitions" in page
+    folder, other = _judged(tmp_path, "copy", seeds=(1001,))
+    assert [shown(folder, each)["copy"]["seed"] for each in (one, other)] == [1000, 1001], "images of the first seed"
+
+
+@pytest.mark.usefixtures("_few")
+def test_the_folder_of_an_agent_stands_for_all_its_runs(runs: dict[str, Path], tmp_path: Path) -> None:
+    agent = str(runs["imaginer"].parent)
+    folder, one = _judged(tmp_path, agent, seeds=(1000,))
+    assert [(cell["model"], cell["seed"]) for cell in kept(folder, one)] == [(agent, 0), (agent, 1)]
+    assert not list(folder.glob("data-*")), "nothing is collected for what does not learn"
+    assert list(shown(folder, one)) == [agent]
+    (row,) = (line for line in judgement_report(folder, one).splitlines() if line.startswith("imaginer"))
+    assert "seed" not in row
+    page = (folder / "report/report.md").read_text()
+    assert "over the runs of each trained agent" in page
+    assert "after 40 transitions" not in page and "How much data" not in page
+
+
+def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path]) -> None:
+    assert model_entry(str(runs["table"])).title == "table, seed 0"
+    with pytest.raises(InvalidValueError, match="does not imagine"):
+        load_model(runs["table"], "arrow_puzzle")
+    with pytest.raises(InvalidValueError, match="learned arrow_puzzle, not pick_place"):
+        load_model(runs["imaginer"], "pick_place")
+    visited = load_model(runs["imaginer"], "arrow_puzzle").visited
+    assert 0 < len(visited) <= 2 * 20, "what it experienced is what the bench counted"
+    assert all(len(state) == 4 and 0 <= action < 6 for state, action in visited)
+    twice = (str(runs["imaginer"]), str(runs["imaginer"] / ".." / "seed_0"))
+    with pytest.raises(InvalidValueError, match="give each world model or run once"):
+        Judgement(task="arrow_puzzle", models=twice)
+
+
+_TWICE = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:model.dropout=0.1,model.members=2")
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "words"),
+    [
+        ({"models": ("oracle",)}, UnknownNameError, "No world model 'oracle'"),
+        ({"sizes": (30, 20)}, InvalidValueError, "ascending numbers"),
+        ({"task": "arrows:cubes=2,lag=1"}, InvalidValueError, "hide or delay a part .* without the dials"),
+        (
+            {"models": ("copy", "structured"), "encoder": "pick_place-mild"},
+            InvalidValueError,
+            r"No model of \('copy', 'structured'\) reads latents, which pick_place-",
+        ),
+        ({"samples": 0}, InvalidValueError, "samples is 0"),
+        ({"seeds": (0, 1, 0)}, InvalidValueError, r"seeds is \(0, 1, 0\); give each seed once"),
+        ({"models": ("copy", "exact", "copy")}, InvalidValueError, "give each world model or run once"),
+        ({"models": _TWICE}, InvalidValueError, "give each world model or run once"),
+    ],
+)  # fmt: skip
+def test_nonsense_is_refused(given: dict[str, object], kind: type[Exception], words: str) -> None:
+    with pytest.raises(kind, match=words):
+        Judgement(**{"task": "pick_place", "models": ("copy",), **given})  # type: ignore[arg-type]
+
+
+def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> None:
+    judged = Judgement(task="pick_place", models=("gaussian", "structured"), encoder="pick_place-mild")
+    spec = registry.task("pick_place")
+    index = RenderedFrameIndex(spec, "clean")
+    costs = [make(name, spec, index, "clean", SeedTree(1000), judged.encoder)[1] for name in judged.models]
+    assert [cost["encoder"] for cost in costs] == ["pick_place-mild", "pick_place-clean-codes"]
+    assert judged.folder_name != dataclasses.replace(judged, encoder=None).folder_name
+
+
+def test_two_judges_at_once_train_one_reader_and_see_it_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec, trained = registry.task("pick_place"), []
+
+    class Slow(BlindReader):
+        def content(self) -> bytes:
+            return b"whole"
+
+    def train(*_: object) -> Slow:
+        trained.append(threading.get_ident())
+        time.sleep(0.2)
+        return Slow(4)
+
+    code = SimpleNamespace(train_reader=train, load_reader=lambda spec, path: path.read_bytes())
+    monkeypatch.setattr(registry, "load", lambda name: code)
+    monkeypatch.setattr(judgement, "reader_errors", lambda *_: {})
+    with ThreadPoolExecutor(2) as pool:
+        jobs = [pool.submit(_OWN_READER, spec, "clean", tmp_path) for _ in range(2)]
+    assert [job.result() for job in jobs] == [b"whole", b"whole"]
+    assert len(trained) == 1
+
+
+def test_a_half_written_reader_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "reader.safetensors").write_bytes(b"half")
+    with pytest.raises(ArtefactError, match=r"reader\.safetensors is not the judge's reader; remove it, and the same"):
+        _OWN_READER(registry.task("pick_place"), "clean", tmp_path)

@@ -1,0 +1,263 @@
+"""The open-loop comparison and rollouts beside reality, with imaginers whose predictions are known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import bench_fakes
+import gymnasium
+import numpy as np
+import pytest
+from judged import labelled, shown
+from numpy.typing import NDArray
+from small_runs import context
+
+from imagine_bench import registry
+from imagine_bench.interfaces import Frame, Observation, Outcome, TaskSpec
+from imagine_bench.interfaces.capabilities import ImaginedRollout
+from imagine_bench.judge.open_loop import (
+    EXAMPLES,
+    SAMPLED_ROLLOUTS,
+    compare_rollout,
+    examples,
+    imagine_sampled_rollouts,
+    open_loop,
+    surviving_actions,
+)
+from imagine_bench.judge.questions import EvalSet
+from imagine_bench.judge.truth import shares
+from imagine_bench.report import filmstrips
+from imagine_bench.rules import is_random
+from imagine_bench.seeding import TUNING_SEEDS, SeedTree, evaluation_split
+from imagine_bench.store.results import ComparedRollout
+
+PUZZLE, PICK_PLACE = labelled("arrow_puzzle"), labelled("pick_place")
+START = np.array([0, 0, 0, 0])
+"""The human points at the left object."""
+ASKS_MIDDLE, ASKS_RIGHT, IMPOSSIBLE = (1, 0, 0, 1), (1, 0, 0, 2), (1, 1, 0, 2)
+
+
+def asked(spec: TaskSpec, starts: int, depth: int) -> EvalSet:
+    found = surviving_actions(spec, starts=starts, depth=depth, appearance="clean")
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def puzzle() -> EvalSet:
+    return asked(PUZZLE, 40, 10)
+
+
+def test_the_rules_keep_every_rollout_alive(puzzle: EvalSet) -> None:
+    assert puzzle.asked.shape == (40, 10)
+    for start, actions, steps in zip(puzzle.states, puzzle.asked.tolist(), puzzle.truth, strict=True):
+        state = start
+        for action, outcomes in zip(actions, steps, strict=True):
+            (outcome,) = PUZZLE.rules.outcomes(state, action)
+            state = outcome.macrostate
+            assert not outcome.terminated and outcomes == {(state, False): (1.0, -1.0)}
+    assert len(set(map(tuple, puzzle.asked.tolist()))) > 30, "actions vary"
+    again = asked(PUZZLE, 40, 10)
+    assert np.array_equal(again.frames, puzzle.frames) and np.array_equal(again.actions, puzzle.actions)
+
+
+def test_blind_random_actions_would_not_stay_alive() -> None:
+    """Non-vacuous: without the choice, nearly every rollout of ten would end."""
+    rng = np.random.default_rng(0)
+    alive = 0
+    for start in PUZZLE.rules.start_states:
+        state, over = start, False
+        for _ in range(10):
+            (outcome,) = PUZZLE.rules.outcomes(state, int(rng.integers(6)))
+            state, over = outcome.macrostate, over or outcome.terminated
+        alive += not over
+    assert alive <= 1
+
+
+class _Coin:
+    """Two safe states and a pit; action 1 always falls, action 0 falls from state 1 half the time."""
+
+    states = ((0,), (1,), (2,))
+    start_states = ((0,), (1,))
+
+    def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
+        pit = Outcome(0.5, (2,), -5.0, True, False)
+        safe = Outcome(0.5, (0,), -1.0, False, False)
+        if action == 1:
+            return (dataclasses.replace(pit, probability=1.0),)
+        return (pit, safe) if macrostate == (1,) else (dataclasses.replace(safe, probability=1.0),)
+
+
+def test_random_rules_give_only_starts_that_surely_stay_alive() -> None:
+    coin = dataclasses.replace(PUZZLE, rules=_Coin(), action_names=("stay", "jump"))  # type: ignore[arg-type]
+    found = asked(coin, 8, 3)
+    assert found.states == ((0,),) * 8 and (found.asked == 0).all()  # staying
+    assert surviving_actions(coin, starts=0, depth=3, appearance="clean") is None
+
+
+class Told(bench_fakes.RulesImaginer):
+    """Imagines the truth of a set, one question after another, but for ``wrong``: (question, depth) pairs."""
+
+    def __init__(self, known: EvalSet, wrong: NDArray[np.bool_]) -> None:
+        super().__init__(context())
+        self.known, self.wrong, self.question = known, wrong, 0
+
+    def imagine(
+        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
+    ) -> ImaginedRollout:
+        truth, wrong = self.known.truth[self.question], self.wrong[self.question]
+        self.question += 1
+        states = np.array([next(iter(shares(outcomes))) for outcomes in truth])
+        states[wrong, 3] += 1
+        unsure = {"epistemic": np.where(wrong, 0.8, 0.1), "modal": np.where(wrong, 0.2, 0.9)}
+        rollout = super().imagine(frame, actions=actions, depth=depth, rng=rng)
+        return dataclasses.replace(rollout, macrostates=states, **unsure)
+
+
+def test_scores_by_depth(puzzle: EvalSet) -> None:
+    wrong = np.broadcast_to(np.arange(10) >= 3, (40, 10))
+    loop = open_loop(Told(puzzle, wrong), puzzle, SeedTree(0))
+    assert loop.count.tolist() == [40] * 10
+    assert loop.correct.tolist() == loop.accepted.tolist() == [1.0] * 3 + [0.0] * 7
+    assert loop.correct_accepted[:3].tolist() == [1.0] * 3
+    assert np.isnan(loop.correct_accepted[3:]).all()
+    assert loop.reward_mae.tolist() == [0.5] * 10  # it says -0.5, the rules say -1
+    assert loop.termination_error.tolist() == [0.0] * 3 + [1.0] * 7
+    assert (loop.epistemic[0], loop.aleatoric[0], loop.modal[0]) == pytest.approx((0.1, 0.5, 0.9))
+
+
+def test_uncertainty_is_held_to_the_errors_it_should_find(puzzle: EvalSet) -> None:
+    wrong = np.zeros((40, 10), dtype=np.bool_)
+    wrong[1::2, 2] = True  # every other rollout, at depth 3
+    loop = open_loop(Told(puzzle, wrong), puzzle, SeedTree(0))
+    assert loop.judged.tolist() == [40] * 3 + [20] + [40] * 6  # what begins wrong is not judged
+    assert (loop.auroc_epistemic[2], loop.auroc_modal[2], loop.auroc_aleatoric[2]) == (1.0, 0.0, 0.5)
+    assert np.isnan(loop.auroc_epistemic[[0, 1, 3, 9]]).all()  # nothing is wrong there
+
+
+class Perfect(bench_fakes.RulesImaginer):
+    """Imagines what the environment itself shows, from a start that its first frame cannot tell from the real one."""
+
+    fresh = False
+
+    def __init__(self, spec: TaskSpec) -> None:
+        super().__init__(context())
+        self.spec, self.env = spec, gymnasium.make(spec.env_id, execution="kinematic", disable_env_checker=True)
+
+    def begin_episode(self) -> None:
+        self.fresh = True
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        self.fresh = False
+        return 0
+
+    def imagine(
+        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
+    ) -> ImaginedRollout:
+        assert self.fresh, "it is asked in the middle of an episode"
+        actions, seen = np.zeros(depth, dtype=np.int64) if actions is None else actions, shown(frame, self.spec)
+        alike = [state for state in self.spec.rules.start_states if ((seen == state) | (seen < 0)).all()]
+        start = alike[int(rng.integers(len(alike)))]
+        looks = (self.env.reset(seed=int(rng.integers(2**31)), options={"macrostate": start})[1] for _ in range(100))
+        next(info for info in looks if np.array_equal(info.get("shown", info["macrostate"]), seen))
+        infos = [self.env.step(action)[4] for action in actions]
+        read = [self.spec.as_observed(info.get("shown", info["macrostate"])) for info in infos]
+        rollout = super().imagine(frame, actions=actions, depth=depth, rng=rng)
+        return dataclasses.replace(rollout, macrostates=np.array(read))
+
+
+@pytest.mark.parametrize(
+    ("task", "depth"),
+    [("pick_place:gesture=first", 1), ("arrows:cubes=2,gesture=0.5,lag=2", 4), ("arrows:cubes=2,gesture=0.0", 4)],
+)
+def test_who_imagines_what_frames_will_show_is_right(task: str, depth: int) -> None:
+    spec = labelled(task)
+    agent, found = Perfect(spec), asked(spec, 6, 4)
+    agent.act(Observation(frame=found.frames[0, 0]), explore=False)  # the last frame of a test episode
+    assert open_loop(agent, found, SeedTree(0)).correct.tolist() == [1.0] * depth
+
+
+def test_examples_and_samples_begin_an_episode_and_go_as_imagined() -> None:
+    spec = labelled("pick_place:gesture=first")
+    agent = Perfect(spec)
+    found = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
+    agent.fresh = False
+    found += imagine_sampled_rollouts(agent, spec, appearance="clean", seeds=SeedTree(0))
+    assert len(found) == EXAMPLES + SAMPLED_ROLLOUTS
+    for each in found:  # chance goes as was imagined, as far as frames tell
+        until = int(each.real_terminated.argmax()) if each.real_terminated.any() else len(each.real_terminated)
+        assert np.array_equal(each.real_macrostates[:until], each.rollout.macrostates[:until])
+
+
+def test_examples_stand_beside_the_truth() -> None:
+    first, again, tuning = (
+        examples(bench_fakes.RulesImaginer(context()), PUZZLE, appearance="clean", seeds=SeedTree(0), purpose=purpose)
+        for purpose in ("evaluation", evaluation_split(0), evaluation_split(TUNING_SEEDS))
+    )
+    assert len(first) == EXAMPLES
+    for one, other in zip(first, again, strict=True):
+        assert np.array_equal(one.rollout.frames, other.rollout.frames)
+        assert np.array_equal(one.real_frames, other.real_frames)
+        assert np.array_equal([shown(frame, PUZZLE) for frame in one.real_frames], one.real_macrostates)
+        assert one.real_terminated[-1]  # always turning the left cube ends in two arrows alike
+    starts = [[each.start_macrostate.tolist() for each in found] for found in (first, tuning)]
+    assert starts[0] != starts[1], "a run that tunes begins elsewhere"
+    few = examples(bench_fakes.RulesImaginer(context()), PICK_PLACE, appearance="clean", seeds=SeedTree(0))
+    assert len(PICK_PLACE.rules.start_states) < EXAMPLES == len(few), "a task with few starts has examples too"
+
+
+def compared(seed: int, *steps: tuple[int, tuple[int, ...]]) -> ComparedRollout:
+    actions = np.array([action for action, _ in steps])
+    imaginer, frame, rng = (
+        bench_fakes.RulesImaginer(context()),
+        np.zeros((64, 64, 3), np.uint8),
+        np.random.default_rng(seed),
+    )
+    rollout = imaginer.imagine(frame, actions=actions, depth=9, rng=rng)
+    rollout = dataclasses.replace(rollout, macrostates=np.array([state for _, state in steps]))
+    return compare_rollout(PICK_PLACE, frame=frame, macrostate=START, rollout=rollout, appearance="clean", rng=rng)
+
+
+def test_reality_goes_as_was_imagined_where_it_may() -> None:
+    """Three wishes are possible: by luck, twenty draws would not all be the imagined one (3e-10)."""
+    for seed in range(10):
+        for wish in (ASKS_MIDDLE, ASKS_RIGHT):
+            assert tuple(compared(seed, (0, wish)).real_macrostates[0]) == wish
+    reached = {tuple(compared(seed, (0, IMPOSSIBLE)).real_macrostates[0]) for seed in range(30)}
+    assert reached == {outcome.macrostate for outcome in PICK_PLACE.rules.outcomes(tuple(START), 0)}
+
+
+def test_only_a_task_with_chance_has_sampled_rollouts() -> None:
+    imaginer = bench_fakes.RulesImaginer(context())
+    assert is_random(PICK_PLACE.rules) and not is_random(PUZZLE.rules)
+    assert imagine_sampled_rollouts(imaginer, PUZZLE, appearance="clean", seeds=SeedTree(0)) == ()
+    sampled = imagine_sampled_rollouts(imaginer, PICK_PLACE, appearance="clean", seeds=SeedTree(0))
+    assert len(sampled) == SAMPLED_ROLLOUTS
+    for one in sampled:
+        assert np.array_equal(one.start_frame, sampled[0].start_frame)
+        assert np.array_equal(one.start_macrostate, sampled[0].start_macrostate)
+
+
+def test_changes_are_named_and_judged_by_the_rules() -> None:
+    spec, wish = registry.task("pick_place"), np.array(ASKS_RIGHT)
+    assert filmstrips.changes(START, wish, spec) == "left object picked, gesture right"
+    assert filmstrips.changes(wish, wish, spec) == "nothing changes"
+    assert filmstrips.is_possible(spec.rules, START, 0, wish)
+    assert not filmstrips.is_possible(spec.rules, START, 0, np.array(IMPOSSIBLE))
+    assert not filmstrips.is_possible(spec.rules, START, 1, wish), "another macro-action leads elsewhere"
+    assert not filmstrips.is_possible(spec.rules, np.array(IMPOSSIBLE), 0, wish), "nothing follows the impossible"
+
+
+def test_impossible_steps_are_marked_and_the_longest_fits() -> None:
+    right, wrong = compared(0, (0, ASKS_RIGHT)), compared(0, (0, IMPOSSIBLE), (0, ASKS_RIGHT))
+    short, long = (filmstrips.sampled_filmstrips(rows, PICK_PLACE) for rows in ((right, right), (right, wrong)))
+    assert long.shape[0] > short.shape[0], "more values change, and all are written out"
+    assert long.shape[1] > short.shape[1]
+
+    def inked(sheet: NDArray[np.uint8], color: tuple[int, int, int]) -> bool:
+        return bool((sheet == color).all(axis=2).any())
+
+    assert inked(short, filmstrips.RIGHT) and inked(long, filmstrips.WRONG) and not inked(short, filmstrips.WRONG)
+    hidden = dataclasses.replace(PICK_PLACE, sight=registry.task("pick_place:gesture=first").sight)
+    unjudged = filmstrips.sampled_filmstrips((right, wrong), hidden)
+    assert not inked(unjudged, filmstrips.RIGHT) and not inked(unjudged, filmstrips.WRONG)

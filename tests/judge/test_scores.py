@@ -1,0 +1,184 @@
+"""The two ends of the scale score what enumeration says they must, and a planted mistake is charged exactly."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from imagine_bench.agents.world_models.limits import Copy, Exact
+from judged import JudgedWorld, judged_world
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame, Rules, State
+from imagine_bench.interfaces.model import Imagined
+from imagine_bench.judge import questions
+from imagine_bench.judge.questions import FRAMES
+from imagine_bench.judge.scores import after_the_end_scores, by_depth, filter_scores, one_step_scores, risks
+
+ERRORS = (
+    *("total_variation", "missed", "invented", "nothing", "outcome_ece", "outcome_brier", "reward_error", "reward_ece"),
+    *("reward_brier", "end_error", "end_ece", "end_brier", "value_loss", "worst_value_loss"),
+)
+ARROWS, BOTH = "arrows:cubes=2", pytest.mark.parametrize("task", ["arrows:cubes=2", "pick_place"])
+
+
+@BOTH
+def test_exact_is_without_any_error(task: str) -> None:
+    world = judged_world(task)
+    scores = world.scores(world.exact)
+    assert {name: scores[name] for name in ERRORS} == pytest.approx(dict.fromkeys(ERRORS, 0.0), abs=1e-12)
+    assert scores["regret"] == scores["worth_of_refusing"] == 0.0
+    assert math.isnan(scores["auroc_wrong"]) and math.isnan(scores["best_skill"])  # there is no error to find
+    deep = by_depth(world.rollouts, world.predictions(world.exact, world.rollouts))
+    assert deep["tv_by_depth"] == pytest.approx([0.0] * 10, abs=1e-12)
+    several = any(len(outcomes) > 2 for steps in world.rollouts.truth for outcomes in steps)
+    assert several == (task == "pick_place"), "some of the truth is random"
+
+
+def reached(rules: Rules, start: State, actions: list[int]) -> dict[State, float]:
+    """The distribution after actions, one path after another."""
+    if not actions:
+        return {start: 1.0}
+    found: dict[State, float] = {}
+    for outcome in rules.outcomes(start, actions[0]):
+        for state, share in reached(rules, outcome.macrostate, actions[1:]).items():
+            found[state] = found.get(state, 0.0) + outcome.probability * share
+    return found
+
+
+@BOTH
+def test_copy_scores_what_enumeration_says(task: str) -> None:
+    world = judged_world(task)
+    rules = world.spec.rules
+    scores = world.scores(Copy())
+    alive = [state for state in rules.states or () if not rules.is_terminal(state)]
+    stays = [reached(rules, state, [action]).get(state, 0.0) for state in alive for action in range(rules.n_actions)]
+    assert scores["total_variation"] == pytest.approx(1.0 - np.mean(stays))
+    assert math.isnan(scores["reward_error"]) and math.isnan(scores["auroc_wrong"])
+    deep = by_depth(world.rollouts, world.predictions(Copy(), world.rollouts))["tv_by_depth"]
+    for depth in (1, 4):
+        pairs = zip(world.rollouts.states, world.rollouts.asked[:, :depth].tolist(), strict=True)
+        away = [1.0 - reached(rules, state, actions).get(state, 0.0) for state, actions in pairs]
+        assert deep[depth - 1] == pytest.approx(np.mean(away))
+
+
+def best(rules: Rules, state: State, left: int, choose: Callable[[State], list[int]]) -> float:
+    """The expected return of the best of the actions that may be chosen, by recursion."""
+    if not left:
+        return 0.0
+    return max(
+        sum(
+            o.probability * (o.reward + (0.0 if o.terminated else best(rules, o.macrostate, left - 1, choose)))
+            for o in rules.outcomes(state, action)
+        )
+        for action in choose(state)
+    )
+
+
+def test_copy_loses_what_always_doing_the_same_loses() -> None:
+    world = judged_world(ARROWS)
+    rules = world.spec.rules
+    every = list(range(rules.n_actions))
+    losses = [
+        best(rules, state, 5, lambda _: every) - best(rules, state, 5, lambda _: [0]) for state in rules.start_states
+    ]
+    short = dataclasses.replace(world.spec, horizon=5)
+    found = one_step_scores(short, world.one_step, world.predictions(Copy(), world.one_step), set())
+    assert found["value_loss"] == pytest.approx(np.mean(losses))
+    assert found["worst_value_loss"] == pytest.approx(max(losses)) and max(losses) > 0.0
+    assert found["value_loss_by_start"] == pytest.approx(losses)
+
+
+def test_after_the_end_is_what_no_training_contains() -> None:
+    world = judged_world(ARROWS)
+    rules = world.spec.rules
+    asked = questions.after_the_end(world.spec, world.index.render)
+    assert asked is not None and all(rules.is_terminal(state) for state in asked.states)
+    assert not set(asked.states) & set(world.one_step.states)
+    for state, steps in zip(asked.states, asked.truth, strict=True):
+        ((after, _),) = steps[0]
+        assert sum(a != b for a, b in zip(state, after, strict=True)) == 1, "a macro-action still turns a cube"
+    exact, still = (
+        after_the_end_scores(asked, world.predictions(model, asked), world.predictions(model, world.one_step))
+        for model in (world.exact, Copy())
+    )
+    assert (exact["after_the_end"], still["after_the_end"]) == (0.0, 1.0)
+    assert exact["auroc_after_the_end"] == 0.5 and math.isnan(still["auroc_after_the_end"])
+    assert all(map(math.isnan, after_the_end_scores(None, None, world.predictions(Copy(), world.one_step)).values()))
+
+
+class Mistaken(Exact):
+    """Exact, but for some transitions, of which it says that nothing changes; it is unsure of those alone."""
+
+    def __init__(self, world: JudgedWorld, wrong: set[tuple[State, int]]) -> None:
+        super().__init__(world.spec, world.index)
+        self.wrong = wrong
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        right, still = super().imagine(frames, actions, samples, rng), Copy().imagine(frames, actions, samples, rng)
+        pairs = zip([self.renderer.shows(frame) for frame in frames[:, -1]], actions[:, 0].tolist(), strict=True)
+        wrong = np.array([pair in self.wrong for pair in pairs])
+        images = np.where(wrong[:, None, None, None, None, None], still.pictures, right.pictures)
+        epistemic = np.where(wrong[:, None], 1.0, np.zeros(right.pictures.shape[:1] + right.pictures.shape[2:3]))
+        return dataclasses.replace(right, pictures=images, epistemic=epistemic, accepted=epistemic < 0.5)
+
+
+def test_known_mistakes_are_charged_exactly() -> None:
+    world = judged_world(ARROWS)
+    pairs = list(dict.fromkeys(zip(world.one_step.states, world.one_step.first_actions, strict=True)))
+    wrong = {pairs[index] for index in (3, 11, 20)}
+    scores = world.scores(Mistaken(world, wrong))
+    share = len(wrong) / len(pairs)
+    for name in ("total_variation", "missed", "invented", "outcome_ece"):
+        assert scores[name] == pytest.approx(share)
+    assert scores["outcome_brier"] == pytest.approx(2 * share)
+    charged = {pairs[row // FRAMES] for row, away in enumerate(scores["by_question"]) if away}
+    assert charged == wrong == {pairs[row // FRAMES] for row in scores["worst"][: FRAMES * len(wrong)]}
+    assert scores["auroc_wrong"] == scores["best_skill"] == scores["filter_skill"] == 1.0
+    assert (scores["filter_keeps"], scores["filter_error"]) == (pytest.approx(1.0 - share), 0.0)
+    assert scores["risk"][0] == 0.0 and scores["risk"][-1] == pytest.approx(share)
+    where = scores["where"]
+    assert where["coordinate"]["pointed cube"] == 0.0 < where["coordinate"][world.spec.macrostate_names[0]]
+    by_action = [where["action"][name] for name in world.spec.action_names]
+    assert np.mean(by_action) == pytest.approx(share) and len(set(by_action)) > 1
+
+
+def test_a_filter_is_worth_what_its_mistakes_would_cost() -> None:
+    world = judged_world(ARROWS)
+    ends = {
+        (state, action)
+        for state, action in zip(world.one_step.states, world.one_step.first_actions, strict=True)
+        if any(o.terminated and not o.success for o in world.spec.rules.outcomes(state, action))
+    }
+    scores = world.scores(Mistaken(world, ends))
+    assert 0.0 <= scores["worth_of_filter"] <= scores["value_loss"] + 1e-9
+
+
+def test_skill_is_what_is_discarded_rightly_less_what_wrongly() -> None:
+    away = np.array([1.0, 1.0, 0.0, 0.0, 0.0])
+    epistemic = np.array([0.9, 0.3, 0.5, 0.1, 0.1])
+    found = filter_scores(epistemic, epistemic <= 0.4, away)
+    assert found["filter_keeps"] == pytest.approx(3 / 5) and found["filter_error"] == pytest.approx(1 / 3)
+    assert found["filter_skill"] == pytest.approx(1 / 2 - 1 / 3)
+    assert found["best_skill"] == pytest.approx(1 - 1 / 3)  # between 0.1 and 0.3
+    assert filter_scores(-epistemic, None, away)["best_skill"] == 0.0  # to discard nothing
+    assert math.isnan(filter_scores(epistemic, None, np.zeros(5))["best_skill"])
+    assert risks(np.zeros(5), away) == pytest.approx([0.4] * 20), "equally sure ones count in equal shares"
+
+
+def test_rewards_are_judged_as_outcomes() -> None:
+    world = judged_world("pick_place")
+
+    class Greedy(Exact):
+        def imagine(self, *given: Any) -> Imagined:
+            found = super().imagine(*given)
+            return dataclasses.replace(found, rewards=np.full(found.pictures.shape[:3], 4.9))
+
+    scores = world.scores(Greedy(world.spec, world.index))
+    wrong = [not any(reward == 5.0 for _, reward in steps[0].values()) for steps in world.one_step.truth]
+    assert scores["reward_ece"] == pytest.approx(np.mean(wrong))
+    assert scores["reward_brier"] == pytest.approx(2.0 * np.mean(wrong))
