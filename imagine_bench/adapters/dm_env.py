@@ -28,8 +28,8 @@ try:
 except ImportError as error:
     raise SetupError(
         "dm_control is not installed. It needs Python 3.11 or 3.12 (labmaze, which it requires, has no wheel for later "
-        "ones): run 'make setup', or \"pip install 'dm-control==1.0.50'\", with one of these. Everything else, such as "
-        "gymnasium.make, works without it."
+        "ones): run 'make setup', or \"pip install 'imagine-bench[dm-control]'\", with one of these. Everything "
+        "else, such as gymnasium.make, works without it."
     ) from error
 
 _STILL_S = 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,27 +27,38 @@ Command = (
 )
 
 
+def parsed(words: Sequence[str]) -> Command:
+    """The command of a command line, also of a former one; calling it carries it out.
+
+    Raises:
+        SystemExit: The words are no command, or ask for help, which is then printed.
+        InvalidValueError: As :func:`.words.understood`.
+    """
+    command: Command = tyro.cli(
+        Command,
+        prog="imagine-bench",
+        description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs. "
+        "--version says which this is.",
+        args=understood(words),
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    return command
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Carry out a command line and return its exit code: 0, 1 (a run or check failed), 2 (bad input), 130 (Ctrl-C)."""
-    command: Callable[[], None] | None = None
+    command: Command | None = None
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; a window system's backend would fail only at the end
     if sys.stderr is None:
         sys.stderr = Path(os.devnull).open("w")
     try:
         if sys.stdout is None:
             raise SetupError("Standard output is closed; open it, or send it to a file or /dev/null.")
-        given = understood(sys.argv[1:] if words is None else words)
+        given = sys.argv[1:] if words is None else list(words)
         if given == ["--version"]:
             print(f"imagine-bench {__version__}")
             return 0
-        command = tyro.cli(
-            Command,
-            prog="imagine-bench",
-            description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs. "
-            "--version says which this is.",
-            args=given,
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-        )
+        command = parsed(given)
         command()
         sys.stdout.flush()
     except ImagineBenchError as error:

@@ -84,6 +84,8 @@ def plan(
         raise InvalidValueError(f"{task} has no images to encode; leave --encoder out.")
     require_known("preset", preset, PRESETS)
     values = {**PRESETS[preset], **changes}
+    if preset == "smoke":
+        values.setdefault("variants", registry.regression(task).variants[:2])
     if "seeds" in values:  # in whatever order they are given, it is the same bench
         values["seeds"] = tuple(sorted(values["seeds"]))
     wanted = RegressionProtocol(task=task, preset=preset, **values)

@@ -349,7 +349,7 @@ def risk(found: Judged) -> Section | None:
     labels = {"xlabel": "questions answered, the surest first (%)", "ylabel": "total variation of those answered"}
     caption = (
         "A model that knows its errors has a curve that is low on the left. Models without an uncertainty are not "
-        f"here. Mean over seeds, {size:,} transitions."
+        f"here. Mean over seeds{f' after {size:,} transitions' if found.judgement.learning else ''}."
     )
     image = figures.plot("risk_coverage", lambda: _lines(percentages, risks[size], **labels)[0], caption)
     return Section("The errors of the surest answers", images=[image])

@@ -22,7 +22,9 @@ _SOFTWARE_GL = ("llvmpipe", "softpipe", "swrast")
 _FRAMES = 200
 _NEEDED_DISK_GIB = 1.0
 EXTRAS_OF_A_BENCH = ("agents", "report", "rerun")
-"""Extras that make an installation of environments one of benches; ``all`` is all of them."""
+"""Extras that make an installation of environments one of benches."""
+_DM_CONTROL = "dm-control"
+"""The extra of an interface and a viewer, and the package that it brings."""
 _LOCK = PACKAGE_FOLDER.parent / ".ci" / "requirements.lock"
 _REASONS = {
     "mujoco": " MuJoCo 4.0 breaks dm-control 1.0.50: 'MjModel' has no 'flex_vertedge'.",
@@ -88,6 +90,8 @@ def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str
         version = version_of(wanted.name)
         if extra is None or (extra and version == "missing"):
             continue
+        if extra == _DM_CONTROL and version_of(_DM_CONTROL) == "missing":
+            continue
         if version == "missing" or not wanted.specifier.contains(version, prereleases=True):
             state = "is missing" if version == "missing" else f"{version} is installed"
             complaints.append(
@@ -103,15 +107,16 @@ def _repair() -> str:
 
 
 def _extra_of(wanted: Requirement) -> str | None:
-    """Which of the extras of a bench brings a package; ``""`` where it always comes, None where it never does."""
+    """The extra that brings a package: ``""`` if it always comes, None if it comes with development alone."""
     marker = wanted.marker
-    return next((extra for extra in ("", *EXTRAS_OF_A_BENCH) if not marker or marker.evaluate({"extra": extra})), None)
+    extras = ("", *EXTRAS_OF_A_BENCH, _DM_CONTROL)
+    return next((extra for extra in extras if not marker or marker.evaluate({"extra": extra})), None)
 
 
 def missing_extras(version_of: Callable[[str], str] = installed) -> list[str]:
     """A sentence that names the extras of a bench that are not installed, or none; ``version_of`` as above."""
     wanted = [Requirement(text) for text in metadata.requires("imagine-bench") or []]
-    lacks = {_extra_of(each) for each in wanted if version_of(each.name) == "missing"} - {"", None}
+    lacks = {_extra_of(each) for each in wanted if version_of(each.name) == "missing"} - {"", _DM_CONTROL, None}
     if not lacks:
         return []
     names = ",".join(sorted(str(extra) for extra in lacks))

@@ -89,7 +89,7 @@ def without_guests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert main(["list"]) == 0
+    assert main(["describe"]) == 0
     marked = [line for line in capsys.readouterr().out.splitlines() if line.startswith("not installed")]
     for folder, line in zip(FOLDERS, marked, strict=True):
         names = project(folder)["entry-points"][registry.AGENT_GROUP]

@@ -14,11 +14,10 @@ from pathlib import Path
 import gymnasium
 import pytest
 import thesis_elements
-import tyro
 from doc_cells import ROOT
 from doc_tables import PAGES
 
-from imagine_bench.cli import Bench, Command
+from imagine_bench.cli import Bench, parsed
 from imagine_bench.registry import REGRESSIONS, has_task
 
 WRITTEN = [*PAGES, ROOT / "CHANGELOG.md"]
@@ -64,13 +63,15 @@ def test_commands_could_be_carried_out() -> None:
     benches = 0
     for page, said in named:
         try:
-            command = tyro.cli(Command, args=shlex.split(said), config=(tyro.conf.OmitArgPrefixes,))
+            command = parsed(shlex.split(said))
         except SystemExit:
             pytest.fail(f"{page} names a command that is not understood: imagine-bench {said}")
         assert getattr(command, "task", None) in (None, "my_task", *REGRESSIONS) or has_task(command.task), (
             f"{page}: {said}"
         )
-        if isinstance(command, Bench) and not (command.dataset or str(command.encoder).endswith(".safetensors")):
+        if isinstance(command, Bench) and not (
+            command.learner.dataset or str(command.learner.encoder).endswith(".safetensors")
+        ):
             command.planned()
             benches += 1
     assert benches > 20

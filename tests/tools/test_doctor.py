@@ -29,6 +29,8 @@ def test_the_broken_pair_is_named() -> None:
     (complaint,) = doctor.unmet_requirements(with_version(mujoco="4.0.0"))
     assert complaint.startswith("mujoco 4.0.0 is installed, but")
     assert "MuJoCo 4.0 breaks dm-control 1.0.50" in complaint and "make setup" in complaint
+    alone = with_version(**{"mujoco": "4.0.0", "dm-control": "missing"})
+    assert doctor.unmet_requirements(alone) == [] == doctor.missing_extras(alone)
 
 
 def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,7 +68,7 @@ def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.
 def test_the_command_is_what_a_shell_takes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["/x/imagine_bench/__main__.py", "bench", "--task", "a b"])
     assert environment.command() == "python -m imagine_bench bench --task 'a b'"
-    monkeypatch.setattr("sys.argv", ["/x/bin/imagine-bench", "list"])
+    monkeypatch.setattr("sys.argv", ["/x/bin/imagine-bench", "describe"])
     assert environment.command() == "imagine-bench describe"
 
 

@@ -123,7 +123,7 @@ def test_sample_counts_out_of_range_name_the_range(variant: str) -> None:
         ik.require_variant(variant)
 
 
-def test_decisions_are_carried_out_by_the_arm() -> None:
+def test_decisions_are_carried_out_by_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of networks that say what they like: the arm rests where equation 4.29 puts the joints, and misses by that."""
 
     def predict(points: np.ndarray, purpose: str) -> Prediction:
@@ -133,7 +133,9 @@ def test_decisions_are_carried_out_by_the_arm() -> None:
         told = rng.uniform(ik.LOW_RAD, ik.HIGH_RAD, (*shape, 3))
         return Prediction(prediction=told, **said, **scores, predictive=None, drawn=None)  # type: ignore[arg-type]
 
-    found = ik.evaluate("1000", predict, (SeedTree(0), SeedTree(1)))
+    monkeypatch.setattr(ik, "DECISIONS", 5)
+    monkeypatch.setattr(ik, "GRID", 9)
+    found = ik.evaluate("100", predict, (SeedTree(0), SeedTree(1)))
     for part in ("decision", "disc"):
         reached, points = found[f"{part}/reached"], found[f"{part}/points"]
         assert reached.shape == points.shape == (2, ik.DECISIONS, ik.CANDIDATES, 2)
