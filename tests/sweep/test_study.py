@@ -17,6 +17,7 @@ import pytest
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
 from imagine_bench.agents.settings import flatten
 from numpy.typing import NDArray
+from small_runs import do
 
 from imagine_bench import registry
 from imagine_bench.cli import main
@@ -29,6 +30,7 @@ from imagine_bench.protocols.runs import OnProgress
 from imagine_bench.report.page import write_page
 from imagine_bench.report.sweep import study_page
 from imagine_bench.rules import states_of
+from imagine_bench.running import run_state
 from imagine_bench.running.launchers.jobs import Failure, Job
 from imagine_bench.store.results import PolicyTable
 from imagine_bench.sweep.catalogue import STUDIES
@@ -282,3 +284,25 @@ def test_every_deviation_of_quick_is_undone_or_varied_by_a_study() -> None:
         for name, value in variant.settings.items():
             if name != "model.precision":  # the thesis' is that of the machine
                 assert value == flatten(chapter_5.published)[name] != chapter_5.sets["fast"][name].value
+
+
+def test_tuning_runs_never_meet_starts_of_reported_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: dict[int, list[int]] = {0: [], 1000: []}
+    make = run_state.gymnasium.make
+
+    def noting(*arguments: object, **options: object) -> object:
+        env = make(*arguments, **options)
+        reset = env.reset
+
+        def noted(**how: object) -> object:
+            seeds[current].append(int(str(how["seed"])))
+            return reset(**how)
+
+        env.reset = noted  # type: ignore[method-assign]
+        return env
+
+    monkeypatch.setattr(run_state.gymnasium, "make", noting)
+    for current in seeds:
+        do(tmp_path / str(current), seed=current, seeds=(current,))
+    assert len(seeds[0]) == len(seeds[1000]) == 9 + 2 * 5
+    assert not set(seeds[0]) & set(seeds[1000])
