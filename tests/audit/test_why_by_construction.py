@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
 from flawed_agents import Sound
 from small_runs import Inline
@@ -25,6 +26,13 @@ from imagine_bench.running.task_types import load_bench
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.results import Checkpoint, RunResult
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _scene() -> None:
+    """The scene of pick-and-place, which takes seconds to be compiled and drawn for the first time."""
+    spec = registry.task("pick_place")
+    spec.render_macrostates(np.array(states_of(spec.rules)[:1]), "clean", np.random.default_rng(0))
 
 
 def finished(root: Path, agent: str, task: str, **changes: Any) -> RunResult:
