@@ -61,9 +61,12 @@ def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint
     [
         ("blind", "misread", "arrows:cubes=2"),
         ("bad", "values", "arrows:cubes=2"),
-        ("not_greedy", "planning", "pick_place"),
-        ("wrong_model", "model", "pick_place"),
-        ("timid", "unexperienced", "pick_place"),
+        ("not_greedy", "planning", "arrows:cubes=2"),
+        pytest.param("not_greedy", "planning", "pick_place", marks=pytest.mark.slow),
+        ("wrong_model", "model", "arrows:cubes=2"),
+        pytest.param("wrong_model", "model", "pick_place", marks=pytest.mark.slow),
+        ("timid", "unexperienced", "arrows:cubes=2"),
+        pytest.param("timid", "unexperienced", "pick_place", marks=pytest.mark.slow),
         ("timid_modeller", "unexperienced", "arrows:cubes=2"),
     ],
 )
