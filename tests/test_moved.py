@@ -10,7 +10,7 @@ import warnings
 import pytest
 
 import imagine_bench
-from imagine_bench.registry.moved import MOVED
+from imagine_bench import MOVED
 
 
 @pytest.mark.parametrize("old", MOVED)

@@ -26,6 +26,7 @@ from imagine_bench.store import encoders
 from imagine_bench.store.files import read_json, read_sealed
 from imagine_bench.store.run_folder import load_run
 
+__path__: list[str] = []  # the old path imagine_bench.judge.models.outcomes is looked for below this module
 _CONFIG = "config.json"
 _MOST = 0.5  # share of its futures that a filter keeps of a step that counts as kept
 
