@@ -10,6 +10,7 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
+
 class _MovedModules(MetaPathFinder, Loader):
     """Finds a module by its old path and fills it with the names of the new one."""
 
