@@ -239,3 +239,18 @@ def test_the_probability_of_improvement_is_mann_and_whitney_s() -> None:
     assert found == pytest.approx(stats.mannwhitneyu(a, b).statistic / 35)
     assert found + statistics.probability_of_improvement(b, a) == pytest.approx(1.0)
     assert statistics.probability_of_improvement(a + 2, b) == 1.0
+
+
+def test_auroc_by_hand_and_against_counting_pairs() -> None:
+    rising = np.array([0.1, 0.2, 0.3, 0.4])
+    wrong = np.array([False, False, True, True])
+    assert (statistics.auroc(rising, wrong), statistics.auroc(-rising, wrong)) == (1.0, 0.0)
+    assert statistics.auroc(np.ones(4), wrong) == 0.5
+    assert np.isnan(statistics.auroc(rising, np.ones(4, dtype=np.bool_)))
+    rng = np.random.default_rng(0)
+    scores = rng.integers(0, 6, 60).astype(float)
+    wrong = rng.random(60) < 0.3
+    pairs = np.subtract.outer(scores[wrong], scores[~wrong])
+    assert statistics.auroc(scores, wrong) == pytest.approx(np.mean(0.5 * (np.sign(pairs) + 1.0)))
+    with pytest.raises(InvalidValueError, match="one number a prediction"):
+        statistics.auroc(np.array([1.0]), np.array([True, False]))

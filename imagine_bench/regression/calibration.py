@@ -8,7 +8,7 @@ import numpy as np
 
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import SCORES, RegressionSpec, Regressor
-from imagine_bench.judge.calibration import (
+from imagine_bench.regression.scores import (
     LEVELS,
     coverage,
     crps,

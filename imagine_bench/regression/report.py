@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.interfaces.regression import SCORES
-from imagine_bench.judge.calibration import LEVELS
+from imagine_bench.regression.scores import LEVELS
 from imagine_bench.regression import report_robot_ik, report_toy_regression
 from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.results import RegressionResult

@@ -15,39 +15,38 @@ from imagine_bench.judge.truth import (
 )
 from imagine_bench.rules import advance
 
-
-def test_distances_are_those_computed_by_hand() -> None:
-    exact, other = {(1,): 0.5, (2,): 0.5}, {(1,): 0.5, (3,): 0.25, (4,): 0.25}
-    assert total_variation(exact, exact) == 0.0
-    assert total_variation(exact, other) == pytest.approx(0.5)
-    assert total_variation(exact, {(9,): 1.0}) == 1.0
-    assert missed_modes(exact, other) == 1
-    assert hallucinated_modes(exact, other) == 2
-    assert missed_modes(exact, {(1,): 0.89, (2,): 0.11}) == 0, "0.11 is just above a fifth of 0.5"
-    assert missed_modes(exact, {(1,): 0.91, (2,): 0.09}) == 1
-    assert hallucinated_modes(exact, {(1,): 0.48, (2,): 0.48, (3,): 0.04}) == 0, "below the least of a mode"
+HALVES = {(1,): 0.5, (2,): 0.5}
+THREE = {(1,): 0.5, (2,): 0.3, (3,): 0.2}
 
 
-def test_a_collapsed_distribution_misses_modes() -> None:
-    exact = {(1,): 0.5, (2,): 0.3, (3,): 0.2}
-    collapsed = {(1,): 1.0}
-    assert total_variation(exact, collapsed) == pytest.approx(0.5)
-    assert (missed_modes(exact, collapsed), hallucinated_modes(exact, collapsed)) == (2, 0)
+@pytest.mark.parametrize(
+    ("exact", "imagined", "away", "missed", "hallucinated"),
+    [
+        (HALVES, HALVES, 0.0, 0, 0),
+        (HALVES, {(1,): 0.5, (3,): 0.25, (4,): 0.25}, 0.5, 1, 2),
+        (HALVES, {(9,): 1.0}, 1.0, 2, 1),
+        (HALVES, {(1,): 0.89, (2,): 0.11}, 0.39, 0, 0),  # 0.11 is just above a fifth of 0.5
+        (HALVES, {(1,): 0.91, (2,): 0.09}, 0.41, 1, 0),
+        (HALVES, {(1,): 0.48, (2,): 0.48, (3,): 0.04}, 0.04, 0, 0),  # below the least of a mode
+        (THREE, {(1,): 1.0}, 0.5, 2, 0),
+    ],
+)
+def test_distances_are_those_computed_by_hand(
+    exact: dict[State, float], imagined: dict[State, float], away: float, missed: int, hallucinated: int
+) -> None:
+    assert total_variation(exact, imagined) == pytest.approx(away)
+    assert (missed_modes(exact, imagined), hallucinated_modes(exact, imagined)) == (missed, hallucinated)
 
 
 def test_the_sampling_floor_is_what_samples_of_the_truth_show() -> None:
-    exact = {(1,): 0.5, (2,): 0.3, (3,): 0.2}
-    rng = np.random.default_rng(0)
-    shares = rng.multinomial(50, list(exact.values()), size=20_000) / 50
-    distance = 0.5 * np.abs(shares - np.array(list(exact.values()))).sum(axis=1)
-    assert sampling_noise_floor(exact, 50) == pytest.approx(distance.mean(), rel=0.01)
+    shares = np.random.default_rng(0).multinomial(50, list(THREE.values()), size=20_000) / 50
+    distance = 0.5 * np.abs(shares - np.array(list(THREE.values()))).sum(axis=1)
+    assert sampling_noise_floor(THREE, 50) == pytest.approx(distance.mean(), rel=0.01)
     assert sampling_noise_floor({(1,): 1.0}, 50) == 0.0
 
 
 class Toss:
     """From state 0, one in four wins and ends; what was won stays, and would pay again."""
-
-    n_actions = 1
 
     def outcomes(self, state: State, action: int) -> tuple[Outcome, ...]:
         if state == (1,):
