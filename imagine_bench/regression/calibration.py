@@ -8,6 +8,7 @@ import numpy as np
 
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import SCORES, RegressionSpec, Regressor
+from imagine_bench.regression.results import Row
 from imagine_bench.regression.scores import (
     LEVELS,
     coverage,
@@ -16,7 +17,6 @@ from imagine_bench.regression.scores import (
     probability_transform,
     transform_distance,
 )
-from imagine_bench.regression.results import Row
 from imagine_bench.seeding import SeedTree
 from imagine_bench.statistics import auroc
 from imagine_bench.store.codec import Arrays

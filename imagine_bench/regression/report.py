@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.interfaces.regression import SCORES
-from imagine_bench.regression.scores import LEVELS
 from imagine_bench.regression import report_robot_ik, report_toy_regression
 from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.results import RegressionResult
+from imagine_bench.regression.scores import LEVELS
 from imagine_bench.report.figures import image
 from imagine_bench.report.page import made, write_page
 from imagine_bench.report.tables import Image, Page, Section, Table, mean_std, number

@@ -18,7 +18,6 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.interfaces.regression import SCORES, Mixtures, Prediction, RegressionData, RegressorContext
-from imagine_bench.regression.scores import log_score
 from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.regression import report_robot_ik as robot_ik
 from imagine_bench.regression import report_toy_regression as toy_regression
@@ -26,6 +25,7 @@ from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.report import write_report
 from imagine_bench.regression.results import RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
+from imagine_bench.regression.scores import log_score
 from imagine_bench.report.page import flat
 from imagine_bench.report.tables import number
 from imagine_bench.report.why import why_report
