@@ -19,10 +19,9 @@ from imagine_bench.judge.open_loop import (
 )
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.runs import OnProgress, RunSpec
+from imagine_bench.protocols.runs import Failure, Job, Launcher, OnProgress, RunSpec
 from imagine_bench.rules import states_of
 from imagine_bench.running.control import run_control
-from imagine_bench.running.launchers.jobs import Failure, Job, Launcher
 from imagine_bench.running.run_state import Run, make_env
 from imagine_bench.running.runner import AtBudget, AtEnd, RunObserver
 from imagine_bench.seeding import SeedTree, evaluation_split
@@ -108,7 +107,7 @@ class RecordingObserver(RunObserver):
         protocol = run.protocol
         if protocol.recorded_episodes == 0:
             return {}
-        from imagine_bench.recording import record_run  # noqa: PLC0415 - loading Rerun costs a second
+        from imagine_bench.recording.episodes import record_run  # noqa: PLC0415 - loading Rerun costs a second
 
         run.tell("recording", at_once=True)
         with closing(make_env(protocol, protocol.task, testing=True)) as env:

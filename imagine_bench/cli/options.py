@@ -12,7 +12,8 @@ import tyro
 from imagine_bench import registry
 from imagine_bench.cli.observers import Observed
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.running.launchers.jobs import Launcher, launcher
+from imagine_bench.protocols.runs import Launcher
+from imagine_bench.running.launchers.jobs import launcher
 from imagine_bench.running.task_types import task_type
 from imagine_bench.store.bench_folder import require_either
 

@@ -38,7 +38,7 @@ class View:
 
     def __call__(self) -> None:
         """Find and open."""
-        from imagine_bench.recording import open_in_viewer  # noqa: PLC0415 - Rerun loads slowly
+        from imagine_bench.recording.stream import open_in_viewer  # noqa: PLC0415 - Rerun loads slowly
 
         file, task = path_or_task(self.file, self.task)
         open_in_viewer(file or newest_recording(self.out, *only(task)))

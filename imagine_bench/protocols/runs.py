@@ -124,3 +124,44 @@ class TaskType(Generic[P]):
     plan: Callable[..., tuple[P, Encoders]]
     run: Callable[[RunSpec[P], Path, OnProgress], object]  #: Carries out a run in a folder
     load_so_far: Callable[[Path], Result]  #: Reads a bench folder, as far as it can be reported
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A run and where its files go."""
+
+    spec: RunSpec[ProtocolData]
+    folder: Path
+
+    @property
+    def log(self) -> Path:
+        """Everything the run printed."""
+        return self.folder / "log.txt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """A job that did not finish, and why in one sentence."""
+
+    job: Job
+    reason: str
+
+    @property
+    def progress(self) -> Progress:
+        """What an observer is told of it."""
+        spec = self.job.spec
+        return Progress(
+            agent=spec.agent, seed=spec.seed, bench=spec.protocol.hash, phase="failed", done=0, work=spec.work,
+            detail=self.reason,
+        )  # fmt: skip
+
+
+class Launcher(Interface):
+    """Carries out jobs, somewhere."""
+
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+        """Carry out every job, whatever becomes of the others, and return those that failed.
+
+        Jobs are independent of one another, and each resumes by itself. ``on_progress`` is told now and then, from this
+        process, how far each is, and at once of one that failed.
+        """

@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.report.filmstrips import png
+from imagine_bench.recording.filmstrips import png
 
 
 class Recording:

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.recording.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
 from imagine_bench.report.data import ReportData, agent_title, known_agent
-from imagine_bench.report.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
 from imagine_bench.report.tables import DASH, Image, Section, Table, percent
 from imagine_bench.store import encoders
 from imagine_bench.store.files import read_json, reading

@@ -23,9 +23,9 @@ from imagine_bench.judge.judgement import Judgement, kept, prepare, shown
 from imagine_bench.judge.models import model_entry, runs_of
 from imagine_bench.judge.scores import COVERAGES
 from imagine_bench.judge.truth import sampling_noise_floor, shares
+from imagine_bench.recording.filmstrips import png, transition_sheet
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
-from imagine_bench.report.filmstrips import png, transition_sheet
 from imagine_bench.report.page import flat, write_page
 from imagine_bench.report.tables import DASH, Cell, Image, Page, Section, Table, estimate, number, p_value
 from imagine_bench.rules import fewest_actions

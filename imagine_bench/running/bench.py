@@ -14,9 +14,8 @@ from imagine_bench.errors import RunFailedError, SetupError, plain, require_modu
 from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.protocols.control import Protocol, spec_of
 from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.runs import Encoders, OnProgress, Progress, Result, RunSpec
+from imagine_bench.protocols.runs import Encoders, Failure, Job, Launcher, OnProgress, Progress, Result, RunSpec
 from imagine_bench.registry.machine import describe_environment, gl_renderer
-from imagine_bench.running.launchers.jobs import Failure, Job, Launcher
 from imagine_bench.running.progress import ProgressBars, RunKey
 from imagine_bench.running.task_types import load_bench, require_options, task_type
 from imagine_bench.store import run_folder

@@ -24,9 +24,9 @@ from imagine_bench.interfaces import Rules
 from imagine_bench.judge.causes import expected_rightly
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.runs import Encoders
+from imagine_bench.protocols.runs import Encoders, Launcher
 from imagine_bench.running.bench import carry_out, plan
-from imagine_bench.running.launchers.jobs import Launcher, processes
+from imagine_bench.running.launchers.jobs import processes
 from imagine_bench.running.task_types import load_bench, task_type
 from imagine_bench.statistics import Estimate, difference
 from imagine_bench.store.bench_folder import BenchStore, bench_folder

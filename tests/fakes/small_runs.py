@@ -18,9 +18,8 @@ from imagine_bench.data.folder import Apart, Dataset, write_dataset
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol, protocol
-from imagine_bench.protocols.runs import OnProgress, RunSpec
+from imagine_bench.protocols.runs import Failure, Job, OnProgress, RunSpec
 from imagine_bench.running.collect import collect, policy_of
-from imagine_bench.running.launchers.jobs import Failure, Job
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import Checkpoint, RunResult

@@ -26,7 +26,7 @@ from imagine_bench.judge.open_loop import (
 )
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.truth import shares
-from imagine_bench.report import filmstrips
+from imagine_bench.recording import filmstrips
 from imagine_bench.rules import is_random
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, evaluation_split
 from imagine_bench.store.results import ComparedRollout

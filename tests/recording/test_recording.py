@@ -23,8 +23,10 @@ from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, U
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
 from imagine_bench.judge.open_loop import compare_rollout
-from imagine_bench.recording import episodes, open_in_viewer, q_table, record_run, recording_file, stream
+from imagine_bench.recording import episodes, stream
+from imagine_bench.recording.episodes import q_table, record_run
 from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, rotated
+from imagine_bench.recording.stream import open_in_viewer, recording_file
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}

@@ -14,10 +14,9 @@ from small_runs import same_but_for_time, small
 
 from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import DivergedError
-from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.protocols.runs import Job, RunSpec
 from imagine_bench.running import lanes
 from imagine_bench.running.launchers import local
-from imagine_bench.running.launchers.jobs import Job
 from imagine_bench.running.run_state import Run
 from imagine_bench.store.results import RunResult
 

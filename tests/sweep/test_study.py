@@ -26,12 +26,11 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.causes import true_model
 from imagine_bench.protocols.data import digest
-from imagine_bench.protocols.runs import OnProgress
+from imagine_bench.protocols.runs import Failure, Job, OnProgress
 from imagine_bench.report.page import write_page
 from imagine_bench.report.sweep import study_page
 from imagine_bench.rules import states_of
 from imagine_bench.running import run_state
-from imagine_bench.running.launchers.jobs import Failure, Job
 from imagine_bench.store.results import PolicyTable
 from imagine_bench.sweep.catalogue import STUDIES
 from imagine_bench.sweep.grid import BASE, Study, Variant, read_grid

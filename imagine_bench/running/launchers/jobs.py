@@ -5,16 +5,13 @@ from __future__ import annotations
 import os
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Protocol
+from dataclasses import replace
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known
-from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.runs import OnProgress, Progress, RunSpec
+from imagine_bench.protocols.runs import Job, Launcher, OnProgress
 from imagine_bench.registry.machine import usable_cores
 from imagine_bench.running.task_types import task_type
 from imagine_bench.store.files import make_folder, writing
@@ -23,36 +20,6 @@ ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
 """Small networks are slower on two threads than on one, and bits repeat only at a fixed count."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Job:
-    """A run and where its files go."""
-
-    spec: RunSpec[ProtocolData]
-    folder: Path
-
-    @property
-    def log(self) -> Path:
-        """Everything the run printed."""
-        return self.folder / "log.txt"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Failure:
-    """A job that did not finish, and why in one sentence."""
-
-    job: Job
-    reason: str
-
-    @property
-    def progress(self) -> Progress:
-        """What an observer is told of it."""
-        spec = self.job.spec
-        return Progress(
-            agent=spec.agent, seed=spec.seed, bench=spec.protocol.hash, phase="failed", done=0, work=spec.work,
-            detail=self.reason,
-        )  # fmt: skip
 
 
 def require_workers(workers: int) -> None:
@@ -84,17 +51,6 @@ def launcher(name: str, workers: int | None = None) -> Launcher:
 def processes(workers: int | None) -> int:
     """How many processes work at a time: so many, or, of None, one a core."""
     return usable_cores() if workers is None else workers
-
-
-class Launcher(Protocol):
-    """Carries out jobs, somewhere."""
-
-    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
-        """Carry out every job, whatever becomes of the others, and return those that failed.
-
-        Jobs are independent of one another, and each resumes by itself. ``on_progress`` is told now and then, from this
-        process, how far each is, and at once of one that failed.
-        """
 
 
 def absolute(job: Job) -> Job:

@@ -12,9 +12,9 @@ from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from imagine_bench.protocols.runs import OnProgress, Progress
+from imagine_bench.protocols.runs import Failure, Job, OnProgress, Progress
 from imagine_bench.registry.machine import usable_cores
-from imagine_bench.running.launchers.jobs import ONE_THREAD, Failure, Job, carry_out, require_workers
+from imagine_bench.running.launchers.jobs import ONE_THREAD, carry_out, require_workers
 
 _POLL_S = 0.5
 _PATIENCE_S = 5.0

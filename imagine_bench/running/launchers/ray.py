@@ -14,16 +14,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from imagine_bench.errors import BusyError, SetupError, lacking
-from imagine_bench.protocols.runs import OnProgress, Progress
-from imagine_bench.running.launchers.jobs import (
-    ONE_THREAD,
-    Failure,
-    Job,
-    absolute,
-    carry_out,
-    require_workers,
-    run_job,
-)
+from imagine_bench.protocols.runs import Failure, Job, OnProgress, Progress
+from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out, require_workers, run_job
 
 _LOST = 20
 """Times that a task may lose its worker or its node before its run counts as failed."""

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench.errors import lacking
-from imagine_bench.protocols.runs import OnProgress, Progress
-from imagine_bench.running.launchers.jobs import ONE_THREAD, Failure, Job, absolute, carry_out, require_workers
+from imagine_bench.protocols.runs import Failure, Job, OnProgress, Progress
+from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out, require_workers
 from imagine_bench.store.files import make_folder, write_bytes
 
 _POLL_S = 1.0

@@ -16,8 +16,8 @@ import pytest
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.protocols.control import protocol
-from imagine_bench.protocols.runs import Progress, RunSpec
-from imagine_bench.running.launchers.jobs import LAUNCHERS, Job, absolute, launcher
+from imagine_bench.protocols.runs import Job, Progress, RunSpec
+from imagine_bench.running.launchers.jobs import LAUNCHERS, absolute, launcher
 from imagine_bench.running.launchers.local import LocalPool
 from imagine_bench.running.launchers.ray import RayCluster
 from imagine_bench.running.launchers.slurm import SlurmCluster

@@ -15,8 +15,7 @@ from bench_fakes import FakeRunSpec
 from small_runs import small
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.protocols.runs import Progress
-from imagine_bench.running.launchers.jobs import Job
+from imagine_bench.protocols.runs import Job, Progress
 from imagine_bench.running.launchers.local import LocalPool
 from imagine_bench.store import run_folder
 
