@@ -94,10 +94,12 @@ make_venv() {
 pip_install() { "$venv/bin/python" -m pip install -qq --disable-pip-version-check --retries 1 "$@"; }
 
 # uv installs in seconds what takes pip a minute. It reads none of pip's settings, so what it cannot find, pip may.
+# Where Python may not write bytecode, the packages are compiled now: otherwise each process compiles torch again.
 install() {
-    local uv
+    local uv compile=()
+    [ -z "${PYTHONDONTWRITEBYTECODE:-}" ] || compile=(--compile-bytecode)
     if uv=$(command -v uv || command -v "$here/bin/uv"); then
-        UV_FIND_LINKS=${UV_FIND_LINKS:-${PIP_FIND_LINKS:-}} "$uv" pip install -q --python "$venv/bin/python" "$@" && return
+        UV_FIND_LINKS=${UV_FIND_LINKS:-${PIP_FIND_LINKS:-}} "$uv" pip install -q ${compile[@]+"${compile[@]}"} --python "$venv/bin/python" "$@" && return
     fi
     pip_install "$@"
 }

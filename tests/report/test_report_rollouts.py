@@ -13,8 +13,9 @@ from PIL import Image
 
 from imagine_bench import registry
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.recording import filmstrips
 from imagine_bench.recording.filmstrips import changes, sampled_filmstrips
-from imagine_bench.report import bench_page, filmstrips, write_report
+from imagine_bench.report import bench_page, write_report
 from imagine_bench.store.results import BenchResult, RunResult
 
 
