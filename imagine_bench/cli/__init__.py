@@ -7,13 +7,15 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Annotated
 
 import tyro
+from tyro.conf import subcommand
 
 from imagine_bench.cli.analysis import Judge, Plan, Verify
 from imagine_bench.cli.benches import Bench, Report, Sweep
-from imagine_bench.cli.data import Dataset, Encoder
-from imagine_bench.cli.tools import Check, Describe, Doctor, New, Play, View
+from imagine_bench.cli.data import DatasetCommand, EncoderCommand
+from imagine_bench.cli.tools import CheckCommand, Describe, Doctor, New, Play, ViewCommand
 from imagine_bench.cli.words import understood
 from imagine_bench.errors import EXTRAS, ImagineBenchError, SetupError, lacking, plain
 from imagine_bench.store.files import reason
@@ -23,7 +25,20 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
 Command = (
-    Bench | Report | Judge | Verify | Plan | Sweep | Dataset | Encoder | View | Play | Describe | Check | New | Doctor
+    Bench
+    | Report
+    | Judge
+    | Verify
+    | Plan
+    | Sweep
+    | Annotated[DatasetCommand, subcommand("dataset")]
+    | Annotated[EncoderCommand, subcommand("encoder")]
+    | Annotated[ViewCommand, subcommand("view")]
+    | Play
+    | Describe
+    | Annotated[CheckCommand, subcommand("check")]
+    | New
+    | Doctor
 )
 
 

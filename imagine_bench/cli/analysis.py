@@ -127,7 +127,7 @@ class Verify:
     def __call__(self) -> None:
         """Play and compare."""
         from imagine_bench.judge.verify import cost  # noqa: PLC0415 - as above
-        from imagine_bench.report.analysis import chosen  # noqa: PLC0415 - as above
+        from imagine_bench.report.page import chosen  # noqa: PLC0415 - as above
         from imagine_bench.report.verify import verify  # noqa: PLC0415 - as above
         from imagine_bench.report.why import why_report  # noqa: PLC0415 - as above
 

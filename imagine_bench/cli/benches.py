@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class World:
+class WorldOptions:
     """Options of the world."""
 
     execution: Annotated[str | None, shown("STR", "(default: physics)")] = None
@@ -119,7 +119,7 @@ class Bench:
     """Task to compare on, also as --task TASK; 'imagine-bench describe' names them."""
     preset: str = "quick"
     """Size of the comparison; 'imagine-bench describe' names them."""
-    world: World = field(default_factory=World)
+    world: WorldOptions = field(default_factory=WorldOptions)
     learner: Learner = field(default_factory=Learner)
     budget: Budget = field(default_factory=Budget)
     tests: Tests = field(default_factory=Tests)
@@ -252,7 +252,7 @@ class Sweep:
             raise RunFailedError(f"{len(result.failures)} runs failed; the same command tries them again.")
 
 
-_PAGES = {"control": "imagine_bench.report:bench_page", "regression": "imagine_bench.regression.report:report_page"}
+_PAGES = {"control": "imagine_bench.report:bench_page", "regression": "imagine_bench.report.regression:report_page"}
 """Functions that make the page of a bench of each type of task."""
 
 

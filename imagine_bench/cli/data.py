@@ -17,7 +17,7 @@ _RECIPES_OWN = shown("INT", "(default: the recipe's)")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dataset:
+class DatasetCommand:
     """Collect episodes of a task as a dataset, or say what one holds."""
 
     task: MaybeTaskWord = None
@@ -75,7 +75,7 @@ class Dataset:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Encoder:
+class EncoderCommand:
     """Train an encoder anew and say how it compares to the bundled one."""
 
     task: TaskWord

@@ -19,6 +19,7 @@ from imagine_bench.judge.open_loop import (
 )
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import Failure, Job, Launcher, OnProgress, RunSpec
 from imagine_bench.rules import states_of
 from imagine_bench.running.control import run_control
@@ -128,18 +129,30 @@ OBSERVERS = tuple(
     f"{__name__}:{observer.__name__}"
     for observer in (OpenLoopObserver, BeliefsObserver, ExamplesObserver, RecordingObserver)
 )
-"""What looks at every run of a bench, in this order, each as ``"module:attr"``."""
+"""What looks at every run of a control task, in this order, each as ``"module:attr"``."""
+RECORDERS = {
+    "toy_regression": "imagine_bench.recording.toy_regression:record",
+    "robot_ik": "imagine_bench.recording.robot_ik:record",
+}
+"""Functions that record the regression tasks of this suite; another package's task names its own."""
+
+
+def observers_of(protocol: ProtocolData) -> tuple[str, ...]:
+    """What looks at each run of a bench, by ``"module:attr"``."""
+    if isinstance(protocol, Protocol):
+        return OBSERVERS
+    return (RECORDERS[protocol.task],) if protocol.task in RECORDERS else ()
 
 
 class Observed:
-    """A launcher whose runs are looked at by :data:`OBSERVERS`."""
+    """A launcher whose runs are looked at, as :func:`observers_of` says."""
 
     def __init__(self, launcher: Launcher) -> None:
         self._launcher = launcher
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job by the launcher within; see :class:`.Launcher`."""
-        observed = [replace(job, spec=replace(job.spec, observers=OBSERVERS)) for job in jobs]
+        observed = [replace(job, spec=replace(job.spec, observers=observers_of(job.spec.protocol))) for job in jobs]
         return self._launcher.launch(observed, on_progress)
 
 

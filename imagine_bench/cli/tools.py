@@ -26,7 +26,7 @@ from imagine_bench.tools.doctor import examine
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class ViewCommand:
     """Open a recording in the Rerun viewer."""
 
     file: FolderOrTask = None
@@ -93,7 +93,7 @@ class Play:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
+class CheckCommand:
     """Say whether a task, an agent or a world model, of this suite or another package, keeps the contract."""
 
     task: MaybeTaskWord = None

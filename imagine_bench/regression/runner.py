@@ -27,11 +27,6 @@ from imagine_bench.store.files import lock, make_folder, reading, sweep, writing
 
 TRAINING, MEASURING = 100, 10
 """Steps of progress of a variant."""
-_RECORDERS = {
-    "toy_regression": "imagine_bench.recording.toy_regression:record",
-    "robot_ik": "imagine_bench.recording.robot_ik:record",
-}
-"""Functions that record the suite's own tasks; another package's task names its own."""
 
 
 def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> RegressionRun:
@@ -147,12 +142,12 @@ class _Run:
 
     def _record(self) -> None:
         """Record beside the results; the file appears whole or not at all."""
-        recorder = self.task.recorder or _RECORDERS.get(self.task.id)
-        if recorder is None or not self.protocol.recorded:
-            return
-        self._report("recording", "recording", 0)
-        path = run_folder.recording_path(self.folder)
-        registry.load(recorder)(self.evaluations, task=self.task, name=self.spec.agent, path=path)
+        own = () if self.task.recorder is None else (self.task.recorder,)
+        for recorder in own or self.spec.observers:
+            if self.protocol.recorded:
+                self._report("recording", "recording", 0)
+                path = run_folder.recording_path(self.folder)
+                registry.load(recorder)(self.evaluations, task=self.task, name=self.spec.agent, path=path)
 
     def _snapshot(self, regressor: Regressor, variant: str) -> Snapshot:
         values = {"variant": variant, "rows": self.rows, "train_cpu_s": self.train_cpu_s}

@@ -15,7 +15,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.plans import PlanResult, make_plans, require_threshold
 from imagine_bench.recording.filmstrips import filmstrip, png
-from imagine_bench.report.analysis import chosen, provenance
+from imagine_bench.report.page import chosen, provenance
 from imagine_bench.report.tables import DASH, Table, percent
 from imagine_bench.running.progress import counted
 from imagine_bench.running.task_types import load_bench

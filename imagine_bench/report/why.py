@@ -9,8 +9,8 @@ from pathlib import Path
 from imagine_bench import registry
 from imagine_bench.judge.causes import WhyAnalysis
 from imagine_bench.report import write_report
-from imagine_bench.report.analysis import chosen, origin, provenance
 from imagine_bench.report.exact import HEAD, causes_table, failures
+from imagine_bench.report.page import chosen, origin, provenance
 from imagine_bench.running.progress import counted
 from imagine_bench.running.trained import learners, load_trained, protocol_of_agents
 from imagine_bench.seeding import evaluation_split

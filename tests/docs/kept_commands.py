@@ -11,10 +11,8 @@ import shlex
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import tyro
-
+from imagine_bench.cli import parsed
 from imagine_bench.cli.benches import Bench
-from imagine_bench.cli.words import understood
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.registry import TASKS
@@ -45,9 +43,9 @@ def read() -> dict[str, Command]:
 
 def planned(words: list[str]) -> ProtocolData:
     """The protocol that a command has today, but for its encoders, which only its runs need."""
-    task, preset, options = tyro.cli(
-        Bench, args=understood(["bench", *words])[1:], config=(tyro.conf.OmitArgPrefixes,)
-    ).asked()
+    command = parsed(["bench", *words])
+    assert isinstance(command, Bench)
+    task, preset, options = command.asked()
     options.pop("encoder", None)
     if task.partition(":")[0] not in TASKS:
         return plan(task, preset, **options)[0]

@@ -15,18 +15,17 @@ from recordings import contents, times
 
 from imagine_bench import registry
 from imagine_bench.cli import main
+from imagine_bench.cli.observers import observers_of
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.interfaces.regression import SCORES, Mixtures, Prediction, RegressionData, RegressorContext
 from imagine_bench.protocols.runs import Progress, RunSpec
-from imagine_bench.regression import report_robot_ik as robot_ik
-from imagine_bench.regression import report_toy_regression as toy_regression
 from imagine_bench.regression.calibration import calibrate
-from imagine_bench.regression.report import write_report
 from imagine_bench.regression.results import RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.regression.scores import log_score
 from imagine_bench.report.page import flat
+from imagine_bench.report.regression import robot_ik, toy_regression, write_report
 from imagine_bench.report.tables import number
 from imagine_bench.report.why import why_report
 from imagine_bench.running.bench import plan
@@ -42,7 +41,8 @@ def tiny(task: str, agent: str = "mc_dropout", **changes: Any) -> RunSpec:
     values = {"networks": 2, "test_points": 30, "overrides": _overrides(agent), "agents": (agent,), **changes}
     protocol, encoders = plan(task, "smoke", **values)
     assert encoders == {}
-    return RunSpec(protocol=protocol, agent=agent, seed=0, checkpoint_every_s=0.0)
+    observers = observers_of(protocol)
+    return RunSpec(protocol=protocol, agent=agent, seed=0, checkpoint_every_s=0.0, observers=observers)
 
 
 VARIANTS = ("base", "low_data", "high_noise")

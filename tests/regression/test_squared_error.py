@@ -12,9 +12,9 @@ from imagine_bench.agents.imagination.uncertainty import decompose
 from imagine_bench.tasks import toy_regression as toy
 
 from imagine_bench.protocols.runs import RunSpec
-from imagine_bench.regression.report_toy_regression import sections, squared_error_terms
 from imagine_bench.regression.results import RegressionResult
 from imagine_bench.regression.runner import run
+from imagine_bench.report.regression.toy_regression import sections, squared_error_terms
 from imagine_bench.running.bench import plan
 
 PAIRS = 400_000

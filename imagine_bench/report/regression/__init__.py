@@ -10,18 +10,18 @@ from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.interfaces.regression import SCORES
-from imagine_bench.regression import report_robot_ik, report_toy_regression
 from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.results import RegressionResult
 from imagine_bench.regression.scores import LEVELS
 from imagine_bench.report.figures import image
 from imagine_bench.report.page import made, write_page
+from imagine_bench.report.regression import robot_ik, toy_regression
 from imagine_bench.report.tables import Image, Page, Section, Table, mean_std, number
 from imagine_bench.store.codec import table_text
 
 SECTIONS: dict[str, Callable[[RegressionResult], list[Section]]] = {
-    "toy_regression": report_toy_regression.sections,
-    "robot_ik": report_robot_ik.sections,
+    "toy_regression": toy_regression.sections,
+    "robot_ik": robot_ik.sections,
 }
 """Sections of the suite's own tasks; another package's task names the function that makes its own."""
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
