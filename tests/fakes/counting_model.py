@@ -3,35 +3,51 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 
 import torch
 from imagine_bench.agents.dqn import Controller
+from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.rollouts import Imagination
+from imagine_bench.agents.imagination.model_only import ModelOnlyTraining
+from imagine_bench.agents.imagination.rollouts import Counts, Imagination
 from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings
-from imagine_bench.agents.replay import RealMemory
+from imagine_bench.agents.meters import Meters
+from imagine_bench.agents.replay import RealMemory, StartMemory
 
 from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.seeding import SeedTree
 
 CPU = torch.device("cpu")
 T = 4
+Change = Callable[[Mixture, torch.Tensor], Mixture]
 
 
 class CountingModel:
     """An identifiable world model: latent (i, c) goes to (i, c + 1), and uncertainty and end come at chosen counts.
 
-    The first latent dimension tells the rollouts apart by the action taken first.
+    The first latent dimension tells the rollouts apart by the action taken first. ``change`` gets the mixtures of
+    latents, and these, and returns what is predicted instead.
     """
 
-    members, latent_size = 1, 2
+    members = 1
+    latent_size = 2
+    n_actions = 2
 
     def __init__(
-        self, *, uncertain_at: int = -1, end_at: int = -1, reward_uncertain_at: int = -1, torn_at: int = -1
+        self,
+        *,
+        uncertain_at: int = -1,
+        end_at: int = -1,
+        reward_uncertain_at: int = -1,
+        torn_at: int = -1,
+        change: Change | None = None,
     ) -> None:
-        self.uncertain_at, self.end_at = uncertain_at, end_at
-        self.reward_uncertain_at, self.torn_at = reward_uncertain_at, torn_at
+        self.uncertain_at = uncertain_at
+        self.end_at = end_at
+        self.reward_uncertain_at = reward_uncertain_at
+        self.torn_at = torn_at
+        self.change = change
 
     def draw_weights(self, count: int, dropout: torch.Generator) -> None:
         return None
@@ -50,7 +66,8 @@ class CountingModel:
         spread = torch.linspace(-1.0, 1.0, T)[:, None] * uncertain * 3.0  # [T, N]; zero mean over weight samples
         means = following.expand(T, *following.shape).clone()
         means[..., 0] += spread
-        return Mixture(torch.zeros(T, len(z), 1), means.unsqueeze(2), torch.full((T, len(z), 1, 2), -9.0))
+        sound = Mixture(torch.zeros(T, len(z), 1), means.unsqueeze(2), torch.full((T, len(z), 1, 2), -9.0))
+        return self.change(sound, z) if self.change else sound
 
     def predict_outcome(
         self, z: torch.Tensor, action: torch.Tensor, next_z: torch.Tensor
@@ -67,11 +84,35 @@ def make(*, filtered: bool, model: CountingModel, **changes: object) -> tuple[Im
     return imagination, Controller(2, 2, settings.controller, torch.Generator().manual_seed(0))
 
 
+def imagined(
+    model: CountingModel, *, filtered: bool = False, epsilon: float = 0.5, states: int = 1, **changes: object
+) -> tuple[Imagination, Counts]:
+    """What such a model imagined from (0, 0), with so many real states remembered."""
+    imagination, controller = make(filtered=filtered, model=model, **changes)
+    counts = imagination.rollouts(controller, torch.zeros(2), remembering(states), epsilon)
+    return imagination, counts
+
+
+def practising(
+    model: CountingModel, *, filtered: bool = False, **changes: object
+) -> tuple[ModelOnlyTraining, Meters, Callable[[], None]]:
+    """Model-only training in such a model, its meters, and how it imagines one more episode from (0, 0)."""
+    imagination, _ = make(filtered=filtered, model=model, **changes)
+    controller = ControllerSettings(hidden=(8,), batch_size=4, epsilon_decay=0.1)
+    settings = Settings(imagination=imagination.settings, controller=controller)
+    training = ModelOnlyTraining(imagination, 2, settings, SeedTree(0), CPU)
+    starts = StartMemory(1, 2, CPU)
+    starts.add((torch.zeros(2), torch.zeros(2)))
+    meters = Meters()
+    return training, meters, lambda: training.episode(starts, remembering(4), meters)
+
+
 def remembering(count: int) -> RealMemory:
     """Real states (i, 5) for i below ``count``, known exactly."""
     real = RealMemory(count, 2, CPU)
     for index in range(count):
-        z, sigma = torch.tensor([float(index), 5.0]), torch.zeros(2)
+        z = torch.tensor([float(index), 5.0])
+        sigma = torch.zeros(2)
         real.add((z, sigma), 0, 0.0, (z, sigma), False)
     return real
 
@@ -85,7 +126,9 @@ class RuledModel:
     members = 1
 
     def __init__(self, task: TaskSpec, uncertain: Collection[tuple[State, int]] = ()) -> None:
-        self.rules, self.n_actions, self.uncertain = task.rules, task.n_actions, frozenset(uncertain)
+        self.rules = task.rules
+        self.n_actions = task.n_actions
+        self.uncertain = frozenset(uncertain)
         self._outcome = functools.cache(lambda state, action: task.rules.outcomes(state, action)[0])
         self.sizes = [len(values) for values in task.macrostate_values]
         self.latent_size = sum(self.sizes)

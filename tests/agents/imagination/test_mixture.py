@@ -28,9 +28,9 @@ def test_log_likelihood_and_mean_are_those_of_the_density() -> None:
     mixture = random_mixture(N)
     targets = torch.randn(N, Z, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 3.0
     assert mdn.log_likelihood(mixture, targets).numpy() == pytest.approx(log_density(mixture, targets), rel=1e-10)
-    for row in range(N):
-        weights, means = mixture.log_weights[row].exp().numpy(), mixture.means[row].numpy()
-        assert mdn.mean(mixture)[row].numpy() == pytest.approx(sum(w * m for w, m in zip(weights, means, strict=True)))
+    weights = mixture.log_weights.exp()
+    torch.testing.assert_close(weights.sum(-1), torch.ones(N, dtype=torch.float64))
+    torch.testing.assert_close(mdn.mean(mixture), torch.einsum("nk,nkz->nz", weights, mixture.means))
 
 
 def test_log_likelihood_stays_finite_where_densities_underflow() -> None:
@@ -40,53 +40,34 @@ def test_log_likelihood_stays_finite_where_densities_underflow() -> None:
     assert torch.isfinite(mdn.log_likelihood(mixture, far)).all()
 
 
-def test_log_likelihood_gradient_against_finite_differences() -> None:
-    outputs = torch.randn(2, mdn.output_size(K, Z), dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    target = torch.randn(2, Z, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-
-    def loss(values: torch.Tensor) -> torch.Tensor:
-        return mdn.log_likelihood(mdn.from_outputs(values, K, Z, -4.0), target)
-
-    assert torch.autograd.gradcheck(loss, (outputs.requires_grad_(),), eps=1e-6, atol=1e-7)
-
-
-def test_log_likelihood_gradients_sum_over_broadcast_axes() -> None:
-    """Targets of one leading axis more than the mixture, and a mixture of one more than the targets."""
+@pytest.mark.parametrize(("leading", "targets"), [((2,), (2,)), ((), (3,)), ((2, 3), (3,))])
+def test_log_likelihood_gradients_against_finite_differences(leading: tuple[int, ...], targets: tuple[int, ...]) -> None:
+    """They sum over broadcast axes: of targets that the mixture lacks, and of the mixture that targets lack."""
     draws = torch.Generator().manual_seed(5)
 
-    def loss(log_weights: torch.Tensor, means: torch.Tensor, sigmas: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-        return mdn.log_likelihood(Mixture(log_weights, means, sigmas), t)
+    def loss(outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        return mdn.log_likelihood(mdn.from_outputs(outputs, K, Z, -4.0), values)
 
-    for leading, targets in (((), (3,)), ((2, 3), (3,))):
-        shapes = (*leading, K), (*leading, K, Z), (*leading, K, Z), (*targets, Z)
-        values = [torch.randn(shape, dtype=torch.float64, generator=draws).requires_grad_() for shape in shapes]
-        assert torch.autograd.gradcheck(loss, values, eps=1e-6, atol=1e-7)
-
-
-def test_sigma_stays_above_its_floor_and_keeps_a_gradient() -> None:
-    outputs = torch.full((1, mdn.output_size(K, Z)), -8.0, dtype=torch.float64, requires_grad=True)
-    mixture = mdn.from_outputs(outputs, K, Z, log_sigma_floor=-4.0)
-    assert (mixture.log_sigmas >= -4.0).all()
-    mixture.log_sigmas.sum().backward()
-    assert outputs.grad is not None
-    assert (outputs.grad[:, -K * Z :] > 0.1).all()
+    shapes = ((*leading, mdn.output_size(K, Z)), (*targets, Z))
+    values = [torch.randn(shape, dtype=torch.float64, generator=draws).requires_grad_() for shape in shapes]
+    assert torch.autograd.gradcheck(loss, values, eps=1e-6, atol=1e-7)
 
 
-def test_sigma_stays_between_its_floor_and_ceiling() -> None:
+def test_sigma_stays_between_its_floor_and_ceiling_and_keeps_a_gradient() -> None:
     log_variances = torch.tensor([[-1e3, -2.0, 0.0, 2.0, 1e3]], dtype=torch.float64)
     outputs = torch.cat([torch.zeros(1, 10, dtype=torch.float64), log_variances], dim=1)  # K = 5, Z = 1
     bounded = mdn.from_outputs(outputs, 5, 1, log_sigma_floor=-30.0, log_sigma_ceiling=40.0).log_sigmas.flatten()
     assert bounded.tolist() == pytest.approx([-30.0, -1.0, 0.0, 1.0, 40.0], abs=1e-9)
     assert mdn.from_outputs(outputs, 5, 1, -30.0).log_sigmas.max() == 500.0, "there need not be a ceiling"
-
-
-def test_coefficients_sum_to_one() -> None:
-    torch.testing.assert_close(random_mixture(N).log_weights.exp().sum(-1), torch.ones(N, dtype=torch.float64))
+    below = torch.full((1, mdn.output_size(K, Z)), -8.0, requires_grad=True)
+    mdn.from_outputs(below, K, Z, log_sigma_floor=-4.0).log_sigmas.sum().backward()
+    assert below.grad is not None
+    assert (below.grad[:, -K * Z :] > 0.1).all()
 
 
 def test_samples_have_the_mean_and_variance_of_the_mixture() -> None:
     one = random_mixture(1)
-    count = 200_000
+    count = 50_000
     many = one.map(lambda values: values.expand(count, *values.shape[1:]))
     weights = one.log_weights.exp().unsqueeze(-1)  # [1, K, 1]
     squares = (weights * (one.means.square() + (2.0 * one.log_sigmas).exp())).sum(dim=1)
@@ -94,7 +75,7 @@ def test_samples_have_the_mean_and_variance_of_the_mixture() -> None:
     drawn = mdn.sample(many, 1.0, torch.Generator().manual_seed(4))
     error = drawn.mean(0) - mdn.mean(one)[0]
     assert (error.abs() < 4.0 * (variance / count).sqrt()).all()
-    torch.testing.assert_close(drawn.var(0), variance, rtol=0.03, atol=0.0)
+    torch.testing.assert_close(drawn.var(0), variance, rtol=0.05, atol=0.0)
 
 
 def test_temperature_scales_the_noise_around_a_component() -> None:
@@ -113,11 +94,6 @@ def test_average_is_over_coefficients_means_and_variances() -> None:
     torch.testing.assert_close(averaged.log_weights.exp(), samples.log_weights.exp().mean(0))
     torch.testing.assert_close(averaged.means, samples.means.mean(0))
     torch.testing.assert_close((2.0 * averaged.log_sigmas).exp(), (2.0 * samples.log_sigmas).exp().mean(0))
-
-
-@pytest.mark.parametrize(("components", "dimensions", "size"), [(5, 8, 85), (1, 1, 3)])
-def test_output_size(components: int, dimensions: int, size: int) -> None:
-    assert mdn.output_size(components, dimensions) == size
 
 
 def test_an_ensemble_predicts_with_all_its_members_components() -> None:

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeVar
+from unittest import mock
 
 import numpy as np
-import pytest
 import torch
 from imagine_bench.agents import dqn
-from imagine_bench.agents.dqn import DQN
 from imagine_bench.agents.encoders import perception
 
 from imagine_bench import registry
 from imagine_bench.interfaces import AgentContext, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
-LATENTS, ACTIONS = 4, 3
+LATENTS = 4
+ACTIONS = 3
+Made = TypeVar("Made")
 CODES = torch.from_numpy(np.random.default_rng(5).normal(size=(16, LATENTS)).astype(np.float32))
 SIGMA = 0.05
 SMALL: dict[str, Any] = {
@@ -78,17 +80,26 @@ def transition(
     )
 
 
-def context(monkeypatch: pytest.MonkeyPatch, overrides: dict[str, Any] | None = None, **changes: Any) -> AgentContext:
-    """A context whose encoder is the fake one and whose networks are tiny."""
-    monkeypatch.setattr(perception, "Encoder", FakeEncoder)
-    values = {"n_actions": ACTIONS, "preprocessing": "gray_strips", "encoder": Path("fake.safetensors")}
-    values |= {"seeds": SeedTree(0), "hyperparameters": "published", "overrides": {**SMALL, **(overrides or {})}}
-    return AgentContext(**(values | changes))
+def built(maker: Callable[[AgentContext], Made], overrides: dict[str, Any] | None = None, **changes: Any) -> Made:
+    """What a maker makes of a context whose encoder is the fake one and whose networks are tiny."""
+    context = AgentContext(
+        n_actions=ACTIONS,
+        preprocessing="gray_strips",
+        encoder=Path("fake.safetensors"),
+        seeds=SeedTree(0),
+        hyperparameters="published",
+        overrides={**SMALL, **(overrides or {})},
+    )
+    with mock.patch.object(perception, "Encoder", FakeEncoder):
+        return maker(replace(context, **changes))
 
 
-def make_dqn(context: AgentContext) -> DQN:
-    """The DQN, given those of the overrides that it has, as in a bench."""
-    return dqn.make(replace(context, overrides=registry.own_settings("dqn", context.overrides)))
+def with_own_settings(name: str, maker: Callable[[AgentContext], Made]) -> Callable[[AgentContext], Made]:
+    """The maker of an agent, given those of the overrides that it has, as in a bench."""
+    return lambda context: maker(replace(context, overrides=registry.own_settings(name, context.overrides)))
+
+
+make_dqn = with_own_settings("dqn", dqn.make)
 
 
 def live(agent: Any, episodes: range, rng: np.random.Generator, states: int = 6) -> list[int]:

@@ -8,18 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_latents import CODES, context, frame, live, transition
+from fake_latents import CODES, built, frame, live, transition, with_own_settings
 from imagine_bench.agents.dqn import td_target
 from imagine_bench_controls.efficient import EfficientDQN, EpisodicMemory, make
 
-from imagine_bench import registry
 
 CPU, GAMMA = torch.device("cpu"), 0.5
 
 
-def agent(monkeypatch: pytest.MonkeyPatch, **settings: Any) -> EfficientDQN:
-    given = context(monkeypatch, {name.replace("__", "."): value for name, value in settings.items()})
-    return make(replace(given, overrides=registry.own_settings("dqn_efficient", given.overrides)))
+def agent(**settings: Any) -> EfficientDQN:
+    given = {name.replace("__", "."): value for name, value in settings.items()}
+    return built(with_own_settings("dqn_efficient", make), given)
 
 
 def filled(capacity: int, rows: list[tuple[float, str]]) -> EpisodicMemory:
@@ -72,8 +71,8 @@ def test_a_full_ring_joins_no_new_row_to_an_old_one() -> None:
     }
 
 
-def test_a_reset_keeps_a_share_of_the_hidden_layers_and_nothing_of_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = agent(monkeypatch, reuse__kept=1.0, controller__target_rate=0.1)
+def test_a_reset_keeps_a_share_of_the_hidden_layers_and_nothing_of_the_last() -> None:
+    learner = agent(reuse__kept=1.0, controller__target_rate=0.1)
     live(learner, range(3), np.random.default_rng(0))
     before = [part.detach().clone() for part in learner.controller.network.parameters()]
     learner.reset_controller()
@@ -84,7 +83,7 @@ def test_a_reset_keeps_a_share_of_the_hidden_layers_and_nothing_of_the_last(monk
     slow = learner.controller.target.parameters()
     assert all(torch.equal(one, other) for one, other in zip(slow, after, strict=True))
 
-    other = agent(monkeypatch, reuse__kept=0.0)
+    other = agent(reuse__kept=0.0)
     live(other, range(3), np.random.default_rng(0))
     held = [part.detach().clone() for part in other.controller.network.parameters()]
     other.reset_controller()
@@ -92,16 +91,16 @@ def test_a_reset_keeps_a_share_of_the_hidden_layers_and_nothing_of_the_last(monk
 
 
 @pytest.mark.parametrize(("every", "resets"), [(0, 0), (5, 4), (4, 5), (100, 0)])
-def test_resets_come_as_often_as_settings_say(monkeypatch: pytest.MonkeyPatch, every: int, resets: int) -> None:
-    learner, made = agent(monkeypatch, reuse__reset_every=every, controller__updates_per_step=2), []
-    monkeypatch.setattr(learner, "reset_controller", lambda: made.append(learner.updates))
+def test_resets_come_as_often_as_settings_say(every: int, resets: int) -> None:
+    learner, made = agent(reuse__reset_every=every, controller__updates_per_step=2), []
+    learner.reset_controller = lambda: made.append(learner.updates)  # type: ignore[method-assign]
     for step in range(10):
         learner.observe(transition(step % 6, 0, 0.0, (step + 1) % 6), episode=step)
     assert learner.updates == 20 and len(made) == resets
 
 
-def test_where_an_episode_ends_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    learner = agent(monkeypatch)
+def test_where_an_episode_ends_is_remembered() -> None:
+    learner = agent()
     for how in ({}, {"truncated": True}, {"terminated": True}, {}):
         learner.observe(transition(0, 0, 0.0, 1, **how), episode=0)
     assert learner.real.arrays()["last"].tolist() == [False, True, True, False]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_latents import ACTIONS, CODES, FakeEncoder, context, frame, transition
+from fake_latents import ACTIONS, CODES, FakeEncoder, built, frame, transition
 from imagine_bench.agents.imagination.rollouts import ImaginedStep
 from imagine_bench_controls import exact
 from imagine_bench_controls.exact import LOOKS, ExactFilterAgent, ExactImaginationAgent
@@ -50,9 +50,9 @@ def told(moved: Transition) -> Transition:
     return replace(moved, observation=seen[0], next_observation=seen[1])
 
 
-def knowing(monkeypatch: pytest.MonkeyPatch, **settings: Any) -> ExactImaginationAgent:
+def knowing(**settings: Any) -> ExactImaginationAgent:
     own = {f"imagination.{name}": value for name, value in settings.items()}
-    agent = exact.make(context(monkeypatch, {"memory.imagined": 2_000, **own}, exact_world=WORLD))
+    agent = built(exact.make, {"memory.imagined": 2_000, **own}, exact_world=WORLD)
     assert isinstance(agent, ExactImaginationAgent)
     return agent
 
@@ -69,8 +69,8 @@ def live(agent: Any, steps: int, seed: int = 0) -> None:
         state = 0 if outcome.terminated else after
 
 
-def test_what_is_imagined_is_of_the_rules_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = knowing(monkeypatch, depth=4, breadth=5, start_states="replayed", exploration=1.0)
+def test_what_is_imagined_is_of_the_rules_alone() -> None:
+    agent = knowing(depth=4, breadth=5, start_states="replayed", exploration=1.0)
     live(agent, 80)
     rows = agent.imagined.arrays()
     before, after = (FakeEncoder().read_macrostate(torch.as_tensor(rows[name]))[:, 0] for name in ("z", "next_z"))
@@ -85,8 +85,8 @@ def test_what_is_imagined_is_of_the_rules_alone(monkeypatch: pytest.MonkeyPatch)
     assert abs(by_chance.mean() - 0.5) < 4.0 * 0.5 / np.sqrt(len(by_chance)), "outcomes have their probabilities"
 
 
-def test_a_rollout_goes_on_from_what_it_reached(monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = knowing(monkeypatch, depth=3, breadth=1, start_states="current", start_episode=0, exploration=1.0)
+def test_a_rollout_goes_on_from_what_it_reached() -> None:
+    agent = knowing(depth=3, breadth=1, start_states="current", start_episode=0, exploration=1.0)
     agent.observe(told(transition(3, 0, -1.0, 3)), episode=0)
     rows = agent.imagined.arrays()
     assert np.array_equal(rows["z"][1:], rows["next_z"][:-1])
@@ -94,8 +94,8 @@ def test_a_rollout_goes_on_from_what_it_reached(monkeypatch: pytest.MonkeyPatch)
     assert len(rows["z"]) == 3 or rows["terminated"][-1] == 1.0
 
 
-def test_imagining_begins_and_ends_when_settings_say(monkeypatch: pytest.MonkeyPatch) -> None:
-    agent, counts = knowing(monkeypatch, start_episode=3, end_episode=6), []
+def test_imagining_begins_and_ends_when_settings_say() -> None:
+    agent, counts = knowing(start_episode=3, end_episode=6), []
     for episode in range(9):
         agent.observe(told(transition(0, 1, -1.0, 1)), episode=episode)
         counts.append(agent.imagined.added)
@@ -103,7 +103,7 @@ def test_imagining_begins_and_ends_when_settings_say(monkeypatch: pytest.MonkeyP
     assert agent.updates == 9 + 6, "one on real transitions a step, and one more from the third episode on"
 
 
-def test_looks_do_not_depend_on_the_order_of_asking(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_looks_do_not_depend_on_the_order_of_asking() -> None:
     drawn: list[np.random.Generator] = []
 
     def noisy(states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -111,7 +111,7 @@ def test_looks_do_not_depend_on_the_order_of_asking(monkeypatch: pytest.MonkeyPa
         return np.stack([frame(int(rng.integers(16))) for _ in states])
 
     world = replace(WORLD, render=noisy)
-    ahead, back = (exact.make(context(monkeypatch, exact_world=world)) for _ in range(2))
+    ahead, back = (built(exact.make, exact_world=world) for _ in range(2))
     assert isinstance(ahead, ExactImaginationAgent) and isinstance(back, ExactImaginationAgent)
     for agent, order in ((ahead, (1, 2)), (back, (2, 1))):
         for state in order:
@@ -124,8 +124,8 @@ def test_looks_do_not_depend_on_the_order_of_asking(monkeypatch: pytest.MonkeyPa
     assert len(drawn) == 4, f"{LOOKS} looks of each are rendered once"
 
 
-def test_the_exact_filter_keeps_what_is_right(monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = exact.make_filter(context(monkeypatch, exact_world=WORLD))
+def test_the_exact_filter_keeps_what_is_right() -> None:
+    agent = built(exact.make_filter, exact_world=WORLD)
     assert isinstance(agent, ExactFilterAgent)
     rows = [  # from state 4: action, reached, reward, probability of the end; and whether that is right
         (1, 5, 7.4, 0.9, True),
@@ -143,11 +143,11 @@ def test_the_exact_filter_keeps_what_is_right(monkeypatch: pytest.MonkeyPatch) -
     assert agent.imagination.admits(z, torch.tensor(action), step, 0.0).tolist() == right
 
 
-def test_only_who_is_given_the_world_imagines_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_who_is_given_the_world_imagines_exactly() -> None:
     with pytest.raises(InvalidValueError, match="given the exact world"):
-        exact.make(context(monkeypatch))
+        built(exact.make)
     with pytest.raises(InvalidValueError, match="was shown none"):
-        knowing(monkeypatch).observe(transition(0, 1, -1.0, 1), episode=0)
+        knowing().observe(transition(0, 1, -1.0, 1), episode=0)
     hidden, plain = (registry.task(name) for name in ("arrows:gesture=0.5", "arrow_puzzle"))
     assert ExactWorld.of(hidden, "clean") is None
     found = ExactWorld.of(plain, "clean")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from counting_model import RuledModel, ruled
-from fake_latents import ACTIONS, CODES, context, frame
+from fake_latents import ACTIONS, CODES, built, frame
 from gymnasium.utils.env_checker import check_env
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination.vector_env import ImaginedEnv, ImaginedVectorEnv
@@ -111,11 +111,11 @@ class Ring(gymnasium.Env[Any, Any]):
         return frame(self.state), float(self.state == 0), False, self.steps == 2, {"is_success": self.state == 0}
 
 
-def test_imagined_episodes_follow_real_ones_once_they_may(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_imagined_episodes_follow_real_ones_once_they_may() -> None:
     from imagine_bench_peers.mixed_experience import MixedExperience
 
     overrides = {"imagination.start_episode": 2, "imagination.depth": 3}
-    learner = imagination_agents.make_uncertainty(context(monkeypatch, overrides))
+    learner = built(imagination_agents.make_uncertainty, overrides)
     env = MixedExperience(Ring(), learner, count=3, seed=1)
     start, _ = env.reset(seed=0)
     rng, kinds, real = np.random.default_rng(0), "", 0
