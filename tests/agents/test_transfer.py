@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts, success
-from fake_latents import context
+from fake_latents import built
 from fake_latents import live as live_on_latents
 from imagine_bench.agents.factored.dynamics import Dynamics
 from imagine_bench.agents.factored.exploration import last_step, likeliest
@@ -260,9 +260,9 @@ def test_a_prior_for_staying_is_no_knowledge() -> None:
 # --- the thesis' agents ------------------------------------------------------------------------------------------
 
 
-def test_a_threshold_that_moved_is_where_it_began(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_threshold_that_moved_is_where_it_began() -> None:
     moving = {"imagination.threshold": 99.0, "imagination.threshold_quantile": 0.5}
-    learner = imagination_agents.make_uncertainty(context(monkeypatch, moving))
+    learner = built(imagination_agents.make_uncertainty, moving)
     live_on_latents(learner, range(4), np.random.default_rng(0))
     assert learner.imagination.filter.threshold < 99.0
     learner.reset_for_new_task()
@@ -270,8 +270,8 @@ def test_a_threshold_that_moved_is_where_it_began(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("make", [imagination_agents.make_uncertainty, imagination_only.make])
-def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
-    learner, resumed = make(context(monkeypatch)), make(context(monkeypatch))
+def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make) -> None:  # type: ignore[no-untyped-def]
+    learner, resumed = (built(make) for _ in range(2))
     live_on_latents(learner, range(8), np.random.default_rng(0))
     model = learner.imagination.model
     kept = [weight.clone() for weight in model.dynamics.parameters()]

@@ -41,7 +41,9 @@ def test_log_likelihood_stays_finite_where_densities_underflow() -> None:
 
 
 @pytest.mark.parametrize(("leading", "targets"), [((2,), (2,)), ((), (3,)), ((2, 3), (3,))])
-def test_log_likelihood_gradients_against_finite_differences(leading: tuple[int, ...], targets: tuple[int, ...]) -> None:
+def test_log_likelihood_gradients_against_finite_differences(
+    leading: tuple[int, ...], targets: tuple[int, ...]
+) -> None:
     """They sum over broadcast axes: of targets that the mixture lacks, and of the mixture that targets lack."""
     draws = torch.Generator().manual_seed(5)
 

@@ -178,9 +178,7 @@ def test_rollouts_explore_at_least_as_the_settings_say(
     exploration: float, epsilon: float, least: float, most: float
 ) -> None:
     """Half of two random actions are the greedy one."""
-    imagination, controller = make(
-        filtered=False, model=CountingModel(), breadth=200, depth=1, exploration=exploration
-    )
+    imagination, controller = make(filtered=False, model=CountingModel(), breadth=200, depth=1, exploration=exploration)
     greedy = int(controller.values(torch.zeros(1, 2)).argmax())
     imagination.rollouts(controller, torch.zeros(2), remembering(1), epsilon)
     share = (imagination.memory.arrays()["action"] != greedy).mean()

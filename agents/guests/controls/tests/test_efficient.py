@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ import torch
 from fake_latents import CODES, built, frame, live, transition, with_own_settings
 from imagine_bench.agents.dqn import td_target
 from imagine_bench_controls.efficient import EfficientDQN, EpisodicMemory, make
-
 
 CPU, GAMMA = torch.device("cpu"), 0.5
 
