@@ -1,0 +1,112 @@
+"""A trained agent is taken up as its run left it, through the encoder that it saw through, or a sentence says why."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench_fakes import TableAgent
+from fake_results import bench_result
+from small_runs import Inline, do, final_arrays, small
+
+from imagine_bench import registry
+from imagine_bench.errors import ArtefactError
+from imagine_bench.judge.plans import make_plans
+from imagine_bench.protocols.control import protocol
+from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.running import bench as benches
+from imagine_bench.running.runner import run
+from imagine_bench.running.trained import best_run, learners, load_trained
+from imagine_bench.store import encoders, run_folder
+from imagine_bench.store.files import sealed
+from imagine_bench.store.results import RunResult
+
+TASK = registry.task("arrow_puzzle")
+
+
+def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
+    tiny = (
+        ("imagination.weight_samples", 3),
+        ("model.batch_size", 8),
+        ("model.dynamics_hidden", (16,)),
+        ("model.updates_per_step", 1),
+    )
+    encoder = encoders.resolve(TASK, "clean")
+    agent = "imagination_uncertainty"
+    named = encoders.identity(encoder)
+    wanted = small(agents=(agent,), budgets=(2,), evaluation_episodes=1, overrides=tiny, encoder=named)
+    spec = RunSpec(protocol=wanted, agent=agent, seed=0, encoder=encoder)
+    folder = tmp_path / "run"
+    run(spec, folder, lambda progress: None)
+    who = load_trained(folder)
+    assert who.episodes == 2 and who.task.id == "arrow_puzzle"
+    left = final_arrays(folder)
+    taken_up = who.agent.state().arrays
+    assert set(taken_up) == set(left) and all(np.array_equal(array, taken_up[name]) for name, array in left.items())
+    first, again = (next(make_plans(load_trained(folder), count=1, execution="kinematic")) for _ in range(2))
+    assert np.array_equal(first.compared.rollout.q_values, again.compared.rollout.q_values)
+    with pytest.raises(ArtefactError, match=r"There is no .*config\.json, a run's configuration; give a run's folder"):
+        load_trained(tmp_path)
+    with pytest.raises(ArtefactError, match=r"saw through encoder arrow_puzzle-clean@.*give the right file"):
+        load_trained(folder, encoder="arrow_puzzle-mild")
+    other = dataclasses.replace(spec, encoder=encoders.resolve(TASK, "mild"))
+    with pytest.raises(ArtefactError, match=r"is encoder arrow_puzzle-mild@.*, and this bench is of .*-clean@"):
+        run(other, tmp_path / "another node", lambda progress: None)
+
+
+def test_training_in_the_model_comes_before_an_analysis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    do(tmp_path, budgets=(2,), evaluation_episodes=1)
+    left = [True, True, False]
+    monkeypatch.setattr(TableAgent, "train_in_model", lambda agent: left.pop(0), raising=False)
+    load_trained(tmp_path)
+    assert left == []
+
+
+def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> None:
+    own = tmp_path / "own.safetensors"
+    shutil.copy(encoders.resolve(TASK, "clean"), own)
+    codes = encoders.resolve(TASK, "clean", kind="codes")
+    names = {"encoder": encoders.identity(own), "codes": encoders.identity(codes)}
+    wanted = protocol("arrow_puzzle", "smoke", agents=("dqn", "factored:given"), **names)
+    config = {"format": run_folder.FORMAT, "protocol": wanted.as_dict(), "seed": 0, "settings": {}}
+    for agent in ("factored:given", "dqn"):
+        (tmp_path / "config.json").write_text(json.dumps(sealed({**config, "agent": agent})))
+        with pytest.raises(ArtefactError, match="has no checkpoint"):  # the encoder was found
+            load_trained(tmp_path, encoder=str(own))
+    with pytest.raises(ArtefactError, match=r"own@\w+, which is not here; give its file with --encoder"):
+        load_trained(tmp_path)
+    with pytest.raises(ArtefactError, match=r"own@\w+, and .*arrow_puzzle-mild.* give the right file"):
+        load_trained(tmp_path, encoder="arrow_puzzle-mild")
+
+
+def test_a_bench_without_learners_says_so(tmp_path: Path) -> None:
+    wanted = small(agents=("random",), budgets=(2,), evaluation_episodes=1)
+    with pytest.raises(ArtefactError, match="has a checkpoint of an agent that learns"):
+        learners(benches.bench(wanted, {}, root=tmp_path, launcher=Inline()).folder)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "best"),
+    [
+        ((0.9, 0.9, 0.9, 1.0), (0.1, 0.1, 1.0, 1.0), 1),
+        ((0.1, 0.1, 0.1, 1.0), (0.9, 0.9, 0.9, 0.9), 0),
+        ((0.5, 0.5, 0.5, 0.5), (0.5, 0.5, 0.5, 0.5), 0),
+    ],
+)
+def test_of_runs_that_end_alike_the_earlier_one_is_taken(
+    first: tuple[float, ...], second: tuple[float, ...], best: int, tmp_path: Path
+) -> None:
+    wanted = protocol("arrow_puzzle", agents=("imagination",), seeds=(0, 1), budgets=(1, 2, 3, 4))
+    result = bench_result(tmp_path, protocol=wanted)
+
+    def solving(run: RunResult, shares: tuple[float, ...]) -> RunResult:
+        pairs = zip(run.checkpoints, shares, strict=True)
+        tests = [dataclasses.replace(test, successes=round(share * test.test_episodes)) for test, share in pairs]
+        return dataclasses.replace(run, checkpoints=tuple(tests))
+
+    runs = tuple(map(solving, result.runs, (first, second)))
+    assert best_run(dataclasses.replace(result, runs=runs)).seed == best
