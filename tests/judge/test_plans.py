@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -49,10 +48,12 @@ class Dreamer:
         state: State = self.env.unwrapped.world.read().macrostate
         chosen: list[int] = []
         states = []
-        while len(chosen) < depth and (not chosen or not outcome.success):
+        success = False
+        while len(chosen) < depth and not success:
             chosen.append(self.choose(state))
             (outcome,) = TASK.rules.outcomes(state, chosen[-1])
             state = outcome.macrostate
+            success = outcome.success
             states.append(state)
         nothing = np.zeros(len(chosen), dtype=np.float32)
         return ImaginedRollout(
