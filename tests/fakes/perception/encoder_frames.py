@@ -18,6 +18,7 @@ CHAPTER_5 = RECIPES["chapter_5"]
 TINY = replace(
     CHAPTER_5["default"], name="tiny", widths=(32,), frames=300, held_out_frames=200, steps=40, batch=32, probe_steps=60
 )
+QUICK = replace(TINY, name="quick", frames=60, held_out_frames=30, steps=7, batch=8, probe_steps=5)
 TINY_CONV = replace(
     CHAPTER_5["thesis"], name="tiny_conv", frames=40, held_out_frames=20, steps=2, batch=8, probe_steps=5
 )
