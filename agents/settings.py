@@ -9,9 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from types import UnionType
-from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
+from imagine_bench.values import Setting
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 _HUGE = 10**300  # integers beyond it are no floats, and in no range
 CONFIG_GROUPS = ("chapter_3", "chapter_5")
@@ -20,7 +24,8 @@ SETS = ("minimal", "fast", "published")
 """Named sets of values: ``published`` is the thesis', ``fast`` what fits minutes, ``minimal`` what only shows that all
 parts work."""
 
-S = TypeVar("S")
+S = TypeVar("S", bound="DataclassInstance")
+V = TypeVar("V")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +41,8 @@ def between(low: float, high: float, why: str = "") -> Range:
     return Range(lambda value: low <= value <= high, f"must lie in [{low:g}, {high:g}]" + (why and f": {why}"))
 
 
+Allowed = Range | tuple[str, ...]
+"""The values that a setting may have: a range, or words."""
 PROBABILITY = between(0.0, 1.0)
 INSIDE = Range(lambda value: 0.0 < value < 1.0, "must lie between 0 and 1")
 RATE = Range(lambda value: 0.0 < value <= 1.0, "must lie in (0, 1]")
@@ -61,7 +68,7 @@ PRECISIONS = ("auto", "float32", "bfloat16")
 """Number formats of hidden layers: ``auto`` is bfloat16 where the device has instructions for it, else float32."""
 
 
-def setting(default: Any, allowed: Range | tuple[str, ...]) -> Any:
+def setting(default: V, allowed: Allowed) -> V:
     """A dataclass field with a default and the values that it may have: a range, or words."""
     return field(default=default, metadata={"allowed": allowed})
 
@@ -70,7 +77,7 @@ def setting(default: Any, allowed: Range | tuple[str, ...]) -> Any:
 class Override:
     """A value that is not the published one, and why."""
 
-    value: Any
+    value: Setting
     reason: str
 
 
@@ -99,7 +106,7 @@ class Hyperparameters(Generic[S]):
         """The dotted names of all settings."""
         return frozenset(flatten(next(iter(self.groups.values())).published))
 
-    def resolve(self, hyperparameters: str, overrides: Mapping[str, Any], group: str) -> S:
+    def resolve(self, hyperparameters: str, overrides: Mapping[str, Setting], group: str) -> S:
         """The settings of a set, with single ones replaced.
 
         Args:
@@ -118,15 +125,15 @@ class Hyperparameters(Generic[S]):
         return replaced(chosen.published, {**{name: change.value for name, change in changes.items()}, **used})
 
 
-def flatten(settings: Any) -> dict[str, Any]:
+def flatten(settings: DataclassInstance) -> dict[str, Setting]:
     """Every setting by dotted name."""
     return {name: value for name, value, _, _ in _walk(settings)}
 
 
-def replaced(settings: S, values: Mapping[str, Any]) -> S:
+def replaced(settings: S, values: Mapping[str, Setting]) -> S:
     """The settings with values replaced by dotted name; a section's own rules are checked once it is whole."""
-    own: dict[str, Any] = {}
-    sections: dict[str, dict[str, Any]] = {}
+    own: dict[str, Setting] = {}
+    sections: dict[str, dict[str, Setting]] = {}
     for name, value in values.items():
         section, _, inner = name.rpartition(".")
         (sections.setdefault(section, {}) if section else own)[inner] = value
@@ -134,7 +141,7 @@ def replaced(settings: S, values: Mapping[str, Any]) -> S:
     return replace(settings, **own)  # type: ignore[type-var]
 
 
-def checked(settings: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+def checked(settings: DataclassInstance, values: Mapping[str, Setting]) -> dict[str, Setting]:
     """Values by dotted name, each of its setting's type and within its range; raises as ``resolve``."""
     declared = {name: (hint, allowed) for name, _, hint, allowed in _walk(settings)}
     found = {}
@@ -144,25 +151,25 @@ def checked(settings: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         hint, allowed = declared[name]
         found[name] = typed = _typed(name, hint, value)
         if isinstance(allowed, tuple):
-            require_known(f"value of setting {name}:", typed, allowed)
+            require_known(f"value of setting {name}:", str(typed), allowed)
         elif typed is not None and not allowed.holds(typed):
             raise InvalidValueError(f"Setting {name} is {brief(typed)}; it {allowed.words}.")
     return found
 
 
-def _walk(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any, Any]]:
+def _walk(settings: DataclassInstance, prefix: str = "") -> Iterator[tuple[str, Setting, type, Allowed]]:
     """Name, value, type and range of every setting."""
     hints = get_type_hints(type(settings))
     for part in fields(settings):
         value = getattr(settings, part.name)
         name = f"{prefix}{part.name}"
-        if is_dataclass(value):
+        if is_dataclass(value) and not isinstance(value, type):
             yield from _walk(value, f"{name}.")
         else:
             yield name, value, hints[part.name], part.metadata["allowed"]
 
 
-def _typed(name: str, hint: Any, value: Any) -> Any:
+def _typed(name: str, hint: type, value: Setting) -> Setting:
     """``value`` as the type ``hint``, where nothing is lost by it."""
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     for option in options:

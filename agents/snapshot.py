@@ -11,20 +11,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from imagine_bench.arrays import Array, Arrays
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState
 
 from .networks.adam import MOMENTS, Adam
 
-Arrays = dict[str, NDArray[Any]]
 
-
-def prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+def prefixed(prefix: str, arrays: Mapping[str, Array]) -> Arrays:
     """The arrays under ``prefix/``."""
     return {f"{prefix}/{name}": array for name, array in arrays.items()}
 
 
-def below(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+def below(prefix: str, arrays: Mapping[str, Array]) -> Arrays:
     """The arrays that lie under ``prefix/``, without it."""
     start = f"{prefix}/"
     return {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
@@ -42,9 +41,7 @@ def training_arrays(module: nn.Module, optimiser: Adam | torch.optim.Optimizer) 
 
 
 @torch.no_grad()
-def load_training(
-    module: nn.Module, optimiser: Adam | torch.optim.Optimizer, arrays: Mapping[str, NDArray[Any]]
-) -> None:
+def load_training(module: nn.Module, optimiser: Adam | torch.optim.Optimizer, arrays: Mapping[str, Array]) -> None:
     """Take up the result of :func:`training_arrays`."""
     for name, weight in module.named_parameters():
         weight.copy_(torch.tensor(arrays[f"{name}/weight"]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,3 +15,15 @@ State = tuple[int, ...]
 """A macrostate that can be a key. Length M."""
 Floats = NDArray[np.float64]
 """Numbers of double precision, of any shape."""
+Images = NDArray[np.uint8] | NDArray[np.floating]
+"""Images of any shape: uint8, or floats in [0, 1]."""
+Array = NDArray[np.generic]
+"""An array of any dtype and shape that is only passed on."""
+Arrays = dict[str, NDArray[Any]]
+"""Arrays by name, as a file or a state holds them: each has a dtype and a shape of its own."""
+Observed = NDArray[Any] | Arrays
+"""What is observed of one moment: one part, an image or a vector, or several by name."""
+Action = np.int64 | int
+"""The number of a macro-action."""
+Info = dict[str, Any]
+"""Gymnasium's ``info``: numpy scalars and arrays, and sentences."""

@@ -13,13 +13,14 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Info, Observed
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
 from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, State, TaskSpec
 from imagine_bench.rules import states_of
 
 from .frames import frames_of
 from .motion.executor import MacroResult
-from .observations import Observed, Observer
+from .observations import Observer
 from .parameters.gesture import hides
 from .parameters.lag import Lag
 from .rendering.cameras import FRAME_PX, agent_camera, human_camera_view
@@ -33,8 +34,6 @@ from .world import World, WorldState
 
 _BUILT = PhysicsSettings()
 _WINDOW_HZ = 25.0  # images a second of a window
-Info = dict[str, Any]
-"""What Gymnasium calls info: numpy scalars and arrays, and sentences."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Observed
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Frame
 
@@ -20,8 +21,6 @@ from .world import World
 
 Part = NDArray[np.uint8] | NDArray[np.float32]
 """An image, or a vector."""
-Observed = Part | dict[str, Part]
-"""What is observed of one moment: one part, or several by name."""
 _Space = gymnasium.Space[Any]  # of one part, or of several
 _Camera = Callable[[str, int], Renderer]
 _Moment = tuple["Observer", tuple[int, ...]]

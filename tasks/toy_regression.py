@@ -6,11 +6,10 @@ uncertainties are known in closed form.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import SCORES, Predict, RegressionData, RegressionSpec
@@ -96,7 +95,7 @@ def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
     return nearest / noise_sigma(variant, x)
 
 
-def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arrays:
     """The curves of figure 4.1 on a common grid, with the truth beside them.
 
     Returns:

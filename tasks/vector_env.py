@@ -20,11 +20,11 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Info, Observed
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
 from imagine_bench.interfaces import Frame
 
-from .macro_env import Info, MacroEnv
-from .observations import Observed
+from .macro_env import MacroEnv
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
 Batch = tuple[Observed, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]

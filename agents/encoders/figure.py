@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import textwrap
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from imagine_bench.arrays import Arrays, Images
 from imagine_bench.interfaces import Frame, TaskSpec
 from imagine_bench.preprocessing import preprocess
 
@@ -40,7 +40,7 @@ def sample_sheet(
     frames = frames[:COLUMNS]
     macrostates = macrostates[:COLUMNS]
     latents = Latents(*encoder.encode(frames))
-    rows: dict[str, NDArray[Any]] = {
+    rows: Arrays = {
         "camera": frames,
         "encoder's view": view(preprocess(encoder.card.preprocessing)(frames), encoder.card.preprocessing),
         "decoded mean": encoder.decode(latents.mu),
@@ -81,7 +81,7 @@ def _write_heading(draw: ImageDraw.ImageDraw, encoder: Encoder) -> None:
     draw.text((_GAP, _GAP + 46), reading, fill=_MUTED, font=ImageFont.load_default(14))
 
 
-def _enlarged(pixels: NDArray[Any]) -> Image.Image:
+def _enlarged(pixels: Images) -> Image.Image:
     if pixels.dtype != np.uint8:
         pixels = np.rint(pixels * 255.0).astype(np.uint8)
     return Image.fromarray(pixels).convert("RGB").resize((_CELL, _CELL), Image.Resampling.NEAREST)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..snapshot import Arrays
+from imagine_bench.arrays import Arrays
 
 Code = tuple[int, ...]
 Codes = NDArray[np.int64]

@@ -198,11 +198,11 @@ class ImaginingAgent(DQN):
         before = accumulate(map(imagination.uncertainty, imagined), initial=nothing)
         gathered = before if imagination.settings.accumulates else repeat(0.0)
 
-        def joined(values: Iterable[Tensor]) -> NDArray[Any]:
+        def joined(values: Iterable[Tensor]) -> NDArray[np.float32]:
             return torch.cat(list(values)).cpu().numpy()
 
         return ImaginedRollout(
-            actions=joined(actions),
+            actions=torch.cat(actions).cpu().numpy(),
             frames=encoder.decode(latents),
             start_frame=encoder.decode(start)[0],
             rewards=joined(step.reward for step in imagined),

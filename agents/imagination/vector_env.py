@@ -13,6 +13,7 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Info, State
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats, Frame
 
@@ -75,7 +76,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         self._gathered = torch.zeros(num_envs, device=self._generator.device)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: dict[str, State] | None = None
     ) -> tuple[Latents, dict[str, Any]]:
         """Begin N episodes; the first observations (N, Z), and no info. No options are known."""
         super().reset(seed=seed)
@@ -120,7 +121,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         values = {"accepted": accepted} | {
             name: self.imagination.filter.score(getattr(parts, name)).cpu().numpy() for name in VERDICT[1:]
         }
-        info: dict[str, Any] = {}
+        info: Info = {}
         for index, over in enumerate(ended):
             own = {name: column[index].item() for name, column in values.items()}
             self._add_info(info, own, index)
@@ -145,7 +146,7 @@ class ImaginedEnv(gymnasium.Env[Latents, np.int64]):
         self.action_space = world.single_action_space
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: dict[str, State] | None = None
     ) -> tuple[Latents, dict[str, Any]]:
         """Begin an episode: latents (Z,)."""
         super().reset(seed=seed)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.values import Setting
 
 from .. import settings as kinds
 from ..settings import COUNT, POSITIVE, PROBABILITY, ConfigGroup, Hyperparameters, Override, Range, between, setting
@@ -126,6 +126,7 @@ def _ensemble_epochs(epochs: int) -> int:
 
 def _of_ensemble(changes: Mapping[str, Override]) -> dict[str, Override]:
     epochs = changes["epochs"].value if "epochs" in changes else 3000
+    assert isinstance(epochs, int)
     fewer = Override(_ensemble_epochs(epochs), "five members together must not cost more than one network")
     return {**changes, **_ENSEMBLE, "epochs": fewer}
 
@@ -137,6 +138,6 @@ HYPERPARAMETERS = Hyperparameters({
 })  # fmt: skip
 
 
-def resolve_all(hyperparameters: str, overrides: Mapping[str, Any]) -> tuple[RegressorSettings, ...]:
+def resolve_all(hyperparameters: str, overrides: Mapping[str, Setting]) -> tuple[RegressorSettings, ...]:
     """The settings of one network and of an ensemble; raises what any regressor would raise for them."""
     return tuple(HYPERPARAMETERS.resolve(hyperparameters, overrides, group) for group in HYPERPARAMETERS.groups)

@@ -16,9 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import AgentContext, Frame
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined
+from imagine_bench.values import Setting
 
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception, prepare_torch
@@ -65,9 +67,7 @@ class LatentModel:
         for batch in self.batches({name: np.asarray(column) for name, column in columns.items()}, dataset, generator):
             self.imagination.model.update(batch, generator)
 
-    def batches(
-        self, columns: dict[str, NDArray[Any]], dataset: Episodes, generator: torch.Generator
-    ) -> Iterator[Batch]:
+    def batches(self, columns: Arrays, dataset: Episodes, generator: torch.Generator) -> Iterator[Batch]:
         """What is learned from: :data:`UPDATES` batches of transitions, whose columns are given."""
         del dataset
         model = self.settings.model
@@ -126,7 +126,7 @@ class LatentModel:
         return torch.Generator(self.encoder.device).manual_seed(int(rng.integers(2**63)))
 
 
-def _make(context: AgentContext, overrides: Mapping[str, Any]) -> LatentModel:
+def _make(context: AgentContext, overrides: Mapping[str, Setting]) -> LatentModel:
     given = {**overrides, **context.overrides}
     settings = HYPERPARAMETERS.resolve(context.hyperparameters, given, context.config_group)
     prepare_torch(context.device)

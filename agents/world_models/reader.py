@@ -7,7 +7,6 @@ far from every real frame is none either, whatever the network says.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn import functional
 
+from imagine_bench.arrays import Array
 from imagine_bench.interfaces import State, TaskSpec, appearance_of_tests
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
@@ -52,7 +52,7 @@ class Reader:
         self.network = network.to_empty(device="cpu")
 
     @torch.no_grad()
-    def read(self, pictures: NDArray[Any]) -> NDArray[np.int64]:
+    def read(self, pictures: Array) -> NDArray[np.int64]:
         """Macrostates (N, M) of pictures (N, H, W) or (N, H, W, 3), uint8 or in [0, 1]; -1 where one shows nothing."""
         parts = [self._read(images_of(pictures[at : at + _CHUNK])) for at in range(0, len(pictures), _CHUNK)]
         return np.concatenate(parts) if parts else np.zeros((0, len(self.sizes)), dtype=np.int64)
@@ -82,7 +82,7 @@ class Reader:
         return self
 
 
-def images_of(pictures: NDArray[Any]) -> Tensor:
+def images_of(pictures: Array) -> Tensor:
     """Pictures as RGB images in [0, 1] of 32 pixels. Shape (N, 3, 32, 32)."""
     scale = 255.0 if pictures.dtype == np.uint8 else 1.0
     images = torch.from_numpy(np.ascontiguousarray(pictures, dtype=np.float32)) / scale

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import AgentContext, Frame
 from imagine_bench.interfaces.episodes import Episodes
 
@@ -37,9 +37,7 @@ class RecurrentLatentModel(latent.LatentModel):
             size, context.n_actions, self.settings, filtered=True, seeds=context.seeds, device=device
         )
 
-    def batches(
-        self, columns: dict[str, NDArray[Any]], dataset: Episodes, generator: torch.Generator
-    ) -> Iterator[Batch]:
+    def batches(self, columns: Arrays, dataset: Episodes, generator: torch.Generator) -> Iterator[Batch]:
         """Batches of sequences, each with all that came before it in its episode."""
         model = self.settings.model
         rows = len(columns["action"])

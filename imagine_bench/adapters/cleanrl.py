@@ -11,13 +11,16 @@ import time
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
+
+from imagine_bench.arrays import Arrays, Info, Observed, State
+from imagine_bench.environments import Lanes
 
 from .lanes import endings, vector_env
 
 
-def as_cleanrl(env: VectorEnv[Any, Any, Any] | str, **kwargs: Any) -> FinalObservation:
+def as_cleanrl(env: Lanes | str, **kwargs: Any) -> FinalObservation:
     """A vector environment with the infos of Gymnasium 0.29.
 
     Args:
@@ -38,12 +41,12 @@ class FinalObservation(VectorWrapper):
     gave them, each an array (1,). Gymnasium's own ``final_obs`` is gone.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(self, env: Lanes) -> None:
         super().__init__(env)
         self._returns, self._lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
         self._begun_s = np.zeros(env.num_envs)
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
         """Begin an episode in every lane, or in those of ``options["reset_mask"]``."""
         fresh = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
         first = self.env.reset(seed=seed, options=options)
@@ -52,7 +55,7 @@ class FinalObservation(VectorWrapper):
 
     def step(
         self, actions: NDArray[np.int64]
-    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+    ) -> tuple[Observed, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
         """One macro-action in every lane."""
         seen, rewards, terminated, truncated, infos = self.env.step(actions)
         self._returns, self._lengths, over = self._returns + rewards, self._lengths + 1, terminated | truncated
@@ -66,7 +69,7 @@ class FinalObservation(VectorWrapper):
             self._begin(over)
         return seen, rewards, terminated, truncated, infos
 
-    def _statistics(self, lane: int) -> dict[str, NDArray[Any]]:
+    def _statistics(self, lane: int) -> Arrays:
         lasted_s = time.perf_counter() - self._begun_s[lane]
         return {
             "r": self._returns[[lane]].astype(np.float32), "l": self._lengths[[lane]].astype(np.int32),

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.arrays import Action, Info
+from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError, SetupError
 
 try:
@@ -36,9 +38,7 @@ _STILL_S = 1.0
 """How far the viewer's clock goes on for a macro-action that took no simulated time."""
 
 
-def as_dm_env(
-    env: gymnasium.Env[Any, Any] | str, *, seed: int | None = None, motion_hz: float = 0.0, **kwargs: Any
-) -> DmEnvironment:
+def as_dm_env(env: Env | str, *, seed: int | None = None, motion_hz: float = 0.0, **kwargs: Any) -> DmEnvironment:
     """An environment of ours as a ``dm_env.Environment``.
 
     Args:
@@ -80,7 +80,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         info: What Gymnasium's latest ``reset`` or ``step`` gave beside the observation.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], *, seed: int | None, motion_hz: float) -> None:
+    def __init__(self, env: Env, *, seed: int | None, motion_hz: float) -> None:
         space, actions = env.observation_space, env.action_space
         if not isinstance(space, gymnasium.spaces.Box) or not isinstance(actions, gymnasium.spaces.Discrete):
             raise InvalidValueError(f"No adapter for the spaces {space} and {actions}; give a Box and a Discrete one.")
@@ -95,7 +95,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
             self._scene.agent_view()  # contexts end in reverse order at exit; after ours the display is closed
         self._observation_spec = specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "observation")
         self._action_spec = specs.DiscreteArray(int(actions.n), name="action")
-        self.info: dict[str, Any] = {}
+        self.info: Info = {}
         self._physics: Any = None
         self._time_s = 0.0
         self._shown = self._pose(0.0)
@@ -121,7 +121,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         self._show(self._pose(self._time_s))
         return self._latest
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: Action) -> Any:
         """Carry out a macro-action, show more of its motion, or begin an episode."""
         if not self._to_show:
             if self._latest is None or self._latest.last():

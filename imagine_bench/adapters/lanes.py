@@ -7,12 +7,14 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 
+from imagine_bench.arrays import Info, Observed
+from imagine_bench.environments import Lanes
 from imagine_bench.errors import InvalidValueError
 
 
-def vector_env(env: VectorEnv[Any, Any, Any] | str, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
+def vector_env(env: Lanes | str, **kwargs: Any) -> Lanes:
     """A vector environment that resets in the same step, or that of an id.
 
     Raises:
@@ -27,7 +29,7 @@ def vector_env(env: VectorEnv[Any, Any, Any] | str, **kwargs: Any) -> VectorEnv[
     return env
 
 
-def info_of(infos: dict[str, Any], lane: int) -> dict[str, Any]:
+def info_of(infos: Info, lane: int) -> Info:
     """What the infos of all lanes say of one, copied; how it ended (``final_obs``, ``final_info``) left out."""
     info = {}
     for key, value in infos.items():
@@ -37,9 +39,9 @@ def info_of(infos: dict[str, Any], lane: int) -> dict[str, Any]:
     return info
 
 
-def endings(infos: dict[str, Any]) -> dict[int, tuple[Any, dict[str, Any]]]:
+def endings(infos: Info) -> dict[int, tuple[Observed, Info]]:
     """The last observation and info of each lane whose episode ended."""
-    ended: dict[int, tuple[Any, dict[str, Any]]] = {}
+    ended: dict[int, tuple[Observed, Info]] = {}
     for lane in np.flatnonzero(infos.get("_final_obs", ())).tolist():
         last = infos["final_obs"]
         seen = info_of(last, lane) if isinstance(last, dict) else last[lane]

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
+from imagine_bench.environments import Lanes
 from imagine_bench.errors import lacking
 
 from .lanes import endings, info_of, vector_env
@@ -28,7 +28,7 @@ except ImportError as error:
     raise lacking("stable_baselines3") from error
 
 
-def as_sb3(env: VectorEnv[Any, Any, Any] | str, **kwargs: Any) -> Sb3VecEnv:
+def as_sb3(env: Lanes | str, **kwargs: Any) -> Sb3VecEnv:
     """A vector environment of Gymnasium as one of Stable-Baselines3.
 
     Args:
@@ -48,7 +48,7 @@ class Sb3VecEnv(VecEnv):
     are those of the lanes, ``env.envs``; a vector environment without lanes of its own stands for each.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+    def __init__(self, env: Lanes) -> None:
         self.env = env
         self._laned = hasattr(env, "envs")
         self._lanes: Sequence[Any] = getattr(env, "envs", [env] * env.num_envs)

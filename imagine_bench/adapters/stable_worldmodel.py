@@ -18,16 +18,16 @@ where the recorded episodes do, ``callables=[{"method": "start_at", "args": {"ma
 
 from __future__ import annotations
 
-from typing import Any
-
-import gymnasium
 import numpy as np
+from numpy.typing import ArrayLike
 
+from imagine_bench.arrays import Action, Info, Observed, State
+from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame
 
 
-class SuccessTerminates(gymnasium.Wrapper[Any, Any, Any, Any]):
+class SuccessTerminates(Wrapper):
     """Terminates on success alone; every other end of an episode is a truncation.
 
     The ``pixels`` that the library records and shows its models are what our agents see, info holds Python's bools,
@@ -38,20 +38,20 @@ class SuccessTerminates(gymnasium.Wrapper[Any, Any, Any, Any]):
         InvalidValueError: An environment of something else.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+    def __init__(self, env: Env) -> None:
         if not hasattr(env.unwrapped, "agent_view"):
             raise InvalidValueError(f"{env} is no task of imagine_bench; give one.")
         super().__init__(env)
         self._bookkeeping = np.random.default_rng(0)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
         """Begin an episode."""
         if seed is not None:
             self._bookkeeping = np.random.default_rng(seed)
         seen, info = self.env.reset(seed=seed, options=options)
         return seen, _plain(info)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observed, float, bool, bool, Info]:
         """Carry out one macro-action."""
         seen, reward, terminated, truncated, info = self.env.step(action)
         success = bool(info["success"])
@@ -61,9 +61,9 @@ class SuccessTerminates(gymnasium.Wrapper[Any, Any, Any, Any]):
         """What the agent sees. Shape (64, 64, 3)."""
         return self.env.unwrapped.agent_view()  # type: ignore[attr-defined]
 
-    def start_at(self, macrostate: Any) -> None:
+    def start_at(self, macrostate: ArrayLike) -> None:
         """Begin an episode in a recorded macrostate, one of ``callables`` of an evaluation from a dataset."""
-        self.reset(options={"macrostate": np.asarray(macrostate).reshape(-1).tolist()})
+        self.reset(options={"macrostate": tuple(np.asarray(macrostate).reshape(-1).tolist())})
 
     @property
     def unwrapped(self) -> SuccessTerminates:
@@ -80,5 +80,5 @@ class SuccessTerminates(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._bookkeeping = value
 
 
-def _plain(info: dict[str, Any]) -> dict[str, Any]:
+def _plain(info: Info) -> Info:
     return {key: bool(value) if isinstance(value, np.bool_) else value for key, value in info.items()}

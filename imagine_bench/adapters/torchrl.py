@@ -11,24 +11,23 @@ A vector environment is wrapped as it is, in the mode that leaves resets to Torc
 
 from __future__ import annotations
 
-from typing import Any
+from imagine_bench.arrays import Action, Info, Observed, State
+from imagine_bench.environments import Wrapper
 
-import gymnasium
 
-
-class NumericInfo(gymnasium.Wrapper[Any, Any, Any, Any]):
+class NumericInfo(Wrapper):
     """The environment without the texts of its infos, such as ``fault_reason``."""
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
         """Begin an episode."""
         seen, info = self.env.reset(seed=seed, options=options)
         return seen, _numbers(info)
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observed, float, bool, bool, Info]:
         """Carry out one macro-action."""
-        *step, info = self.env.step(action)
-        return (*step, _numbers(info))
+        seen, reward, terminated, truncated, info = self.env.step(action)
+        return seen, float(reward), terminated, truncated, _numbers(info)
 
 
-def _numbers(info: dict[str, Any]) -> dict[str, Any]:
+def _numbers(info: Info) -> Info:
     return {key: value for key, value in info.items() if not isinstance(value, str)}

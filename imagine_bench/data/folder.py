@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.arrays import Array, Arrays
 from imagine_bench.errors import ArtefactError, InvalidValueError, require_known
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.episodes import Episodes, content_hash
@@ -29,7 +29,7 @@ _MARKS = {
 }
 """Files by which formats are known; their modules read from there."""
 _CARD = "card.json"
-Apart = Mapping[str, Mapping[str, NDArray[Any]]]
+Apart = Mapping[str, Mapping[str, Array]]
 """Named arrays that no learner is given, by the file they are in."""
 
 
@@ -108,7 +108,7 @@ def read_dataset(folder: Path) -> Dataset:
     return Dataset(folder=folder, format=format, episodes=episodes, card=card)
 
 
-def read_apart(dataset: Dataset) -> dict[str, dict[str, NDArray[Any]]]:
+def read_apart(dataset: Dataset) -> dict[str, Arrays]:
     """What no learner is given, by file, such as ``privileged``: ``macrostates`` (N + E, M) and ``seeds`` (E,).
 
     Raises ArtefactError: a file is missing or damaged.

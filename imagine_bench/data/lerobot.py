@@ -22,6 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Array, Arrays
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes
@@ -74,7 +75,7 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
     write_json(folder / _INFO, _info(episodes))
 
 
-def _columns(episodes: Episodes, firsts: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+def _columns(episodes: Episodes, firsts: NDArray[np.int64]) -> Arrays:
     """The columns of one number a row, in the order of their types."""
     which = np.repeat(np.arange(len(firsts)), episodes.lengths)
     index = np.arange(len(episodes.actions))
@@ -87,7 +88,7 @@ def _columns(episodes: Episodes, firsts: NDArray[np.int64]) -> dict[str, NDArray
     return {name: array.astype(dtype) for (name, dtype), array in zip(_TYPES.items(), columns, strict=True)}
 
 
-def _table(columns: Mapping[str, NDArray[Any]], frames: Frame) -> pa.Table:
+def _table(columns: Mapping[str, Array], frames: Frame) -> pa.Table:
     """Columns and images, and what the ``datasets`` library is told of them."""
     arrays: list[pa.Array] = [_pngs(frames)]
     features: dict[str, dict[str, Any]] = {_IMAGE: {"_type": "Image"}}
@@ -116,7 +117,7 @@ def _file(folder: Path, chunk_index: int, file_index: int) -> Path:
     return path
 
 
-def _statistics(columns: Mapping[str, NDArray[Any]], frames: Frame) -> dict[str, dict[str, list[Any]]]:
+def _statistics(columns: Mapping[str, Array], frames: Frame) -> dict[str, dict[str, list[Any]]]:
     """Of every column, and of each color in [0, 1], whose arrays have the shape (3, 1, 1)."""
     levels = np.arange(256) / 255
     counts = [np.bincount(frames[..., color].ravel(), minlength=256) for color in range(3)]

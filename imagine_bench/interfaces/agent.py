@@ -13,11 +13,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Frame, State
+from imagine_bench.arrays import Arrays, Frame, State
 from imagine_bench.interfaces.observation import FRAME_PX, Observation, Transition
 from imagine_bench.interfaces.task import TaskSpec
 from imagine_bench.rules import Rules
 from imagine_bench.seeding import SeedTree
+from imagine_bench.values import Setting
 
 DEVICES = ("cpu", "cuda")
 """Devices that learners compute on, by torch's names."""
@@ -50,7 +51,7 @@ class AgentContext:
     config_group: str = "chapter_5"  #: name of the config group of settings, as the task names it
     hyperparameters: str = "fast"  #: name of the group's set of values (``"minimal"``, ``"fast"`` or ``"published"``)
     #: single settings that replace the set's, by dotted name
-    overrides: Mapping[str, Any] = field(default_factory=dict)
+    overrides: Mapping[str, Setting] = field(default_factory=dict)
     device: str = "cpu"  #: a torch device name, ``"cpu"`` or ``"cuda"``
     #: makes an optimal policy, which says what to do after what is shown and so many macro-actions of an episode; only
     #: for agents registered as privileged, None for every other
@@ -64,7 +65,7 @@ class AgentContext:
 class AgentState:
     """All that an agent needs to go on as if never interrupted: weights, optimisers, memories, generators, counters."""
 
-    arrays: dict[str, NDArray[Any]]  #: named numpy arrays; they become one safetensors file
+    arrays: Arrays  #: named numpy arrays; they become one safetensors file
     values: dict[str, Any]  #: JSON-serialisable values
 
 
@@ -75,7 +76,7 @@ class FrameEncoder(Protocol):
     ``code_sizes``, the numbers of values of factors whose one-hot codes, one behind the other, its latents are.
     """
 
-    def encode(self, frames: Frame) -> NDArray[np.floating[Any]]:
+    def encode(self, frames: Frame) -> NDArray[np.floating]:
         """Latents (N, Z), finite, of frames (N, 64, 64, 3); equal frames have equal latents, and Z never changes."""
 
 

@@ -10,12 +10,11 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from imagine_bench.arrays import Frame
+from imagine_bench.arrays import Array, Arrays, Frame
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.observation import Observation, Transition
 
@@ -90,7 +89,7 @@ class Episodes:
         last = np.cumsum(self.lengths + 1) - 1
         return np.delete(np.arange(len(self.frames)), last), last
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> Arrays:
         """Every array by its name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
@@ -148,7 +147,7 @@ class Episodes:
         return content_hash(self.arrays())
 
 
-def content_hash(arrays: Mapping[str, NDArray[Any]]) -> str:
+def content_hash(arrays: Mapping[str, Array]) -> str:
     """64 hex digits of the names, types, shapes and bytes of arrays."""
     sha = hashlib.sha256()
     for name in sorted(arrays):
@@ -158,18 +157,19 @@ def content_hash(arrays: Mapping[str, NDArray[Any]]) -> str:
     return sha.hexdigest()
 
 
-def joined(parts: Sequence[Mapping[str, Any]]) -> Episodes:
+def joined(parts: Sequence[Mapping[str, ArrayLike]]) -> Episodes:
     """Episodes from one mapping each: ``frames``, ``action_masks``, ``actions``, ... and one ``success``."""
     if not parts:
         raise InvalidValueError("there is no episode")
-    arrays: dict[str, Any] = {"lengths": np.array([len(part["actions"]) for part in parts], dtype=np.int64)}
-    arrays["success"] = np.array([part["success"] for part in parts], dtype=np.bool_)
+    arrays: Arrays = {"success": np.array([part["success"] for part in parts], dtype=np.bool_)}
+    arrays["lengths"] = np.array([len(np.asarray(part["actions"])) for part in parts], dtype=np.int64)
     for name in set(_TYPES) - set(arrays):
         arrays[name] = np.concatenate([np.asarray(part[name]) for part in parts])
-    return Episodes(**{name: _exactly(name, array) for name, array in arrays.items()})
+    exact: Arrays = {name: _exactly(name, array) for name, array in arrays.items()}
+    return Episodes(**exact)
 
 
-def _exactly(name: str, array: NDArray[Any]) -> NDArray[Any]:
+def _exactly(name: str, array: Array) -> Array:
     """An array in the type that episodes have it in, if that changes no value."""
     cast = array.astype(_TYPES[name]) if array.dtype.kind in "biuf" else array
     return cast if np.array_equal(cast, array, equal_nan=array.dtype.kind == "f") else array

@@ -6,12 +6,12 @@ Shapes: ``N`` questions, ``K`` frames of history, ``D`` imagined depth, ``S`` im
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Floats, Frame
+from imagine_bench.arrays import Array, Arrays, Floats, Frame, Images
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.episodes import Episodes
 
@@ -24,17 +24,17 @@ class Imagined:
     """What a model imagines. Whatever it does not offer stays None, and is judged as not offered."""
 
     #: Pictures, gray or RGB, uint8 or floats in [0, 1]. Shape (N, S, D, H, W) or (N, S, D, H, W, 3).
-    pictures: NDArray[Any]
+    pictures: Images
     #: Probability of each picture among those of its question and depth, summing to 1 over S. Shape (N, S, D). None
     #: makes all equally likely; a model that gives them may give any number S of pictures.
-    probabilities: NDArray[Any] | None = None
-    rewards: NDArray[Any] | None = None  #: Reward of that action, 0 once that future has ended. Shape (N, S, D).
-    p_ended: NDArray[Any] | None = None  #: Probability that the episode ended there or before. Shape (N, S, D).
-    epistemic: NDArray[Any] | None = None  #: How much it does not know for want of data, in any unit. Shape (N, D).
-    aleatoric: NDArray[Any] | None = None  #: How much is noise. Shape (N, D).
-    modal: NDArray[Any] | None = None  #: How far several possible outcomes are apart. Shape (N, D).
+    probabilities: Array | None = None
+    rewards: Array | None = None  #: Reward of that action, 0 once that future has ended. Shape (N, S, D).
+    p_ended: Array | None = None  #: Probability that the episode ended there or before. Shape (N, S, D).
+    epistemic: Array | None = None  #: How much it does not know for want of data, in any unit. Shape (N, D).
+    aleatoric: Array | None = None  #: How much is noise. Shape (N, D).
+    modal: Array | None = None  #: How far several possible outcomes are apart. Shape (N, D).
     #: Whether a filter of its own would let it learn from, or act on, what it imagines there. Shape (N, D), bool.
-    accepted: NDArray[Any] | None = None
+    accepted: Array | None = None
 
 
 class WorldModel(Protocol):
@@ -75,7 +75,7 @@ def require_imagined(imagined: object, *, name: str, rows: int, depth: int, samp
     return imagined
 
 
-def _require_numbers(offered: dict[str, Any], said: str) -> None:
+def _require_numbers(offered: Arrays, said: str) -> None:
     """Raise InvalidValueError for what is no array of finite numbers."""
     for each, array in offered.items():
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
@@ -86,7 +86,7 @@ def _require_numbers(offered: dict[str, Any], said: str) -> None:
             raise InvalidValueError(f"{said} gave {each} with NaN or infinity; give finite numbers.")
 
 
-def _require_shapes(offered: dict[str, NDArray[Any]], said: str, asked: tuple[int, int, int]) -> None:
+def _require_shapes(offered: Arrays, said: str, asked: tuple[int, int, int]) -> None:
     """Raise InvalidValueError for arrays of other shapes than those of pictures (N, S, D, ...)."""
     rows, samples, depth = asked
     given = offered["pictures"].shape
@@ -104,7 +104,7 @@ def _require_shapes(offered: dict[str, NDArray[Any]], said: str, asked: tuple[in
             raise InvalidValueError(f"{said} gave {each} of shape {array.shape}; give {wanted}.")
 
 
-def _require_ranges(offered: dict[str, NDArray[Any]], said: str) -> None:
+def _require_ranges(offered: Arrays, said: str) -> None:
     """Raise InvalidValueError for pixels or probabilities out of range."""
     pixels = offered["pictures"]
     if pixels.dtype != np.uint8 and not (pixels.dtype.kind == "f" and pixels.min() >= 0.0 and pixels.max() <= 1.0):

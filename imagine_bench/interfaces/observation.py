@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Frame, Macrostate
+from imagine_bench.arrays import Array, Frame, Info, Macrostate, Observed
 
 OBSERVATIONS = ("frame", "human", "state", "proprio")
 """Parts of what an environment of ours can show of one moment."""
@@ -31,10 +29,10 @@ class Observation:
     macrostate: Macrostate | None = None
     shown: Macrostate | None = None  #: what ``frame`` shows of the macrostate it was taken of, -1 for what it hides
     #: other parts of :data:`OBSERVATIONS` that the protocol shows, by name; no agent that takes frames alone gets any
-    more: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    more: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, seen: Any, info: Mapping[str, Any], *, privileged: bool) -> Observation:
+    def of(cls, seen: Observed, info: Info, *, privileged: bool) -> Observation:
         """What an agent may see of a frame, or of parts by name; of ``info`` only if it is privileged."""
         more = {name: part for name, part in seen.items() if name != "frame"} if isinstance(seen, Mapping) else {}
         frame = seen.get("frame", np.zeros((0, 0, 3), dtype=np.uint8)) if isinstance(seen, Mapping) else seen

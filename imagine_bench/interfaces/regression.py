@@ -9,15 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Floats
+from imagine_bench.arrays import Arrays, Floats
 from imagine_bench.interfaces.agent import AgentState
 from imagine_bench.interfaces.scene import Motion, Shape3D
 from imagine_bench.seeding import SeedTree
+from imagine_bench.values import Setting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,7 +122,7 @@ class RegressorContext:
     datasets: tuple[RegressionData, ...]  #: one a network, all of the same size. Length E.
     seeds: tuple[SeedTree, ...]  #: one node of the seed tree a network. Length E.
     hyperparameters: str = "fast"  #: name of the set of settings: ``"minimal"``, ``"fast"`` or ``"published"``
-    overrides: Mapping[str, Any] = field(default_factory=dict)  #: single settings that replace the set's
+    overrides: Mapping[str, Setting] = field(default_factory=dict)  #: single settings that replace the set's
     device: str = "cpu"
 
 
@@ -133,7 +133,7 @@ Predict = Callable[[Floats, str], Prediction]
 class Evaluate(Protocol):
     """A task's own measurements of trained networks."""
 
-    def __call__(self, variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+    def __call__(self, variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arrays:
         """What the task's figures and tables are made of, by name; the first axis is the network, if there is one.
 
         ``variant`` is what the networks were trained on; ``seeds``, one node a network, draw test inputs.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from imagine_bench.arrays import Frame, Macrostate, State
 from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
 from imagine_bench.rules import RuleFacts, Rules
+from imagine_bench.values import Setting
 
 EXECUTIONS = ("physics", "kinematic")
 SENSES = ("true", "nominal")
@@ -128,7 +129,7 @@ class TaskSpec:
     reference: str | None = None  #: name of the thesis' table in :mod:`imagine_bench.reference`, or None
     config_group: str = "chapter_5"  #: config group of learners' settings: the thesis' chapter that the task is from
     #: what each protocol preset changes for this task: fields of the protocol by preset
-    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    presets: Mapping[str, Mapping[str, Setting]] = field(default_factory=dict)
     success_threshold: float = 0.95  #: success rate, in (0, 1], at which the task counts as learned
     #: what ``check --physics`` measures it against; None for a task whose scene another one measures
     targets: PerformanceTargets | None = None

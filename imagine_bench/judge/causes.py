@@ -28,12 +28,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, Floats, Frame, Observation, Outcome, Rules, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.judge.truth import total_variation
 from imagine_bench.rules import states_of
-from imagine_bench.running.evaluation import Env
 from imagine_bench.running.run_state import make_env
 from imagine_bench.running.trained import Trained
 from imagine_bench.seeding import Purpose, SeedTree, episode_seed, evaluation_split

@@ -16,19 +16,15 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.registry.old_names import FIRST, TODAY, agent_label, edition_of, name_in_edition_1
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
+from imagine_bench.values import Json, Setting
 
-LATER: Mapping[str, Any] = {"later": True}
+LATER: Mapping[str, bool] = {"later": True}
 """Metadata of a field that protocols did not always have: at its default it changes no hash."""
 MOST = 10_000_000
 """Episodes, budgets and the like; a real robot lives to see a thousandth of it."""
 
 
-Scalar = bool | int | float | str | None
-Setting = Scalar | tuple[Scalar, ...] | list[Scalar] | dict[str, Scalar]
-"""The value of an agent's setting, as JSON has it."""
-
-
-def digest(values: Any) -> str:
+def digest(values: Json) -> str:
     """Twelve hex digits that change when anything in JSON-like values does."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Generic, Literal, TypeVar
 from typing import Protocol as Interface
 
 from imagine_bench import registry
@@ -14,6 +14,7 @@ from imagine_bench.interfaces import PROPRIO_SIZE, AgentContext, ExactWorld, Tas
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.seeding import SeedTree
+from imagine_bench.values import Setting
 
 P = TypeVar("P", bound=ProtocolData)
 P_co = TypeVar("P_co", bound=ProtocolData, covariant=True)
@@ -119,7 +120,7 @@ class TaskType(Generic[P]):
     learners: Callable[[], Mapping[str, object]]  #: Gives its agents or regressors, by name
     draws: bool  #: Whether its runs need OpenGL
     protocol: type[P]  #: The class of its protocols
-    presets: Mapping[str, Mapping[str, Any]]  #: What each protocol preset changes, by name
+    presets: Mapping[str, Mapping[str, Setting]]  #: What each protocol preset changes, by name
     #: Makes a protocol from a task, a preset and changes to single fields, all checked, and finds its encoders.
     plan: Callable[..., tuple[P, Encoders]]
     run: Callable[[RunSpec[P], Path, OnProgress], object]  #: Carries out a run in a folder

@@ -6,16 +6,17 @@ frame), ``episode``, ``imagined_depth``. Entities: ``/scene/...``, ``/real/...``
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.arrays import Arrays, Info, Macrostate, Observed
+from imagine_bench.environments import Env
 from imagine_bench.interfaces import Agent, Frame, Observation, SceneReader, State, TaskSpec
 from imagine_bench.interfaces.capabilities import (
     Imaginer,
@@ -48,7 +49,7 @@ def record_run(
     *,
     name: str,
     seed: int,
-    env: gymnasium.Env[Any, Any],
+    env: Env,
     appearance: str,
     episodes: int,
     path: Path,
@@ -128,7 +129,7 @@ class _EpisodeRecorder:
         self._env_step = -1
         self._episode = list[State]()
 
-    def record(self, env: gymnasium.Env[Any, np.int64], episode: int) -> None:
+    def record(self, env: Env, episode: int) -> None:
         """One greedy real episode, numbered from 1."""
         seen, info = env.reset(seed=episode_seed("recording", self._seed, episode))
         begin_episode(self._agent)
@@ -176,7 +177,7 @@ class _EpisodeRecorder:
             self._clock_s += _STILL_S
             self._recording.set_clocks(self._clock_s, env_step=self._env_step, episode=1)
 
-    def _log_frame(self, scene: Any, episode: int, seen: Any, info: dict[str, Any]) -> Observation:
+    def _log_frame(self, scene: Any, episode: int, seen: Observed, info: Info) -> Observation:
         """A new real frame: set the clocks, show it and how the scene stands. Returns what the agent sees."""
         observation = Observation.of(seen, info, privileged=self._privileged)
         frame = observation.frame if observation.frame.size else self._unseen_frame(scene, info)
@@ -190,20 +191,20 @@ class _EpisodeRecorder:
             log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences, only_moved=True)
         return observation
 
-    def _unseen_frame(self, scene: Any, info: Mapping[str, Any]) -> Frame:
+    def _unseen_frame(self, scene: Any, info: Info) -> Frame:
         """For people, the frame of an agent that sees something else: as late as that, and hiding as much."""
         shown = np.asarray(info.get("shown", info["macrostate"]))
         if np.array_equal(shown, info["macrostate"]):
             return np.asarray(scene.agent_view())
         return self._spec.render_macrostates(shown[None], self._appearance, np.random.default_rng(self._env_step))[0]
 
-    def _describe(self, heading: str, info: Mapping[str, Any], last: str, frame: Frame) -> None:
+    def _describe(self, heading: str, info: Info, last: str, frame: Frame) -> None:
         """What has happened, what is true, and what the frame shows where that is something else; what comes next.
 
         Of an agent with memory also what a read-out finds in it.
         """
         spec = self._spec
-        truth = info["macrostate"]
+        truth: Macrostate = info["macrostate"]
         remembered = truth
         if isinstance(self._agent, MemoryReader):
             remembered = self._agent.read_memory(frame, [len(values) for values in spec.macrostate_values])
@@ -274,7 +275,7 @@ class _EpisodeRecorder:
         """The same rollout along ``imagined_depth``; depth 0 is the real start."""
         rollout = compared.rollout
         recording = self._recording
-        curves: dict[str, NDArray[Any]] = {
+        curves: Arrays = {
             **{f"uncertainty/{kind}": getattr(rollout, kind) for kind in _KINDS},
             "prediction/reward": rollout.rewards,
             "prediction/p_terminated": rollout.p_terminated,

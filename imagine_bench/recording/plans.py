@@ -11,10 +11,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import rerun as rr
 import rerun.blueprint as rrb
 
+from imagine_bench.environments import Env
 from imagine_bench.interfaces import SceneReader
 from imagine_bench.judge.plans import PlanResult, carry_out, make_env
 from imagine_bench.recording.blueprint import playing, scene_view
@@ -56,7 +56,7 @@ class _PlanRecorder:
         self,
         recording: Recording,
         trained: Trained,
-        env: gymnasium.Env[Any, Any],
+        env: Env,
         count: int,
         max_epistemic: float | None,
     ) -> None:

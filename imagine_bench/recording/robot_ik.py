@@ -8,13 +8,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import RegressionSpec
 from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
@@ -27,9 +26,7 @@ _CHOSEN, _ERROR, _OUTSIDE = (0, 90, 200), (200, 30, 60), (120, 120, 120)
 _HEIGHT_M = 0.02
 
 
-def record(
-    evaluations: Mapping[str, Mapping[str, NDArray[Any]]], *, task: RegressionSpec, name: str, path: Path
-) -> Path:
+def record(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, name: str, path: Path) -> Path:
     """Record the first choices of the first network that learned from the last variant.
 
     ``evaluations`` are by variant; ``name`` is the regressor's. ``path``, which is returned, ends in ``.rrd``.
@@ -79,9 +76,7 @@ def _lifted(points: Floats) -> Floats:
     return np.concatenate([points, np.full((*points.shape[:-1], 1), _HEIGHT_M)], axis=-1)
 
 
-def _show_candidates(
-    recording: Recording, data: Mapping[str, NDArray[Any]], points: Floats, scores: Floats, chosen: int
-) -> None:
+def _show_candidates(recording: Recording, data: Arrays, points: Floats, scores: Floats, chosen: int) -> None:
     ranks = scores.argsort().argsort() / (len(scores) - 1)  # 0 the surest
     colors = (_SURE + ranks[:, None] * (_UNSURE - _SURE)).astype(np.uint8)
     recording.log("/choice/candidates", rr.Points3D(_lifted(points), colors=colors, radii=0.022))
@@ -103,7 +98,7 @@ def _show_error(recording: Recording, tip_m: Floats, target_m: Floats) -> None:
 
 
 def _describe(
-    recording: Recording, name: str, variant: str, data: Mapping[str, NDArray[Any]], choice: int, chosen: int,
+    recording: Recording, name: str, variant: str, data: Arrays, choice: int, chosen: int,
     *, arrived: bool,
 ) -> None:  # fmt: skip
     error, scores = data["decision/error"][0, choice], data["decision/epistemic"][0, choice]

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import RegressionSpec
 from imagine_bench.recording.stream import Recording, recording_file
@@ -25,9 +24,7 @@ _TICKS = 100  # steps of the timeline per unit of x: a timeline counts whole num
 _TIMELINE = "x_hundredths"
 
 
-def record(
-    evaluations: Mapping[str, Mapping[str, NDArray[Any]]], *, task: RegressionSpec, name: str, path: Path
-) -> Path:
+def record(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, name: str, path: Path) -> Path:
     """Record the first network of every variant: data, predictions, each uncertainty beside its true value.
 
     ``evaluations`` are by variant; ``name`` is the regressor's. ``path``, which is returned, ends in ``.rrd``.

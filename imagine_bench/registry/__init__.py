@@ -41,6 +41,7 @@ from imagine_bench.registry.entries import WorldModelEntry as WorldModelEntry
 from imagine_bench.registry.entries import entrant, parse_options, read_mapping
 from imagine_bench.registry.guests import Guest, guest_of, guests
 from imagine_bench.registry.old_names import LABEL_OF_OLD_AGENT
+from imagine_bench.values import Setting
 
 TASK_GROUP, AGENT_GROUP, ENCODER_GROUP = (f"imagine_bench.{name}" for name in ("tasks", "agents", "encoders"))
 REGRESSION_GROUP, REGRESSOR_GROUP, STUDY_GROUP, WORLD_MODEL_GROUP = (
@@ -220,7 +221,7 @@ def task_entry(name: str) -> TaskEntry:
     return entry
 
 
-def _options(base: str, entry: TaskEntry, said: str) -> dict[str, Any]:
+def _options(base: str, entry: TaskEntry, said: str) -> dict[str, Setting]:
     """What is said after the colon, ``key=value,...`` or ``@`` and a JSON file, by option."""
     if not entry.world:
         raise InvalidValueError(f"Task {base} takes no options; leave out {brief(':' + said)}.")
@@ -291,7 +292,7 @@ def setting_names(agent: str) -> frozenset[str]:
     return names
 
 
-def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
+def own_settings(agent: str, overrides: Mapping[str, Setting]) -> dict[str, Setting]:
     """Those of a protocol's overrides that this agent has settings for, and above them those of an entrant's own.
 
     Raises:
@@ -305,7 +306,7 @@ def own_settings(agent: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
     return {**{name: value for name, value in overrides.items() if name in names}, **own}
 
 
-def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Any], group: str) -> Any:
+def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Setting], group: str) -> Any:
     """An agent's settings, a dataclass, with those of the overrides that it has; None of an agent without settings.
 
     Raises:

@@ -13,9 +13,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from imagine_bench.errors import ArtefactError, InvalidValueError, brief, plain
+from imagine_bench.values import Setting
 
 _BETWEEN = re.compile(r",(?=[\w.]+=)")
 _LONGEST = 100
@@ -30,7 +31,7 @@ class TaskEntry:
     env: str  #: ``"module:attr"`` of the environment's constructor
     horizon: int | None  #: Macro-actions before truncation; None where its environment truncates by itself
     #: Keyword arguments of both, which say which member of a family it is.
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Setting] = field(default_factory=dict)
     #: ``"module:attr"`` of the frozen dataclass of all such arguments; with it, ``NAME:key=value,...`` is a task, too,
     #: whose TaskSpec has a name and an ``env_id`` of its own.
     world: str = ""
@@ -92,7 +93,7 @@ class Entrant(NamedTuple):
     """An agent and the settings that it alone has in a bench."""
 
     agent: str  #: registered name
-    settings: Mapping[str, Any]  #: by dotted name, in the order of names
+    settings: Mapping[str, Setting]  #: by dotted name, in the order of names
 
     def __str__(self) -> str:
         """The one name of this entrant, however its settings were written."""
@@ -118,7 +119,7 @@ def entrant(text: str) -> Entrant:
     return Entrant(agent, dict(parse_settings(words, f"entrant {text!r}:")))
 
 
-def parse_settings(pairs: Sequence[str], where: str = "--set") -> tuple[tuple[str, Any], ...]:
+def parse_settings(pairs: Sequence[str], where: str = "--set") -> tuple[tuple[str, Setting], ...]:
     """``name=value`` words to sorted (name, value) pairs; values are read as JSON, and as text where they are none.
 
     Raises InvalidValueError: a word without ``=``, or a name given twice.
@@ -126,14 +127,14 @@ def parse_settings(pairs: Sequence[str], where: str = "--set") -> tuple[tuple[st
     return tuple(sorted((name, _value(text)) for name, text in _texts(pairs, where).items()))
 
 
-def parse_options(text: str, kinds: Mapping[str, str], where: str) -> dict[str, Any]:
+def parse_options(text: str, kinds: Mapping[str, str], where: str) -> dict[str, Setting]:
     """``name=value,...`` to values by name; those whose kind has a number in it are read as JSON. Raises likewise."""
     texts = _texts(_BETWEEN.split(text), where)
     numbers = {name for name, kind in kinds.items() if "int" in kind or "float" in kind}
     return {name: _value(text) if name in numbers else text for name, text in texts.items()}
 
 
-def read_mapping(file: Path) -> dict[str, Any]:
+def read_mapping(file: Path) -> dict[str, Setting]:
     """A JSON file that holds one mapping. Raises ArtefactError: it does not, or cannot be read."""
     try:
         found = json.loads(file.read_text())
@@ -164,12 +165,12 @@ def file_name(text: str) -> str:
     return f"{safe[:_LONGEST]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def _value(text: str) -> Any:
+def _value(text: str) -> Setting:
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
         return text
 
 
-def _text(value: Any) -> str:
+def _text(value: Setting) -> str:
     return value if isinstance(value, str) and _value(value) == value else json.dumps(value, separators=(",", ":"))

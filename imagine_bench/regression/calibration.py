@@ -6,6 +6,7 @@ from operator import itemgetter
 
 import numpy as np
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import SCORES, RegressionSpec, Regressor
 from imagine_bench.regression.results import Row
@@ -19,7 +20,6 @@ from imagine_bench.regression.scores import (
 )
 from imagine_bench.seeding import SeedTree
 from imagine_bench.statistics import auroc
-from imagine_bench.store.codec import Arrays
 
 CRPS_POINTS = 50
 """Points of each network at which both distributions are scored: all weight samples together cost (T K)^2 a point."""

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.arrays import Arrays
 from imagine_bench.regression.protocol import RegressionProtocol
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_protocol_as
-from imagine_bench.store.codec import Arrays, grouped, read_arrays, table_rows, table_text, write_arrays
+from imagine_bench.store.codec import grouped, read_arrays, table_rows, table_text, write_arrays
 from imagine_bench.store.files import write_bytes
 from imagine_bench.store.results import require_every_run
 

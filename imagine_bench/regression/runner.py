@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
+from imagine_bench.arrays import Arrays
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import Prediction, Regressor, RegressorContext
@@ -22,7 +23,7 @@ from imagine_bench.regression.results import RegressionRun, Row, finish, flatten
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
 from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot, sweep_partial
-from imagine_bench.store.codec import Arrays, grouped
+from imagine_bench.store.codec import grouped
 from imagine_bench.store.files import lock, make_folder, reading, sweep, writing
 
 TRAINING, MEASURING = 100, 10

@@ -11,12 +11,13 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
+from imagine_bench.arrays import Arrays, State
 from imagine_bench.data.folder import Apart, Dataset, read_apart
+from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.interfaces import Agent, AgentContext, ArmMotion, ArmReader, Observation, TaskSpec
@@ -105,7 +106,7 @@ def collect(
             parts.append(_episode(env, policy.players[index % len(policy.players)], seeds[index], options, watch))
     played = joined(parts)
     macrostates = np.concatenate([part["macrostates"] for part in parts])
-    apart: dict[str, dict[str, NDArray[Any]]] = {"privileged": {"macrostates": macrostates, "seeds": np.array(seeds)}}
+    apart: dict[str, Arrays] = {"privileged": {"macrostates": macrostates, "seeds": np.array(seeds)}}
     if motion:
         names = [field.name for field in dataclasses.fields(ArmMotion)]
         apart["arm"] = {name: np.concatenate([getattr(each, name) for each in motion]) for name in names}
@@ -114,7 +115,7 @@ def collect(
     return played, apart, {**_card(spec, policy, played), **made, "faults": sum(part["faults"] for part in parts)}
 
 
-def _watching(env: gymnasium.Env[Any, Any], motion_hz: float, motion: list[ArmMotion]) -> Callable[[], None]:
+def _watching(env: Env, motion_hz: float, motion: list[ArmMotion]) -> Callable[[], None]:
     """What is to be done after each macro-action: nothing, or to add the arm's motion to what was seen of it."""
     scene = env.unwrapped
     if not motion_hz:
@@ -126,10 +127,10 @@ def _watching(env: gymnasium.Env[Any, Any], motion_hz: float, motion: list[ArmMo
 
 
 def _episode(
-    env: gymnasium.Env[Any, Any],
+    env: Env,
     player: tuple[Agent, bool],
     seed: int,
-    options: dict[str, Any] | None,
+    options: dict[str, State] | None,
     watch: Callable[[], None],
 ) -> dict[str, Any]:
     """One episode, its arrays as lists; with ``options`` of a start, one macro-action and then a truncation."""

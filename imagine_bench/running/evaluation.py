@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, SupportsFloat, TypedDict
 
 import gymnasium
 import numpy as np
 
+from imagine_bench.arrays import Action, Info, Observed
+from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, State, Transition
 from imagine_bench.interfaces.capabilities import begin_episode
 from imagine_bench.seeding import Purpose, episode_seed
 from imagine_bench.store.results import KeptEpisodes
-
-Info = dict[str, Any]
-Env = gymnasium.Env[Any, Any]
 
 
 @dataclass
@@ -34,12 +33,12 @@ class EpisodeRecord:
     success: bool = False
 
     @classmethod
-    def begun(cls, env: gymnasium.Env[Any, Any], info: Mapping[str, Any]) -> EpisodeRecord:
+    def begun(cls, env: Env, info: Info) -> EpisodeRecord:
         """One that has just been reset."""
         start = [int(value) for value in info["macrostate"]]
         return cls(start, zlib.crc32(f"{start} {env.unwrapped.np_random.bit_generator.state}".encode()))
 
-    def add(self, action: int, reward: float, info: Mapping[str, Any]) -> None:
+    def add(self, action: int, reward: float, info: Info) -> None:
         """Take in one macro-action."""
         self.actions.append(int(action))
         self.total += reward
@@ -47,6 +46,17 @@ class EpisodeRecord:
         self.success = bool(info["is_success"])
         happened = np.array([*info["macrostate"], reward], dtype=np.float64)
         self.fingerprint = zlib.crc32(happened.tobytes(), self.fingerprint)
+
+
+class TestFigures(TypedDict):
+    """The fields of a :class:`.Checkpoint` that follow from its test episodes."""
+
+    test_episodes: int
+    successes: int
+    solved: str
+    mean_return: float
+    mean_length: float
+    faults: int
 
 
 @dataclass
@@ -83,25 +93,31 @@ class EvaluationCounts:
         self.faults.append(played.faults)
         self.fingerprints.append(played.fingerprint)
 
-    def figures(self) -> dict[str, Any]:
+    def figures(self) -> TestFigures:
         """The fields of a :class:`.Checkpoint` that follow from the episodes."""
         return {
-            "test_episodes": self.episodes, "successes": self.successes, "solved": self.solved,
-            "mean_return": sum(self.returns) / self.episodes, "mean_length": len(self.actions) / self.episodes,
+            "test_episodes": self.episodes,
+            "successes": self.successes,
+            "solved": self.solved,
+            "mean_return": sum(self.returns) / self.episodes,
+            "mean_length": len(self.actions) / self.episodes,
             "faults": sum(self.faults),
-        }  # fmt: skip
+        }
 
     def kept(self) -> KeptEpisodes:
         """All of them as arrays."""
         return KeptEpisodes(
-            starts=np.array(self.starts, dtype=np.int64), lengths=np.array(self.lengths, dtype=np.int64),
-            actions=np.array(self.actions, dtype=np.int64), returns=np.array(self.returns, dtype=np.float64),
-            success=np.array([each == "1" for each in self.solved]), faults=np.array(self.faults, dtype=np.int64),
+            starts=np.array(self.starts, dtype=np.int64),
+            lengths=np.array(self.lengths, dtype=np.int64),
+            actions=np.array(self.actions, dtype=np.int64),
+            returns=np.array(self.returns, dtype=np.float64),
+            success=np.array([each == "1" for each in self.solved]),
+            faults=np.array(self.faults, dtype=np.int64),
             fingerprints=np.array(self.fingerprints, dtype=np.int64),
-        )  # fmt: skip
+        )
 
 
-class AsDict(gymnasium.ObservationWrapper[Any, Any, Any]):
+class AsDict(gymnasium.ObservationWrapper[Any, Action, Observed]):
     """An observation of one part, as a dict of that part."""
 
     def __init__(self, env: Env, name: str) -> None:
@@ -109,7 +125,7 @@ class AsDict(gymnasium.ObservationWrapper[Any, Any, Any]):
         self._name = name
         self.observation_space = gymnasium.spaces.Dict({name: env.observation_space})
 
-    def observation(self, observation: Any) -> dict[str, Any]:
+    def observation(self, observation: Observed) -> dict[str, Observed]:
         """See above."""
         return {self._name: observation}
 
@@ -141,20 +157,28 @@ def play(
         _require_sound(env, frame, reward)
         after = Observation.of(frame, info, privileged=privileged)
         transition = Transition(
-            observation=before, action=action, reward=float(reward), next_observation=after,
-            terminated=bool(terminated), truncated=bool(truncated),
-        )  # fmt: skip
+            observation=before,
+            action=action,
+            reward=float(reward),
+            next_observation=after,
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+        )
         yield transition, info
         before = after
         over = terminated or truncated
 
 
-def _require_sound(env: Env, seen: Any, reward: Any) -> None:
+def _require_sound(env: Env, seen: Observed, reward: SupportsFloat) -> None:
     """Raise InvalidValueError for what no agent should be shown: a package's environment can give anything."""
     space = env.observation_space
-    named = isinstance(space, gymnasium.spaces.Dict) and isinstance(seen, Mapping)
-    for name, wanted in space.spaces.items() if named else [("frame", space)]:  # type: ignore[attr-defined]
-        part = seen.get(name) if named else seen
+    spaces = {"frame": space}
+    parts = {"frame": seen}
+    if isinstance(space, gymnasium.spaces.Dict) and isinstance(seen, dict):
+        spaces = space.spaces
+        parts = seen
+    for name, wanted in spaces.items():
+        part = parts.get(name)
         more = "'imagine-bench check --task' finds such faults."
         if isinstance(wanted, gymnasium.spaces.Box):
             given = (getattr(part, "shape", None), getattr(part, "dtype", type(part)))
@@ -163,9 +187,9 @@ def _require_sound(env: Env, seen: Any, reward: Any) -> None:
                     f"{env} gave a {name} of {given[1]} and shape {given[0]}; it declares {wanted.dtype} of shape "
                     f"{wanted.shape}. {more}"
                 )
-            if part.dtype.kind == "f" and not np.isfinite(part).all():
+            if isinstance(part, np.ndarray) and part.dtype.kind == "f" and not np.isfinite(part).all():
                 raise InvalidValueError(f"{env} gave a {name} with NaN or infinity. {more}")
-    if not math.isfinite(reward):
+    if not math.isfinite(float(reward)):
         raise InvalidValueError(f"{env} gave the reward {reward}; rewards are finite.")
 
 
@@ -199,14 +223,14 @@ def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[EpisodeRecord, 
     return played, bool(over)
 
 
-class StartFrom(gymnasium.Wrapper[Any, Any, Any, Any]):
+class StartFrom(Wrapper):
     """Starts every episode in one of some macrostates, equally likely, that its seed decides."""
 
     def __init__(self, env: Env, starts: Sequence[State]) -> None:
         super().__init__(env)
         self._starts = tuple(starts)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
+    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
         """Start an episode, where ``options`` say so if they do."""
         if options is None:
             rng = np.random.default_rng(seed)
@@ -214,7 +238,7 @@ class StartFrom(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self.env.reset(seed=seed, options=options)
 
 
-class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
+class TrainingStarts(Wrapper):
     """Starts each training episode of a run where every agent of that seed starts it, whatever seed a loop asks for."""
 
     def __init__(self, env: Env, seed: int) -> None:
@@ -222,7 +246,7 @@ class TrainingStarts(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._seed = seed
         self._episode = 0
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
+    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
         """Start the next training episode; ``seed`` changes nothing."""
         start = episode_seed("training", self._seed, self._episode)
         self._episode += 1

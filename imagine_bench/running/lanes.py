@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 
 from imagine_bench import registry
+from imagine_bench.arrays import Info, Observed
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import Agent, Observation
 from imagine_bench.interfaces.capabilities import EpisodeRememberer
@@ -62,7 +63,7 @@ def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -
     following = 0
     actions = dict[int, int]()
 
-    def act(lane: int, frame: Any, info: dict[str, Any]) -> None:
+    def act(lane: int, frame: Observed, info: Info) -> None:
         actions[lane] = int(agent.act(Observation.of(frame, info, privileged=privileged), explore=False))
         lanes.send([actions[lane]], [lane])
 
@@ -93,5 +94,5 @@ def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -
             following += 1
 
 
-def _row(infos: dict[str, Any], row: int) -> dict[str, Any]:
+def _row(infos: Info, row: int) -> dict[str, Any]:
     return {key: values[row] for key, values in infos.items() if not key.startswith("_")}

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 
+from imagine_bench.arrays import Info
+from imagine_bench.environments import Env
 from imagine_bench.interfaces import Observation
 from imagine_bench.interfaces.capabilities import (
     ExternalTrainer,
@@ -16,9 +18,7 @@ from imagine_bench.interfaces.capabilities import (
 )
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.running.evaluation import (
-    Env,
     EvaluationCounts,
-    Info,
     TrainingStarts,
     play,
     play_test_episode,

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.arrays import Info
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Rules, Transition
 from imagine_bench.interfaces.capabilities import ExternalTrainer, Label, QueryingAgent, TransferLearner
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.rules import optimal_actions, tabulate
-from imagine_bench.running.evaluation import Info
 
 
 def require_able(agent: object, name: str, protocol: Protocol) -> None:

@@ -9,20 +9,21 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.arrays import Action, Arrays, Info, Observed, State
 from imagine_bench.data.folder import read_dataset
+from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import OBSERVATIONS, Agent, AgentState
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
-from imagine_bench.running.evaluation import AsDict, Env, EvaluationCounts, Info, StartFrom
+from imagine_bench.running.evaluation import AsDict, EvaluationCounts, StartFrom
 from imagine_bench.running.queries import Teacher, demonstrator, require_able
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot, sweep_partial
@@ -64,7 +65,7 @@ class Counters:
         """Count a macro-action of the training episode that goes on."""
         self.tried.setdefault(" ".join(map(str, (*macrostate, action))), self.episode)
 
-    def training(self) -> dict[str, NDArray[Any]]:
+    def training(self) -> Arrays:
         """What ``training.npz`` holds.
 
         ``success``, ``length`` and ``queries`` of every training episode, shape (episodes,); ``starts`` of those that
@@ -90,7 +91,7 @@ class Counters:
         return unpack(cls, snapshot.values, snapshot.arrays)
 
 
-class CountVisits(gymnasium.Wrapper[Any, Any, Any, Any]):
+class CountVisits(Wrapper):
     """Counts where training episodes start and which macro-actions are tried where; the agent is told nothing."""
 
     def __init__(self, env: Env, counters: Counters) -> None:
@@ -98,14 +99,14 @@ class CountVisits(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._counters = counters
         self._at = list[int]()
 
-    def reset(self, **options: Any) -> tuple[Any, Info]:
+    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
         """As the environment's."""
-        seen, info = self.env.reset(**options)
+        seen, info = self.env.reset(seed=seed, options=options)
         self._at = np.asarray(info["macrostate"]).tolist()
         self._counters.starts.append(self._at)
         return seen, info
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, Info]:
+    def step(self, action: Action) -> tuple[Observed, SupportsFloat, bool, bool, Info]:
         """As the environment's."""
         after = self.env.step(action)
         self._counters.try_out(self._at, int(action))

@@ -10,7 +10,6 @@ import dataclasses
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
@@ -18,6 +17,7 @@ from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import Result, TaskType
 from imagine_bench.store.archive import load_archive
 from imagine_bench.store.bench_folder import is_archive, read_protocol_as, read_protocol_values
+from imagine_bench.values import Setting
 
 TASK_TYPES = {
     "control": "imagine_bench.running.control:CONTROL",
@@ -51,7 +51,7 @@ def field_names(kind: TaskType[ProtocolData]) -> set[str]:
     return {field.name for field in dataclasses.fields(kind.protocol)}
 
 
-def type_of(values: Mapping[str, Any]) -> TaskType[ProtocolData]:
+def type_of(values: Mapping[str, Setting]) -> TaskType[ProtocolData]:
     """Return the type of a protocol by its values, be the package of its task here or not.
 
     Raises ValueError: no type has protocols of such values.
@@ -96,7 +96,7 @@ def load_bench(folder: Path) -> Result:
     return result
 
 
-def require_options(task: str, options: Mapping[str, Any]) -> None:
+def require_options(task: str, options: Mapping[str, Setting]) -> None:
     """Raise InvalidValueError for an option that protocols of this task's type do not have."""
     names = field_names(task_type(task))
     for name in options:

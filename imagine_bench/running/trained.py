@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError
@@ -21,6 +20,7 @@ from imagine_bench.store.bench_folder import BenchStore, is_archive, read_contro
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.files import reading
 from imagine_bench.store.results import BenchResult, RunResult
+from imagine_bench.values import Setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,9 +153,9 @@ def _is_other(task: TaskSpec, protocol: Protocol, given: str, used: str) -> bool
     return found != used and found in (protocol.encoder, protocol.codes)
 
 
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(settings: Mapping[str, Setting], prefix: str = "") -> dict[str, Setting]:
     """Nested settings by dotted name."""
-    flat: dict[str, Any] = {}
+    flat: dict[str, Setting] = {}
     for name, value in settings.items():
         flat.update(_flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value})
     return flat

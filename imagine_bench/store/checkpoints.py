@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from imagine_bench.arrays import Array, Arrays
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.store.files import (
@@ -44,7 +44,7 @@ class Snapshot:
 
     episode: int  #: Training episodes done
     agent: AgentState  #: The agent's own state
-    arrays: Mapping[str, NDArray[Any]]  #: The runner's arrays
+    arrays: Mapping[str, Array]  #: The runner's arrays
     values: Mapping[str, Any]  #: The runner's JSON-serialisable values
 
 
@@ -142,11 +142,11 @@ def _remove(checkpoint: Path) -> None:
     shutil.rmtree(checkpoint.rename(checkpoint.with_name(f"{_PARTIAL}{checkpoint.name}")))
 
 
-def _packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+def _packed(arrays: Mapping[str, Array]) -> bytes:
     return save({name: np.asarray(array, order="C") for name, array in arrays.items()})
 
 
-def _unpacked(path: Path, digests: Mapping[str, str]) -> dict[str, NDArray[Any]]:
+def _unpacked(path: Path, digests: Mapping[str, str]) -> Arrays:
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -157,7 +157,7 @@ def _unpacked(path: Path, digests: Mapping[str, str]) -> dict[str, NDArray[Any]]
             "to start that run anew."
         )
     try:
-        arrays: dict[str, NDArray[Any]] = load(content)
+        arrays: Arrays = load(content)
     except SafetensorError as error:
         raise ArtefactError(f"{path} is not a safetensors file: {error}. It was left untouched.") from error
     return arrays

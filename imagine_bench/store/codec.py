@@ -16,12 +16,10 @@ from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
+from imagine_bench.arrays import Array, Arrays
 from imagine_bench.errors import ArtefactError
 from imagine_bench.store.files import csv_text, write_bytes
-
-Arrays = dict[str, NDArray[Any]]
 
 
 def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
@@ -49,7 +47,7 @@ def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
     return value, {}
 
 
-def unpack(kind: Any, values: Any, arrays: Mapping[str, NDArray[Any]], path: str = "") -> Any:
+def unpack(kind: Any, values: Any, arrays: Mapping[str, Array], path: str = "") -> Any:
     """Rebuild an object of type ``kind`` from what :func:`pack` gave; ``values`` is None if only arrays were kept.
 
     A field that files do not have takes its default.
@@ -81,7 +79,7 @@ def unpack(kind: Any, values: Any, arrays: Mapping[str, NDArray[Any]], path: str
     return values
 
 
-def _unpack_fields(kind: Any, values: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], path: str) -> Any:
+def _unpack_fields(kind: Any, values: Mapping[str, Any], arrays: Mapping[str, Array], path: str) -> Any:
     hints = get_type_hints(kind)
     found = {}
     for field in dataclasses.fields(kind):
@@ -97,19 +95,19 @@ def _join(path: str, name: str | int) -> str:
     return f"{path}/{name}" if path else str(name)
 
 
-def _has_arrays(arrays: Mapping[str, NDArray[Any]], path: str) -> bool:
+def _has_arrays(arrays: Mapping[str, Array], path: str) -> bool:
     """Whether an array lies at ``path`` or below it."""
     return (not path and bool(arrays)) or any(name == path or name.startswith(f"{path}/") for name in arrays)
 
 
-def _count(arrays: Mapping[str, NDArray[Any]], path: str) -> int:
+def _count(arrays: Mapping[str, Array], path: str) -> int:
     """How many parts of a sequence have arrays: one more than the largest index below ``path``."""
     prefix = f"{path}/" if path else ""
     below = (name.removeprefix(prefix) for name in arrays if name.startswith(prefix))
     return max((int(name.partition("/")[0]) + 1 for name in below), default=0)
 
 
-def grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
+def grouped(arrays: Mapping[str, Array]) -> dict[str, Arrays]:
     """Arrays by the first part of their slashed names."""
     groups: dict[str, Arrays] = {}
     for name, array in arrays.items():
@@ -118,7 +116,7 @@ def grouped(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
     return groups
 
 
-def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
     """Write named arrays, atomically. Raises SetupError: they cannot be written."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]

@@ -16,6 +16,7 @@ from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRoll
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.store.files import first_difference
+from imagine_bench.values import Setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +129,7 @@ class RunResult:
     agent: str  #: Registered agent
     seed: int  #: The run's seed
     checkpoints: tuple[Checkpoint, ...]  #: One a budget, in the protocol's order
-    settings: Mapping[str, Any]  #: The agent's settings as run
+    settings: Mapping[str, Setting]  #: The agent's settings as run
     training_success: NDArray[np.bool_]  #: Whether each training episode succeeded. Shape (episodes,).
     training_length: NDArray[np.int64]  #: Macro-actions of each training episode. Shape (episodes,).
     folder: Path  #: Where the run's files lie
@@ -164,7 +165,9 @@ def require_every_run(
             _require_same_settings(known, wanted_settings, where, settings)
 
 
-def _require_same_settings(known: Path, wanted: Mapping[str, Any], other: Path, given: Mapping[str, Any]) -> None:
+def _require_same_settings(
+    known: Path, wanted: Mapping[str, Setting], other: Path, given: Mapping[str, Setting]
+) -> None:
     difference = first_difference(wanted, given)
     if difference is not None:
         name, value, differs = difference

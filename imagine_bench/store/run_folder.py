@@ -17,11 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.registry.old_names import agent_label
 from imagine_bench.store.checkpoints import load_newest
-from imagine_bench.store.codec import Arrays, pack, read_arrays, table_rows, table_text, unpack, write_arrays
+from imagine_bench.store.codec import pack, read_arrays, table_rows, table_text, unpack, write_arrays
 from imagine_bench.store.files import first_difference, read_sealed, reading, sealed, sha256, write_bytes, write_json
 from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RunResult
 

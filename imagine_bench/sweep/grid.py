@@ -20,6 +20,7 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, re
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest, require_types
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
+from imagine_bench.values import Setting
 
 BASE = "base"
 """Name of the factor of a variant that others are compared with."""
@@ -40,7 +41,7 @@ class Variant:
     factor: str = BASE  #: The factor that it varies, :data:`BASE` for a reference
     agent: str  #: Registered agent
     against: str | None = None  #: Name of the variant whose success its own is compared with, or None
-    settings: Mapping[str, Any] = field(default_factory=dict)  #: Agent settings, by dotted name
+    settings: Mapping[str, Setting] = field(default_factory=dict)  #: Agent settings, by dotted name
     #: Fields of the protocol that differ from the study's: appearance, execution, physics, queries, ...
     world: Mapping[str, Any] = field(default_factory=dict)
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium
 
+from imagine_bench.environments import Env
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces import TaskSpec
 
@@ -20,6 +19,6 @@ def require(holds: bool, otherwise: str) -> None:
         raise InvalidValueError(otherwise)
 
 
-def make_env(spec: TaskSpec) -> gymnasium.Env[Any, Any]:
+def make_env(spec: TaskSpec) -> Env:
     """A task's environment as it is checked: kinematic where it can be, clean."""
     return gymnasium.make(spec.env_id, execution=spec.executions[-1], appearance="clean", disable_env_checker=True)

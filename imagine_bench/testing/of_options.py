@@ -22,6 +22,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.data.folder import write_dataset
+from imagine_bench.environments import Env
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentState, Observation, Transition
 from imagine_bench.interfaces.capabilities import ExternalTrainer, begin_episode
@@ -30,7 +31,7 @@ from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.running import phases
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.control import plan_control
-from imagine_bench.running.evaluation import Env, play
+from imagine_bench.running.evaluation import play
 from imagine_bench.running.run_state import Counters, Run, make_env
 from imagine_bench.store import encoders
 from imagine_bench.testing.common import NotOffered, require

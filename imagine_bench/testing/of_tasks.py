@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from contextlib import closing
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.utils.env_checker import check_env
 
+from imagine_bench.environments import Env
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.rules import facts, states_of
 from imagine_bench.testing.common import NotOffered, make_env, require
@@ -66,7 +66,7 @@ def _steps(spec: TaskSpec) -> None:
             over = terminated or truncated
 
 
-def _episode(env: gymnasium.Env[Any, Any], seed: int) -> list[Any]:
+def _episode(env: Env, seed: int) -> list[Any]:
     rng = np.random.default_rng(seed)
     found: list[Any] = [env.reset(seed=seed)[0]]
     over = False

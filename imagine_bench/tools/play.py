@@ -8,13 +8,14 @@ import warnings
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, SupportsFloat, cast
 
 import gymnasium
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from imagine_bench import registry
+from imagine_bench.arrays import Action, Info, State
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
@@ -27,9 +28,10 @@ _FPS, _HOLD = 25, 50
 """Images a second, and those for which the end of an episode stands still."""
 _WIDTH, _HEIGHT, _PANEL, _FRAME, _TOP = 640, 480, 284, 192, 36
 """Pixels: the scene, the width of a panel beside it, the edge of a frame in that, and where it begins."""
+_Step = tuple[Frame, SupportsFloat, bool, bool, Info]
 
 
-class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
+class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
     """A task for ``gymnasium.utils.play``: a step is one image of a window.
 
     Action ``A`` waits and lets go of the key; one that stays down acts once. While a macro-action is shown, steps
@@ -39,7 +41,7 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     render_mode = "rgb_array"
 
-    def __init__(self, env: gymnasium.Env[Any, Any], task: TaskSpec, imaginer: Imaginer | None, seed: int) -> None:
+    def __init__(self, env: gymnasium.Env[Frame, Action], task: TaskSpec, imaginer: Imaginer | None, seed: int) -> None:
         super().__init__(env)
         self.action_space = gymnasium.spaces.Discrete(task.n_actions + 1)
         self._task, self._imaginer, self._seed = task, imaginer, seed
@@ -48,17 +50,17 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._scene.capture_motion_hz = float(_FPS)
         self.episodes = self.solved = self.foreseen = self.imagined = 0
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Frame, Info]:
         """Begin an episode; only the first one is seeded, or all would begin alike."""
         self._frame, self._info = self.env.reset(seed=self._reset_seed, options=options)
         self._reset_seed, self._start, self._actions = None, self._frame, list[int]()
         self._rollout: ImaginedRollout | None = None
-        self._due: tuple[Any, Any, bool, bool, dict[str, Any]] | None = None
+        self._due: _Step | None = None
         self._said, self._released = "press a key", False
         self._images, self._image = iter(list[Frame]()), self._window()
         return self._frame, self._info
 
-    def step(self, action: int) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> _Step:
         """Show one more image, else return what came of a macro-action, else wait or carry one out."""
         waits = action == self._task.n_actions
         self._released |= waits
@@ -96,7 +98,9 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._due = self.env.step(action)
         self._images = self._showing(*self._due)
 
-    def _showing(self, frame: Frame, reward: Any, terminated: bool, truncated: bool, info: Any) -> Iterator[Frame]:
+    def _showing(
+        self, frame: Frame, reward: SupportsFloat, terminated: bool, truncated: bool, info: Info
+    ) -> Iterator[Frame]:
         """Images of a macro-action, each drawn when it is due, and of what came of it."""
         for _ in getattr(self._scene, "replay", tuple)():
             yield self._window()
@@ -105,10 +109,10 @@ class KeyboardGame(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.solved += bool(info["is_success"])
         if self._rollout is not None:
             self.imagined += 1
-            shown = self._task.as_observed(info.get("shown", info["macrostate"]))
+            shown = self._task.as_observed(info["shown"] if "shown" in info else info["macrostate"])
             self.foreseen += tuple(self._rollout.macrostates[-1].tolist()) == shown
         end = "solved" if info["is_success"] else "an illegal end" if terminated else "out of time" if truncated else ""
-        self._said += f"\nreward {reward:+g}" + f", {end}" * bool(end) + ", a fault" * bool(info["fault"])
+        self._said += f"\nreward {float(reward):+g}" + f", {end}" * bool(end) + ", a fault" * bool(info["fault"])
         yield from [self._window()] * (_HOLD if end else 1)
 
     def _window(self) -> Frame:
@@ -176,7 +180,7 @@ def play(
     if "matplotlib" in sys.modules:
         sys.modules["matplotlib"].use("agg")
     env = gymnasium.make(spec.env_id, disable_env_checker=True, **chosen)
-    keys = dict(zip(KEYS, range(spec.n_actions), strict=False))
+    keys: dict[str, Action] = dict(zip(KEYS, range(spec.n_actions), strict=False))
     with closing(KeyboardGame(env, spec, imaginer, seed)) as game:
         keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)
     return game.summary()

@@ -7,11 +7,11 @@ MuJoCo. Importing this module is cheap: MuJoCo loads with the first movement.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import SCORES, Predict, RegressionData, RegressionSpec
@@ -138,7 +138,7 @@ def missed(points_m: Floats, joints_rad: Floats) -> Floats:
     return np.linalg.norm(arm().execute(joints_rad) - points_m, axis=-1)
 
 
-def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dict[str, NDArray[Any]]:
+def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arrays:
     """The decisions of table 4.1 and the maps of figures 4.2 and 4.3.
 
     Returns:
@@ -160,7 +160,7 @@ def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> dic
     return {**measured, "babbling": training(variant, seeds[0].child("data").generator()).inputs}
 
 
-def _decide(points_m: Floats, predict: Predict, purpose: str) -> dict[str, NDArray[Any]]:
+def _decide(points_m: Floats, predict: Predict, purpose: str) -> Arrays:
     """Candidates (E, DECISIONS CANDIDATES, 2): how far each would be missed, and what every score says of it."""
     shape = (len(points_m), DECISIONS, CANDIDATES)
     said = predict(points_m, purpose)
@@ -179,7 +179,7 @@ def _mink_errors(points_m: Floats, seeds: tuple[SeedTree, ...]) -> Floats:
     return np.stack([missed(*pair) for pair in zip(first, solved, strict=True)])
 
 
-def _map(variant: str, predict: Predict, networks: int) -> dict[str, NDArray[Any]]:
+def _map(variant: str, predict: Predict, networks: int) -> Arrays:
     side = np.linspace(-MARGIN_M, MARGIN_M, GRID)
     points = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     outside_m = distance_to_workspace(points)

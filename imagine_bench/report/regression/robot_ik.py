@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imagine_bench import reference, statistics
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces.regression import SCORES
 from imagine_bench.regression.results import Pair, RegressionResult, Values
 from imagine_bench.report.figures import image
 from imagine_bench.report.tables import DASH, Image, Section, Table, mean_std
-from imagine_bench.store.codec import Arrays
 
 _INTERVALS = "In brackets: 95 % interval over networks (Fieller). Below 1 a criterion beats chance."
 _HINDSIGHT = ("min", "max", "random")

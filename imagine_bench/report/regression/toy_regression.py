@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.regression.results import Pair, RegressionResult, Values
 from imagine_bench.report.figures import image
 from imagine_bench.report.tables import Image, Section, Table, number
-from imagine_bench.store.codec import Arrays
 
 _EDGE = 30.0
 """Where the data ends; beyond, networks extrapolate."""

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.protocols.data import digest
-from imagine_bench.store.codec import Arrays, read_arrays, table_rows, table_text, write_arrays
+from imagine_bench.store.codec import read_arrays, table_rows, table_text, write_arrays
 from imagine_bench.store.files import sealed, sha256
 
 Forge = Callable[[Path, np.random.Generator], None]

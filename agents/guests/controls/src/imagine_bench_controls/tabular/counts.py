@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from imagine_bench.agents.snapshot import Arrays
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import Floats
 
 Row = tuple[int, int, int, float, bool]

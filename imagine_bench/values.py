@@ -1,0 +1,11 @@
+"""The values that settings and JSON files hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+Scalar = bool | int | float | str | None
+Setting = Scalar | tuple[Scalar, ...] | list[Scalar] | dict[str, Scalar]
+"""The value of an agent's setting, as JSON has it."""
+Json = Scalar | Sequence["Json"] | Mapping[str, "Json"]
+"""A value that a JSON file can hold."""
