@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Arrays, Info, Observed, State
+from imagine_bench.arrays import Arrays, Info, Observed
 from imagine_bench.environments import Lanes
 
 from .lanes import endings, vector_env
@@ -46,7 +46,7 @@ class FinalObservation(VectorWrapper):
         self._returns, self._lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
         self._begun_s = np.zeros(env.num_envs)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
+    def reset(self, *, seed: int | None = None, options: Arrays | None = None) -> tuple[Observed, Info]:
         """Begin an episode in every lane, or in those of ``options["reset_mask"]``."""
         fresh = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
         first = self.env.reset(seed=seed, options=options)

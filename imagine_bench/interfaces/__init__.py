@@ -7,6 +7,7 @@ interfaces alone. Shapes: ``H = W = 64`` pixels, ``A`` macro-actions, ``M`` coor
 from imagine_bench.appearance import APPEARANCES as APPEARANCES
 from imagine_bench.appearance import HELD_OUT as HELD_OUT
 from imagine_bench.appearance import appearance_of_tests as appearance_of_tests
+from imagine_bench.arrays import Arrays as Arrays
 from imagine_bench.arrays import Floats as Floats
 from imagine_bench.arrays import Frame as Frame
 from imagine_bench.arrays import Macrostate as Macrostate

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Arrays
-from imagine_bench.interfaces import Floats
+from imagine_bench.interfaces import Arrays, Floats
 
 Row = tuple[int, int, int, float, bool]
 """State, action, following state, reward, and whether the episode ended there."""
