@@ -58,7 +58,18 @@ FOLDERS = (
     PACKAGE,
 )
 """Every folder, from the ground up: a file may import from its own folder and from those that stand before it."""
-GROUND = {"arrays", "assets", "appearance", "environments", "errors", "interfaces", "values", "preprocessing", "rules", "seeding"}
+GROUND = {
+    "arrays",
+    "assets",
+    "appearance",
+    "environments",
+    "errors",
+    "interfaces",
+    "values",
+    "preprocessing",
+    "rules",
+    "seeding",
+}
 """The parts of imagine_bench that tasks and agents may import; they never import each other."""
 _HEAVY = {
     "torch": "agents",
