@@ -22,7 +22,7 @@ _EXPECTED = 0.9
 """A transition held less probable than this is unexpected, as is any that would still be explored."""
 
 
-class Perception(Protocol):
+class FactorReader(Protocol):
     """Frames to codes; ``sizes`` are the numbers of values of the P factors."""
 
     @property
@@ -33,7 +33,7 @@ class Perception(Protocol):
         """The code of a frame (64, 64, 3)."""
 
 
-PerceptionT = TypeVar("PerceptionT", bound=Perception)
+PerceptionT = TypeVar("PerceptionT", bound=FactorReader)
 
 
 class CodeAgent(Generic[PerceptionT]):

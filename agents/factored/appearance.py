@@ -84,7 +84,7 @@ class Part(NamedTuple):
         return self.values[apart.argmin(axis=1)], apart.min(axis=1) <= self.reach
 
 
-class Factor(NamedTuple):
+class SeenFactor(NamedTuple):
     """One factor: regions that do not vary freely, and the joint values that were seen. Shape (K, parts)."""
 
     parts: tuple[Part, ...]
@@ -98,7 +98,7 @@ class Factor(NamedTuple):
         return wrong.argmin(axis=1), known.all(axis=1) & (wrong.min(axis=1) == 0)
 
 
-def read(factors: list[Factor], frames: Frame) -> tuple[Codes, Mask]:
+def read(factors: list[SeenFactor], frames: Frame) -> tuple[Codes, Mask]:
     """Codes (N, P) of frames (N, 64, 64, 3), and whether each value is known, (N, P)."""
     images = relative(frames)
     shapes = contours(images)
@@ -108,7 +108,7 @@ def read(factors: list[Factor], frames: Frame) -> tuple[Codes, Mask]:
     return np.stack([value for value, _ in pairs], axis=1), np.stack([known for _, known in pairs], axis=1)
 
 
-def find(frames: Frame, begins: Mask | None = None, actions: NDArray[np.int64] | None = None) -> list[Factor]:
+def find(frames: Frame, begins: Mask | None = None, actions: NDArray[np.int64] | None = None) -> list[SeenFactor]:
     """The factors of frames (N, 64, 64, 3) in the order in which they were seen; none where nothing changes.
 
     ``begins``: which are the first of an episode, (N,); none if not given. ``actions``: which led from each frame to
@@ -125,7 +125,7 @@ def find(frames: Frame, begins: Mask | None = None, actions: NDArray[np.int64] |
         one, other = pair
         (parts_1, joint_1), (parts_2, joint_2) = factors[one], factors.pop(other)
         factors[one] = ((*parts_1, *parts_2), np.concatenate([joint_1, joint_2], axis=1))
-    return [Factor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
+    return [SeenFactor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
 
 
 def _parts(

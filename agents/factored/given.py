@@ -15,7 +15,7 @@ from ..encoders.perception import prepare_torch
 from .agent import CodeAgent
 from .exploration import last_step, query
 from .factors import Code, CodeTransition
-from .perception import CodePerception, ImaginedStep, load_code_perception
+from .perception import CodePerception, ImaginedCode, load_code_perception
 from .settings import HYPERPARAMETERS
 
 _TERMINAL = 0.5
@@ -51,7 +51,7 @@ class GivenPerceptionAgent(CodeAgent[CodePerception]):
         """
         planned = planned_actions(actions, depth, self.n_actions)
         start = code = self.perception.code(frame)
-        steps: list[ImaginedStep] = []
+        steps: list[ImaginedCode] = []
         for index in range(depth if planned is None else len(planned)):
             steps.append(self._imagined(code, None if planned is None else planned[index], rng))
             if planned is None and steps[-1].p_terminated > _TERMINAL:
@@ -59,15 +59,15 @@ class GivenPerceptionAgent(CodeAgent[CodePerception]):
             code = steps[-1].code
         return self.perception.rollout(start, steps)
 
-    def _imagined(self, code: Code, action: int | None, rng: np.random.Generator) -> ImaginedStep:
+    def _imagined(self, code: Code, action: int | None, rng: np.random.Generator) -> ImaginedCode:
         """One imagined step of ``action``, or of the greedy one."""
         values = self._values(code)
         chosen = int(values.argmax()) if action is None else action
         if not self._ready:
-            return ImaginedStep(chosen, code, reward=0.0, p_terminated=0.0, values=values, unknown=1.0, p_other=0.0)
+            return ImaginedCode(chosen, code, reward=0.0, p_terminated=0.0, values=values, unknown=1.0, p_other=0.0)
         following, p_likeliest = self.model.sample(code, chosen, rng)
         reward, p_terminated, unknown = (float(each[chosen]) for each in self.planner.outcome(code))
-        return ImaginedStep(chosen, following, reward, p_terminated, values, unknown, 1.0 - p_likeliest)
+        return ImaginedCode(chosen, following, reward, p_terminated, values, unknown, 1.0 - p_likeliest)
 
     def read_frames(self, frames: Frame) -> NDArray[np.int64]:
         """What a probe reads; see :class:`.capabilities.FrameReader`."""

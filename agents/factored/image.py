@@ -19,7 +19,7 @@ _COLORS = np.array(
 """Told apart by the colour-blind (Okabe and Ito 2008)."""
 
 
-def image(found: Sequence[appearance.Factor], frames: Frame) -> NDArray[np.uint8]:
+def image(found: Sequence[appearance.SeenFactor], frames: Frame) -> NDArray[np.uint8]:
     """Factors that were found in ``frames`` (N, 64, 64, 3). Shape (320, 832, 3) or, of many factors, higher."""
     gray = np.repeat(frames.mean(axis=(0, 3))[..., None], 3, axis=2)
     rows = max(_SCALE * 64, (min(len(found), len(_COLORS)) * (_CELL_PX + _GAP_PX)))

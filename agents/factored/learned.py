@@ -82,7 +82,7 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
         if transition.terminated or transition.truncated:
             self.begin_episode()
 
-    def _recode(self, found: list[appearance.Factor], found_in: int) -> None:
+    def _recode(self, found: list[appearance.SeenFactor], found_in: int) -> None:
         """Give every replayed transition the codes that its frames have now, and learn from all of them once more.
 
         What was ``found`` before is kept where outcomes contradict what is found now and did not contradict that.

@@ -32,7 +32,7 @@ class LearnedPerception:
         """Whether each of these is the first of an episode."""
         self.actions: list[int] = []
         """The macro-action of each."""
-        self.found: list[appearance.Factor] = []
+        self.found: list[appearance.SeenFactor] = []
         self.memory: Memory | None = None
         self.found_in = self.looked_at = 0
         """In how many of the first frames factors were found, and looked for."""
@@ -127,7 +127,7 @@ class LearnedPerception:
                 actions[before] = action
         return np.stack(self.frames[:count]), begins, actions
 
-    def take(self, found: list[appearance.Factor], found_in: int) -> None:
+    def take(self, found: list[appearance.SeenFactor], found_in: int) -> None:
         """See these factors from now on."""
         self.found, self.found_in, self.memory = found, found_in, None
         self._recent.clear()

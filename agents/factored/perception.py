@@ -23,7 +23,7 @@ ACCEPTED = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class ImaginedStep:
+class ImaginedCode:
     """One imagined transition to ``code``, with expected reward and the probability that the episode ends."""
 
     action: int
@@ -72,7 +72,7 @@ class CodePerception:
         """What the evaluation's probe reads from N codes; the agent must not use it. Shape (N, M)."""
         return self._encoder.read_macrostate(self._latents(codes))
 
-    def rollout(self, start: Code, steps: Sequence[ImaginedStep]) -> ImaginedRollout:
+    def rollout(self, start: Code, steps: Sequence[ImaginedCode]) -> ImaginedRollout:
         """The rollout that bench and recordings show: codes decoded to images, and read by the evaluation's probe."""
         codes = [start, *(step.code for step in steps)]
         frames = self._encoder.decode(self._latents(codes))

@@ -18,7 +18,7 @@ from imagine_bench.interfaces import Floats
 
 from .factors import Code
 from .model import FactoredModel
-from .predictions import Predictions, Rows
+from .predictions import PredictedTransitions, Rows
 from .settings import PlanningSettings
 
 _KEPT = 20
@@ -45,7 +45,7 @@ class Planner:
 
     def _forget(self) -> None:
         """Drop every prediction."""
-        self._predictions = Predictions(self._model, self._settings.branches)
+        self._predictions = PredictedTransitions(self._model, self._settings.branches)
         self.learned(())
 
     def learned(self, actions: Iterable[int]) -> None:

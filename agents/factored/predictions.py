@@ -21,7 +21,7 @@ _HAPPENS = 1e-3
 """Branches in which the episode goes on less probably than this are not followed."""
 
 
-class Predictions:
+class PredictedTransitions:
     """Codes that were met, numbered in rows, and what every action would lead to from those that were asked about.
 
     Attributes:

@@ -14,7 +14,7 @@ from imagine_bench.interfaces.model import Imagined
 from imagine_bench.rules import Outcomes, outcomes_by_depth
 
 
-class Renderer(Protocol):
+class MacrostateRenderer(Protocol):
     """Frames of macrostates that the judge rendered."""
 
     def frame(self, state: State) -> Frame:
@@ -47,7 +47,7 @@ class Copy:
 class Exact:
     """The rules, and a rendered frame of each outcome; it knows what each frame of the judge shows."""
 
-    def __init__(self, spec: TaskSpec, renderer: Renderer) -> None:
+    def __init__(self, spec: TaskSpec, renderer: MacrostateRenderer) -> None:
         self._rules = spec.rules
         self.renderer = renderer
 
@@ -94,6 +94,6 @@ def make_copy(context: AgentContext) -> Copy:
     return Copy()
 
 
-def make_exact(spec: TaskSpec, renderer: Renderer) -> Exact:
+def make_exact(spec: TaskSpec, renderer: MacrostateRenderer) -> Exact:
     """The rules and the renderer."""
     return Exact(spec, renderer)

@@ -226,7 +226,7 @@ def test_what_was_seen_is_kept_where_outcomes_contradict_what_is_seen_anew(
     assert learner.perception.sizes == (3, 3, 2)
     found, find = [], own.appearance.find
 
-    def blind(frames: Frame, begins: NDArray[np.bool_], actions: NDArray[np.int64]) -> list[own.appearance.Factor]:
+    def blind(frames: Frame, begins: NDArray[np.bool_], actions: NDArray[np.int64]) -> list[own.appearance.SeenFactor]:
         found.append(len(frames))
         return [factor for factor in find(frames, begins, actions) if len(factor.joint) == 3]
 
