@@ -10,7 +10,6 @@ import importlib
 import math
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from imagine_bench.seeding import SeedTree
 from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe
 from .network import EncoderNetwork
 from .perception import prepare_torch
-from .probe import Latents, accuracy, train_probe
+from .probe import Latents, Probe, accuracy, train_probe
 from .recipes import Recipe
 from .training import classes_of, draw_frames
 
@@ -87,7 +86,7 @@ class OfferedNetwork(EncoderNetwork):
 class OfferedEncoder(Encoder):
     """An encoder whose network sees frames as they are."""
 
-    def __init__(self, network: EncoderNetwork, probe: Any, card: EncoderCard, device: str = "cpu") -> None:
+    def __init__(self, network: EncoderNetwork, probe: Probe, card: EncoderCard, device: str = "cpu") -> None:
         super().__init__(network, probe, card, device)
         self._preprocess = np.asarray
 
@@ -106,8 +105,13 @@ def fit_offered(spec: TaskSpec, *, name: str, offer: str, appearance: str, path:
     """
     begun_s = time.process_time()
     prepare_torch("cpu")
-    size: dict[str, Any] = {"frames": _FRAMES, "held_out_frames": _FRAMES // 4, "probe_steps": _PROBE_STEPS}
-    recipe = Recipe(name=name, architecture="offered", **size)
+    recipe = Recipe(
+        name=name,
+        architecture="offered",
+        frames=_FRAMES,
+        held_out_frames=_FRAMES // 4,
+        probe_steps=_PROBE_STEPS,
+    )
     seeds = SeedTree(0).child("encoder_training", spec.id, appearance)
     rng = seeds.generator()
     generator = torch.Generator().manual_seed(seeds.child("torch").integer())

@@ -33,7 +33,7 @@ from .network import EncoderNetwork
 from .perception import prepare_torch
 from .probe import Latents, Probe, accuracy, train_probe
 from .recipes import RECIPES, Recipe, recipe_named
-from .unfinished import Unfinished
+from .unfinished import Kept, Unfinished
 from .vae import MlpVae, Vae
 
 Progress = Callable[[str, float], None]
@@ -138,7 +138,7 @@ def train_vae(
         optimiser.load_state_dict(kept["optimiser"])
         generator.set_state(kept["generator"])
 
-    def so_far(step: int, order: Tensor) -> dict[str, Any]:
+    def so_far(step: int, order: Tensor) -> Kept:
         made = {"vae": vae.state_dict(), "optimiser": optimiser.state_dict(), "generator": generator.get_state()}
         return {"step": step, "order": order, "cpu_s": time.process_time() - begun_s, **made}
 

@@ -13,6 +13,8 @@ import torch
 
 from imagine_bench.errors import ArtefactError
 
+Kept = dict[str, Any]
+"""Numbers, tensors and states of optimisers, as torch saves them."""
 _SAVE_EVERY_S = 60.0
 
 
@@ -24,7 +26,7 @@ class Unfinished:
         self._what = what
         self._saved_s = time.monotonic()
 
-    def load(self) -> dict[str, Any] | None:
+    def load(self) -> Kept | None:
         """What was kept, or None. Raises ArtefactError: damaged or of another training; the file is left untouched."""
         if not self._path.exists():
             return None
@@ -36,7 +38,7 @@ class Unfinished:
             raise ArtefactError(f"{self._path} is of another training; remove it or choose another folder.")
         return dict(kept)
 
-    def save(self, kept: Callable[[], dict[str, Any]]) -> None:
+    def save(self, kept: Callable[[], Kept]) -> None:
         """Keep numbers and tensors, whole or not at all; nothing within a minute of the last time, nor asked for."""
         if time.monotonic() - self._saved_s < _SAVE_EVERY_S:
             return

@@ -80,7 +80,8 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
     ) -> tuple[Latents, dict[str, Any]]:
         """Begin N episodes; the first observations (N, Z), and no info. No options are known."""
         super().reset(seed=seed)
-        self._z, self._steps[:] = self._draw_starts(self.num_envs), 0
+        self._z = self._draw_starts(self.num_envs)
+        self._steps[:] = 0
         self._gathered.zero_()
         return self._z.copy(), {}
 
@@ -98,9 +99,8 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         generator = self._generator
         imagination = self.imagination
         generator.manual_seed(int(self.np_random.integers(2**63)))
-        z, action = (
-            torch.tensor(values, device=generator.device) for values in (self._z, np.asarray(actions, np.int64))
-        )
+        z = torch.tensor(self._z, device=generator.device)
+        action = torch.tensor(np.asarray(actions, np.int64), device=generator.device)
         step = imagination.step(z, action, imagination.draw_weights(generator), generator)
         accepted = imagination.keeps(step, self._gathered).cpu().numpy()
         self._gathered = imagination.gathered_with(step, self._gathered)
@@ -111,7 +111,8 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         truncated = ~terminated & (~accepted | (self._steps >= self.horizon))
         ended = terminated | truncated
         info = self._info(step, accepted, reached, ended)
-        reached[ended], self._steps[ended] = self._draw_starts(int(ended.sum())), 0
+        reached[ended] = self._draw_starts(int(ended.sum()))
+        self._steps[ended] = 0
         self._gathered[torch.from_numpy(ended)] = 0.0
         self._z = reached
         return self._z.copy(), reward, terminated, truncated, info

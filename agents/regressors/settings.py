@@ -125,9 +125,8 @@ def _ensemble_epochs(epochs: int) -> int:
 
 
 def _of_ensemble(changes: Mapping[str, Override]) -> dict[str, Override]:
-    epochs = changes["epochs"].value if "epochs" in changes else 3000
-    assert isinstance(epochs, int)
-    fewer = Override(_ensemble_epochs(epochs), "five members together must not cost more than one network")
+    of_one = kinds.replaced(RegressorSettings(), {name: change.value for name, change in changes.items()})
+    fewer = Override(_ensemble_epochs(of_one.epochs), "five members together must not cost more than one network")
     return {**changes, **_ENSEMBLE, "epochs": fewer}
 
 
