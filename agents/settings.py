@@ -138,7 +138,7 @@ def replaced(settings: S, values: Mapping[str, Setting]) -> S:
         section, _, inner = name.rpartition(".")
         (sections.setdefault(section, {}) if section else own)[inner] = value
     own |= {section: replaced(getattr(settings, section), inner) for section, inner in sections.items()}
-    return replace(settings, **own)  # type: ignore[type-var]
+    return replace(settings, **own)
 
 
 def checked(settings: DataclassInstance, values: Mapping[str, Setting]) -> dict[str, Setting]:

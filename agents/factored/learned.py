@@ -13,6 +13,7 @@ from itertools import compress
 
 import numpy as np
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
 from imagine_bench.interfaces.capabilities import Perceived
 
@@ -148,7 +149,7 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
 
 def _flat(state: AgentState) -> AgentState:
     """A snapshot whose codes are in one row: how many factors they are of changes as it learns."""
-    codes: snapshot.Arrays = {
+    codes: Arrays = {
         name: state.arrays[name].ravel() for name in ("replay/code", "replay/following") if name in state.arrays
     }
     return AgentState(arrays={**state.arrays, **codes}, values=state.values)

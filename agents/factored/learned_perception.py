@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import AgentState, Frame
 
-from .. import snapshot
 from . import appearance
 from .factors import Code, Memory
 from .settings import LearnedPerceptionSettings
@@ -132,7 +132,7 @@ class LearnedPerception:
         self.found, self.found_in, self.memory = found, found_in, None
         self._recent.clear()
 
-    def arrays(self) -> snapshot.Arrays:
+    def arrays(self) -> Arrays:
         """The frames that it remembers, and which are those of each transition."""
         seen = np.stack(self.frames) if self.frames else np.zeros((0, 64, 64, 3), dtype=np.uint8)
         pairs: NDArray[np.int64] = np.array(self.transitions, dtype=np.int64).reshape(-1, 2)

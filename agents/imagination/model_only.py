@@ -13,6 +13,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import AgentState, Transition
 from imagine_bench.seeding import SeedTree
 
@@ -107,7 +108,7 @@ class ModelOnlyTraining:
             "imagined": self._memory.added,
         }
 
-    def arrays(self) -> snapshot.Arrays:
+    def arrays(self) -> Arrays:
         """Copies of weights, moments, target network, memory and generator."""
         return {
             **snapshot.prefixed("controller", snapshot.training_arrays(self.controller, self.controller.optimiser)),
@@ -115,7 +116,7 @@ class ModelOnlyTraining:
             "generator": snapshot.generator_array(self._generator),
         }
 
-    def load(self, arrays: snapshot.Arrays, values: dict[str, int]) -> None:
+    def load(self, arrays: Arrays, values: dict[str, int]) -> None:
         """Take up the results of :meth:`arrays` and :meth:`values`."""
         self.begin(values["real_step"])
         self.episodes = values["episodes"]

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
 
@@ -250,7 +251,7 @@ class Imagination:
         explores = torch.rand(greedy.shape, generator=generator, device=generator.device) < epsilon
         return torch.where(explores, random, greedy)
 
-    def arrays(self) -> snapshot.Arrays:
+    def arrays(self) -> Arrays:
         """Copies of weights, moments, memory and generators."""
         generators = {name: snapshot.generator_array(generator) for name, generator in self.generators.items()}
         return {
@@ -260,7 +261,7 @@ class Imagination:
             "threshold": np.array(self.filter.threshold),
         }
 
-    def load(self, arrays: snapshot.Arrays, added: int) -> None:
+    def load(self, arrays: Arrays, added: int) -> None:
         """Take up the result of :meth:`arrays` and the number of transitions ever imagined."""
         snapshot.load_training(self.model, self.model.optimiser, snapshot.below("model", arrays))
         self.memory.load(snapshot.below("memory", arrays), added)

@@ -7,10 +7,10 @@ found anew, it counts all remembered transitions once more by the codes that the
 from __future__ import annotations
 
 import numpy as np
-from imagine_bench.agents import snapshot
 from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.factored.learned_perception import LearnedPerception
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
@@ -59,12 +59,12 @@ class OwnCountTableAgent(CountTableAgent):
     def state(self) -> AgentState:
         """A snapshot: also the frames that it remembers."""
         common = super().state()
-        happened: snapshot.Arrays = {
+        happened: Arrays = {
             "replay/action": np.array(self.eyes.actions, dtype=np.int64),
             "replay/reward": np.array([reward for reward, _ in self._happened], dtype=np.float64),
             "replay/terminated": np.array([ended for _, ended in self._happened], dtype=np.bool_),
         }
-        arrays: snapshot.Arrays = {**common.arrays, **self.eyes.arrays(), **happened}
+        arrays: Arrays = {**common.arrays, **self.eyes.arrays(), **happened}
         return AgentState(arrays=arrays, values={**common.values, **self.eyes.values()})
 
     def restore(self, state: AgentState) -> None:
