@@ -101,8 +101,8 @@ class CodeAgent(Generic[PerceptionT]):
             code = self.perception.code(transition.observation.frame)
             following = self.perception.code(transition.next_observation.frame)
             row = CodeTransition(code, transition.action, following, transition.reward, transition.terminated)
-            probability, unknown = self.model.probability(row)
-            unexpected = probability < _EXPECTED or unknown > self.settings.planning.exploration_threshold
+            (probability,), (unknown,) = self.model.probabilities([row])
+            unexpected = bool(probability < _EXPECTED or unknown > self.settings.planning.exploration_threshold)
             self.replay.add(row)
             if unexpected:
                 self.learn()

@@ -12,7 +12,6 @@ Or a factor changes by itself, in the same way whatever the action.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,32 +44,23 @@ class FactorPrediction:
     unknown: Floats  #: weight of the prior in ``expected``; 0 where it is negligible. Shape (N, A).
 
 
-@dataclass(frozen=True, slots=True)
-class _Counted:
-    """What was counted for n codes of T tables that matter."""
-
-    codes: slice
-    own: tuple[NDArray[np.int64], slice, NDArray[np.int64]]  #: where an array (n, A, K) has the value that they have
-    apart: Floats  #: weight of each table. Shape (T, A).
-    alike: Floats  #: the same if its rows are alike
-    counts: Floats  #: of next values. Shape (n, T, A, K).
-    total: Floats  #: sums of them. Shape (n, T, A).
-    moved: Floats  #: the same without the value that a code has
-
-
 class FactorDynamics:
     """How one factor changes; ``sizes`` are the numbers of values of every factor."""
 
     def __init__(self, factor: int, sizes: tuple[int, ...], n_actions: int, settings: DynamicsSettings) -> None:
-        self.factor, self.values, self.settings = factor, sizes[factor], settings
-        self._pseudo, self._others = settings.concentration * self.values, max(1, self.values - 1)
+        self.factor = factor
+        self.values = sizes[factor]
+        self.settings = settings
+        self._pseudo = settings.concentration * self.values
+        self._others = max(1, self.values - 1)
         others = [other for other in range(len(sizes)) if other != factor]
         sets = [(factor, *more) for size in range(settings.parents) for more in itertools.combinations(others, size)]
         sets = [parents for parents in sets if table_size(parents, sizes) <= _LARGEST_TABLE] or [(factor,)]
         self.parents = sets
         """Of each Dirichlet table the factors that the next value depends on."""
         rows = [table_size(parents, sizes) for parents in sets]
-        self._first, self._strides = np.cumsum(rows) - rows, np.zeros((len(sizes), len(sets)))
+        self._first = np.cumsum(rows) - rows
+        self._strides = np.zeros((len(sizes), len(sets)))
         for index, parents in enumerate(sets):
             self._strides[list(parents), index] = strides(parents, sizes)
         self.counts = np.zeros((sum(rows), n_actions, self.values))
@@ -87,7 +77,8 @@ class FactorDynamics:
         self.evidence = np.tile(np.log([settings.persistence, by_itself, *both]), (n_actions, 1))
         """Log prior plus log evidence that the action leaves the factor alone, that it changes by itself, then of each
         table, then of each whose rows are alike. Shape (A, 2 + 2T)."""
-        self.tried, self.stayed = np.zeros(n_actions), np.zeros(n_actions)
+        self.tried = np.zeros(n_actions)
+        self.stayed = np.zeros(n_actions)
         """How often each action was tried, and left the factor at its value. Shape (A,)."""
         self.fails = settings.fails
         """How often any action that changes the factor is expected to leave it at its value."""
@@ -97,11 +88,17 @@ class FactorDynamics:
 
     def add(self, code: Codes, action: int, value: int) -> None:
         """Learn that ``action`` in ``code`` (P,) led to ``value``."""
-        slip, pseudo, others, own = self.settings.slip, self._pseudo, self._others, code[self.factor]
+        slip = self.settings.slip
+        pseudo = self._pseudo
+        others = self._others
+        own = code[self.factor]
         stayed = value == own
-        rows, tables = self._rows(code[None])[0], _TABLES + len(self.parents)
-        counts, total = self.counts[rows, action, value], self._total[rows, action]
-        fails, moved = self._fails()[action], total - self.counts[rows, action, own]
+        rows = self._rows(code[None])[0]
+        tables = _TABLES + len(self.parents)
+        counts = self.counts[rows, action, value]
+        total = self._total[rows, action]
+        fails = self._fails()[action]
+        moved = total - self.counts[rows, action, own]
         goes = (1.0 - fails) * (counts + pseudo / others) / (moved + pseudo)
         self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / others)
         self.evidence[action, 1] += np.log(self._by_itself[own, value])
@@ -125,55 +122,73 @@ class FactorDynamics:
         return np.array([changes @ self.tried, changes @ self.stayed])
 
     def predict(self, codes: Codes, actions: slice = EVERY) -> FactorPrediction:
-        """What some actions would lead to in ``codes`` (N, P)."""
-        weight, pseudo, fails = self._weights(actions), self._pseudo, self._fails()[actions]
-        own = codes[:, self.factor]
-        expected = self._stays(weight, codes) + weight[:, 1, None] * self._by_itself[own][:, None]
-        unknown = weight[:, 1] * self._unsure[own][:, None]
-        unsure = fails * pseudo / (self.tried[actions] + pseudo)
-        for each in self._counted(weight, codes, actions):
-            apart = each.apart / (each.total + pseudo)
-            alike = each.alike * (1.0 - fails) / (each.moved + pseudo)
-            expected[each.codes] += ((apart + alike)[..., None] * each.counts).sum(axis=1)
-            expected[each.codes] += pseudo * (apart / self.values + alike / self._others).sum(axis=1)[..., None]
-            goes = (alike * (each.total - each.moved + pseudo / self._others)).sum(axis=1)
-            expected[each.codes][each.own] += (each.alike * fails).sum(axis=0) - goes  # which stays, if rows are alike
-            unknown[each.codes] += ((apart + alike) * pseudo + each.alike * unsure).sum(axis=1)
+        """Predict the next values after some actions in ``codes`` (N, P)."""
+        expected, unknown = self._average(codes, actions, self._pseudo, self._fails(), self._by_itself)
         return FactorPrediction(expected, np.where(unknown < self.settings.least_unknown, 0.0, unknown))
 
     def seen(self, codes: Codes) -> Floats:
-        """The same from observations alone: staying, if ever tried, and frequencies; 0 of none. Shape (N, A, K)."""
-        weight, failed = self._weights(EVERY), self.stayed / np.maximum(self.tried, 1.0)
-        turns = self._pooled[codes[:, self.factor]]
-        turns /= np.maximum(turns.sum(axis=1, keepdims=True), 1.0)
-        seen = (self._stays(weight, codes) + weight[:, 1, None] * turns[:, None]) * (self.tried[:, None] > 0.0)
-        for each in self._counted(weight, codes, EVERY):
-            apart = each.apart / np.maximum(each.total, 1.0)
-            alike = each.alike * (1.0 - failed) / np.maximum(each.moved, 1.0)
-            seen[each.codes] += ((apart + alike)[..., None] * each.counts).sum(axis=1)
-            stays = (each.alike * failed).sum(axis=0) - (alike * (each.total - each.moved)).sum(axis=1)
-            seen[each.codes][each.own] += stays
-        return seen
+        """Frequencies of the next values without any prior; zeros for an action that was never tried. (N, A, K)."""
+        failed = self.stayed / np.maximum(self.tried, 1.0)
+        turns = self._pooled / np.maximum(self._pooled.sum(axis=1, keepdims=True), 1.0)
+        seen, _ = self._average(codes, EVERY, 0.0, failed, turns)
+        return seen * (self.tried[:, None] > 0.0)
 
     def happens(self, codes: Codes, actions: NDArray[np.int64]) -> tuple[Floats, Floats]:
         """How probable each value is after one action (N,) each, as it was seen to happen, or as expected where never.
 
         Returns these, (N, K), and the weight of the prior, (N,).
         """
-        each, predicted = np.arange(len(codes)), self.predict(codes)
-        seen, unknown = self.seen(codes)[each, actions], predicted.unknown[each, actions]
+        each = np.arange(len(codes))
+        predicted = self.predict(codes)
+        seen = self.seen(codes)[each, actions]
+        unknown = predicted.unknown[each, actions]
         chance = np.where((seen.sum(axis=1) > unknown)[:, None], seen, predicted.expected[each, actions])
         return chance / chance.sum(axis=1, keepdims=True), unknown
 
-    def _weights(self, actions: slice) -> Floats:
-        """Those of :meth:`weights` that are not negligible."""
+    def _average(
+        self, codes: Codes, actions: slice, pseudo: float, fails: Floats, by_itself: Floats
+    ) -> tuple[Floats, Floats]:
+        """Average over the structures: the next values, (N, A, K), and the weight of the prior, (N, A).
+
+        Args:
+            codes: Codes (N, P).
+            actions: The A actions that are asked about.
+            pseudo: Counts that the prior of each row of a table is worth.
+            fails: How often each action leaves the factor at its value, where rows are alike. One a macro-action.
+            by_itself: Next values of a factor that changes by itself. Shape (K, K).
+        """
         weight = self.weights()[actions]
         weight[weight <= _NEGLIGIBLE] = 0.0
-        return weight
+        firsts = range(0, len(codes), _AT_ONCE)
+        some = [codes[first : first + _AT_ONCE] for first in firsts]
+        averages = [self._average_of_few(few, actions, pseudo, fails[actions], by_itself, weight) for few in some]
+        expected, unknown = zip(*averages, strict=True)
+        return np.concatenate(expected), np.concatenate(unknown)
 
-    def _stays(self, weight: Floats, codes: Codes) -> Floats:
-        """The share of structures by which the factor is left alone, at its value. Shape (N, A, K)."""
-        return weight[None, :, :1] * np.eye(self.values)[codes[:, self.factor]][:, None, :]
+    def _average_of_few(
+        self, codes: Codes, actions: slice, pseudo: float, fails: Floats, by_itself: Floats, weight: Floats
+    ) -> tuple[Floats, Floats]:
+        """Average over the structures for a few codes; see :meth:`_average`. ``weight``: (A, 2 + 2T)."""
+        apart, alike = weight[:, _TABLES:].T.reshape(2, len(self.parents), -1)  # [T, A]
+        matters = np.flatnonzero((apart + alike).any(axis=1))
+        alike = alike[matters]
+        rows = self._rows(codes)[:, matters]
+        each = np.arange(len(codes))
+        own = codes[:, self.factor]
+        counts = self.counts[rows, actions]  # [N, T, A, K]
+        total = self._total[rows, actions]  # [N, T, A]
+        stayed = counts[each, ..., own]
+        least = 0.0 if pseudo else 1.0
+        tables = apart[matters] / np.maximum(total + pseudo, least)
+        goes = alike * (1.0 - fails) / np.maximum(total - stayed + pseudo, least)
+        unsure = fails * pseudo / np.maximum(self.tried[actions] + pseudo, least)
+        expected = weight[None, :, :1] * np.eye(self.values)[own][:, None, :]
+        expected = expected + weight[:, 1, None] * by_itself[own][:, None]
+        expected += ((tables + goes)[..., None] * counts).sum(axis=1)
+        expected += pseudo * (tables / self.values + goes / self._others).sum(axis=1)[..., None]
+        expected[each, :, own] += (alike * fails).sum(axis=0) - (goes * (stayed + pseudo / self._others)).sum(axis=1)
+        unknown = weight[:, 1] * self._unsure[own][:, None]
+        return expected, unknown + ((tables + goes) * pseudo + alike * unsure).sum(axis=1)
 
     def _rows(self, codes: Codes) -> NDArray[np.int64]:
         """The row of each table T that holds for each code (N, P). Shape (N, T)."""
@@ -183,27 +198,13 @@ class FactorDynamics:
         """Learn how it changes by itself, from each value to each, (K, K), and the weight of the prior, (K,)."""
         self._pooled = self._turns.copy()
         total = self._pooled.sum(axis=1, keepdims=True) + self._pseudo
-        self._by_itself, self._unsure = (self._pooled + self.settings.concentration) / total, self._pseudo / total[:, 0]
+        self._by_itself = (self._pooled + self.settings.concentration) / total
+        self._unsure = self._pseudo / total[:, 0]
 
     def _fails(self) -> Floats:
         """How often each action leaves the factor at its value, where rows are alike. Shape (A,)."""
         pseudo = self.settings.pseudo_fails
         return np.asarray((self.stayed + pseudo * self.fails) / (self.tried + pseudo))
-
-    def _counted(self, weight: Floats, codes: Codes, actions: slice) -> Iterator[_Counted]:
-        """What was counted for a few codes at a time."""
-        apart, alike = weight[:, _TABLES:].T.reshape(2, len(self.parents), -1)
-        matters = np.flatnonzero((apart + alike).any(axis=1))
-        if not len(matters):
-            return
-        rows = self._rows(codes)[:, matters]
-        for first in range(0, len(codes), _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
-            counts, total = self.counts[rows[some], actions], self._total[rows[some], actions]
-            value = codes[some, self.factor]
-            own = np.arange(len(value)), EVERY, value
-            stayed = counts[np.arange(len(value)), ..., value]
-            yield _Counted(some, own, apart[matters], alike[matters], counts, total, total - stayed)
 
 
 class Dynamics:
@@ -214,7 +215,9 @@ class Dynamics:
     ) -> None:
         factors = range(len(sizes) if moving is None else moving)
         self.factors = [FactorDynamics(factor, sizes, n_actions, settings) for factor in factors]
-        self._settings, self._seen, self.pooled_at = settings, 0, 0
+        self._settings = settings
+        self._seen = 0
+        self.pooled_at = 0
 
     def add(self, code: Codes, action: int, following: Codes) -> None:
         """Learn from one transition from a code (P,) to values of those that move."""
@@ -226,7 +229,8 @@ class Dynamics:
 
     def _pool(self) -> None:
         """Learn anew how factors change by themselves, and how often actions fail, of each factor and of all."""
-        self.pooled_at, pseudo = self._seen, self._settings.pseudo_fails
+        pseudo = self._settings.pseudo_fails
+        self.pooled_at = self._seen
         each = [factor.pool() for factor in self.factors]
         tried, stayed = np.sum(each, axis=0)
         fails = (stayed + self._settings.fails) / (tried + 1.0)

@@ -46,7 +46,10 @@ class FactoredModel:
     def __init__(
         self, sizes: tuple[int, ...], n_actions: int, settings: FactoredSettings, memory: Memory | None = None
     ) -> None:
-        self.n_actions, self.sizes, self._planning, self.memory = n_actions, sizes, settings.planning, memory
+        self.n_actions = n_actions
+        self.sizes = sizes
+        self.memory = memory
+        self._planning = settings.planning
         self._moving = len(sizes) - (memory is not None)
         self.dynamics = Dynamics(sizes, n_actions, settings.dynamics, self._moving)
         self.outcomes = OutcomeModel(sizes, n_actions, settings.outcomes)
@@ -58,33 +61,31 @@ class FactoredModel:
         if row.has_reward:
             self.outcomes.add(row)
 
-    def log_likelihood(self, rows: Sequence[CodeTransition]) -> float:
-        """Log likelihood of transitions (each has at least 0.1 %): what is seen next and what it brings."""
-        causes, each = self.outcomes.causes, np.arange(len(rows))
-        if causes is None or not rows:
-            return len(rows) * float(np.log(_LEAST))
-        codes, actions, following = (np.array([row[column] for row in rows]) for column in range(3))
-        moved = [predicted.expected[each, actions, following[:, factor]]
-                 for factor, predicted in enumerate(self.dynamics.predict(codes))]  # fmt: skip
-        known = {outcome: index for index, outcome in enumerate(causes.outcomes)}
-        which = np.array([known.get((row.reward, row.terminated), -1) for row in rows])
-        brought = self.outcomes.predict(codes, actions, following)[0][each, which]
-        chance = np.prod(moved, axis=0) * np.where(which < 0, 0.0, brought)
-        return float(np.log(np.maximum(chance, _LEAST)).sum())
+    def probabilities(self, rows: Sequence[CodeTransition]) -> tuple[Floats, Floats]:
+        """Return the predicted probability of each of N transitions, and how much about it is unknown: (N,) and (N,).
 
-    def probability(self, row: CodeTransition) -> tuple[float, float]:
-        """How probable a transition is held to be, and how much about it is unknown."""
-        code, action, following = as_codes(row.code), row.action, as_codes(row.following)
-        moving = following[: self._moving]
-        outcome = (row.reward, row.terminated)
+        A transition whose outcome was never seen has probability 0 and is wholly unknown.
+        """
         causes = self.outcomes.causes
-        if causes is None or outcome not in causes.outcomes:
-            return 0.0, 1.0
-        factors = self.dynamics.predict(code[None])
-        moved = np.prod([each.expected[0, action, value] for each, value in zip(factors, moving, strict=True)])
-        outcomes, untested = self.outcomes.predict(code[None], np.array([action]), following[None])
-        unknown = 1.0 - (1.0 - untested[0]) * np.prod([1.0 - each.unknown[0, action] for each in factors])
-        return float(moved) * float(outcomes[0, causes.outcomes.index(outcome)]), float(unknown)
+        if causes is None or not rows:
+            return np.zeros(len(rows)), np.ones(len(rows))
+        codes, actions, following = (np.array([row[column] for row in rows]) for column in range(3))
+        places = {outcome: place for place, outcome in enumerate(causes.outcomes)}
+        outcome = np.array([places.get((row.reward, row.terminated), -1) for row in rows])
+        each = np.arange(len(rows))
+        brought, untested = self.outcomes.predict(codes, actions, following)
+        moved = np.ones(len(rows))
+        known = np.ones(len(rows))
+        for factor, predicted in enumerate(self.dynamics.predict(codes)):
+            moved = moved * predicted.expected[each, actions, following[:, factor]]
+            known = known * (1.0 - predicted.unknown[each, actions])
+        seen = outcome >= 0
+        probability = np.where(seen, moved * brought[each, outcome], 0.0)
+        return probability, np.where(seen, 1.0 - (1.0 - untested) * known, 1.0)
+
+    def log_likelihood(self, rows: Sequence[CodeTransition]) -> float:
+        """Return the log likelihood of transitions, of which each counts as at least 0.1 % probable."""
+        return float(np.log(np.maximum(self.probabilities(rows)[0], _LEAST)).sum())
 
     def moves(self, codes: Codes, actions: slice = EVERY) -> Moves:
         """Where some actions would lead from ``codes`` (N, P)."""

@@ -213,7 +213,7 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
         assert found.unknown[row, action] == pytest.approx(1.0 - known * (1.0 - untested))
     assert dropped > 0
     for each in lived()[:3]:
-        probability, unknown = model.probability(each)
+        (probability,), (unknown,) = model.probabilities([each])
         factors = [predicted(factor, each.code, each.action)[0] for factor in range(2)]
         chance, untested = brought(model, each.code, each.action, each.following)
         moved = factors[0].expected[each.following[0]] * factors[1].expected[each.following[1]]

@@ -101,7 +101,7 @@ def test_what_is_remembered_follows_from_what_is_seen() -> None:
         code = (0, HIDDEN, HIDDEN)
         drawn = {model.sample(code, 0, rng)[0] for _ in range(200)}
         assert (drawn == set(found[memory, code])) == (known is not None)
-        probability, unknown = model.probability(CodeTransition(code, 0, (1, 0, 0), 0.0, terminated=False))
+        (probability,), (unknown,) = model.probabilities([CodeTransition(code, 0, (1, 0, 0), 0.0, terminated=False)])
         assert probability == pytest.approx(0.25 if known else 0.0625, abs=0.05) and unknown < 0.05
     assert found[memory, (0, HIDDEN, HIDDEN)] == pytest.approx(
         {(1, HIDDEN, HIDDEN): 0.5, (1, 0, 0): 0.25, (1, 1, 1): 0.25}, abs=0.08

@@ -81,6 +81,7 @@ class Dreamer:
         """Forget what was seen: the next frame is an episode's first."""
         self._player.init_states()
         self._first = True
+        self._acted = False
         self._test_random.reset(0)
 
     @torch.no_grad()
@@ -93,14 +94,27 @@ class Dreamer:
             shown = {name: array[None] for name, array in self._shown(observation.frame).items()}
             seen = prepare_obs(self._fabric, shown, cnn_keys=[_PIXELS])
             chosen = self._player.get_actions(seen, greedy=not explore)
+        self._acted = explore
         if not explore or self.steps >= self.settings.learning_starts:
             return int(chosen[0].argmax())
         action = int(self._rng.integers(self.n_actions))
-        self._player.actions = nn.functional.one_hot(torch.tensor([[action]]), self.n_actions).to(chosen[0])
+        self._take(action)
         return action
 
+    def _take(self, action: int) -> None:
+        """Let the recurrent state take in a macro-action that the policy did not choose."""
+        self._player.actions = nn.functional.one_hot(torch.tensor([[action]]), self.n_actions).to(self._player.actions)
+
     def observe(self, transition: Transition, *, episode: int) -> None:
-        """Remember the transition, and update the networks as often as the replay ratio says."""
+        """Remember the transition, and update the networks as often as the replay ratio says.
+
+        Acting and updates draw from the same generators, so a transition that was only shown takes the draws of an
+        act, too: it then teaches what an own one does.
+        """
+        if not self._acted:
+            self.act(transition.observation, explore=True)
+            self._take(transition.action)
+        self._acted = False
         action = np.eye(self.n_actions, dtype=np.float32)[transition.action]
         self._remember(transition.observation.frame, action)
         self._arrived, self._first = (transition.reward, transition.terminated, transition.truncated), False

@@ -58,6 +58,7 @@ class LeWMPlanner:
         self.meters = Meters()
         self.steps = self.updates = 0
         self._owed = 0.0  # updates
+        self._acted = False
 
     def begin_episode(self) -> None:
         """Nothing is remembered within an episode."""
@@ -68,6 +69,7 @@ class LeWMPlanner:
         Without a goal a test takes macro-action 0.
         """
         settings = self.settings
+        self._acted = explore
         if explore:
             left = max(0.0, 1.0 - self.steps / settings.exploration_steps)
             epsilon = settings.exploration_final_eps + left * (1.0 - settings.exploration_final_eps)
@@ -90,7 +92,14 @@ class LeWMPlanner:
         return self._first[int((apart.cumsum(dim=1) + rest * apart).flatten(1).amin(dim=1).argmin())]
 
     def observe(self, transition: Transition, *, episode: int) -> None:
-        """Remember the transition, and update the networks as often as the replay ratio says."""
+        """Remember the transition, and update the networks as often as the replay ratio says.
+
+        Acting and updates draw from the same generator, so a transition that was only shown takes the draws of an act,
+        too: it then teaches what an own one does.
+        """
+        if not self._acted:
+            self.act(transition.observation, explore=True)
+        self._acted = False
         frame, following = transition.observation.frame, transition.next_observation.frame
         for name, value in zip(_ROW, (frame, transition.action, following), strict=True):
             self._rows[name].append(value)

@@ -103,7 +103,7 @@ class LibraryAgent:
         """The policy's weights: enough to look at, not to train on from."""
         if self._model is None:
             return AgentState(arrays={}, values={})
-        weights = {name: np.array(value.cpu()) for name, value in self._model.policy.state_dict().items()}
+        weights = {name: value.cpu().numpy().copy() for name, value in self._model.policy.state_dict().items()}
         return AgentState(arrays=weights, values={})
 
     def restore(self, state: AgentState) -> None:
