@@ -1,0 +1,82 @@
+"""Files that hold names which agents had earlier: they are read under today's labels, and their hashes stay."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from small_runs import Inline, final_arrays
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.registry.old_names import agent_label, edition_of, label_today, name_in_edition_1
+from imagine_bench.report import figures
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.task_types import read_protocol
+from imagine_bench.store.bench_folder import bench_folder
+from imagine_bench.store.results import BenchResult
+
+KEPT = Path(__file__).parent / "of_abcb05c" / "two_names"
+"""A bench of ``factored``, killed within its second test, and of ``factored_own``, which was done."""
+HASH = "51e2eefd864f"
+LEARNED = {"factored:given": "1d15ecd95ba8ba8e", "factored": "86be7a126e3fc599"}
+"""Digests of all that the agents had learned where commit abcb05c did the whole bench."""
+
+
+@pytest.mark.parametrize("name", [*registry.AGENTS, "factored:planning.depth=1", "factored:given,planning.depth=1"])
+def test_an_old_name_and_todays_label_translate_into_each_other(name: str) -> None:
+    assert label_today(name_in_edition_1(name)) == name
+    assert agent_label(name_in_edition_1(name), {}) == name
+    assert agent_label(name, {"agent_names": 2}) == name
+
+
+@pytest.mark.parametrize("agents", [("dqn",), ("factored",), ("factored:given",), ("factored", "factored:given")])
+def test_a_new_protocol_is_read_as_it_was_written(agents: tuple[str, ...]) -> None:
+    new = protocol("arrow_puzzle", "smoke", agents=agents)
+    written = new.as_dict()
+    assert written["agents"] == list(agents)
+    assert ("agent_names" in written) == ("factored" in agents), "said only where edition 1 meant another agent"
+    assert Protocol.from_dict(json.loads(json.dumps(written))) == new
+
+
+@pytest.mark.parametrize("agents", [["factored"], ["factored_own"], ["dqn", "factored:planning.depth=1"], ["dqn"]])
+def test_a_kept_protocol_keeps_its_text_and_hash(agents: list[str]) -> None:
+    kept = protocol("arrow_puzzle", "smoke").as_dict() | {"agents": agents}
+    read = Protocol.from_dict(kept)
+    assert read.agents == tuple(label_today(agent) for agent in agents)
+    assert read.as_dict() == kept
+    same_labels = protocol("arrow_puzzle", "smoke", agents=read.agents)
+    assert (read.hash == same_labels.hash) == (edition_of(agents) == 2), "the two editions never meet in one folder"
+
+
+def test_an_old_name_is_refused_with_the_new_one() -> None:
+    with pytest.raises(InvalidValueError, match=r"Agent 'factored_own' is now called 'factored'; give that name\."):
+        registry.agent_entry("factored_own")
+
+
+def test_the_agent_that_was_factored_keeps_its_color() -> None:
+    assert figures.color("factored:given") == "#999933"
+
+
+def test_a_kept_bench_is_read_and_finished_under_todays_labels(tmp_path: Path) -> None:
+    kept = read_protocol(KEPT)
+    assert kept.agents == ("factored:given", "factored")
+    assert kept.hash == HASH
+    _, paths = plan(kept.task, kept.preset, agents=kept.agents)
+    folder = bench_folder(tmp_path, kept)
+    shutil.copytree(KEPT, folder)
+    launcher = Inline()
+    result = bench(kept, paths, root=tmp_path, launcher=launcher)
+    assert isinstance(result, BenchResult)
+    assert [agent for agent, *_ in launcher.order] == ["factored:given"], "the other one was done"
+    digests = {}
+    for run in result.runs:
+        learned = hashlib.sha256()
+        for name, array in sorted(final_arrays(run.folder).items()):
+            learned.update(name.encode() + array.tobytes())
+        digests[run.agent] = learned.hexdigest()[:16]
+    assert digests == LEARNED
