@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import gymnasium
-import numpy as np
 from imagine_bench.agents.encoders.latent_observation import LatentObservation
 from imagine_bench.agents.encoders.perception import load_perception, prepare_torch
 from imagine_bench.agents.imagination.agent import ImaginingAgent, build
