@@ -32,7 +32,7 @@ from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, Floats, Frame, Observation, Outcome, Rules, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
-from imagine_bench.judge.truth import total_variation
+from imagine_bench.judge.truth import added_up, total_variation
 from imagine_bench.rules import states_of
 from imagine_bench.running.run_state import make_env
 from imagine_bench.running.trained import Trained
@@ -263,15 +263,12 @@ def expected_rightly(rules: Rules, held: PolicyTable) -> float:
     found = []
     for row, state in enumerate(states):
         for action in range(0 if rules.is_terminal(state) else rules.n_actions):
-            exact: dict[State, float] = {}
-            for outcome in rules.outcomes(state, action):
-                after = () if outcome.terminated else outcome.macrostate
-                exact[after] = exact.get(after, 0.0) + outcome.probability
-            expected: dict[State, float] = {(): 1.0 - float(shares[:, row, action].sum())}
-            for after, share in zip(
-                map(tuple, own[:, row, action].tolist()), shares[:, row, action].tolist(), strict=True
-            ):
-                expected[after] = expected.get(after, 0.0) + share
+            exact = added_up(
+                (() if outcome.terminated else outcome.macrostate, outcome.probability)
+                for outcome in rules.outcomes(state, action)
+            )
+            after = zip(map(tuple, own[:, row, action].tolist()), shares[:, row, action].tolist(), strict=True)
+            expected = added_up([((), 1.0 - float(shares[:, row, action].sum())), *after])
             found.append(1.0 - total_variation(exact, expected))
     return float(np.mean(found))
 

@@ -197,23 +197,12 @@ def _together(
 ) -> dict[tuple[State, State], float]:
     """Probabilities of pairs where one uniform number chooses from both distributions, each in its order."""
     found: dict[tuple[State, State], float] = {}
+    ends = [np.cumsum([share for _, share in each]) for each in (one, other)]
     at = 0.0
-    row = 0
-    column = 0
-    ends = [one[0][1], other[0][1]]
-    while True:
-        upto = min(ends)
-        if upto - at > _SLIVER:
+    for upto in np.unique(np.concatenate(ends)).tolist():
+        row, column = (int(np.searchsorted(each, upto)) for each in ends)
+        if upto - at > _SLIVER and row < len(one) and column < len(other):
             pair = one[row][0], other[column][0]
             found[pair] = found.get(pair, 0.0) + upto - at
         at = upto
-        if ends[0] <= ends[1]:
-            row += 1
-            if row == len(one):
-                return found
-            ends[0] += one[row][1]
-        else:
-            column += 1
-            if column == len(other):
-                return found
-            ends[1] += other[column][1]
+    return found

@@ -284,16 +284,12 @@ def _named(spec: TaskSpec, outcomes: Distribution) -> dict[str, float]:
     }
 
 
+@functools.lru_cache(maxsize=4)
 def data_of(judgement: Judgement, folder: Path, seed: int) -> Dataset:
     """The data of a seed, made in the kinematic execution where it is not there yet."""
-    return _data(judgement.task, judgement.policy, judgement.appearance, judgement.sizes[-1], folder, seed)
-
-
-@functools.lru_cache(maxsize=4)
-def _data(task: str, policy: str, appearance: str, transitions: int, folder: Path, seed: int) -> Dataset:
     place = folder / f"data-seed{seed}"
     with _making(folder):
-        return read_dataset(place) if place.exists() else _collected(task, policy, appearance, transitions, place, seed)
+        return read_dataset(place) if place.exists() else _collected(judgement, place, seed)
 
 
 @contextmanager
@@ -303,14 +299,20 @@ def _making(folder: Path) -> Iterator[None]:
         yield
 
 
-def _collected(task: str, policy: str, appearance: str, transitions: int, place: Path, seed: int) -> Dataset:
-    """Episodes of at least so many transitions, kept in a new folder."""
-    spec = registry.task(task)
-    episodes = -(-transitions // spec.horizon)
+def _collected(judgement: Judgement, place: Path, seed: int) -> Dataset:
+    """Episodes of at least as many transitions as a model learns from, kept in a new folder."""
+    spec = registry.task(judgement.task)
+    episodes = -(-judgement.sizes[-1] // spec.horizon)
     while True:
-        settings: dict[str, Any] = {"execution": "kinematic", "appearance": appearance}
-        played, apart, card = collect(spec, policy_of(policy, spec, seed), episodes=episodes, seed=seed, **settings)
-        if len(played.actions) >= transitions:
+        played, apart, card = collect(
+            spec,
+            policy_of(judgement.policy, spec, seed),
+            episodes=episodes,
+            seed=seed,
+            execution="kinematic",
+            appearance=judgement.appearance,
+        )
+        if len(played.actions) >= judgement.sizes[-1]:
             return write_dataset(place, played, apart, card, "npz")
         episodes *= 2
 
@@ -321,20 +323,16 @@ def visited(dataset: Dataset, transitions: int) -> set[tuple[State, int]]:
     return set(zip(map(tuple, macrostates.tolist()), dataset.episodes.actions[:transitions].tolist(), strict=True))
 
 
+@functools.lru_cache(maxsize=2)
 def prepare(judgement: Judgement, folder: Path) -> _World:
     """Questions and reader, made once in each process."""
-    return _prepared(judgement.task, judgement.appearance, folder)
-
-
-@functools.lru_cache(maxsize=2)
-def _prepared(task: str, appearance: str, folder: Path) -> _World:
-    spec = registry.task(task)
-    index = RenderedFrameIndex(spec, appearance)
+    spec = registry.task(judgement.task)
+    index = RenderedFrameIndex(spec, judgement.appearance)
     one_step = questions.one_step(spec, index.render)
     return _World(
         spec=spec,
         index=index,
-        reader=_reader(spec, appearance, folder),
+        reader=_reader(spec, judgement.appearance, folder),
         one_step=one_step,
         rollouts=questions.rollouts(spec, index.render),
         ranked=questions.ranked(spec, index.render),

@@ -16,7 +16,7 @@ from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, Sight, 
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.judge.models import AgentModel
 from imagine_bench.judge.questions import EvalSet
-from imagine_bench.judge.truth import Distribution, expected_reward, shares
+from imagine_bench.judge.truth import added_up, expected_reward, shares
 from imagine_bench.rules import Outcomes, advance, is_random
 from imagine_bench.seeding import Purpose, SeedTree
 from imagine_bench.statistics import auroc
@@ -87,12 +87,12 @@ def _observed(spec: TaskSpec, reached: Sequence[Outcomes], look: State, step: in
     taken = step - spec.sight.lag
     if taken <= 0:
         return {(spec.as_observed(look), False): (1.0, reward)}
-    found: Distribution = {}
-    for state, share in shares(reached[taken]).items():
-        for probability, shown in spec.sight.seen(state, taken):
-            read = spec.as_observed(shown)
-            found[read] = found.get(read, 0.0) + share * probability
-    return {(read, False): (share, reward) for read, share in found.items()}
+    looks = (
+        (spec.as_observed(shown), share * probability)
+        for state, share in shares(reached[taken]).items()
+        for probability, shown in spec.sight.seen(state, taken)
+    )
+    return {(read, False): (share, reward) for read, share in added_up(looks).items()}
 
 
 def open_loop(agent: Imaginer, questions: EvalSet, seeds: SeedTree) -> OpenLoop:

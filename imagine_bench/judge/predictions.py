@@ -15,7 +15,7 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
 from imagine_bench.interfaces import Floats, Frame, State, TaskSpec
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 from imagine_bench.judge.questions import EvalSet
-from imagine_bench.judge.truth import Distribution
+from imagine_bench.judge.truth import Distribution, added_up
 from imagine_bench.seeding import SeedTree
 
 _AT_ONCE = 96  # questions handed to a model at a time, to bound memory
@@ -85,11 +85,8 @@ class Predictions:
 
     def distribution(self, row: int, step: int) -> Distribution:
         """Of the macrostates after a step."""
-        found: Distribution = {}
-        for state, weight in zip(self.states[row, :, step].tolist(), self.weights[row, :, step].tolist(), strict=True):
-            if weight:
-                found[tuple(state)] = found.get(tuple(state), 0.0) + weight
-        return found
+        futures = zip(self.states[row, :, step].tolist(), self.weights[row, :, step].tolist(), strict=True)
+        return added_up((tuple(state), weight) for state, weight in futures if weight)
 
 
 def evaluate(
@@ -122,13 +119,13 @@ def evaluate(
         answers.append(imagined)
         states.append(read_images(imagined, reader, index, len(questions.states[0])))
     offered = {each: _all_of(answers, each) for each in UNCERTAINTIES}
-    accepted = [each.accepted for each in answers if each.accepted is not None]
+    accepted = _all_of(answers, "accepted")
     return Predictions(
         states=_joined(states, -1),
         weights=_joined([weights_of(each) for each in answers], 0),
         rewards=_padded(_all_of(answers, "rewards")),
         p_ended=_padded(_all_of(answers, "p_ended")),
-        accepted=np.concatenate(accepted) if len(accepted) == len(answers) else None,
+        accepted=np.concatenate(accepted).astype(np.bool_) if accepted else None,
         uncertainties={each: np.concatenate(parts) for each, parts in offered.items() if parts},
         cpu_s=cpu_s,
         steps=sum(int(np.prod(each.pictures.shape[:3])) for each in answers),

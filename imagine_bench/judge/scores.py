@@ -6,8 +6,9 @@ The names of scores are columns of kept files and stay as they are there.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from imagine_bench.judge.predictions import Predictions
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.truth import (
     Distribution,
+    Value,
+    added_up,
     expected_reward,
     hallucinated_modes,
     missed_modes,
@@ -26,20 +29,20 @@ from imagine_bench.judge.truth import (
 )
 from imagine_bench.judge.values import (
     exact_machine,
+    gain_of_avoiding,
     imagined_machine,
     mean_by_pair,
     regrets,
     value_losses,
-    value_of_abstaining,
-    value_of_filter,
 )
 from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import auroc
 
 _BINS = 10
+_MOST = 0.5  # share of a transition's frames in which a filter keeps it
+_AVOIDED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # shares of the transitions, those that a model knows least of
 _WRONG = 0.5  # total variation from which a transition counts as imagined wrongly
 Scores = dict[str, float]
-Key = TypeVar("Key")
 COVERAGES = tuple(round(0.05 * index, 2) for index in range(1, 21))
 """Shares of the questions that are answered, the surest first."""
 
@@ -106,8 +109,8 @@ def after_the_end_scores(asked: EvalSet | None, predictions: Predictions | None,
 def _values(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dict[str, Any]:
     """Value losses, in the mean, the worst and by start, and the value of abstaining; NaN where not all is asked about.
 
-    The value of abstaining has two figures: from the best share that the model knows least of, and from what its own
-    filter discards.
+    The value of abstaining is what planning gains where it avoids transitions: those that the model knows least of, of
+    :data:`_AVOIDED` the best share with the truth known and 0 where none gains; or those that its own filter discards.
     """
     machine = imagined_machine(questions, predictions, spec.rules)
     truth = exact_machine(questions, spec.n_actions)
@@ -118,14 +121,16 @@ def _values(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dic
     if not set(starts) <= set(truth.states):
         return {**found, "value_loss_by_start": []}
     losses = value_losses(truth, machine, starts, spec.horizon)
+    gain = partial(gain_of_avoiding, truth, machine, starts, spec.horizon)
     found["value_loss"] = float(losses.mean())
     found["worst_value_loss"] = float(losses.max())
     if predictions.epistemic is not None:
         unknown = mean_by_pair(questions, predictions.epistemic)
-        found["worth_of_refusing"] = value_of_abstaining(unknown, truth, machine, starts, spec.horizon)
+        known = [unknown <= np.quantile(unknown, 1.0 - share) for share in _AVOIDED]
+        found["worth_of_refusing"] = max(0.0, *map(gain, known))
     if predictions.accepted is not None:
         kept = mean_by_pair(questions, predictions.accepted[:, 0].astype(np.float64))
-        found["worth_of_filter"] = value_of_filter(kept, truth, machine, starts, spec.horizon)
+        found["worth_of_filter"] = gain(kept >= _MOST)
     return {**found, "value_loss_by_start": losses.round(6).tolist()}
 
 
@@ -134,7 +139,7 @@ def ranking_scores(spec: TaskSpec, questions: EvalSet, predictions: Predictions)
     return {"regret": float(regrets(questions, predictions, spec.rules).mean())}
 
 
-def _calibration(of: str, exact: Sequence[Mapping[Key, float]], imagined: Sequence[Mapping[Key, float]]) -> Scores:
+def _calibration(of: str, exact: Sequence[Mapping[Value, float]], imagined: Sequence[Mapping[Value, float]]) -> Scores:
     """Expected calibration error of probabilities, and Brier score beyond that of the exact ones."""
     held = []
     true = []
@@ -171,10 +176,10 @@ def _reward_scores(questions: EvalSet, predictions: Predictions) -> Scores:
     rewards = predictions.rewards[:, :, 0]
     true = np.array([expected_reward(steps[0]) for steps in questions.truth])
     error = float(np.abs((weights * rewards).sum(axis=1) - true).mean())
-    exact = [_gathered((reward, share) for share, reward in steps[0].values()) for steps in questions.truth]
+    exact = [added_up((reward, share) for share, reward in steps[0].values()) for steps in questions.truth]
     given = np.array(sorted({reward for each in exact for reward in each}))
     nearest = given[np.abs(rewards[..., None] - given).argmin(axis=-1)]
-    imagined = [_gathered(zip(*pair, strict=True)) for pair in zip(nearest.tolist(), weights.tolist(), strict=True)]
+    imagined = [added_up(zip(*pair, strict=True)) for pair in zip(nearest.tolist(), weights.tolist(), strict=True)]
     return {"reward_error": error, **_calibration("reward", exact, imagined)}
 
 
@@ -189,14 +194,6 @@ def _end_scores(questions: EvalSet, predictions: Predictions) -> Scores:
         "end_ece": calibration_error(held, true, np.ones(len(held))),
         "end_brier": float(((held - true) ** 2).mean()),
     }
-
-
-def _gathered(pairs: Iterable[tuple[Key, float]]) -> dict[Key, float]:
-    """Probability of each value."""
-    found: dict[Key, float] = {}
-    for value, share in pairs:
-        found[value] = found.get(value, 0.0) + share
-    return found
 
 
 def _where(
@@ -242,11 +239,7 @@ def _apart(coordinate: int, exact: Distribution, imagined: Distribution) -> floa
     """Total variation of one coordinate."""
 
     def marginal(whole: Distribution) -> Distribution:
-        found: Distribution = {}
-        for state, share in whole.items():
-            value = (state[coordinate],)
-            found[value] = found.get(value, 0.0) + share
-        return found
+        return added_up(((state[coordinate],), share) for state, share in whole.items())
 
     return total_variation(marginal(exact), marginal(imagined))
 

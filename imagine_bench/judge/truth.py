@@ -7,7 +7,8 @@ at the end.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterable, Mapping
+from typing import TypeVar
 
 import numpy as np
 import scipy  # its parts load, slowly, when they are first used
@@ -17,16 +18,22 @@ from imagine_bench.rules import Outcomes, advance, states_of
 
 MODE = 0.05  # least probability of an outcome that counts as a mode
 MISSED = 0.2  # a mode is missed if it is imagined less than this times as often as it happens
+Value = TypeVar("Value", bound=Hashable)
 Distribution = dict[State, float]
 """Probability of each macrostate; of an image that shows nothing of this world, all coordinates are -1."""
 
 
+def added_up(pairs: Iterable[tuple[Value, float]]) -> dict[Value, float]:
+    """The probability of each value, of pairs in which a value may come more than once."""
+    found: dict[Value, float] = {}
+    for value, share in pairs:
+        found[value] = found.get(value, 0.0) + share
+    return found
+
+
 def shares(outcomes: Outcomes) -> Distribution:
     """Probability of each macrostate, whether or not the episode is over."""
-    found: Distribution = {}
-    for (state, _), (share, _) in outcomes.items():
-        found[state] = found.get(state, 0.0) + share
-    return found
+    return added_up((state, share) for (state, _), (share, _) in outcomes.items())
 
 
 def p_ended(outcomes: Outcomes) -> float:

@@ -21,7 +21,6 @@ from imagine_bench.rules import evaluate, greedy, optimal_policy, tabulate
 
 _TIE = 1e-9
 _PATIENCE = 1_000  # macro-actions after which a termination is taken for one that never comes
-_MOST = 0.5  # share of a transition's frames in which a filter keeps it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,28 +101,17 @@ def value_losses(exact: DecisionTables, imagined: DecisionTables, starts: tuple[
     return np.asarray(np.maximum(best - found, 0.0)[rows])
 
 
-def value_of_abstaining(
-    unknown: Floats, exact: DecisionTables, imagined: DecisionTables, starts: tuple[State, ...], horizon: int
+def gain_of_avoiding(
+    exact: DecisionTables,
+    imagined: DecisionTables,
+    starts: tuple[State, ...],
+    horizon: int,
+    allowed: NDArray[np.bool_],
 ) -> float:
-    """Reward a start that planning gains where it avoids the macro-actions that the model knows least of.
+    """Reward a start that planning in a model gains where it avoids the macro-actions that are not ``allowed`` (A, X).
 
-    ``unknown`` (A, X) is the epistemic uncertainty. The share that is avoided is the best of 5, 10, 20, 30, 40 and
-    50 %, chosen with the truth; 0 where none gains.
+    An action is avoided only where another is allowed.
     """
-    masks = [unknown <= np.quantile(unknown, 1.0 - share) for share in (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)]
-    return max(0.0, *(_gained(mask, exact, imagined, starts, horizon) for mask in masks))
-
-
-def value_of_filter(
-    kept: Floats, exact: DecisionTables, imagined: DecisionTables, starts: tuple[State, ...], horizon: int
-) -> float:
-    """The same where it avoids what the model's own filter discards; ``kept`` (A, X) is the share that it keeps."""
-    return _gained(kept >= _MOST, exact, imagined, starts, horizon)
-
-
-def _gained(
-    allowed: NDArray[np.bool_], exact: DecisionTables, imagined: DecisionTables, starts: tuple[State, ...], horizon: int
-) -> float:
     rows = [exact.states.index(state) for state in starts]
     usual = plan_values(exact, optimal_plan(imagined, horizon))
     restricted = plan_values(exact, optimal_plan(imagined, horizon, allowed))

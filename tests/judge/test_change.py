@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -34,16 +35,15 @@ ARROWS, BOTH = "arrows:cubes=2", pytest.mark.parametrize("task", ["arrows:cubes=
 def test_streams_walk_as_the_rules_say(task: str) -> None:
     there = judged_world(task)
     streams = there.streams["usual"]
-    counts: dict[tuple[object, int], dict[object, int]] = {}
-    for row, reached in zip(streams.rows.ravel().tolist(), streams.reached.ravel().tolist(), strict=True):
-        found = counts.setdefault((there.one_step.states[row], there.one_step.first_actions[row]), {})
-        found[streams.states[reached]] = found.get(streams.states[reached], 0) + 1
-    for (state, action), found in counts.items():
-        exact = {o.macrostate: o.probability for o in there.spec.rules.outcomes(state, action)}  # type: ignore[arg-type]
-        total = sum(found.values())
-        for macrostate, count in found.items():
-            p = exact[macrostate]  # type: ignore[index]
-            assert abs(count / total - p) <= 5.0 * math.sqrt(p * (1.0 - p) / total) + 1e-12
+    asked = list(zip(there.one_step.states, there.one_step.first_actions, strict=True))
+    walks = Counter(
+        (*asked[row], streams.states[after]) for row, after in zip(streams.rows.flat, streams.reached.flat, strict=True)
+    )
+    totals = Counter(asked[row] for row in streams.rows.flat)
+    for (state, action, reached), count in walks.items():
+        (p,) = (o.probability for o in there.spec.rules.outcomes(state, action) if o.macrostate == reached)
+        total = totals[state, action]
+        assert abs(count / total - p) <= 5.0 * math.sqrt(p * (1.0 - p) / total) + 1e-12
     assert {there.one_step.states[row] for row in streams.rows[:, 0]} == set(there.spec.rules.start_states)
 
 

@@ -94,8 +94,8 @@ def _blind() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(judgement, "_reader", _read_nothing)
         yield
-    judgement._prepared.cache_clear()
-    judgement._data.cache_clear()
+    judgement.prepare.cache_clear()
+    judgement.data_of.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -152,8 +152,8 @@ def test_what_is_kept_is_not_judged_again(said: Said) -> None:
 
 
 def test_the_same_seed_gives_the_same_scores(said: Said, tmp_path: Path) -> None:
-    judgement._data.cache_clear()
-    judgement._prepared.cache_clear()
+    judgement.data_of.cache_clear()
+    judgement.prepare.cache_clear()
     again, _ = judgement.judge_cell(_of("nearest"), tmp_path, ModelFit("nearest", 1000, 20))
     first = next(cell for cell in kept(said.folder, _of("nearest")) if cell["transitions"] == 20)
     timed = ("fit_s", "imagine_s_per_1000")
@@ -176,9 +176,9 @@ def _few(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(questions, "STATES", 10)
     monkeypatch.setattr(questions, "AFTER_THE_END", 10)
     monkeypatch.setattr(questions, "ROLLOUTS", 4)
-    judgement._prepared.cache_clear()
+    judgement.prepare.cache_clear()
     yield
-    judgement._prepared.cache_clear()
+    judgement.prepare.cache_clear()
 
 
 def _judged(root: Path, *models: str, seeds: tuple[int, ...]) -> tuple[Path, Judgement]:

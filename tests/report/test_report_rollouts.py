@@ -97,3 +97,33 @@ def test_real_frames_are_shown_unaltered_and_upright() -> None:
     left, top = filmstrips.left_px(0), filmstrips.HEADER_PX
     shown = strip[top : top + 128 : 2, left : left + 128 : 2]
     np.testing.assert_array_equal(shown, compared.start_frame)
+
+
+PICK_PLACE = registry.task("pick_place")
+START, ASKS_RIGHT, IMPOSSIBLE = np.array([[0, 0, 0, 0], [1, 0, 0, 2], [1, 1, 0, 2]])
+
+
+def test_changes_are_named_and_judged_by_the_rules() -> None:
+    assert changes(START, ASKS_RIGHT, PICK_PLACE) == "left object picked, gesture right"
+    assert changes(ASKS_RIGHT, ASKS_RIGHT, PICK_PLACE) == "nothing changes"
+    assert filmstrips.is_possible(PICK_PLACE.rules, START, 0, ASKS_RIGHT)
+    assert not filmstrips.is_possible(PICK_PLACE.rules, START, 0, IMPOSSIBLE)
+    assert not filmstrips.is_possible(PICK_PLACE.rules, START, 1, ASKS_RIGHT), "another macro-action leads elsewhere"
+    assert not filmstrips.is_possible(PICK_PLACE.rules, IMPOSSIBLE, 0, ASKS_RIGHT), "nothing follows the impossible"
+
+
+def test_impossible_steps_are_marked_unless_frames_hide_something() -> None:
+    compared = compared_rollout(np.random.default_rng(0), depth=2)
+    states = np.array([IMPOSSIBLE, ASKS_RIGHT])
+    rollout = dataclasses.replace(compared.rollout, macrostates=states, actions=np.zeros(2, dtype=np.int64))
+    wrong = dataclasses.replace(compared, start_macrostate=START, rollout=rollout)
+    right = dataclasses.replace(wrong, rollout=dataclasses.replace(rollout, macrostates=states[::-1]))
+    hidden = dataclasses.replace(PICK_PLACE, sight=registry.task("pick_place:gesture=first").sight)
+    for rows, task, green, red in (
+        ((right,), PICK_PLACE, True, True),  # right at first, then a step that is impossible
+        ((wrong,), PICK_PLACE, False, True),
+        ((right, wrong), hidden, False, False),
+    ):
+        sheet = sampled_filmstrips(rows, task)
+        marked = [bool((sheet == color).all(axis=2).any()) for color in (filmstrips.RIGHT, filmstrips.WRONG)]
+        assert marked == [green, red]
