@@ -47,12 +47,19 @@ def dynamics_of(learner: GivenPerceptionAgent) -> list[np.ndarray]:
     return [part.evidence for part in learner.model.dynamics.factors]
 
 
-def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
-    learner, rng = agent(), np.random.default_rng(0)
+@pytest.fixture(scope="module")
+def experienced() -> GivenPerceptionAgent:
+    """Has learned the first task; tests change copies of it."""
+    learner = agent(3)
+    live(learner, range(40), np.random.default_rng(3))
+    return learner
+
+
+def test_the_dynamics_stay_and_the_outcomes_begin_anew(experienced: GivenPerceptionAgent) -> None:
+    learner = copy.deepcopy(experienced)
     assert isinstance(learner, TransferLearner)
-    live(learner, range(30), rng)
     assert learner.diagnostics()["real_transitions"] == len(learner.replay)
-    live(learner, range(30, 31), rng)
+    live(learner, range(40, 41), np.random.default_rng(0))
     learner.reset_for_new_task()
     known = Dynamics(learner.perception.sizes, ACTIONS, learner.settings.dynamics)
     for row in learner.replay.rows():
@@ -69,19 +76,22 @@ def test_the_dynamics_stay_and_the_outcomes_begin_anew() -> None:
 @pytest.mark.parametrize("carried", [0.0, 0.5])
 def test_earlier_causes_are_priors_that_one_test_refutes(carried: float) -> None:
     learner = agent(outcomes__transfer_weight=carried)
-    live(learner, range(40), np.random.default_rng(0))
+    live(learner, range(25), np.random.default_rng(0))
     learner.reset_for_new_task()
-    lamp = Observation(frame=frame((0, 2, 1)))
     watch(learner, (0, 2, 0), 1)  # (2, 2, 0), the bad end: both kinds of end are met again, one by prior alone
     watch(learner, (0, 1, 1), 3)  # back to (0, 0, 1)
-    before = float(learner.imagine(lamp.frame, actions=np.array([3]), depth=1, rng=np.random.default_rng(0)).rewards[0])
-    goal = learner.imagine(frame((2, 0, 1)), actions=np.array([2]), depth=1, rng=np.random.default_rng(0))
-    assert (goal.rewards[0] > 2.0) == (carried > 0.0), "an earlier goal is expected where causes are transferred"
+
+    def expected(code: tuple[int, ...], action: int) -> float:
+        imagined = learner.imagine(frame(code), actions=np.array([action]), depth=1, rng=np.random.default_rng(0))
+        return float(imagined.rewards[0])
+
+    before = expected((0, 2, 1), 3)
+    goal = expected((2, 0, 1), 2)
+    assert (goal > 2.0) == (carried > 0.0), "an earlier goal is expected where causes are transferred"
     for _ in range(2):
         won = fake_codes.transition((2, 0, 1), 2)
         learner.observe(dataclasses.replace(won, reward=-1.0, terminated=False), episode=1)
-    after = learner.imagine(frame((2, 0, 1)), actions=np.array([2]), depth=1, rng=np.random.default_rng(0))
-    assert after.rewards[0] < 1.0
+    assert expected((2, 0, 1), 2) < 1.0
     assert (before > -4.0) == (carried > 0.0), "that a move may cost one and go on is expected by the prior alone, too"
 
 
@@ -118,9 +128,10 @@ def test_an_earlier_outcome_is_believed_as_far_as_its_tested_causes_hold() -> No
     assert wall > 0.65 > told[0] + 0.1 and goal < 0.35 < told[1] - 0.1
 
 
-def test_the_next_task_is_learned_in_fewer_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    learned = agent(3)
-    live(learned, range(40), np.random.default_rng(3))
+def test_the_next_task_is_learned_in_fewer_episodes(
+    experienced: GivenPerceptionAgent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned = copy.deepcopy(experienced)
     assert success(learned) == 1.0
     learned.reset_for_new_task()
     fresh = agent(3)
@@ -226,21 +237,16 @@ def test_what_has_no_label_is_not_asked_again() -> None:
     assert learner.replay.without_label == set(asked)
 
 
-def test_queries_lead_where_the_dynamics_do() -> None:
-    learner = agent()
-    live(learner, range(40), np.random.default_rng(0))
+def test_queries_lead_where_the_dynamics_do(experienced: GivenPerceptionAgent) -> None:
+    learner = copy.deepcopy(experienced)
     learner.learn()
     code, action, following = last_step(learner.model, (0, 1, 1), np.array([0, 2, 1]))
     assert code == (1, 2, 1)
     assert (action, following) == (1, (0, 2, 1))
     reached, sure = likeliest(learner.model, np.array(starts()))
-    assert reached.shape == (len(starts()), ACTIONS, 3)
     assert sure.shape == (len(starts()), ACTIONS)
-    assert all(
-        tuple(reached[row, action].tolist()) == _STEP(code, action)[0]
-        for row, code in enumerate(starts())
-        for action in range(ACTIONS)
-    )
+    truth = [[_STEP(code, action)[0] for action in range(ACTIONS)] for code in starts()]
+    assert np.array_equal(reached, truth)
 
 
 def test_a_prior_for_staying_is_no_knowledge() -> None:
