@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from imagine_bench.arrays import Array, Arrays
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState
+from imagine_bench.values import Json
 
 from .networks.adam import MOMENTS, Adam
 
@@ -60,7 +61,7 @@ def load_generator(generator: torch.Generator, array: NDArray[np.uint8]) -> None
     generator.set_state(torch.tensor(array))
 
 
-def jsonable(values: dict[str, Any]) -> dict[str, Any]:
+def jsonable(values: Mapping[str, Any]) -> dict[str, Json]:
     """The values as JSON would give them back."""
     return json.loads(json.dumps(values))
 
@@ -93,7 +94,7 @@ def _require_same_names(given: Collection[str], own: Collection[str]) -> None:
         raise ArtefactError(f"The snapshot {verb} {name!r}, unlike this agent; it is of another agent or damaged.")
 
 
-def _require_equal(name: str, given: Any, own: Any) -> None:
+def _require_equal(name: str, given: Json, own: Json) -> None:
     if isinstance(own, dict) and isinstance(given, dict):
         _require_same_names(given, own)
         for key in own:

@@ -7,7 +7,6 @@ import importlib.util
 import re
 import reprlib
 from collections.abc import Iterable
-from typing import Any
 
 _LONGEST = 200
 _SHORT = reprlib.Repr()
@@ -53,7 +52,7 @@ class UnknownNameError(ImagineBenchError, ValueError):
         self.given = given
         self.known = tuple(names)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, object, tuple[str, ...]]]:
         return type(self), (self.kind, self.given, self.known)  # worker processes send errors back
 
 

@@ -7,7 +7,6 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,6 +16,7 @@ from imagine_bench.arrays import Info, Observed
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
 from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, State, TaskSpec
 from imagine_bench.rules import states_of
+from imagine_bench.values import Json
 
 from .frames import frames_of
 from .motion.executor import MacroResult
@@ -42,7 +42,7 @@ class EnvState:
 
     kind: tuple[str, str, str, PhysicsSettings]  #: task, execution, appearance and physics: where it may be set
     world: WorldState
-    generator: Mapping[str, Any]  #: state of the generator that everything random is drawn from
+    generator: Mapping[str, Json]  #: state of the generator that everything random is drawn from
     macrostate: tuple[int, ...]
     begun: bool
     latest: MacroResult | None = field(repr=False)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Action
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.interfaces import Frame
 
 from .encoder import Encoder, bundled_encoder
 
 
-class LatentObservation(gymnasium.ObservationWrapper[NDArray[np.float32], Any, Frame]):
+class LatentObservation(gymnasium.ObservationWrapper[NDArray[np.float32], Action, Frame]):
     """Replace each camera frame by the mean of its latents, float32 of shape (Z,).
 
     Args:
@@ -28,7 +28,7 @@ class LatentObservation(gymnasium.ObservationWrapper[NDArray[np.float32], Any, F
         InvalidValueError: The encoder reads frames otherwise than the environment's task declares.
     """
 
-    def __init__(self, env: gymnasium.Env[Frame, Any], encoder: Encoder | Path | str) -> None:
+    def __init__(self, env: gymnasium.Env[Frame, Action], encoder: Encoder | Path | str) -> None:
         super().__init__(env)
         self.encoder = encoder if isinstance(encoder, Encoder) else Encoder.load(_path(encoder))
         reads, declared = self.encoder.card.preprocessing, getattr(env.unwrapped, "preprocessing", None)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from itertools import compress
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import AgentState, Frame
+from imagine_bench.values import Json
 
 from . import appearance
 from .factors import Code, Memory
@@ -142,11 +142,16 @@ class LearnedPerception:
             "replay/begins": np.array(self.begins, dtype=np.bool_),
         }
 
-    def values(self) -> dict[str, Any]:
+    def values(self) -> dict[str, Json]:
         """What belongs to :meth:`arrays` in a snapshot."""
         memory = None if self.memory is None else [self.memory.factor, self.memory.hidden]
-        counts = {"looked_at": self.looked_at, "found_in": self.found_in, "history": list(self.history)}
-        return {**counts, "unknown": self.unknown, "memory": memory}
+        return {
+            "looked_at": self.looked_at,
+            "found_in": self.found_in,
+            "history": list(self.history),
+            "unknown": self.unknown,
+            "memory": memory,
+        }
 
     def load(self, state: AgentState) -> None:
         """Take up what :meth:`arrays` and :meth:`values` gave, and the agent's ``replay/action``: find the same."""

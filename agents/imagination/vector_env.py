@@ -27,7 +27,7 @@ VERDICT = ("accepted", "epistemic", "aleatoric", "modal")
 """What an info says of a transition."""
 
 
-class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
+class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic]]):
     """N imagined episodes side by side; observations are latents (N, Z), float32, actions (N,) in [0, A).
 
     An episode starts at a latent of the pool, ends where the model says so (``terminated``), and is cut after
@@ -75,9 +75,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         self._steps = np.zeros(num_envs, np.int64)
         self._gathered = torch.zeros(num_envs, device=self._generator.device)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, State] | None = None
-    ) -> tuple[Latents, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Latents, Info]:
         """Begin N episodes; the first observations (N, Z), and no info. No options are known."""
         super().reset(seed=seed)
         self._z = self._draw_starts(self.num_envs)
@@ -85,7 +83,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         self._gathered.zero_()
         return self._z.copy(), {}
 
-    def step(self, actions: NDArray[np.int64]) -> tuple[Latents, Floats, Switches, Switches, dict[str, Any]]:
+    def step(self, actions: NDArray[np.int64]) -> tuple[Latents, Floats, Switches, Switches, Info]:
         """Imagine one transition of each episode: observations, rewards, terminated, truncated, info.
 
         InvalidValueError before :meth:`reset`, or for actions that are none; DivergedError if the model predicts NaN.
@@ -117,7 +115,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], Any]):
         self._z = reached
         return self._z.copy(), reward, terminated, truncated, info
 
-    def _info(self, step: ImaginedStep, accepted: Switches, reached: Latents, ended: Switches) -> dict[str, Any]:
+    def _info(self, step: ImaginedStep, accepted: Switches, reached: Latents, ended: Switches) -> Info:
         parts = decompose(step.samples)
         values = {"accepted": accepted} | {
             name: self.imagination.filter.score(getattr(parts, name)).cpu().numpy() for name in VERDICT[1:]
@@ -146,15 +144,13 @@ class ImaginedEnv(gymnasium.Env[Latents, np.int64]):
         self.observation_space = world.single_observation_space
         self.action_space = world.single_action_space
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, State] | None = None
-    ) -> tuple[Latents, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Latents, Info]:
         """Begin an episode: latents (Z,)."""
         super().reset(seed=seed)
         seen, info = self.world.reset(seed=seed)
         return seen[0], info
 
-    def step(self, action: np.int64) -> tuple[Latents, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64) -> tuple[Latents, float, bool, bool, Info]:
         """Imagine one transition; errors as of :meth:`ImaginedVectorEnv.step`."""
         seen, (reward,), (terminated,), (truncated,), info = self.world.step(np.array([action]))
         reached = info["final_obs"][0] if terminated or truncated else seen[0]

@@ -124,8 +124,13 @@ class MixtureRegressor:
         arrays |= {f"statistics/{name}": b.cpu().numpy().copy() for name, b in self._model.network.named_buffers()}
         for kind, generators in self._generators.items():
             arrays[f"generators/{kind}"] = np.stack([generator_array(generator) for generator in generators])
-        values = {"settings": dataclasses.asdict(self.settings), "epoch": self.epoch, "losses": self._losses}
-        return AgentState(arrays=arrays, values=jsonable({**values, "batches": self._model.network.batches}))
+        values = {
+            "settings": dataclasses.asdict(self.settings),
+            "epoch": self.epoch,
+            "losses": self._losses,
+            "batches": self._model.network.batches,
+        }
+        return AgentState(arrays=arrays, values=jsonable(values))
 
     def restore(self, state: AgentState) -> None:
         """Continue from ``state``, bit for bit; ArtefactError where it does not fit."""

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Array, Arrays
 from imagine_bench.interfaces import AgentContext, Frame
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined
@@ -92,7 +91,7 @@ class LatentModel:
         alive = torch.ones(len(z))
         kept = torch.ones(len(z), dtype=torch.bool)
         gathered = torch.zeros(len(z))
-        steps: dict[str, list[Any]] = {
+        steps: dict[str, list[Array]] = {
             name: [] for name in ("pictures", "rewards", "p_ended", "accepted", *UNCERTAINTIES)
         }
         for action in torch.from_numpy(actions[:, frames.shape[1] - 1 :]).unbind(dim=1):
@@ -111,7 +110,7 @@ class LatentModel:
             for name in UNCERTAINTIES:
                 reduced = self.imagination.filter.score(getattr(spread, name))
                 steps[name].append(reduced.view(rows, samples).mean(dim=1).numpy())
-        found = {name: np.stack(each, axis=1) for name, each in steps.items()}
+        found: Arrays = {name: np.stack(each, axis=1) for name, each in steps.items()}
         for name in ("pictures", "rewards", "p_ended"):
             found[name] = found[name].reshape(rows, samples, *found[name].shape[1:])
         if not self.compares:

@@ -96,24 +96,24 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         self._observation_spec = specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "observation")
         self._action_spec = specs.DiscreteArray(int(actions.n), name="action")
         self.info: Info = {}
-        self._physics: Any = None
+        self._physics: Physics | None = None
         self._time_s = 0.0
         self._shown = self._pose(0.0)
         self._to_show: list[_Pose | None] = []
-        self._before: Any = None
-        self._latest: Any = None
+        self._before = dm_env.restart(None)
+        self._latest: dm_env.TimeStep | None = None
 
     # --- dm_env --------------------------------------------------------------------------------------------------
 
-    def observation_spec(self) -> Any:
+    def observation_spec(self) -> specs.BoundedArray:
         """Bounds, shape and type of an observation."""
         return self._observation_spec
 
-    def action_spec(self) -> Any:
+    def action_spec(self) -> specs.DiscreteArray:
         """The actions' numbers, from 0."""
         return self._action_spec
 
-    def reset(self) -> Any:
+    def reset(self) -> dm_env.TimeStep:
         """Begin an episode; the first time with the seed."""
         observation, self.info = self._env.reset(seed=self._seed)
         self._seed, self._to_show = None, []
@@ -121,7 +121,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         self._show(self._pose(self._time_s))
         return self._latest
 
-    def step(self, action: Action) -> Any:
+    def step(self, action: Action) -> dm_env.TimeStep:
         """Carry out a macro-action, show more of its motion, or begin an episode."""
         if not self._to_show:
             if self._latest is None or self._latest.last():
@@ -137,7 +137,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         """Close the Gymnasium environment."""
         self._env.close()
 
-    def _carry_out(self, action: Any) -> Any:
+    def _carry_out(self, action: Action) -> dm_env.TimeStep:
         observation, reward, terminated, truncated, self.info = self._env.step(action)
         kind = dm_env.termination if terminated else dm_env.truncation if truncated else dm_env.transition
         return kind(reward=float(reward), observation=observation)
@@ -145,7 +145,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
     # --- the viewer ----------------------------------------------------------------------------------------------
 
     @property
-    def physics(self) -> Any:
+    def physics(self) -> Physics:
         """dm_control's ``Physics`` of what is shown: the task's own model, and data of its own.
 
         What is done to the data, such as by the viewer's mouse, does not reach the task.

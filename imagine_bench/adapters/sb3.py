@@ -13,10 +13,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.environments import Lanes
+from imagine_bench.environments import Env, Lanes
 from imagine_bench.errors import lacking
 
 from .lanes import endings, info_of, vector_env
@@ -24,6 +25,7 @@ from .lanes import endings, info_of, vector_env
 try:
     from stable_baselines3.common import env_util
     from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 except ImportError as error:
     raise lacking("stable_baselines3") from error
 
@@ -51,11 +53,11 @@ class Sb3VecEnv(VecEnv):
     def __init__(self, env: Lanes) -> None:
         self.env = env
         self._laned = hasattr(env, "envs")
-        self._lanes: Sequence[Any] = getattr(env, "envs", [env] * env.num_envs)
+        self._lanes: Sequence[Env] = getattr(env, "envs", [env] * env.num_envs)
         self._begun, self._actions = False, np.zeros(env.num_envs, dtype=np.int64)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
-    def reset(self) -> Any:
+    def reset(self) -> VecEnvObs:
         """Begin an episode in every lane: observations (N, ...)."""
         seeds: Any = self._seeds if self._laned else self._seeds[0]
         each_its_own = any(options != self._options[0] for options in self._options)
@@ -74,7 +76,7 @@ class Sb3VecEnv(VecEnv):
         """Keep the actions (N,)."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[Any, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(self) -> VecEnvStepReturn:
         """Carry them out: observations, rewards, ends, infos."""
         seen, rewards, terminated, truncated, infos = self.env.step(self._actions)
         ends, rows = endings(infos), [info_of(infos, lane) for lane in range(self.num_envs)]
@@ -92,22 +94,22 @@ class Sb3VecEnv(VecEnv):
         """An image of each lane, for render mode ``"rgb_array"``."""
         return self.env.render() or [None] * self.num_envs
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of these lanes, or all."""
         return [getattr(env, attr_name) for env in self._chosen(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set it."""
         for env in self._chosen(indices):
             setattr(env, attr_name, value)
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         """What a method of these lanes, or all, returns."""
         return [getattr(env, method_name)(*args, **kwargs) for env in self._chosen(indices)]
 
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """Whether such a wrapper is around these lanes, or all."""
         return [env_util.is_wrapped(env, wrapper_class) for env in self._chosen(indices)]
 
-    def _chosen(self, indices: Any) -> list[Any]:
+    def _chosen(self, indices: VecEnvIndices) -> list[Env]:
         return [self._lanes[lane] for lane in self._get_indices(indices)]

@@ -18,6 +18,7 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.episodes import Episodes, content_hash
 from imagine_bench.store.codec import write_arrays
 from imagine_bench.store.files import make_folder, read_sealed, reading, sealed, write_json, writing
+from imagine_bench.values import Json
 
 FORMATS = {name: f"imagine_bench.data.{name}" for name in ("npz", "lerobot", "minari")}
 """Modules of ``write`` and ``read``, none of which is imported before it is needed."""
@@ -49,7 +50,7 @@ class Dataset:
         return f"{policy}-{len(self.episodes)}@{self.episodes.hash[:12]}"
 
 
-def write_dataset(folder: Path, episodes: Episodes, apart: Apart, card: Mapping[str, Any], format: str) -> Dataset:
+def write_dataset(folder: Path, episodes: Episodes, apart: Apart, card: Mapping[str, Json], format: str) -> Dataset:
     """Write a dataset into a new folder, whole or not at all.
 
     A killed writer leaves a hidden folder ``.<name>.<8 hex digits>.partial``, which no later one reads or removes.

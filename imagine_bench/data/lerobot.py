@@ -14,7 +14,6 @@ import json
 import operator
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -27,6 +26,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes
 from imagine_bench.store.files import make_folder, read_json, reading, write_json
+from imagine_bench.values import Json
 
 _VERSION = "v3.0"
 _INFO = "meta/info.json"
@@ -46,7 +46,7 @@ _TYPES = {
 """Columns of one number a row. LeRobot's own tools take actions to be real numbers; a second is a macro-action."""
 
 
-def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
+def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
     """Write data, metadata and statistics of episodes; ``card`` has the task's ``description``."""
     firsts = np.cumsum(episodes.lengths) - episodes.lengths
     before, last = episodes.rows
@@ -91,7 +91,7 @@ def _columns(episodes: Episodes, firsts: NDArray[np.int64]) -> Arrays:
 def _table(columns: Mapping[str, Array], frames: Frame) -> pa.Table:
     """Columns and images, and what the ``datasets`` library is told of them."""
     arrays: list[pa.Array] = [_pngs(frames)]
-    features: dict[str, dict[str, Any]] = {_IMAGE: {"_type": "Image"}}
+    features: dict[str, dict[str, Json]] = {_IMAGE: {"_type": "Image"}}
     for name, column in columns.items():
         features[name] = {"dtype": str(column.dtype), "_type": "Value"}
         arrays.append(pa.array(column.ravel()))
@@ -117,7 +117,7 @@ def _file(folder: Path, chunk_index: int, file_index: int) -> Path:
     return path
 
 
-def _statistics(columns: Mapping[str, Array], frames: Frame) -> dict[str, dict[str, list[Any]]]:
+def _statistics(columns: Mapping[str, Array], frames: Frame) -> dict[str, dict[str, Json]]:
     """Of every column, and of each color in [0, 1], whose arrays have the shape (3, 1, 1)."""
     levels = np.arange(256) / 255
     counts = [np.bincount(frames[..., color].ravel(), minlength=256) for color in range(3)]
@@ -127,7 +127,7 @@ def _statistics(columns: Mapping[str, Array], frames: Frame) -> dict[str, dict[s
     ]
     seen = [levels[count > 0] for count in counts]
     colors = {"min": [s[0] for s in seen], "max": [s[-1] for s in seen], "mean": means, "std": spreads}
-    found: dict[str, dict[str, list[Any]]] = {
+    found: dict[str, dict[str, Json]] = {
         _IMAGE: {which: [[[float(value)]] for value in values] for which, values in colors.items()}
     }
     for name, column in columns.items():
@@ -148,9 +148,11 @@ def _tasks(text: list[str]) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(told)})
 
 
-def _info(episodes: Episodes) -> dict[str, Any]:
-    features: dict[str, Any] = {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _TYPES.items()}
-    features["action"]["names"] = ["macro_action"]
+def _info(episodes: Episodes) -> dict[str, Json]:
+    features: dict[str, Json] = {}
+    for name, dtype in _TYPES.items():
+        names = ["macro_action"] if name == "action" else None
+        features[name] = {"dtype": dtype, "shape": [1], "names": names}
     features[_MASK] = {"dtype": "bool", "shape": [episodes.n_actions], "names": None}
     features[_IMAGE] = {"dtype": "image", "shape": list(FRAME_SHAPE), "names": ["height", "width", "channels"]}
     return {
@@ -193,7 +195,7 @@ def read(path: Path) -> Episodes:
         )  # fmt: skip
 
 
-def _decoded(table: pa.Table) -> Iterator[list[Any]]:
+def _decoded(table: pa.Table) -> Iterator[list[Frame]]:
     """The images of a table, and its masks."""
     images = [PIL.Image.open(io.BytesIO(image["bytes"]), formats=["PNG"]) for image in table[_IMAGE].to_pylist()]
     for image in images:

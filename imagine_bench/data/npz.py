@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.store.codec import write_arrays
 from imagine_bench.store.files import reading
+from imagine_bench.values import Json
 
 
-def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
+def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
     """Write the archive."""
     write_arrays(folder / "episodes.npz", episodes.arrays())
 

@@ -9,7 +9,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Self, get_type_hints
+from typing import TYPE_CHECKING, Any, Self, get_type_hints
 
 from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
@@ -17,6 +17,9 @@ from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.registry.old_names import FIRST, TODAY, agent_label, edition_of, name_in_edition_1
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
 from imagine_bench.values import Json, Setting
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 LATER: Mapping[str, bool] = {"later": True}
 """Metadata of a field that protocols did not always have: at its default it changes no hash."""
@@ -92,7 +95,7 @@ class ProtocolData(ABC):
         """Parts of work of a run of this agent as far as the budget ``until``, of whatever the protocol counts."""
 
 
-def require_types(one: Any) -> None:
+def require_types(one: DataclassInstance) -> None:
     """Make lists in the fields of a dataclass tuples, or raise InvalidValueError for a value of another type."""
     for name, hint in get_type_hints(type(one)).items():
         if isinstance(value := getattr(one, name), list):

@@ -177,7 +177,7 @@ class _EpisodeRecorder:
             self._clock_s += _STILL_S
             self._recording.set_clocks(self._clock_s, env_step=self._env_step, episode=1)
 
-    def _log_frame(self, scene: Any, episode: int, seen: Observed, info: Info) -> Observation:
+    def _log_frame(self, scene: Env, episode: int, seen: Observed, info: Info) -> Observation:
         """A new real frame: set the clocks, show it and how the scene stands. Returns what the agent sees."""
         observation = Observation.of(seen, info, privileged=self._privileged)
         frame = observation.frame if observation.frame.size else self._unseen_frame(scene, info)
@@ -191,11 +191,11 @@ class _EpisodeRecorder:
             log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences, only_moved=True)
         return observation
 
-    def _unseen_frame(self, scene: Any, info: Info) -> Frame:
+    def _unseen_frame(self, scene: Env, info: Info) -> Frame:
         """For people, the frame of an agent that sees something else: as late as that, and hiding as much."""
         shown = np.asarray(info.get("shown", info["macrostate"]))
-        if np.array_equal(shown, info["macrostate"]):
-            return np.asarray(scene.agent_view())
+        if isinstance(scene, SceneReader) and np.array_equal(shown, info["macrostate"]):
+            return scene.agent_view()
         return self._spec.render_macrostates(shown[None], self._appearance, np.random.default_rng(self._env_step))[0]
 
     def _describe(self, heading: str, info: Info, last: str, frame: Frame) -> None:

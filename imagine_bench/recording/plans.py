@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -96,7 +95,7 @@ class _PlanRecorder:
         self._env_step += 1
 
     def _arrive(self, *, only_moved: bool) -> None:
-        scene: Any = self._env.unwrapped
+        scene = self._env.unwrapped
         self._recording.set_clocks(self._clock_s, env_step=self._env_step)
         if isinstance(scene, SceneReader):
             sequences = {"env_step": self._env_step, "plan": self._number}
@@ -138,7 +137,7 @@ def _so_far(compared: ComparedRollout, done: int) -> ComparedRollout:
     return dataclasses.replace(compared, **{name: getattr(compared, name)[:done] for name in names})
 
 
-def _layout(scene: Any, trained: Trained) -> rrb.Blueprint:
+def _layout(scene: Env, trained: Trained) -> rrb.Blueprint:
     frames = rrb.Horizontal(
         rrb.Spatial2DView(origin="/real/frame", name="What the camera sees (the agent does not)"),
         rrb.Spatial2DView(origin="/imagined/frame", name="What the agent imagined for this moment"),

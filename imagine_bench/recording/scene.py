@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Motion, SceneReader, Shape3D
 from imagine_bench.recording.stream import Recording
@@ -65,12 +66,12 @@ def log_motion(
         recording.stream.send_columns(body_path(body), indexes=times, columns=columns, strict=True)
 
 
-def macro_duration_s(scene: Any) -> float:
+def macro_duration_s(scene: Env) -> float:
     """How long the latest macro-action took, in simulated seconds; a kinematic one takes none and is given one."""
     return (float(scene.motion().time_s[-1]) if isinstance(scene, SceneReader) else 0.0) or _KINEMATIC_STEP_S
 
 
-def look_target_m(scene: Any) -> NDArray[np.float64]:
+def look_target_m(scene: Env) -> NDArray[np.float64]:
     """What the 3D view looks at: the middle of the small bodies, which are the objects and the fingers."""
     if not isinstance(scene, SceneReader):
         return np.zeros(3)

@@ -112,7 +112,7 @@ def is_own(task: str) -> bool:
     return base in TASKS and TASKS[base].spec.startswith("imagine_bench.")
 
 
-def regressions() -> dict[str, Any]:
+def regressions() -> dict[str, str | RegressionSpec]:
     """All regression tasks by name, likewise."""
     return {**REGRESSIONS, **usable(REGRESSION_GROUP)}
 

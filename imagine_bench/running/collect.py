@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Arrays, State
+from imagine_bench.arrays import Array, Arrays, State
 from imagine_bench.data.folder import Apart, Dataset, read_apart
 from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -27,6 +27,7 @@ from imagine_bench.registry.machine import describe_environment
 from imagine_bench.rules import states_of
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SEEDS, SeedTree, episode_seed
+from imagine_bench.values import Json
 
 POLICIES = {
     "random": "every macro-action by chance",
@@ -44,7 +45,7 @@ class Policy:
 
     name: str  #: One of :data:`POLICIES`, or the agent's
     players: Sequence[tuple[Agent, bool]]  #: Play an episode each in turn; whether each is shown macrostates
-    facts: Mapping[str, Any]  #: More for the card
+    facts: Mapping[str, Json]  #: More for the card
 
 
 def policy_of(name: str, spec: TaskSpec, seed: int, encoder: str | None = None) -> Policy:
@@ -76,7 +77,7 @@ def policy_of(name: str, spec: TaskSpec, seed: int, encoder: str | None = None) 
 
 def collect(
     spec: TaskSpec, policy: Policy, *, episodes: int, seed: int, execution: str, appearance: str, motion_hz: float = 0.0
-) -> tuple[Episodes, Apart, dict[str, Any]]:
+) -> tuple[Episodes, Apart, dict[str, Json]]:
     """Play episodes of a task.
 
     Returns:
@@ -139,8 +140,8 @@ def _episode(
     mask = np.ones(int(env.action_space.n), dtype=np.int8)  # type: ignore[attr-defined]
     faults = 0
     ended = False
-    kept: dict[str, list[Any]] = {name: [] for name in ("frames", "action_masks", "macrostates")}
-    seen: dict[str, list[Any]] = {name: [] for name in ("actions", "rewards", "terminated", "truncated")}
+    kept: dict[str, list[Array]] = {name: [] for name in ("frames", "action_masks", "macrostates")}
+    seen: dict[str, list[float]] = {name: [] for name in ("actions", "rewards", "terminated", "truncated")}
     while True:
         for each, value in zip(kept.values(), (frame, info.get("action_mask", mask), info["macrostate"]), strict=True):
             each.append(np.asarray(value))
@@ -150,13 +151,15 @@ def _episode(
         frame, reward, terminated, truncated, info = env.step(action)
         watch()
         truncated = truncated or (options is not None and not terminated)
-        for each, value in zip(seen.values(), (action, float(reward), bool(terminated), bool(truncated)), strict=True):
-            each.append(value)
+        seen["actions"].append(action)
+        seen["rewards"].append(float(reward))
+        seen["terminated"].append(bool(terminated))
+        seen["truncated"].append(bool(truncated))
         faults = faults + bool(info["fault"])
         ended = terminated or truncated
 
 
-def _card(spec: TaskSpec, policy: Policy, played: Episodes) -> dict[str, Any]:
+def _card(spec: TaskSpec, policy: Policy, played: Episodes) -> dict[str, Json]:
     """What a dataset is: task, policy, counts, success beside chance and optimum, and what made it."""
     environment = describe_environment()
     return {

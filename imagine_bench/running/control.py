@@ -25,6 +25,7 @@ from imagine_bench.store.archive import load_archive
 from imagine_bench.store.bench_folder import is_archive, read_control
 from imagine_bench.store.merge import load_so_far
 from imagine_bench.store.results import BenchResult
+from imagine_bench.values import Json
 
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 
@@ -100,7 +101,7 @@ def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
             require_able(registry.make_agent(agent, spec.context()), agent, wanted)
 
 
-def resolved_settings(wanted: Protocol) -> dict[str, Any]:
+def resolved_settings(wanted: Protocol) -> dict[str, Json]:
     """All settings of every learner by its name, each override checked by the agents that have such a setting.
 
     Raises:

@@ -94,5 +94,5 @@ def _play(lanes: Any, agent: Agent, seeds: Sequence[int], *, privileged: bool) -
             following += 1
 
 
-def _row(infos: Info, row: int) -> dict[str, Any]:
+def _row(infos: Info, row: int) -> Info:
     return {key: values[row] for key, values in infos.items() if not key.startswith("_")}

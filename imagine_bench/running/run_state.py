@@ -30,6 +30,7 @@ from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot
 from imagine_bench.store.codec import pack, unpack
 from imagine_bench.store.files import reading, sweep, writing
 from imagine_bench.store.results import Checkpoint
+from imagine_bench.values import Json
 
 _RECENT = 100
 """Training episodes whose success is shown while running."""
@@ -199,7 +200,7 @@ class Run:
             )
         return found.episodes
 
-    def _config(self) -> Mapping[str, Any]:
+    def _config(self) -> Mapping[str, Json]:
         settings = getattr(self.agent, "settings", None)
         return {
             "protocol": self.protocol.as_dict(),

@@ -23,8 +23,10 @@ from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.registry.entries import file_name
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import lock, make_folder, read_json, read_sealed, reading, sealed, write_json
+from imagine_bench.values import Json
 
 P = TypeVar("P", bound=ProtocolData)
+L = TypeVar("L")
 
 KEPT = "bench.json"
 """Protocol, environment and sessions in one file, as :mod:`.archive` keeps them for good."""
@@ -74,7 +76,7 @@ class BenchStore:
         """Return the folder of one run."""
         return self.folder / file_name(self.protocol.written_name(agent)) / f"seed_{seed}"
 
-    def load(self, load_run: Callable[[Path], Any]) -> dict[tuple[str, int], Any]:
+    def load(self, load_run: Callable[[Path], L]) -> dict[tuple[str, int], L]:
         """Read every run by ``load_run``. Raises ArtefactError: a run is damaged or of another protocol."""
         found = {pair: load_run(self.run_folder(*pair)) for pair in self.pairs}
         for (agent, seed), run in found.items():
@@ -239,7 +241,7 @@ def read_protocol_as(folder: Path, kind: type[P]) -> P:
         return kind.from_dict(values)
 
 
-def is_of_regression(values: Mapping[str, Any]) -> bool:
+def is_of_regression(values: Mapping[str, Json]) -> bool:
     """Return whether a protocol's values are those of a regression task, in which no agent acts."""
     return "variants" in values
 

@@ -21,6 +21,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from imagine_bench.errors import ArtefactError, BusyError, SetupError, brief
+from imagine_bench.values import Json
 
 _LONGEST = 1000
 """Characters of a library's own complaint that are handed on."""
@@ -137,7 +138,7 @@ def read_json(path: Path, what: str, holds: type = dict) -> Any:
         return found
 
 
-def sealed(values: Mapping[str, Any]) -> dict[str, Any]:
+def sealed(values: Mapping[str, Any]) -> dict[str, Json]:
     """Values with the digest of all of them, under ``seal``."""
     return {**values, "seal": _seal(values)}
 
@@ -151,7 +152,7 @@ def read_sealed(path: Path, what: str) -> dict[str, Any]:
     return values
 
 
-def _seal(values: Mapping[str, Any]) -> str:
+def _seal(values: Mapping[str, Json]) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
@@ -172,7 +173,7 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise ArtefactError(f"{path} is not {what}: {text[:_LONGEST]}. It was left untouched.") from error
 
 
-def first_difference(then: Any, now: Any, name: str = "") -> tuple[str, Any, Any] | None:
+def first_difference(then: Json, now: Json, name: str = "") -> tuple[str, Json, Json] | None:
     """Where two JSON values differ first, by sorted name: the dotted name and both values; None where they are equal.
 
     What one has and the other lacks is given as None in the other.

@@ -144,7 +144,7 @@ class RunResult:
 
 
 def require_every_run(
-    folder: Path, protocol: ProtocolData, runs: Sequence[tuple[str, int, Path, Mapping[str, Any]]]
+    folder: Path, protocol: ProtocolData, runs: Sequence[tuple[str, int, Path, Mapping[str, Setting]]]
 ) -> None:
     """Raise ArtefactError unless there is one run for each learner and seed, and all of a learner had equal settings.
 
@@ -158,7 +158,7 @@ def require_every_run(
             f"{folder} should hold one run for each of {len(wanted)} agents and seeds and holds {len(found)}; "
             f"missing: {missing or 'none'}. Run the same bench command again to complete it."
         )
-    first: dict[str, tuple[Path, Mapping[str, Any]]] = {}
+    first: dict[str, tuple[Path, Mapping[str, Setting]]] = {}
     for agent, _, where, settings in runs:
         if settings:
             known, wanted_settings = first.setdefault(agent, (where, settings))

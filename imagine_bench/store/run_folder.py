@@ -25,6 +25,7 @@ from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.codec import pack, read_arrays, table_rows, table_text, unpack, write_arrays
 from imagine_bench.store.files import first_difference, read_sealed, reading, sealed, sha256, write_bytes, write_json
 from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RunResult
+from imagine_bench.values import Json
 
 FORMAT = "imagine_bench run 2"
 CHECKPOINTS = "checkpoints"
@@ -60,7 +61,7 @@ def reached(folder: Path) -> int:
         return int(rows[-1]["episodes"]) if rows else 0
 
 
-def check_config(folder: Path, config: Mapping[str, Any]) -> None:
+def check_config(folder: Path, config: Mapping[str, Json]) -> None:
     """Write what is run into a new run folder, or compare it with what an old one holds.
 
     Raises:
@@ -94,7 +95,7 @@ def require_run_of(folder: Path, protocol: ProtocolData, agent: str, seed: int) 
     """Raise ArtefactError unless the run in ``folder`` is this agent's and seed's of this very protocol."""
     config = read_config(folder)
     protocol_hash = digest(config.get("protocol"))
-    wanted = {
+    wanted: dict[str, Json] = {
         "agent": protocol.written_name(agent),
         "seed": seed,
         "protocol_hash": protocol_hash,

@@ -197,9 +197,9 @@ def _suite(data: dict[str, Any]) -> Suite:
     return Suite(**{**data, "experiments": tuple(experiments)})
 
 
-def _dotted(settings: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+def _dotted(settings: Mapping[str, Setting], before: str = "") -> dict[str, Setting]:
     """Settings, nested or not, by dotted name."""
-    found: dict[str, Any] = {}
+    found: dict[str, Setting] = {}
     for name, value in settings.items():
         if isinstance(value, Mapping):
             found |= _dotted(value, f"{before}{name}.")

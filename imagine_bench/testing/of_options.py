@@ -36,6 +36,7 @@ from imagine_bench.running.run_state import Counters, Run, make_env
 from imagine_bench.store import encoders
 from imagine_bench.testing.common import NotOffered, require
 from imagine_bench.testing.of_agents import CheckedAgent, greedy, same_arrays
+from imagine_bench.values import Setting
 
 _EPISODES = 2
 _TESTS = 8
@@ -161,7 +162,7 @@ class CheckedOptions:
             raise NotOffered(f"{base} has no such option")
         return f"{self.task}{',' if ':' in self.task else ':'}{row.world}"
 
-    def _run(self, task: str, changes: tuple[tuple[str, Any], ...], episodes: int) -> _Left:
+    def _run(self, task: str, changes: tuple[tuple[str, Setting], ...], episodes: int) -> _Left:
         """What some episodes of training, or of tests for one that learns nothing, left: a digest."""
         given: dict[str, Any] = {"execution": registry.task(task).executions[-1], **dict(changes)}
         wanted, paths = plan_control(

@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
+from imagine_bench.values import Setting
 
 from ..parameters.parameters import WorldParameters
 
@@ -115,7 +116,7 @@ class Arrows(WorldParameters):
     def _coupled(self) -> bool:
         return self.coupling == "neighbour"
 
-    def _usual(self, name: str) -> Any:
+    def _usual(self, name: str) -> Setting:
         if name == "forbid":
             return "equal" if self.cubes < N_DIRECTIONS else "neighbours"
         return super()._usual(name)

@@ -17,9 +17,11 @@ import numpy as np
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Observed
 from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
 from imagine_bench.preprocessing import gray_name
 from imagine_bench.rules import facts
+from imagine_bench.values import Setting
 
 from .description import Arrows
 from .rules import ArrowRules, Goal
@@ -95,7 +97,7 @@ def _rendered(rules: ArrowRules, macrostates: NDArray[np.int64], appearance: str
     return frames_of(_maker(scene), rules, macrostates, appearance, rng)
 
 
-def spec_of(**world: Any) -> TaskSpec:
+def spec_of(**world: Setting) -> TaskSpec:
     """A world of the family, by the fields of :class:`.description.Arrows`.
 
     Raises:
@@ -157,7 +159,7 @@ def make_env(**options: Any) -> MacroEnv:
     return MacroEnv(_spec(world), _maker(world), **options)
 
 
-def make_limited_env(**options: Any) -> TimeLimit[Any, np.int64]:
+def make_limited_env(**options: Any) -> TimeLimit[Observed, np.int64]:
     """As :func:`make_env`, truncated at the world's own horizon."""
     env = make_env(**options)
     return TimeLimit(env, env.horizon)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief
 from imagine_bench.interfaces import State
+from imagine_bench.values import Setting
 
 from .gesture import GestureObservation
 
@@ -60,7 +61,7 @@ class WorldParameters:
             raise InvalidValueError(f"{name} is {brief(value)}; give {words}{also}.")
         return kind(value)
 
-    def _usual(self, name: str) -> Any:
+    def _usual(self, name: str) -> Setting:
         """The value that the canonical name leaves out."""
         return getattr(type(self), name)
 
@@ -83,7 +84,7 @@ class WorldParameters:
         return names | {old: new for new, old in cls.NAMED.items()}
 
     @classmethod
-    def taken_from(cls, options: dict[str, Any], others: Iterable[str] = ()) -> Self:
+    def taken_from(cls, options: dict[str, Setting], others: Iterable[str] = ()) -> Self:
         """The world that keyword arguments say, taken out of them.
 
         Raises:

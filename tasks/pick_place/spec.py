@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
 from imagine_bench.rules import facts
+from imagine_bench.values import Setting
 
 from .rules import HANDED_OVER, N_OBJECTS, PickPlace, PickPlaceRules
 
@@ -99,7 +100,7 @@ SPEC = TaskSpec(
 )
 
 
-def spec_of(**world: Any) -> TaskSpec:
+def spec_of(**world: Setting) -> TaskSpec:
     """The task in a world of these parameters. Raises as :class:`.rules.PickPlace`."""
     return _spec(PickPlace.taken_from(world))
 

@@ -126,12 +126,12 @@ class _Canvas:
         self.users = 0  # renderers that share it
         self.pid = os.getpid()
         self.thread: int | None = threading.get_ident()  # in which it may be current; None once it is released
-        self.gl: Any = _new_gl_context(view.width, view.height)
+        self.gl = _new_gl_context(view.width, view.height)
         self._is_egl = type(self.gl).__module__.endswith("egl")
         self._address = ctypes.cast(self.gl._context, ctypes.c_void_p).value if self._is_egl else None
         try:
             with _quality(model, view):
-                self.mjr: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+                self.mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except mujoco.FatalError as error:  # GLFW makes a context object without a display, but nothing can be drawn
             raise _missing_gl(error) from error
         mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
@@ -328,7 +328,7 @@ class Renderer:
                 canvas.release()
         return drawn
 
-    def _one_at_a_time(self) -> AbstractContextManager[Any]:
+    def _one_at_a_time(self) -> AbstractContextManager[bool]:
         """The lock of this process: a thread of the parent's that held it when this was forked lives there alone."""
         if self._pid != os.getpid():
             self._lock = threading.RLock()
@@ -364,5 +364,5 @@ class Renderer:
             if canvas is not None:
                 self._finalizer()
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type[Renderer], tuple[mujoco.MjModel, View]]:
         return type(self), (self._model, self.view)

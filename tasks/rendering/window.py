@@ -74,5 +74,5 @@ class Window:
             self._pygame.display.quit()
             self._pygame = None
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type[Window], tuple[str]]:
         return type(self), (self._title,)
