@@ -17,6 +17,7 @@ from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.errors import SetupError
+from imagine_bench.values import Json
 from imagine_bench.version import PACKAGE_FOLDER, __version__
 
 PACKAGES = ("daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safetensors", "scipy", "torch")
@@ -28,7 +29,7 @@ _CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def describe_environment() -> dict[str, Any]:
+def describe_environment() -> dict[str, Json]:
     """Command, commit, versions, machine, GL renderer (or why there is none), threads; JSON-like."""
     return {
         "command": command(),

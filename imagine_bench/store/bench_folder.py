@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypedDict, TypeVar
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.exact.certificate import Certificate, from_json
@@ -40,6 +40,15 @@ _IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
 """Facts that decide the bits of a result."""
 
 
+class _Session(TypedDict):
+    """One command that worked on a bench."""
+
+    started: str
+    wall_s: float
+    command: Json
+    changed: dict[str, Json]
+
+
 class BenchStore:
     """The folder of one protocol: that of :func:`bench_folder`, or wherever somebody has moved it to."""
 
@@ -47,7 +56,7 @@ class BenchStore:
         self.protocol = protocol
         self.folder = folder
         self._began_s = time.monotonic()
-        self._sessions: list[dict[str, Any]] = []
+        self._sessions: list[_Session] = []
 
     @property
     def pairs(self) -> list[tuple[str, int]]:
@@ -89,7 +98,7 @@ class BenchStore:
         unfinished = [pair for pair in self.pairs if not run_folder.is_done(self.run_folder(*pair))]
         return [pair for pair in unfinished if until is None or run_folder.reached(self.run_folder(*pair)) < until]
 
-    def begin_session(self, environment: dict[str, Any]) -> list[str]:
+    def begin_session(self, environment: Mapping[str, Json]) -> list[str]:
         """Note that work starts now, in what :func:`.describe_environment` says; returns :meth:`changed`."""
         path = self.folder / _ENVIRONMENT
         begun = path.exists()
@@ -118,7 +127,7 @@ class BenchStore:
             if found is not None:
                 write_json(path, sealed(dataclasses.asdict(found)))
 
-    def changed(self, environment: dict[str, Any]) -> list[str]:
+    def changed(self, environment: Mapping[str, Json]) -> list[str]:
         """Return names of facts that decide the bits and differ from the first session's; none before there was one."""
         path = self.folder / _ENVIRONMENT
         first = read_sealed(path, "a bench's environment") if path.exists() else environment
@@ -130,8 +139,11 @@ class BenchStore:
         write_json(self.folder / _SESSIONS, sealed({"sessions": self._sessions}))
 
 
-def _fact(environment: Mapping[str, Any], name: str) -> Any:
-    return environment.get("machine", {}).get("cpu") if name == "cpu" else environment.get(name)
+def _fact(environment: Mapping[str, Json], name: str) -> Json:
+    if name != "cpu":
+        return environment.get(name)
+    machine = environment.get("machine")
+    return machine.get("cpu") if isinstance(machine, Mapping) else None
 
 
 def bench_folder(root: Path, protocol: ProtocolData) -> Path:
@@ -163,11 +175,14 @@ def bench_facts(folder: Path) -> dict[str, Any]:
         return facts if certificate is None else {**facts, "certificate": from_json(certificate)}
 
 
-def _sessions(folder: Path) -> list[dict[str, Any]]:
+def _sessions(folder: Path) -> list[_Session]:
     path = folder / _SESSIONS
     sessions = read_sealed(path, "a bench's sessions")
     with reading(path, "a bench's sessions"):
-        return [{**session, "wall_s": float(session["wall_s"])} for session in sessions["sessions"]]
+        found: list[_Session] = sessions["sessions"]
+        for session in found:
+            session["wall_s"] = float(session["wall_s"])
+        return found
 
 
 def require_either(given: Path | None, task: str | None) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRoll
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.store.files import first_difference
-from imagine_bench.values import Setting
+from imagine_bench.values import Json, Setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,7 +186,7 @@ class BenchResult:
 
     protocol: Protocol  #: What was compared
     runs: tuple[RunResult, ...]  #: One an agent and seed
-    environment: Mapping[str, Any]  #: Command, commit, versions, machine, GL renderer, threads; JSON-like
+    environment: Mapping[str, Json]  #: Command, commit, versions, machine, GL renderer, threads; JSON-like
     folder: Path  #: Where the bench's files lie
     wall_s: float  #: Wall seconds of the bench, over all its sessions
     certificate: Certificate | None = None  #: That of the world; None in results of before 2026-11-25

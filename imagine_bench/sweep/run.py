@@ -33,6 +33,7 @@ from imagine_bench.store.bench_folder import BenchStore, bench_folder
 from imagine_bench.store.results import BenchResult, RunResult
 from imagine_bench.sweep.grid import Experiment, Level, Study, Suite, Variant
 from imagine_bench.sweep.score import Scale, auroc, score
+from imagine_bench.values import Json
 
 Planned = tuple[ProtocolData, Encoders]
 """A bench, and the encoders that its agents need."""
@@ -78,7 +79,7 @@ class Line:
     #: Against the variant it is compared with, one a budget; None for a variant that is compared with nothing.
     difference: tuple[Estimate, ...] | None
     folder: Path  #: Folder of its bench
-    environment: Mapping[str, Any]  #: Command, commit, versions and machine of its first session; JSON-like
+    environment: Mapping[str, Json]  #: Command, commit, versions and machine of its first session; JSON-like
 
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
@@ -156,7 +157,7 @@ class LevelResult:
     scale: Scale | None  #: None if nothing was run
     train_cpu_s: float  #: Mean CPU seconds of training a run; NaN likewise
     benches: tuple[str, ...]  #: Task and folder of the bench of each seed, below the folder of all benches
-    environment: Mapping[str, Any]  #: Of its first session; empty likewise
+    environment: Mapping[str, Json]  #: Of its first session; empty likewise
 
 
 @dataclass(frozen=True, kw_only=True)

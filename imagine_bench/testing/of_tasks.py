@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 from gymnasium.utils.env_checker import check_env
@@ -101,10 +101,10 @@ def _kept(spec: TaskSpec) -> None:
             require(_walk(again, spec) == walked, f"put back {where}, it goes on otherwise")
 
 
-def _walk(env: Any, spec: TaskSpec) -> list[Any]:
+def _walk(env: Env, spec: TaskSpec) -> list[tuple[bytes, SupportsFloat, bool, list[int]]]:
     """What follows on some random macro-actions, to the end of the episode at most."""
     rng = np.random.default_rng(0)
-    found = list[Any]()
+    found = list[tuple[bytes, SupportsFloat, bool, list[int]]]()
     over = False
     while not over and len(found) < spec.horizon:
         frame, reward, over, _, info = env.step(int(rng.integers(spec.n_actions)))

@@ -11,11 +11,16 @@ import os
 import socket
 import time
 from collections.abc import Sequence
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING
 
 from imagine_bench.errors import BusyError, SetupError, lacking
 from imagine_bench.protocols.runs import Failure, Job, OnProgress, Progress
 from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out, require_workers, run_job
+
+if TYPE_CHECKING:
+    from ray import ObjectRef
+    from ray.actor import ActorHandle
 
 _LOST = 20
 """Times that a task may lose its worker or its node before its run counts as failed."""
@@ -51,7 +56,7 @@ class RayCluster:
         finally:
             ray.shutdown()
 
-    def _connect(self, ray: Any) -> None:
+    def _connect(self, ray: ModuleType) -> None:
         address = os.environ.get("RAY_ADDRESS")
         local = {} if address else {"num_cpus": self._workers, "include_dashboard": False}
         try:
@@ -71,7 +76,7 @@ def _require_listening(address: str | None) -> None:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_ANSWERS_WITHIN_S).close()
 
 
-def _launch(ray: Any, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+def _launch(ray: ModuleType, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
     gpus = int(any(job.spec.protocol.device == "cuda" for job in jobs))
     if ray.cluster_resources().get("GPU", 0) < gpus:
         raise SetupError("No node of the Ray cluster has a GPU for device 'cuda'; add one, or use device 'cpu'.")
@@ -102,7 +107,7 @@ def _launch(ray: Any, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Fai
     return tuple(failures)
 
 
-def _reason(ray: Any, task: Any) -> str:
+def _reason(ray: ModuleType, task: ObjectRef) -> str:
     """Why an ended task's run failed, or an empty string."""
     try:
         reason: str = ray.get(task)
@@ -128,7 +133,7 @@ class _Board:
         return news
 
 
-def _work(job: Job, board: Any) -> str:
+def _work(job: Job, board: ActorHandle) -> str:
     """A run. Returns why it failed, or an empty string."""
     return carry_out(job, board.put.remote, _run_when_free)
 

@@ -14,12 +14,15 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from imagine_bench.errors import lacking
 from imagine_bench.protocols.runs import Failure, Job, OnProgress, Progress
 from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out, require_workers
 from imagine_bench.store.files import make_folder, write_bytes
+
+if TYPE_CHECKING:
+    import submitit
 
 _POLL_S = 1.0
 _LIMIT_MIN = 24 * 60
@@ -49,7 +52,7 @@ class SlurmCluster:
         """Carry out every job, in order; those in the queue are cancelled when this is interrupted."""
         waiting = [absolute(job) for job in jobs][::-1]
         failures = []
-        queued: dict[Any, Job] = {}
+        queued: dict[submitit.Job[str], Job] = {}
         try:
             while waiting or queued:
                 while waiting and len(queued) < self._workers:
@@ -71,7 +74,7 @@ class SlurmCluster:
                 ticket.cancel()
         return tuple(failures)
 
-    def _submit(self, job: Job) -> Any:
+    def _submit(self, job: Job) -> submitit.Job[str]:
         news = _news(job)
         news.unlink(missing_ok=True)
         executor = self._submitit.AutoExecutor(folder=make_folder(news.parent), slurm_max_num_timeout=_LOST)
@@ -90,7 +93,7 @@ class _Work:
         os.environ.update(ONE_THREAD)
         return carry_out(job, lambda progress: _tell(job, progress))
 
-    def checkpoint(self, job: Job) -> Any:
+    def checkpoint(self, job: Job) -> submitit.helpers.DelayedSubmission:
         import submitit  # noqa: PLC0415 - as above
 
         return submitit.helpers.DelayedSubmission(self, job)
@@ -111,7 +114,7 @@ def _latest(job: Job) -> Progress | None:
     return None
 
 
-def _reason(ticket: Any) -> str:
+def _reason(ticket: submitit.Job[str]) -> str:
     """Why an ended job's run failed, or an empty string."""
     try:
         reason: str = ticket.result()
