@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import APPEARANCES, SceneReader, State, TaskSpec
+from imagine_bench.interfaces import APPEARANCES, State, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree, episode_seed
 
@@ -92,7 +93,7 @@ def measure_fidelity(spec: TaskSpec, actions: int, appearance: str = _CLEAN) -> 
     return found
 
 
-def _poses(env: SceneReader, objects: Sequence[str]) -> NDArray[np.float64]:
+def _poses(env: Any, objects: Sequence[str]) -> NDArray[np.float64]:
     """Positions and quaternions of the named bodies, now. Shape (N, 7)."""
     if not objects:
         return np.empty((0, 7))

@@ -10,8 +10,7 @@ import numpy as np
 from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.factored.learned_perception import LearnedPerception
 
-from imagine_bench.arrays import Arrays
-from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Arrays, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
 from .count_table import CountTableAgent
