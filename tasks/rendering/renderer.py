@@ -119,11 +119,39 @@ def _release() -> None:
     EGL.eglMakeCurrent(EGL_DISPLAY, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
 
 
+def _empty_scene(model: mujoco.MjModel, view: View) -> mujoco.MjvScene:
+    """An empty scene of a model, to be filled and drawn as a view says."""
+    scene = mujoco.MjvScene(model, maxgeom=model.ngeom + _EXTRA_GEOMS)
+    flags = mujoco.mjtRndFlag
+    scene.flags[flags.mjRND_SHADOW.value] = view.shadow_px > 0
+    scene.flags[flags.mjRND_SKYBOX.value] = view.sky
+    scene.flags[flags.mjRND_REFLECTION.value] = False
+    scene.flags[flags.mjRND_HAZE.value] = False
+    return scene
+
+
+def _drawn_groups(view: View) -> mujoco.MjvOption:
+    """The geom groups that a view draws."""
+    option = mujoco.MjvOption()
+    option.geomgroup[:] = np.isin(np.arange(mujoco.mjNGROUP), view.groups)
+    option.sitegroup[:] = 0
+    return option
+
+
+def _fixed_camera(model: mujoco.MjModel, view: View) -> mujoco.MjvCamera:
+    """The camera of the model that a view names."""
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    camera.fixedcamid = model.camera(view.camera).id
+    return camera
+
+
 class _Canvas:
     """An OpenGL context with one model's meshes and textures in it."""
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
         self.users = 0  # renderers that share it
+        self.damaged = False  # whether other code was found to have freed a part of it
         self.pid = os.getpid()
         self.thread: int | None = threading.get_ident()  # in which it may be current; None once it is released
         self.gl = _new_gl_context(view.width, view.height)
@@ -135,6 +163,31 @@ class _Canvas:
         except mujoco.FatalError as error:  # GLFW makes a context object without a display, but nothing can be drawn
             raise _missing_gl(error) from error
         mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
+        self._model = model  # its scene below points into it
+        self._rect = mujoco.MjrRect(0, 0, view.width, view.height)
+        self._probe = _empty_scene(model, view)
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        option = _drawn_groups(view)
+        mujoco.mjv_updateScene(model, data, option, None, _fixed_camera(model, view), _ALL_OBJECTS, self._probe)
+        self._probe_image = self.draw(self._probe)
+
+    def draw(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
+        """Draw a scene in this context, which is current. Shape (height, width, 3), from the bottom up."""
+        image = np.empty((self._rect.height, self._rect.width, 3), dtype=np.uint8)
+        mujoco.mjr_render(self._rect, scene, self.mjr)
+        mujoco.mjr_readPixels(image, None, self._rect, self.mjr)
+        return image
+
+    def is_whole(self) -> bool:
+        """Whether it still draws its first image.
+
+        Other code damages a context if it frees a context of its own while this one is current: OpenGL then deletes
+        the meshes and textures of this one.
+        """
+        self.make_current()
+        return np.array_equal(self.draw(self._probe), self._probe_image)
 
     def make_current(self) -> None:
         """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything."""
@@ -195,7 +248,14 @@ class _Canvases:
         if self._pid != os.getpid():
             self.close()
             self._pid = os.getpid()
-        canvas = self._canvases.pop((scene, view), None) or _Canvas(model, view)
+        canvas = self._canvases.pop((scene, view), None)
+        if canvas is not None and not canvas.is_whole():
+            canvas.damaged = True  # renderers that use it take a new one for their next frame
+            if not canvas.users:
+                canvas.close()
+            canvas = None
+        if canvas is None:
+            canvas = _Canvas(model, view)
         self._canvases[scene, view] = canvas
         canvas.users += 1
         return canvas
@@ -203,6 +263,8 @@ class _Canvases:
     def give_back(self, canvas: _Canvas) -> None:
         """One renderer less uses it; of those without a user the few that were used last are kept."""
         canvas.users -= 1
+        if not canvas.users and canvas not in self._canvases.values():  # another one took its place
+            canvas.close()
         self.free_idle(_KEPT)
 
     def free_idle(self, keep: int = 0) -> None:
@@ -280,20 +342,9 @@ class Renderer:
         require_known("camera", view.camera, [model.camera(index).name for index in range(model.ncam)])
         self.view = view
         self._model = model
-        self._rect = mujoco.MjrRect(0, 0, view.width, view.height)
-        self._bottom_up = np.empty((view.height, view.width, 3), dtype=np.uint8)
-        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + _EXTRA_GEOMS)
-        flags = mujoco.mjtRndFlag
-        drawn = self._scene.flags
-        drawn[flags.mjRND_SHADOW.value] = view.shadow_px > 0
-        drawn[flags.mjRND_SKYBOX.value] = view.sky
-        drawn[flags.mjRND_REFLECTION.value] = drawn[flags.mjRND_HAZE.value] = False
-        self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = np.isin(np.arange(mujoco.mjNGROUP), view.groups)
-        self._option.sitegroup[:] = 0
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = model.camera(view.camera).id
+        self._scene = _empty_scene(model, view)
+        self._option = _drawn_groups(view)
+        self._camera = _fixed_camera(model, view)
 
     @functools.cached_property
     def _drawn_as(self) -> bytes:
@@ -321,9 +372,7 @@ class Renderer:
             canvas.make_current()
             for scene in scenes:
                 mujoco.mjv_updateScene(*scene, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
-                mujoco.mjr_render(self._rect, self._scene, canvas.mjr)
-                mujoco.mjr_readPixels(self._bottom_up, None, self._rect, canvas.mjr)
-                drawn.append(self._bottom_up[::-1].copy())
+                drawn.append(canvas.draw(self._scene)[::-1].copy())
             if self._takeovers > 1:
                 canvas.release()
         return drawn
@@ -337,9 +386,9 @@ class Renderer:
 
     def _ready_canvas(self) -> _Canvas:
         canvas = self._canvas
-        if canvas is not None and canvas.usable:
+        if canvas is not None and canvas.usable and not canvas.damaged:
             return canvas
-        self._takeovers += canvas is not None and canvas.pid == os.getpid()
+        self._takeovers += canvas is not None and canvas.pid == os.getpid() and not canvas.damaged
         self.close()
         if threading.current_thread() is threading.main_thread() and not self._takeovers:
             canvas = _shared.borrow(self._drawn_as, self._model, self.view)

@@ -119,6 +119,25 @@ def test_frames_survive_a_foreign_renderer_in_the_same_process(world, monkeypatc
     camera.close()
 
 
+def test_a_context_that_other_code_damaged_is_not_shared(world, monkeypatch):
+    if sys.platform == "linux":
+        from mujoco.rendering.classic import gl_context
+
+        monkeypatch.setattr(gl_context, "GLContext", pytest.importorskip("mujoco.egl").GLContext)
+    foreign = mujoco.Renderer(world.model, 64, 64)
+    first, second = agent_camera(world.model), agent_camera(world.model)
+    before = first.frame(world.data)
+    foreign._mjr_context.free()  # while ours is current: OpenGL deletes what has the same numbers in ours
+    assert not np.array_equal(first.frame(world.data), before), "nothing was damaged"
+    assert np.array_equal(second.frame(world.data), before)
+    assert np.array_equal(first.frame(world.data), before), "who shared it takes another one, too"
+    first.close()
+    second.close()
+    assert np.array_equal(first.frame(world.data), before)
+    first.close()
+    foreign._gl_context.free()
+
+
 def test_no_context_is_made_before_the_first_frame(world, monkeypatch):
     monkeypatch.setattr(rendering, "_new_gl_context", lambda *_: pytest.fail("made a context"))
     camera = own_camera(world.model)
