@@ -110,8 +110,9 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Said]:
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         patch.syspath_prepend(install(folder))
         registry.offers.cache_clear()
-        words = ["judge", "--task", "pick_place", "--sizes", "20", "60", "--seeds", "1000", "--workers", "1"]
-        status = main([*words, "--out", str(root), "--models", "nearest", "raises", "late", "unmade", "copy", "exact"])
+        world = ["judge", "--task", "pick_place", "--out", str(root), "--workers", "1"]
+        data = ["--sizes", "20", "60", "--seeds", "1000", "--samples", "2"]
+        status = main([*world, *data, "--models", "nearest", "raises", "late", "unmade", "copy", "exact"])
         (made,) = (path.parent for path in root.glob("*/judgement.json"))
         yield Said(made, status, out.getvalue(), err.getvalue())
     sys.modules.pop("their_models", None)
@@ -119,7 +120,7 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Said]:
 
 
 def _of(*models: str) -> Judgement:
-    return Judgement(task="pick_place", models=models, sizes=(20, 60), seeds=(1000,))
+    return Judgement(task="pick_place", models=models, sizes=(20, 60), seeds=(1000,), samples=2)
 
 
 def test_what_models_do_wrong_is_a_sentence_each(said: Said) -> None:

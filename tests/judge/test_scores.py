@@ -112,19 +112,29 @@ def test_after_the_end_is_what_no_training_contains() -> None:
 
 
 class Mistaken(Exact):
-    """Exact, but for some transitions, of which it says that nothing changes; it is unsure of those alone."""
+    """Exact, but for some transitions, of which it says that nothing comes; it is unsure of those alone."""
 
     def __init__(self, world: JudgedWorld, wrong: set[tuple[State, int]]) -> None:
         super().__init__(world.spec, world.index)
         self.wrong = wrong
 
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        right, still = super().imagine(frames, actions, samples, rng), Copy().imagine(frames, actions, samples, rng)
+        right = super().imagine(frames, actions, samples, rng)
         pairs = zip([self.renderer.shows(frame) for frame in frames[:, -1]], actions[:, 0].tolist(), strict=True)
         wrong = np.array([pair in self.wrong for pair in pairs])
-        images = np.where(wrong[:, None, None, None, None, None], still.pictures, right.pictures)
-        epistemic = np.where(wrong[:, None], 1.0, np.zeros(right.pictures.shape[:1] + right.pictures.shape[2:3]))
-        return dataclasses.replace(right, pictures=images, epistemic=epistemic, accepted=epistemic < 0.5)
+        images = right.pictures.copy()
+        images[wrong] = frames[wrong, -1][:, None, None]
+        unsure = np.broadcast_to(wrong[:, None], (len(frames), images.shape[2]))
+        assert right.rewards is not None and right.p_ended is not None
+        known = ~wrong[:, None, None]
+        return dataclasses.replace(
+            right,
+            pictures=images,
+            rewards=right.rewards * known,
+            p_ended=right.p_ended * known,
+            epistemic=unsure.astype(np.float64),
+            accepted=~unsure,
+        )
 
 
 def test_known_mistakes_are_charged_exactly() -> None:
@@ -147,7 +157,8 @@ def test_known_mistakes_are_charged_exactly() -> None:
     assert np.mean(by_action) == pytest.approx(share) and len(set(by_action)) > 1
 
 
-def test_a_filter_is_worth_what_its_mistakes_would_cost() -> None:
+def test_a_filter_is_worth_what_its_mistakes_cost() -> None:
+    """A model that expects nothing bad of breaking a rule; its filter discards just that."""
     world = judged_world(ARROWS)
     ends = {
         (state, action)
@@ -155,7 +166,8 @@ def test_a_filter_is_worth_what_its_mistakes_would_cost() -> None:
         if any(o.terminated and not o.success for o in world.spec.rules.outcomes(state, action))
     }
     scores = world.scores(Mistaken(world, ends))
-    assert 0.0 <= scores["worth_of_filter"] <= scores["value_loss"] + 1e-9
+    assert scores["worth_of_filter"] == pytest.approx(scores["value_loss"]) and scores["value_loss"] > 1.0
+    assert 0.0 < scores["worth_of_refusing"] <= scores["worth_of_filter"] + 1e-9
 
 
 def test_skill_is_what_is_discarded_rightly_less_what_wrongly() -> None:
