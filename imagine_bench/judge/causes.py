@@ -23,7 +23,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,7 @@ MOST_STATES = 2_000
 _TRIES = 8  # frames of a macrostate, until the agent reads one right
 _NOWHERE = -1e6  # reward of what was never experienced, for an agent that has nothing but what it experienced
 _TIE = 1e-6
+_Number = TypeVar("_Number", np.int64, np.float64)
 
 
 class Model(NamedTuple):
@@ -277,7 +278,7 @@ def _mixed(where: NDArray[np.bool_], one: Model, other: Model) -> Model:
     """One model where (S, A) says so, and the other elsewhere."""
     most = max(one.following.shape[2], other.following.shape[2])
 
-    def wide(values: NDArray[Any]) -> NDArray[Any]:
+    def wide(values: NDArray[_Number]) -> NDArray[_Number]:
         return np.pad(values, ((0, 0), (0, 0), (0, most - values.shape[2])))
 
     return Model(

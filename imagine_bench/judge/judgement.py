@@ -121,7 +121,7 @@ class Judgement:
     @property
     def folder_name(self) -> str:
         """Where it is kept: the same for all that can be compared."""
-        same: tuple[Any, ...] = (_FORMAT, self.task, self.appearance, self.policy, self.samples, self.sizes[-1])
+        same: tuple[int | str, ...] = (_FORMAT, self.task, self.appearance, self.policy, self.samples, self.sizes[-1])
         if self.encoder is not None:
             same += (encoders.identity(encoders.resolve(registry.task(self.task), self.appearance, self.encoder)),)
         digest = hashlib.sha256(json.dumps(same).encode()).hexdigest()[:8]
@@ -223,7 +223,7 @@ def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict
     model, cost = make(name, world.spec, world.index, judgement.appearance, seeds, judgement.encoder)
     if isinstance(model, TrainedModel):  # its data and the cost of its training are its bench's to say
         seen = model.visited
-        learned: dict[str, Any] = {"data": "", "fit_s": math.nan, "parameters": math.nan}
+        learned: dict[str, str | float] = {"data": "", "fit_s": math.nan, "parameters": math.nan}
     else:
         seen, learned = _fit(model, cell, data_of(judgement, folder, cell.seed), seeds.child("fit").generator())
 
@@ -266,14 +266,14 @@ def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict
 
 def _fit(
     model: WorldModel, cell: ModelFit, dataset: Dataset, rng: np.random.Generator
-) -> tuple[set[tuple[State, int]], dict[str, Any]]:
+) -> tuple[set[tuple[State, int]], dict[str, str | float]]:
     """Fit a model: what it has seen then, and the data's hash, CPU seconds and parameters."""
     episodes = dataset.episodes.first(cell.transitions)
     begun_s = time.process_time()
     call(cell.model, "fit", model.fit, episodes, rng)
     fit_s = time.process_time() - begun_s
     parameters = int(call(cell.model, "parameters", model.parameters))
-    learned = {"data": dataset.episodes.hash, "fit_s": fit_s, "parameters": parameters}
+    learned: dict[str, str | float] = {"data": dataset.episodes.hash, "fit_s": fit_s, "parameters": parameters}
     return visited(dataset, cell.transitions), learned
 
 

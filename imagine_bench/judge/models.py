@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,7 +156,7 @@ def load_model(folder: Path, task: str) -> TrainedModel:
 
 def make(
     name: str, spec: TaskSpec, index: RenderedFrameIndex, appearance: str, seeds: SeedTree, encoder: str | None = None
-) -> tuple[WorldModel, dict[str, Any]]:
+) -> tuple[WorldModel, dict[str, str | int]]:
     """A new model, or a trained agent, and what was spent on it beforehand: the encoder's name and frames."""
     if Path(name) in runs_of(name).values():
         trained = load_model(Path(name), spec.id)
@@ -186,7 +185,7 @@ def _encoder(spec: TaskSpec, appearance: str, kind: str, given: str | None) -> P
     return encoders.own(spec, appearance, kind)
 
 
-def _encoder_cost(path: Path | None) -> dict[str, Any]:
+def _encoder_cost(path: Path | None) -> dict[str, str | int]:
     """The encoder's name, and the frames that it was trained on."""
     if path is None:
         return {"encoder": "", "encoder_frames": 0}

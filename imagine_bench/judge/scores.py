@@ -29,11 +29,11 @@ from imagine_bench.judge.truth import (
 )
 from imagine_bench.judge.values import (
     exact_machine,
-    gain_of_avoiding,
     imagined_machine,
     mean_by_pair,
     regrets,
     value_losses,
+    value_of_abstaining,
 )
 from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import auroc
@@ -106,7 +106,7 @@ def after_the_end_scores(asked: EvalSet | None, predictions: Predictions | None,
     return found
 
 
-def _values(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dict[str, Any]:
+def _values(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dict[str, float | list[float]]:
     """Value losses, in the mean, the worst and by start, and the value of abstaining; NaN where not all is asked about.
 
     The value of abstaining is what planning gains where it avoids transitions: those that the model knows least of, of
@@ -115,13 +115,13 @@ def _values(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dic
     machine = imagined_machine(questions, predictions, spec.rules)
     truth = exact_machine(questions, spec.n_actions)
     starts = spec.rules.start_states
-    found: dict[str, Any] = dict.fromkeys(
+    found: dict[str, float | list[float]] = dict.fromkeys(
         ("value_loss", "worst_value_loss", "worth_of_refusing", "worth_of_filter"), math.nan
     )
     if not set(starts) <= set(truth.states):
         return {**found, "value_loss_by_start": []}
     losses = value_losses(truth, machine, starts, spec.horizon)
-    gain = partial(gain_of_avoiding, truth, machine, starts, spec.horizon)
+    gain = partial(value_of_abstaining, truth, machine, starts, spec.horizon)
     found["value_loss"] = float(losses.mean())
     found["worst_value_loss"] = float(losses.max())
     if predictions.epistemic is not None:
@@ -258,7 +258,7 @@ def _uncertainty_scores(
         "noisy": ("aleatoric", entropy > np.median(entropy)),
         "several": ("modal", several),
     }
-    found: dict[str, Any] = {"risk": []}
+    found: dict[str, float | list[float]] = {"risk": []}
     for name, (uncertainty, truth) in to_tell.items():
         offered = predictions.uncertainties.get(uncertainty)
         found[f"auroc_{name}"] = math.nan if offered is None else auroc(offered[:, 0], truth)

@@ -101,7 +101,7 @@ def value_losses(exact: DecisionTables, imagined: DecisionTables, starts: tuple[
     return np.asarray(np.maximum(best - found, 0.0)[rows])
 
 
-def gain_of_avoiding(
+def value_of_abstaining(
     exact: DecisionTables,
     imagined: DecisionTables,
     starts: tuple[State, ...],
