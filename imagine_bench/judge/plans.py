@@ -110,7 +110,7 @@ def carry_out(
 ) -> PlanResult:
     """Imagine plan ``number`` from one frame and, unless it is refused, let the arm do it."""
     frame, info = env.reset(seed=episode_seed("planning", int(is_tuning_seed(trained.spec.seed)), number))
-    start = _state(info)
+    start = tuple(int(value) for value in info["macrostate"])
     rng = SeedTree(trained.spec.seed).child("planning", number).generator()
     model = AgentModel(trained.imaginer)
     (rollout,) = model.rollouts([frame], [None], depth=trained.task.horizon, generators=[rng])
@@ -162,7 +162,3 @@ def _refusal(rollout: ImaginedRollout, max_epistemic: float | None) -> str:
     step = int((~rollout.accepted).argmax())
     why = f"epistemic uncertainty of the state {epistemic[step]:.2g}"
     return f"the agent's filter discards macro-action {step + 1} ({why})"
-
-
-def _state(info: dict[str, Any]) -> State:
-    return tuple(int(value) for value in info["macrostate"])
