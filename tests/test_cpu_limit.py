@@ -25,6 +25,7 @@ def trained():
 def test_cheap(trained): pass
 def test_over(): burn(0.15)
 def test_far_over(): burn(0.6)
+def test_first_import(): import its_library
 @pytest.mark.slow
 def test_marked_slow(): burn(0.6)
 """
@@ -36,16 +37,22 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("session")
     (folder / "conftest.py").write_text((Path(__file__).parent / "conftest.py").read_text() + "\n" + _CHANGES)
     (folder / "test_it.py").write_text(_TESTS)
+    (folder / "its_library.py").write_text("from test_it import burn\nimport its_part\nburn(0.6)\n")
+    (folder / "its_part.py").write_text("")
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--rootdir", str(folder), str(folder), "-q"]
     environment = {**os.environ, "PYTEST_ADDOPTS": ""}
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False).stdout
 
 
 def test_a_test_of_twice_the_limit_fails(report: str) -> None:
-    assert "1 failed, 3 passed" in report
+    assert "1 failed, 4 passed" in report
     assert "test_far_over" in report and "more than twice the limit of 0.1 CPU s" in report
 
 
 def test_a_test_over_the_limit_is_named(report: str) -> None:
     _, _, named = report.partition("fast tests over")
     assert "test_over" in named and "test_cheap" not in named and "test_marked_slow" not in named
+
+
+def test_a_first_import_is_nobodys(report: str) -> None:
+    assert "test_first_import" not in report

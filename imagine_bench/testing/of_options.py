@@ -239,18 +239,22 @@ class _WatchedAgent:
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """Act as the agent does."""
-        for part in (observation.frame, observation.macrostate):
-            self._shown.update(np.asarray(part).tobytes() if part is not None else b"")
-        for name in sorted(observation.more):
-            self._shown.update(observation.more[name].tobytes())
+        self._is_shown(observation)
         action = self._agent.act(observation, explore=explore)
         self._lived.update(str(action).encode())
         return action
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Learn as the agent does."""
+        self._is_shown(transition.next_observation)
         self._lived.update(f"{transition.action} {transition.reward}".encode())
         self._agent.observe(transition, episode=episode)
+
+    def _is_shown(self, observation: Observation) -> None:
+        for part in (observation.frame, observation.macrostate):
+            self._shown.update(np.asarray(part).tobytes() if part is not None else b"")
+        for name in sorted(observation.more):
+            self._shown.update(observation.more[name].tobytes())
 
     def diagnostics(self) -> dict[str, float]:
         """As the agent."""

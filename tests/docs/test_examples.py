@@ -58,8 +58,13 @@ def run(tmp_path: Path, task: str, agent: str, **changes: object) -> BenchResult
 
 
 @pytest.mark.parametrize("example", ["own_agent"], indirect=True)
-def test_the_agent_keeps_the_contract_and_learns(example: ModuleType, tmp_path: Path) -> None:
+def test_the_agent_keeps_the_contract(example: ModuleType) -> None:
     assert report(checks(agent="own_agent")) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", ["own_agent"], indirect=True)
+def test_the_agent_learns(example: ModuleType, tmp_path: Path) -> None:
     found = run(tmp_path, "pick_place", "own_agent", budgets=(5, 500), evaluation_episodes=50)
     few, many = found.success_rates("own_agent")[0]
     assert many > 0.6 > 2 * few
@@ -96,10 +101,17 @@ def test_the_world_model_keeps_the_contract_and_learns(example: ModuleType) -> N
 
 
 @pytest.mark.parametrize("example", ["elsewhere"], indirect=True)
-def test_the_agent_that_learns_to_see_solves_what_nobody_here_wrote(example: ModuleType) -> None:
-    """Gymnasium's frozen lake from pixels, with one seed; blind choice solves it once in fifty times."""
+def test_the_agent_that_learns_to_see_acts_where_nobody_here_wrote_the_task(example: ModuleType) -> None:
+    """Gymnasium's frozen lake from pixels; blind choice solves it once in fifty times."""
     with closing(example.environment("FrozenLake-v1")) as env:
-        assert example.live(None, env, range(200), explore=False) < 0.1
+        assert example.live(None, env, range(60), explore=False) < 0.1
+    found = example.learn("FrozenLake-v1", seed=0, tests=1, budgets=(1, 2))
+    assert list(found["success"]) == [1, 2] and found["real_steps"] >= 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", ["elsewhere"], indirect=True)
+def test_the_agent_that_learns_to_see_solves_what_nobody_here_wrote(example: ModuleType) -> None:
     found = example.learn("FrozenLake-v1", seed=0, tests=5, budgets=(40,))
     assert found["success"] == {40: 1.0} and found["real_steps"] < 1000
 
@@ -135,13 +147,13 @@ def test_what_an_agent_needs_over_the_floor(
     monkeypatch.setattr(example, "launcher", lambda name, workers: Inline())
     floor = certificate(registry.task("arrow_puzzle_easy")).floor
     assert floor
-    for agent, needed, ratio in (("oracle", [0, 0], 0.0), ("random", [None, None], np.inf)):
-        words = f"--agent {agent} --cubes 1 --seeds 1000 1001 --tests 20 --runs {tmp_path} --out {tmp_path}/floors.json"
+    for agent, needed, ratio in (("oracle", [0], 0.0), ("random", [None], np.inf)):
+        words = f"--agent {agent} --cubes 1 --seeds 1000 --tests 20 --runs {tmp_path} --out {tmp_path}/floors.json"
         example.main(words.split())
         (row,) = json.loads((tmp_path / "floors.json").read_text())
         assert (row["transitions"], row["floor"]) == (needed, floor.transitions)
         assert f"{ratio:8.2f} arrow_puzzle_easy clean" in capsys.readouterr().out
-    found = run(tmp_path, "pick_place", "random", budgets=(2, 3, 5, 8))
+    found = run(tmp_path, "arrow_puzzle_easy", "random", budgets=(2, 3, 5, 8), evaluation_episodes=1)
     for successes, first in (([9, 0, 9, 9], 2), ([9, 9, 9, 0], None), ([9, 9, 9, 10], 0), ([8, 9, 10, 10], 1)):
         (learner,) = found.of("random")
         rows = tuple(

@@ -113,7 +113,13 @@ def test_chance_and_optimum_agree_with_100_000_episodes(name):
         assert abs(simulated(world, spec.horizon, how, seed=1) - expected) < limit
 
 
-@pytest.mark.parametrize("name", ["arrow_puzzle:fickle=0.3,horizon=4", "arrows:cubes=2,fickle=0.5,slip=0.1,horizon=3"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("arrow_puzzle:fickle=0.3,horizon=4", marks=pytest.mark.slow),
+        "arrows:cubes=2,fickle=0.5,slip=0.1,horizon=3",
+    ],
+)
 def test_the_optimum_is_that_of_a_linear_programme(name):
     """Where haste pays, so that a policy must count actions: what is best for return is not best within the horizon."""
     spec = registry.task(name)
