@@ -5,8 +5,6 @@ Like DIAMOND's world-model environment (Alonso et al. 2024): ``reset`` and ``ste
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium
 import numpy as np
 import torch
@@ -51,8 +49,6 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
             transitions that are to be weighed by confidence, for which an environment has no place.
     """
 
-    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
-
     def __init__(self, imagination: Imagination, starts: Latents, *, num_envs: int = 1, horizon: int = 10) -> None:
         if num_envs < 1 or horizon < 1:
             raise InvalidValueError(f"num_envs is {num_envs} and horizon {horizon}; each must be at least 1.")
@@ -62,6 +58,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
             raise InvalidValueError(
                 f"The pool of starts has shape {starts.shape}; give at least one of shape (P, {model.latent_size})."
             )
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self.imagination = imagination
         self.starts = starts
         self.num_envs = num_envs
@@ -134,8 +131,6 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
 
 class ImaginedEnv(gymnasium.Env[Latents, np.int64]):
     """One imagined episode after another, for learners that know no vectors: a world of one episode at a time."""
-
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
 
     def __init__(self, world: ImaginedVectorEnv) -> None:
         if world.num_envs != 1:

@@ -13,6 +13,8 @@ from imagine_bench import registry
 from imagine_bench.cli.options import FolderOrTask, MaybeEncoder, OfTask, TaskWord, listed, path_or_task, shown
 from imagine_bench.errors import InvalidValueError, RunFailedError
 from imagine_bench.interfaces import APPEARANCES
+from imagine_bench.judge.judgement import Judgement, judge
+from imagine_bench.judge.verify import cost
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +92,6 @@ class Judge:
 
     def __call__(self) -> None:
         """Judge and report."""
-        from imagine_bench.judge.judgement import Judgement, judge  # noqa: PLC0415 - as above
         from imagine_bench.recording.judgement import record_judgement  # noqa: PLC0415 - as above
         from imagine_bench.report.judge import judgement_report  # noqa: PLC0415 - as above
 
@@ -126,20 +127,17 @@ class Verify:
 
     def __call__(self) -> None:
         """Play and compare."""
-        from imagine_bench.judge.verify import cost  # noqa: PLC0415 - as above
-        from imagine_bench.report.page import chosen  # noqa: PLC0415 - as above
-        from imagine_bench.report.verify import verify  # noqa: PLC0415 - as above
-        from imagine_bench.report.why import why_report  # noqa: PLC0415 - as above
+        from imagine_bench.report import page, verify, why  # noqa: PLC0415 - matplotlib loads slowly
 
         given, task = path_or_task(self.folder, self.task)
         if self.causes:
-            print(why_report(given, root=self.out, task=task, encoder=self.encoder))
+            print(why.why_report(given, root=self.out, task=task, encoder=self.encoder))
             return
         if self.encoder is not None:
             raise InvalidValueError("--encoder goes with --causes; replaying episodes needs none.")
-        folder = chosen(given, self.out, task)
+        folder = page.chosen(given, self.out, task)
         begun_s = time.process_time()
-        verdicts = verify(folder)
+        verdicts = verify.verify(folder)
         print(*verdicts, cost(folder, verdicts, time.process_time() - begun_s), sep="\n")
         if any(verdict.complaint for verdict in verdicts):
             sys.exit(1)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from imagine_bench import registry
+from imagine_bench.adapters.tracking import track
 from imagine_bench.cli.options import (
     FolderOrTask,
     Launch,
@@ -35,7 +36,9 @@ from imagine_bench.running.task_types import load_so_far
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.merge import merge
 from imagine_bench.store.results import BenchResult
+from imagine_bench.sweep.catalogue import SUITE, grid_named
 from imagine_bench.sweep.grid import SUITE_AGENTS, Study, Suite
+from imagine_bench.sweep.run import run_study, run_suite
 
 if TYPE_CHECKING:
     from imagine_bench.report.tables import Page
@@ -177,8 +180,6 @@ class Report:
         given, task = path_or_task(self.folder, self.task)
         folder = given or newest_bench(self.out, only(task))
         if self.track is not None:
-            from imagine_bench.adapters.tracking import track  # noqa: PLC0415 - an extra
-
             print(f"Metrics: {track(folder, self.track)}")
             return
         others = added_up("merge", self.merge)
@@ -213,8 +214,6 @@ class Sweep:
 
     def __call__(self) -> None:
         """Run, compare or score, write."""
-        from imagine_bench.sweep.catalogue import SUITE, grid_named  # noqa: PLC0415 - no other command needs it
-
         grid = grid_named(self.name or ("factors" if self.task else SUITE))
         of_suite = {"experiment": self.experiment, "agents": self.agents, "seeds": self.seeds}
         foreign = of_suite if isinstance(grid, Study) else {"variants": self.variants, "task": self.task}
@@ -231,7 +230,6 @@ class Sweep:
 
     def _study(self, study: Study) -> None:
         from imagine_bench.report.sweep import study_page  # noqa: PLC0415 - matplotlib loads slowly
-        from imagine_bench.sweep.run import run_study  # noqa: PLC0415 - as above
 
         if self.task is None:
             raise InvalidValueError(f"{study.name} is a study of one task; give a task as the first word.")
@@ -242,7 +240,6 @@ class Sweep:
 
     def _suite(self, suite: Suite) -> None:
         from imagine_bench.report.sweep import suite_page  # noqa: PLC0415 - matplotlib loads slowly
-        from imagine_bench.sweep.run import run_suite  # noqa: PLC0415 - as above
 
         launcher = self.launch.chosen()
         agents = self.agents or SUITE_AGENTS

@@ -8,10 +8,13 @@ from typing import Annotated
 
 from imagine_bench import registry
 from imagine_bench.cli.options import MaybeEncoder, MaybeTaskWord, TaskWord, shown
+from imagine_bench.data.folder import read_dataset, require_format, require_new, write_dataset
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.registry.entries import file_name
+from imagine_bench.running.collect import collect, describe, policy_of
 from imagine_bench.store.files import require_writable
+from imagine_bench.tools.standard_data import standard_sets
 
 _RECIPES_OWN = shown("INT", "(default: the recipe's)")
 
@@ -48,10 +51,6 @@ class DatasetCommand:
 
     def __call__(self) -> None:
         """Collect, or describe."""
-        from imagine_bench.data.folder import read_dataset, require_format, require_new, write_dataset  # noqa: PLC0415
-        from imagine_bench.running.collect import collect, describe, policy_of  # noqa: PLC0415 - slow, and only for this
-        from imagine_bench.tools.standard_data import standard_sets  # noqa: PLC0415 - as above
-
         if (self.task is None) == (self.describe is None and not self.standard):
             raise InvalidValueError("Give a task to collect episodes of, or one of --describe and --standard.")
         if self.describe is not None:

@@ -22,6 +22,7 @@ from imagine_bench.cli.options import (
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.store.bench_folder import newest_recording
+from imagine_bench.tools.describe import describe, names
 from imagine_bench.tools.doctor import examine
 
 
@@ -53,8 +54,6 @@ class Describe:
 
     def __call__(self) -> None:
         """Describe, or list."""
-        from imagine_bench.tools.describe import describe, names  # noqa: PLC0415 - nothing else needs it
-
         print(names() if self.task is None else describe(self.task))
 
 

@@ -131,8 +131,7 @@ def _choices(layers: list[_Layer]) -> dict[tuple[State, int], int]:
 
 def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int], nodes: int) -> tuple[dict[State, int], float]:
     """The best policy found and the bound proved."""
-    from scipy.optimize import Bounds, LinearConstraint, milp  # noqa: PLC0415 - loads for long
-    from scipy.sparse import coo_array  # noqa: PLC0415
+    from scipy import optimize, sparse  # noqa: PLC0415 - loads for long
 
     used = [[pair for pair in layer.links if (pair[0][1], pair[1]) in choices] for layer in layers]
     column = [{} for _ in layers]  # type: list[dict[tuple[_Seen, int], int]]
@@ -163,12 +162,12 @@ def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int], nodes: i
             high.append(0.0)
             gain[at], most[at] = layer.wins[pair], weight
     values, rows, columns = zip(*entries, strict=True)
-    matrix = coo_array((values, (rows, columns)), shape=(len(low), total)).tocsr()
-    found = milp(
+    matrix = sparse.coo_array((values, (rows, columns)), shape=(len(low), total)).tocsr()
+    found = optimize.milp(
         -gain,
         integrality=np.arange(total) < len(choices),
-        bounds=Bounds(0.0, most),
-        constraints=LinearConstraint(matrix, np.array(low), np.array(high)),
+        bounds=optimize.Bounds(0.0, most),
+        constraints=optimize.LinearConstraint(matrix, np.array(low), np.array(high)),
         options={"node_limit": nodes, "mip_rel_gap": 0.0},
     )
     policy = {} if found.x is None else {shown: action for (shown, action), at in choices.items() if found.x[at] > 0.5}

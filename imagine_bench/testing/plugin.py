@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from imagine_bench.errors import ImagineBenchError
+
 _GUESTS = ("task", "agent", "model")
 
 
@@ -22,8 +24,7 @@ def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config
     chosen = {guest: config.getoption(f"imagine_bench_{guest}") for guest in _GUESTS}
     if not any(chosen.values()):
         return
-    from imagine_bench.errors import ImagineBenchError  # noqa: PLC0415 - nothing where no option is given
-    from imagine_bench.testing.contract import checks  # noqa: PLC0415 - as above
+    from imagine_bench.testing.contract import checks  # noqa: PLC0415 - nothing where no option is given
 
     try:
         found = checks(**chosen)
@@ -52,8 +53,6 @@ class Check(pytest.Item):
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """The sentence that says what is wrong; of an error that is not ours, where it happened."""
-        from imagine_bench.errors import ImagineBenchError  # noqa: PLC0415 - as above
-
         if isinstance(excinfo.value, ImagineBenchError):
             return str(excinfo.value)
         return super().repr_failure(excinfo, style)

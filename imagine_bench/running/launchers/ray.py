@@ -41,15 +41,15 @@ class RayCluster:
     def __init__(self, workers: int) -> None:
         require_workers(workers)
         try:
-            import ray  # noqa: F401, PLC0415 - an optional dependency
+            import ray  # noqa: PLC0415 - an optional dependency
         except ImportError as error:
             raise lacking("ray") from error
         self._workers = workers
+        self._ray = ray
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job. Raises SetupError: no cluster at ``RAY_ADDRESS``, or none with the GPU wanted."""
-        import ray  # noqa: PLC0415 - as above
-
+        ray = self._ray
         self._connect(ray)
         try:
             return _launch(ray, jobs, on_progress)
