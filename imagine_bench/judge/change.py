@@ -181,8 +181,8 @@ def counterfactual_error(asked: Sequence[EvalSet], predictions: Sequence[Predict
     for one, other in itertools.combinations(range(len(asked)), 2):
         for row in range(len(asked[one].states)):
             both = [asked[index].truth[row][0] for index in (one, other)]
-            possible = _together(*([(state, share) for (state, _), (share, _) in each.items()] for each in both))
-            imagined = _together(*(_futures(predictions[index], row) for index in (one, other)))
+            possible = joint_outcomes(*([(state, share) for (state, _), (share, _) in each.items()] for each in both))
+            imagined = joint_outcomes(*(_futures(predictions[index], row) for index in (one, other)))
             wrong.append(sum(share for pair, share in imagined.items() if pair not in possible))
     return float(np.mean(wrong)) if wrong else math.nan
 
@@ -192,7 +192,7 @@ def _futures(predictions: Predictions, row: int) -> list[tuple[State, float]]:
     return list(zip(states, predictions.weights[row, :, 0].tolist(), strict=True))
 
 
-def _together(
+def joint_outcomes(
     one: Sequence[tuple[State, float]], other: Sequence[tuple[State, float]]
 ) -> dict[tuple[State, State], float]:
     """Probabilities of pairs where one uniform number chooses from both distributions, each in its order."""

@@ -23,6 +23,7 @@ from imagine_bench.judge.change import (
     alarms,
     change_detection_delay,
     coupled,
+    joint_outcomes,
     slipping,
     streams_of,
     unchanged,
@@ -136,3 +137,11 @@ def test_other_draws_are_no_counterfactual() -> None:
         assert answers[0].distribution(row, 0) == pytest.approx(answers[1].distribution(row, 0))
     assert there.counterfactual_error(there.exact) == 0.0
     assert there.counterfactual_error(unlucky) > 0.1
+
+
+def test_one_number_chooses_from_both_distributions_in_their_order() -> None:
+    one, other = [((1,), 0.3), ((2,), 0.7)], [((3,), 0.5), ((4,), 0.5)]
+    expected = {((1,), (3,)): 0.3, ((2,), (3,)): 0.2, ((2,), (4,)): 0.5}
+    assert joint_outcomes(one, other) == pytest.approx(expected)
+    assert joint_outcomes(one, one) == pytest.approx({((1,), (1,)): 0.3, ((2,), (2,)): 0.7})
+    assert joint_outcomes([((1,), 0.5), ((1,), 0.5)], other) == {((1,), (3,)): 0.5, ((1,), (4,)): 0.5}
