@@ -123,17 +123,17 @@ class DQN:
         self.steps = self.updates = 0
 
     def new_controller(self, generator: torch.Generator) -> Controller:
-        """One that has learned nothing."""
+        """Return an untrained controller."""
         return Controller(self.perception.latent_size, self.n_actions, self.settings.controller, generator)
 
     def new_memory(self, device: torch.device) -> RealMemory:
-        """One that is empty."""
+        """Return an empty replay memory."""
         settings = self.settings.memory
         return RealMemory(settings.real, self.perception.latent_size, device, prioritised=settings.priority > 0.0)
 
     @property
     def tested(self) -> Controller:
-        """The controller that acts greedily: here the one that explores too."""
+        """The controller used in tests. A DQN has only one."""
         return self.controller
 
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
@@ -141,7 +141,7 @@ class DQN:
         return self._values(self.tested, observation)
 
     def read_frames(self, frames: Frame) -> NDArray[np.int64]:
-        """What a probe reads; see :class:`imagine_bench.interfaces.capabilities.FrameReader`."""
+        """Read macrostates with the encoder's probe; see :class:`imagine_bench.interfaces.capabilities.FrameReader`."""
         encoder = self.perception.encoder
         return encoder.read_macrostate(encoder.encode(frames)[0])
 
@@ -167,14 +167,14 @@ class DQN:
         self.steps += 1
 
     def store(self, transition: Transition) -> Tensor:
-        """Add a real transition to the memory; the state that it began in. Shape (Z,)."""
+        """Add a real transition to the memory; returns the state that it began in. Shape (Z,)."""
         now = self.perception.posterior(transition.observation.frame)
         then = self.perception.posterior(transition.next_observation.frame)
         self.real.add(now, transition.action, transition.reward, then, transition.terminated)
         return now[0]
 
     def learn_more(self, z: Tensor, episode: int) -> None:
-        """What a subclass does after the updates on real transitions, with the state (Z,) it acted in."""
+        """Learn more after the updates on real transitions, given the state (Z,) before; a DQN does nothing here."""
 
     def learn_values(self, memory: Transitions, updates: int) -> None:
         """Update the controller on batches of a memory, if that holds anything yet."""
@@ -187,7 +187,7 @@ class DQN:
                 self.updates += 1
 
     def draw_batch(self, memory: Transitions) -> Batch:
-        """Transitions of a memory, with the rewards that the controller is to learn from."""
+        """Draw transitions of a memory with the rewards that the controller learns from."""
         count = self.settings.controller.batch_size
         settings = self.settings.memory
         if settings.priority > 0.0 and isinstance(memory, RealMemory):

@@ -119,7 +119,8 @@ def discover(images: Tensor, generator: torch.Generator) -> DiscreteEncoder:
     """
     chosen = images[torch.randperm(len(images), generator=generator)[: _IMAGES * max(images.shape[1], 3)]]
     pixels = torch.cat([smoothed(chunk) for chunk in chosen.split(500)]).double().numpy()  # [N, X]
-    found = [factor for group in pixel_groups(pixels) if (factor := _factor(pixels, group)) is not None]
+    factors = [_factor(pixels, group) for group in pixel_groups(pixels)]
+    found = [factor for factor in factors if factor is not None]
     if not found:
         raise InvalidValueError("No factor with two values or more was found; the images hardly differ.")
     network = DiscreteEncoder(tuple(int(factor.value.max()) + 1 for factor in found), *images.shape[1:])
@@ -224,7 +225,9 @@ def _gaps(clouds: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Distances between the nearest points of clouds (N, F) each. Shape (K, K)."""
     gaps = np.zeros((len(clouds), len(clouds)))
     for a, b in itertools.combinations(range(len(clouds)), 2):
-        gaps[a, b] = gaps[b, a] = scipy.spatial.cKDTree(clouds[a]).query(clouds[b])[0].min()
+        gap = scipy.spatial.cKDTree(clouds[a]).query(clouds[b])[0].min()
+        gaps[a, b] = gap
+        gaps[b, a] = gap
     return gaps
 
 

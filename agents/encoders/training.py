@@ -59,7 +59,7 @@ class FrameSet:
 
 
 def shown_states(spec: TaskSpec) -> NDArray[np.int64]:
-    """All that frames of a task may show: every macrostate, and where something is hidden, those with -1 for it."""
+    """Return everything that frames of a task may show: every macrostate, with -1 for hidden coordinates."""
     states = states_of(spec.rules)
     sight = spec.sight
     seen = [] if sight is None else [what for step in (0, 1) for s in states for _, what in sight.seen(s, step)]
@@ -279,7 +279,7 @@ def _trained_vae(
 
 @torch.no_grad()
 def _round_to_half(network: torch.nn.Module) -> None:
-    """Keep only what the artefact stores, so that what is measured is what is loaded."""
+    """Round the weights to the float16 that the artefact stores, so that the measured encoder is the loaded one."""
     for value in network.state_dict().values():
         value.copy_(value.half())
 
@@ -295,7 +295,7 @@ def latents_of(network: EncoderNetwork, data: FrameSet) -> Latents:
 def _measure(
     network: EncoderNetwork, probe: Probe, linear: Probe, held_out: FrameSet, generator: torch.Generator
 ) -> dict[str, Any]:
-    """What the card says of an encoder on frames that no training saw."""
+    """Measure an encoder on frames that no training saw, for its card."""
     latents = latents_of(network, held_out)
     right = held_out.macrostates
     kl = network.information(latents.mu, 2.0 * latents.sigma.log())

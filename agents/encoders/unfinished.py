@@ -19,7 +19,7 @@ _SAVE_EVERY_S = 60.0
 
 
 class Unfinished:
-    """Keeps a training in a file of three times its weights; ``what`` are words that only this training has."""
+    """Keeps a training in a file, three times as large as its weights; ``what`` names the training uniquely."""
 
     def __init__(self, path: Path, what: str) -> None:
         self._path = path
@@ -27,7 +27,7 @@ class Unfinished:
         self._saved_s = time.monotonic()
 
     def load(self) -> Kept | None:
-        """What was kept, or None. Raises ArtefactError: damaged or of another training; the file is left untouched."""
+        """Return the kept state, or None. Raises ArtefactError if the file is damaged or of another training."""
         if not self._path.exists():
             return None
         try:
@@ -39,7 +39,7 @@ class Unfinished:
         return dict(kept)
 
     def save(self, kept: Callable[[], Kept]) -> None:
-        """Keep numbers and tensors, whole or not at all; nothing within a minute of the last time, nor asked for."""
+        """Write the state atomically; within a minute of the last time this does nothing and ``kept`` is not called."""
         if time.monotonic() - self._saved_s < _SAVE_EVERY_S:
             return
         self._path.parent.mkdir(parents=True, exist_ok=True)

@@ -39,7 +39,7 @@ def kl_from_standard_normal(mu: Tensor, log_variance: Tensor) -> Tensor:
 
 
 class Vae(EncoderNetwork):
-    """What the two architectures share."""
+    """The base class of both architectures."""
 
     @abc.abstractmethod
     def generate(self, latents: Tensor) -> Tensor:

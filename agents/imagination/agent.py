@@ -30,12 +30,12 @@ from .settings import HYPERPARAMETERS, Settings
 from .uncertainty import decompose
 
 _PREDICTIONS = 20_000  # mixtures predicted at once, over weight samples and rows, to bound memory
-_BRANCHES = 8  # samples that stand for what the model expects of a step
+_BRANCHES = 8  # imagined samples that an expected outcome is averaged over
 _Kind = TypeVar("_Kind", bound="ImaginingAgent")
 
 
 class ImaginingAgent(DQN):
-    """Algorithm 1: a DQN that also learns a world model, and from what that imagines.
+    """Algorithm 1: a DQN that also learns a world model, and learns from the transitions that the model imagines.
 
     ``filtered`` says whether transitions of too large an epistemic uncertainty are discarded.
     """
@@ -61,7 +61,7 @@ class ImaginingAgent(DQN):
         )
 
     def learn_more(self, z: Tensor, episode: int) -> None:
-        """N_E model updates; from ``start_episode`` on, imagine from ``z`` (Z,) and make N_I updates on that.
+        """Make N_E model updates; from ``start_episode``, imagine from ``z`` (Z,) and make N_I updates on the result.
 
         After the last episode that imagines, these updates are made on real transitions.
         """
@@ -75,7 +75,7 @@ class ImaginingAgent(DQN):
         self.meters.count("time/imagination_s")
 
     def learn_model(self) -> None:
-        """N_E updates of the world model on real transitions."""
+        """Make N_E updates of the world model on real transitions."""
         model = self.imagination.model
         draws = self.imagination.generators
         with self.meters.cpu_time("time/model_s"):
@@ -87,14 +87,14 @@ class ImaginingAgent(DQN):
         self.meters.count("time/model_s")
 
     def draw_model_batches(self, generator: torch.Generator) -> Iterable[Batch]:
-        """Real transitions for the N_E updates of the world model, drawn at once, which is quicker."""
+        """Draw the real transitions of all N_E updates of the world model at once, which is quicker than one by one."""
         settings = self.settings.model
         rows = settings.updates_per_step * settings.batch_size
         sampled = self.real.sample(rows, generator, spread=settings.spread, balance=settings.balance)
         return sampled.split(settings.batch_size)
 
     def draw_batch(self, memory: Transitions) -> Batch:
-        """As of the DQN; what really happened also pays for what the world model does not know of it (curiosity)."""
+        """Draw as the DQN does; curiosity adds the model's ignorance of each real transition to its reward."""
         batch = super().draw_batch(memory)
         weight = self.settings.imagination.curiosity
         if weight == 0.0 or memory is not self.real:
@@ -111,11 +111,11 @@ class ImaginingAgent(DQN):
         self.meters.add("imagination/mean_depth", counts.accepted, counts.rollouts)
 
     def diagnostics(self) -> dict[str, float]:
-        """As of the DQN, with how many transitions were imagined so far."""
+        """Return the DQN's diagnostics and the number of transitions imagined so far."""
         return {**super().diagnostics(), "imagined_transitions": float(self.imagination.memory.added)}
 
     def state(self) -> AgentState:
-        """A snapshot, world model and imagined memory included."""
+        """Return a snapshot that includes the world model and the imagined memory."""
         state = super().state()
         own = self.imagination
         state.arrays.update(snapshot.prefixed("imagination", own.arrays()))
@@ -139,7 +139,10 @@ class ImaginingAgent(DQN):
         self.steps = self.updates = 0
 
     def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
-        """What curiosity pays for; see :class:`.capabilities.NoveltyReader`. None of a single network."""
+        """Return the curiosity reward of every macro-action; see :class:`.capabilities.NoveltyReader`.
+
+        A single network has no disagreement to measure, so the result is None there.
+        """
         if weight_samples(self.settings) * self.settings.model.members == 1:
             return None
         z = self.perceive(observation.frame).expand(self.n_actions, -1)
@@ -158,7 +161,7 @@ class ImaginingAgent(DQN):
         return self._rollout(start, list(self._unroll(start, planned, depth, rng)))
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
-        """As many samples as :data:`_BRANCHES`; see :class:`.capabilities.OutcomePredictor`."""
+        """Average over :data:`_BRANCHES` imagined samples; see :class:`.capabilities.OutcomePredictor`."""
         z = self.perception.encoder.encode(frames)[0]
         shape = (len(frames), self.n_actions, _BRANCHES)
         generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
@@ -176,7 +179,7 @@ class ImaginingAgent(DQN):
     def _unroll(
         self, z: Tensor, planned: list[int] | None, depth: int, rng: np.random.Generator
     ) -> Iterator[tuple[Tensor, Tensor, ImaginedStep]]:
-        """Values before, action and result of each imagined step, one rollout."""
+        """Yield the values before, the action and the result of each imagined step of one rollout."""
         generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
         weights = self.imagination.draw_weights(generator)
         for index in range(depth if planned is None else len(planned)):
@@ -223,7 +226,7 @@ def build(
     filtered: bool,
     hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS,
 ) -> _Kind:
-    """An imagining agent of a kind, with or without the filter; the precision is that of its device."""
+    """Make an imagining agent of a class, with or without the filter; its device decides an ``auto`` precision."""
     settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
     precision = settle(settings.model.precision, context.device)
     settings = replace(settings, model=replace(settings.model, precision=precision))

@@ -48,7 +48,7 @@ class ModelOnlyTraining:
         self.begin(0)
 
     def begin(self, real_step: int) -> None:
-        """Forget everything and start with a new controller, for what was learned up to ``real_step``."""
+        """Start with a new controller and an empty memory; ``real_step`` names the world model's age."""
         seeds = self._seeds.child(real_step)
         device = self._device
         size = self.imagination.model.latent_size
@@ -160,19 +160,19 @@ class ModelOnlyAgent(ImaginingAgent):
         super().observe(transition, episode=episode)
 
     def learn_more(self, z: Tensor, episode: int) -> None:
-        """N_E model updates; what is imagined is left to :meth:`train_in_model`."""
+        """Make N_E model updates; only :meth:`train_in_model` imagines."""
         self.learn_model()
         self.meters.count("time/model_only_s")
 
     def reset_for_new_task(self) -> None:
-        """As every imagining agent; starts and training begin anew too."""
+        """Reset as every imagining agent does; the starts and the training in the model begin anew too."""
         super().reset_for_new_task()
         self._starts.clear()
         self._episode = -1
         self.training.begin(0)
 
     def train_in_model(self) -> bool:
-        """Imagine one episode and learn from it, if any is left; real steps make training begin anew.
+        """Imagine one episode, learn from it, and return whether one was left; real steps make training begin anew.
 
         DivergedError if the controller's loss is no longer finite.
         """
@@ -189,11 +189,11 @@ class ModelOnlyAgent(ImaginingAgent):
         return True
 
     def diagnostics(self) -> dict[str, float]:
-        """As every imagining agent; ``time/model_only_s`` too is spread over real steps."""
+        """Return the diagnostics of an imagining agent, with the transitions of the training in the model."""
         return {**super().diagnostics(), "imagined_transitions": float(self.training.steps)}
 
     def state(self) -> AgentState:
-        """A snapshot, model-only training and starts included."""
+        """Return a snapshot that includes the training in the model and the starts of episodes."""
         state = super().state()
         state.arrays.update(snapshot.prefixed("model_only", self.training.arrays()))
         state.arrays.update(snapshot.prefixed("starts", self._starts.arrays()))

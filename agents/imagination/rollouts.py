@@ -1,4 +1,4 @@
-"""Imagination: the world model in closed loop, and what the filter keeps of it (thesis 5.2.2).
+"""Imagination: the world model runs in closed loop; the filter keeps certain transitions (thesis 5.2.2).
 
 From one real state, ``I_B`` rollouts of depth ``I_D`` run side by side. One call draws T weight samples of the
 dynamics; every prediction averages over them, and their disagreement is the epistemic variance that the filter reads.
@@ -30,8 +30,9 @@ from .world_model import EnvironmentModel
 TERMINAL = 0.5
 """Predicted probability above which a rollout ends."""
 LATENT_LIMIT = 1e6
-"""A latent as large as this is none: an encoder's are of order 1. Its fourth power, times what networks multiply it by,
-is in the square of a gradient of a controller that learns from it, which Adam keeps and which must not overflow."""
+"""Largest absolute latent that is kept. An encoder's latents are of order 1; a larger one has run away.
+
+Adam keeps the square of a gradient, in which a latent occurs with its fourth power; a larger limit could overflow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ class Counts:
 
 
 class Imagination:
-    """A world model, what it imagines, and the filter between the two.
+    """A world model, the memory of its imagined transitions, and the filter between the two.
 
     ``filtered`` says whether the filter is active. ``seeds`` is this imagination's node of the seed tree, ``device``
     where networks and memory lie.
@@ -99,11 +100,11 @@ class Imagination:
         self.memory = ImaginedMemory(settings.memory.imagined, latent_size, device, weighted=weighted)
 
     def new_model(self, state_size: int, n_actions: int, settings: Settings) -> EnvironmentModel:
-        """A world model that has learned nothing, of states of so many numbers."""
+        """Return an untrained world model of states of ``state_size`` numbers."""
         return EnvironmentModel(state_size, n_actions, settings.model, self.generators["weights"])
 
     def reset_for_new_task(self) -> None:
-        """Keep what predicts states; everything else begins anew, moments of the optimiser included."""
+        """Keep the dynamics network; everything else begins anew, the optimiser's moments included."""
         known = self.model
         self.model = self.new_model(known.latent_size, known.n_actions, self._all_settings)
         self.model.keep_dynamics_of(known)
@@ -111,15 +112,15 @@ class Imagination:
         self.filter.reset()
 
     def draw_weights(self, generator: torch.Generator) -> Weights:
-        """T weight samples of what the filter reads."""
+        """Draw T weight samples of the networks that the filter compares."""
         count = self.settings.weight_samples
         dynamics = self.model.draw_weights(count, generator)
         return Weights(dynamics, self.model.draw_reward_weights(count, generator) if self.filter.reads_reward else None)
 
     def step(self, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator) -> ImaginedStep:
-        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): sample z' from what :attr:`settings` predict with.
+        """Imagine the result of ``action`` (N,) in ``z`` (N, Z): sample z' from the networks that the settings choose.
 
-        DivergedError if what the model predicts is NaN.
+        Raises DivergedError if a prediction is NaN.
         """
         model = self.model
         samples = model.predict(z, action, weights.dynamics)  # [E T, N, ...]
@@ -138,9 +139,9 @@ class Imagination:
         return predicted
 
     def ignorance(self, z: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """Epistemic variance of where actions (N,) lead from z (N, Z), reduced as the filter does, at most 1: (N,).
+        """Return the epistemic variance of the next states of actions (N,) in z (N, Z), reduced and at most 1: (N,).
 
-        Noise and the choice among several outcomes are no part of it (thesis 6): it is to be paid for exploring.
+        Curiosity pays this for exploring, so noise and the choice among several outcomes are no part of it (thesis 6).
         """
         weights = self.model.draw_weights(self.settings.weight_samples, generator)
         return self.filter.score(decompose(self.model.predict(z, action, weights)).epistemic).clamp(max=1.0)
@@ -148,7 +149,7 @@ class Imagination:
     def _predicted(
         self, samples: Mixture, z: Tensor, action: Tensor, weights: Weights, generator: torch.Generator
     ) -> Mixture:
-        """The mixtures (N, E K) that z' is sampled from, of what the weight samples (E T, N) say."""
+        """Return the mixtures (N, E K) that z' is sampled from, given those of the weight samples (E T, N)."""
         members = self.model.members
         if self.settings.predicts_with == "network" and weights.dynamics is not None:
             samples = self.model.predict(z, action, None)
@@ -164,7 +165,7 @@ class Imagination:
         return self.filter.score(decompose(step.samples).epistemic)
 
     def keeps(self, step: ImaginedStep, gathered: Tensor | float = 0.0) -> Tensor:
-        """Which transitions the filter lets pass; where there is none, all that have not run away. Shape (N,), bool.
+        """Return whether the filter keeps each transition; without a filter only runaway ones are dropped. (N,), bool.
 
         ``gathered`` is the uncertainty of each rollout before this step, where it counts, in squared units of z. A
         variance that is sampled in full and fed back can grow without bound, within some five imagined steps.
