@@ -229,28 +229,30 @@ class Sweep:
             self._suite(replace(suite, seeds=tuple(sorted(self.seeds))) if self.seeds else suite)
 
     def _study(self, study: Study) -> None:
-        from imagine_bench.report.sweep import study_page  # noqa: PLC0415 - matplotlib loads slowly
-
         if self.task is None:
             raise InvalidValueError(f"{study.name} is a study of one task; give a task as the first word.")
         lines = run_study(study, self.task, root=self.launch.out, launcher=self.launch.chosen())
         runs = digest(sorted({line.folder.name for line in lines}))  # other runs overwrite no study
         folder = self.launch.out / file_name(registry.task_name(self.task)) / f"study-{study.name}-{runs}"
-        _write(study_page(study, lines), folder)
+        _write(registry.load(_PAGES["study"])(study, lines), folder)
 
     def _suite(self, suite: Suite) -> None:
-        from imagine_bench.report.sweep import suite_page  # noqa: PLC0415 - matplotlib loads slowly
-
         launcher = self.launch.chosen()
         agents = self.agents or SUITE_AGENTS
         result = run_suite(suite, agents, root=self.launch.out, launcher=launcher, planners=self.launch.workers)
-        _write(suite_page(result), self.launch.out / "suite" / f"{suite.name}-{suite.hash}" / "report")
+        page = registry.load(_PAGES["suite"])(result)
+        _write(page, self.launch.out / "suite" / f"{suite.name}-{suite.hash}" / "report")
         if result.failures:
             raise RunFailedError(f"{len(result.failures)} runs failed; the same command tries them again.")
 
 
-_PAGES = {"control": "imagine_bench.report:bench_page", "regression": "imagine_bench.report.regression:report_page"}
-"""Functions that make the page of a bench of each type of task."""
+_PAGES = {
+    "control": "imagine_bench.report:bench_page",
+    "regression": "imagine_bench.report.regression:report_page",
+    "study": "imagine_bench.report.sweep:study_page",
+    "suite": "imagine_bench.report.sweep:suite_page",
+}
+"""Functions that make the page of a bench of each type of task and of a sweep; matplotlib loads with them."""
 
 
 def _show(result: Result) -> None:

@@ -24,31 +24,32 @@ def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config
     chosen = {guest: config.getoption(f"imagine_bench_{guest}") for guest in _GUESTS}
     if not any(chosen.values()):
         return
-    from imagine_bench.testing.contract import checks  # noqa: PLC0415 - nothing where no option is given
+    from imagine_bench.testing import common, contract  # noqa: PLC0415 - nothing where no option is given
 
     try:
-        found = checks(**chosen)
+        found = contract.checks(**chosen)
     except ImagineBenchError as error:
         raise pytest.UsageError(str(error)) from error
     name = chosen["agent"] or chosen["model"] or chosen["task"]
     for words, check in ((f"{name}: {what}", check) for what, check in found.items()):
-        items.append(Check.from_parent(session, name=words, nodeid=f"imagine-bench::{words}", check=check))
+        nodeid = f"imagine-bench::{words}"
+        item = Check.from_parent(session, name=words, nodeid=nodeid, check=check, excuse=common.NotOffered)
+        items.append(item)
 
 
 class Check(pytest.Item):
     """One sentence of the contract."""
 
-    def __init__(self, *, check: Callable[[], None], **given: Any) -> None:
+    def __init__(self, *, check: Callable[[], None], excuse: type[Exception], **given: Any) -> None:
         super().__init__(**given)
         self._check = check
+        self._excuse = excuse
 
     def runtest(self) -> None:
         """Pass, fail, or be skipped where the guest may do without what is checked."""
-        from imagine_bench.testing.common import NotOffered  # noqa: PLC0415 - as above
-
         try:
             self._check()
-        except NotOffered as why:
+        except self._excuse as why:
             pytest.skip(str(why))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:

@@ -113,10 +113,10 @@ def _current() -> Callable[[], int | None]:
 
 def _release() -> None:
     """Let no context of EGL be current in this thread, so that another thread may use it."""
-    from mujoco.egl import EGL_DISPLAY  # noqa: PLC0415  (after the platform is chosen)
-    from OpenGL import EGL  # noqa: PLC0415
+    from mujoco import egl  # noqa: PLC0415  (after the platform is chosen)
 
-    EGL.eglMakeCurrent(EGL_DISPLAY, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
+    nothing = egl.EGL.EGL_NO_SURFACE
+    egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, nothing, nothing, egl.EGL.EGL_NO_CONTEXT)
 
 
 def _empty_scene(model: mujoco.MjModel, view: View) -> mujoco.MjvScene:
