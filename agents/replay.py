@@ -108,7 +108,9 @@ class RealMemory(_Ring):
         columns = self._columns
         columns["mu"][row], columns["sigma"][row] = posterior
         columns["next_mu"][row], columns["next_sigma"][row] = next_posterior
-        columns["action"][row], columns["reward"][row], columns["terminated"][row] = action, reward, float(terminated)
+        columns["action"][row] = action
+        columns["reward"][row] = reward
+        columns["terminated"][row] = float(terminated)
         if "error" in columns:  # what was never replayed comes first
             columns["error"][row] = columns["error"][: len(self)].max() if len(self) else 1.0
         self.added += 1

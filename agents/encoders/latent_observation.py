@@ -31,7 +31,8 @@ class LatentObservation(gymnasium.ObservationWrapper[NDArray[np.float32], Action
     def __init__(self, env: gymnasium.Env[Frame, Action], encoder: Encoder | Path | str) -> None:
         super().__init__(env)
         self.encoder = encoder if isinstance(encoder, Encoder) else Encoder.load(_path(encoder))
-        reads, declared = self.encoder.card.preprocessing, getattr(env.unwrapped, "preprocessing", None)
+        reads = self.encoder.card.preprocessing
+        declared = getattr(env.unwrapped, "preprocessing", None)
         if declared not in (None, reads):
             raise InvalidValueError(
                 f"The encoder of {self.encoder.card.task} reads frames as {reads!r}, this environment's task declares "

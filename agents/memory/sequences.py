@@ -91,7 +91,9 @@ class SequenceMemory(RealMemory):
         """
         row = self.added % self.capacity
         columns = self._columns
-        columns["step"][row], columns["before"][row], columns["stored"][row] = step, before, stored
+        columns["step"][row] = step
+        columns["before"][row] = before
+        columns["stored"][row] = stored
         self.add(posterior, action, reward, next_posterior, terminated)
 
     def draw(
