@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -34,7 +33,9 @@ class BayesianMDN:
     def __init__(
         self, n_inputs: int, n_outputs: int, settings: MDNSettings, generators: Sequence[torch.Generator]
     ) -> None:
-        self.n_outputs, self.settings, self._generators = n_outputs, settings, generators
+        self.n_outputs = n_outputs
+        self.settings = settings
+        self._generators = generators
         sizes = (n_inputs, *settings.hidden, mdn.output_size(settings.components, n_outputs))
         precision = hidden_dtype(settings.precision, generators[0].device.type)
         self.network = NormedMLP(sizes, generators=generators, dropout=settings.dropout, precision=precision)
@@ -85,8 +86,3 @@ def members(network: MemberMLP, first: int, count: int) -> MemberMLP:
         for whole, own in zip(network.parameters(), part.parameters(), strict=True):
             own.copy_(whole[first : first + count])
     return part
-
-
-def rescaled(mixture: Mixture, shift: Tensor, scale: Tensor) -> Mixture:
-    """The mixture of ``shift + scale * y``. Shift and scale (D,), scale above 0."""
-    return replace(mixture, means=mixture.means * scale + shift, log_sigmas=mixture.log_sigmas + scale.log())

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -37,7 +36,7 @@ from ..snapshot import (
     require_fit,
     training_arrays,
 )  # fmt: skip
-from .bayesian_mdn import BayesianMDN, members, rescaled
+from .bayesian_mdn import BayesianMDN, members
 from .settings import HYPERPARAMETERS, RegressorSettings
 from .stationarity import jensen_shannon
 
@@ -45,7 +44,6 @@ _ROWS = 256
 """Rows predicted at a time: T mixtures of each are in memory."""
 _DRAWN = 16
 """Values of equation 4.8 drawn for each row."""
-_Arrays = TypeVar("_Arrays", Prediction, Mixtures)
 
 
 class MixtureRegressor:
@@ -58,7 +56,8 @@ class MixtureRegressor:
     def __init__(self, context: RegressorContext, settings: RegressorSettings) -> None:
         _require_data(context)
         settings = dataclasses.replace(settings, precision=settle(settings.precision, context.device))
-        self.settings, self.networks = settings, len(context.datasets)
+        self.settings = settings
+        self.networks = len(context.datasets)
         self._device = prepare_torch(context.device)
         inputs = np.stack([data.inputs for data in context.datasets])
         targets = np.stack([data.targets for data in context.datasets])
@@ -72,7 +71,8 @@ class MixtureRegressor:
         }
         self._samples = [seeds.child("weight_samples") for seeds in context.seeds]
         self._model = BayesianMDN(inputs.shape[-1], targets.shape[-1], settings, self._generators["network"])
-        self.epoch, self.epochs = 0, settings.epochs
+        self.epoch = 0
+        self.epochs = settings.epochs
         self._losses: list[float] = []
         self._folded: MemberMLP | None = None
 
@@ -94,29 +94,33 @@ class MixtureRegressor:
 
     def _rate(self) -> float:
         """The learning rate of the coming epoch."""
-        final, gone = self.settings.final_rate, min(1.0, self.epoch / self.epochs)
+        final = self.settings.final_rate
+        gone = min(1.0, self.epoch / self.epochs)
         return self.settings.learning_rate * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * gone)))
 
     def diagnostics(self) -> dict[str, float]:
         """Mean negative log-likelihood of the standardised targets while training, since the last call."""
-        losses, self._losses = self._losses, []
+        losses = self._losses
+        self._losses = []
         return {"loss/likelihood": float(np.mean(losses))} if losses else {}
 
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
         """Predict, with uncertainties; see :class:`imagine_bench.interfaces.regression.Regressor`."""
         self._require_inputs(inputs)
         own, other = (self._generator(int(rng.integers(2**62))) for _ in range(2))
-        networks = [
-            _joined([self._predict_rows(e, rows, own, other) for rows in self._tensor(inputs[e]).split(_ROWS)])
-            for e in range(self.networks)
-        ]
-        return _joined(networks, np.stack)
+        networks = []
+        for e in range(self.networks):
+            parts = [self._predict_rows(e, rows, own, other) for rows in self._tensor(inputs[e]).split(_ROWS)]
+            networks.append({name: torch.cat([part[name] for part in parts]) for name in parts[0]})
+        found = _stacked(networks)
+        mixture = {name: found.pop(name) for name in ("weights", "means", "sigmas")}
+        return Prediction(predictive=Mixtures(**mixture), **found)
 
     def pooled(self, inputs: Floats) -> Mixtures:
         """All weight samples' mixtures side by side, equally likely."""
         self._require_inputs(inputs)
         networks = [self._weight_samples(e, self._tensor(inputs[e])) for e in range(self.networks)]
-        return _joined([_mixtures(mdn.average(samples, len(samples.means))) for samples in networks], np.stack)
+        return Mixtures(**_stacked([_parts(mdn.average(samples, len(samples.means))) for samples in networks]))
 
     def state(self) -> AgentState:
         """Weights, moments, running statistics, generators, epochs."""
@@ -142,8 +146,10 @@ class MixtureRegressor:
         for kind, generators in self._generators.items():
             for generator, array in zip(generators, arrays[f"generators/{kind}"], strict=True):
                 load_generator(generator, array)
-        self.epoch, self._model.network.batches = state.values["epoch"], state.values["batches"]
-        self._losses, self._folded = list(state.values["losses"]), None
+        self.epoch = state.values["epoch"]
+        self._model.network.batches = state.values["batches"]
+        self._losses = list(state.values["losses"])
+        self._folded = None
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.tensor(values, dtype=torch.float32, device=self._device)
@@ -155,36 +161,43 @@ class MixtureRegressor:
         """Mixtures (T, N) in the units of the targets; a network's weight samples are always the same ones."""
         if self._folded is None:
             self._folded = self._model.network.folded()
-        settings, masks = self.settings, None
+        settings = self.settings
         part = members(self._folded, network * settings.members, settings.members)
+        masks = None
         if settings.dropout > 0.0:
-            generator, count = self._generator(self._samples[network].integer()), settings.weight_samples
-            masks = [dropout_mask((count, units), settings.dropout, generator) for units in settings.hidden[:-1]]
+            generator = self._generator(self._samples[network].integer())
+            shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
+            masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
         samples = self._model.mixture(sample_outputs(part, x, masks))
-        return rescaled(samples, self._shift[network], self._scale[network])
+        shift, scale = self._shift[network], self._scale[network]
+        means = samples.means * scale + shift
+        return dataclasses.replace(samples, means=means, log_sigmas=samples.log_sigmas + scale.log())
 
-    def _predict_rows(self, network: int, x: Tensor, generator: torch.Generator, other: torch.Generator) -> Prediction:
+    def _predict_rows(
+        self, network: int, x: Tensor, generator: torch.Generator, other: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Fields of a prediction of one network for a few rows, those of its mixture by themselves."""
         samples = self._weight_samples(network, x)
         pooled = mdn.average(samples, len(samples.means))
         parts = decompose(samples)
         predictive = mdn.average(samples, self.settings.members)
         prediction = mdn.sample(predictive, 1.0, generator)
-        sampled = sampled_component_variance(samples, predictive, prediction, self.settings.members)
-        return Prediction(
-            prediction=_array(prediction),
-            sampled_variance=_array(sampled),
-            nll=_array(nll(samples, prediction)),
-            mean=_array(mdn.mean(samples).mean(dim=0)),
-            epistemic=_array(parts.epistemic),
-            aleatoric=_array(parts.aleatoric),
-            modal=_array(parts.modal),
-            stationarity=_array(jensen_shannon(samples, self.settings.divergence_draws, generator)),
-            predictive=_mixtures(predictive),
-            drawn=_array(torch.stack([mdn.sample(pooled, 1.0, other) for _ in range(_DRAWN)], dim=1)),
-        )
+        return {
+            "prediction": prediction,
+            "sampled_variance": sampled_component_variance(samples, predictive, prediction, self.settings.members),
+            "nll": nll(samples, prediction),
+            "mean": mdn.mean(samples).mean(dim=0),
+            "epistemic": parts.epistemic,
+            "aleatoric": parts.aleatoric,
+            "modal": parts.modal,
+            "stationarity": jensen_shannon(samples, self.settings.divergence_draws, generator),
+            "drawn": torch.stack([mdn.sample(pooled, 1.0, other) for _ in range(_DRAWN)], dim=1),
+            **_parts(predictive),
+        }
 
     def _require_inputs(self, inputs: Floats) -> None:
-        wanted, shape = (self.networks, "N", self._x.shape[-1]), np.shape(inputs)
+        wanted = (self.networks, "N", self._x.shape[-1])
+        shape = np.shape(inputs)
         fits = len(shape) == 3 and shape[::2] == wanted[::2] and shape[1] > 0
         if not (fits and np.isfinite(inputs).all()):
             raise InvalidValueError(f"Inputs must be finite numbers of shape {wanted}, N at least 1, not {shape}.")
@@ -213,23 +226,15 @@ def _shapes(data: RegressionData) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return np.shape(data.inputs), np.shape(data.targets)
 
 
-def _array(values: Tensor) -> Floats:
-    return values.double().cpu().numpy()
+def _parts(mixture: Mixture) -> dict[str, Tensor]:
+    """The fields of :class:`Mixtures`."""
+    return {"weights": mixture.log_weights.exp(), "means": mixture.means, "sigmas": mixture.log_sigmas.exp()}
 
 
-def _mixtures(mixture: Mixture) -> Mixtures:
-    weights, sigmas = mixture.log_weights.exp(), mixture.log_sigmas.exp()
-    return Mixtures(weights=_array(weights), means=_array(mixture.means), sigmas=_array(sigmas))
-
-
-def _joined(parts: Sequence[_Arrays], join: Callable[[list[Floats]], Floats] = np.concatenate) -> _Arrays:
-    """Predictions or mixtures joined field by field: along rows, or stacked as networks."""
-
-    def joined(name: str) -> Any:
-        values = [getattr(part, name) for part in parts]
-        return _joined(values, join) if isinstance(values[0], Mixtures) else join(values)
-
-    return type(parts[0])(**{field.name: joined(field.name) for field in dataclasses.fields(parts[0])})
+def _stacked(networks: Sequence[dict[str, Tensor]]) -> dict[str, Floats]:
+    """Tensors by name as arrays whose first axis is the network."""
+    names = networks[0]
+    return {name: torch.stack([each[name] for each in networks]).double().cpu().numpy() for name in names}
 
 
 def make_mc_dropout(context: RegressorContext) -> MixtureRegressor:

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Arrays, Floats
 from imagine_bench.regression.protocol import RegressionProtocol
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_protocol_as
 from imagine_bench.store.codec import grouped, read_arrays, table_rows, table_text, write_arrays
 from imagine_bench.store.files import write_bytes
 from imagine_bench.store.results import require_every_run
+from imagine_bench.values import Setting
 
 METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
-Values = NDArray[np.float64]
 Row = dict[str, float | str]
 """One network of one variant: ``variant``, ``network``, and every measure by name."""
-Pair = tuple[str, str]
-"""A regressor and a variant."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,16 +30,46 @@ class RegressionRun:
 
     agent: str
     seed: int
-    settings: Mapping[str, Any]
+    settings: Mapping[str, Setting]
     rows: tuple[Row, ...]  #: one a variant and network
     #: The task's own measurements by variant, and under ``calibration/`` those of calibration.
     evaluations: Mapping[str, Arrays]
     folder: Path  #: where the run's files lie
     recording: Path | None  #: its Rerun recording, or None
 
-    def values(self, variant: str, name: str) -> Values:
-        """One measure of every network of a variant. Shape (E,)."""
-        return np.array([float(row[name]) for row in self.rows if row["variant"] == variant])
+
+@dataclass(frozen=True)
+class PairResult:
+    """All networks of one regressor on one variant, those of the first seed first."""
+
+    agent: str
+    variant: str
+    runs: tuple[RegressionRun, ...]  #: in the order of the protocol's seeds
+
+    @property
+    def label(self) -> str:
+        """Title of the regressor, and the variant."""
+        return f"{registry.regressor_entry(self.agent).title}, {self.variant}"
+
+    def values(self, name: str) -> Floats:
+        """One measure of every network. Shape (seeds E,)."""
+        rows = [row for run in self.runs for row in run.rows]
+        return np.array([float(row[name]) for row in rows if row["variant"] == self.variant])
+
+    def mean(self, name: str) -> float:
+        """Mean of one measure over the networks of which it is a number; not a number where it is one of none."""
+        values = self.values(name)
+        known = values[np.isfinite(values)]
+        return float(known.mean()) if known.size else np.nan
+
+    def arrays(self, name: str) -> Floats:
+        """A measurement of the task whose first axis is the network. Shape (seeds E, ...)."""
+        return np.concatenate([run.evaluations[self.variant][name] for run in self.runs])
+
+    @property
+    def first(self) -> Arrays:
+        """Everything measured in the run of the first seed."""
+        return self.runs[0].evaluations[self.variant]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,37 +97,23 @@ class RegressionResult:
         return self.protocol.hash
 
     @property
-    def pairs(self) -> list[Pair]:
-        """Every regressor and variant."""
-        return list(itertools.product(self.protocol.agents, self.protocol.variants))
-
-    def title(self, agent: str) -> str:
-        """The name of a regressor for people."""
-        return registry.regressor_entry(agent).title
-
-    def label(self, pair: Pair) -> str:
-        """Title of the regressor, and the variant."""
-        return f"{self.title(pair[0])}, {pair[1]}"
+    def titles(self) -> dict[str, str]:
+        """The names of the regressors for people."""
+        return {agent: registry.regressor_entry(agent).title for agent in self.protocol.agents}
 
     def of(self, agent: str) -> tuple[RegressionRun, ...]:
         """The runs of one regressor, in the order of the protocol's seeds."""
         by_seed = {run.seed: run for run in self.runs if run.agent == agent}
         return tuple(by_seed[seed] for seed in self.protocol.seeds)
 
-    def values(self, pair: Pair, name: str) -> Values:
-        """One measure of every network of all seeds. Shape (seeds E,)."""
-        agent, variant = pair
-        return np.concatenate([run.values(variant, name) for run in self.of(agent)])
+    def by_variant(self, agent: str) -> dict[str, PairResult]:
+        """The networks of one regressor, by the variant that they learned from."""
+        return {variant: PairResult(agent, variant, self.of(agent)) for variant in self.protocol.variants}
 
-    def arrays(self, pair: Pair, name: str) -> NDArray[Any]:
-        """A measurement of the task whose first axis is the network, of all seeds. Shape (seeds E, ...)."""
-        agent, variant = pair
-        return np.concatenate([run.evaluations[variant][name] for run in self.of(agent)])
-
-    def first(self, pair: Pair) -> Arrays:
-        """Everything measured in the run of the first seed."""
-        agent, variant = pair
-        return self.of(agent)[0].evaluations[variant]
+    @property
+    def pairs(self) -> list[PairResult]:
+        """Every regressor on every variant."""
+        return [pair for agent in self.protocol.agents for pair in self.by_variant(agent).values()]
 
 
 def write_rows(folder: Path, rows: Sequence[Row]) -> None:

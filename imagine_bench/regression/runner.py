@@ -6,10 +6,8 @@ bits as one that was not; only CPU times differ.
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from pathlib import Path
-from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays
@@ -22,9 +20,9 @@ from imagine_bench.regression.protocol import RegressionProtocol, overrides_of
 from imagine_bench.regression.results import RegressionRun, Row, finish, flattened, load_run, write_rows
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
-from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot, sweep_partial
+from imagine_bench.store.checkpoints import Snapshot, save_snapshot
 from imagine_bench.store.codec import grouped
-from imagine_bench.store.files import lock, make_folder, reading, sweep, writing
+from imagine_bench.store.files import reading
 
 TRAINING, MEASURING = 100, 10
 """Steps of progress of a variant."""
@@ -39,9 +37,8 @@ def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress
         DivergedError: A likelihood is no longer finite; the message says where the state lies.
         SetupError: The folder cannot be written.
     """
-    make_folder(folder)
-    with lock(folder / ".lock", f"The run folder {folder}", patience_s=5.0):
-        if not run_folder.is_done(folder):
+    with run_folder.unfinished(folder) as left:
+        if left:
             _Run(spec, folder, on_progress).execute()
     return load_run(folder)
 
@@ -58,10 +55,7 @@ class _Run:
         self.rows: list[Row] = []
         self.evaluations: dict[str, Arrays] = {}
         self.train_cpu_s = 0.0
-        with writing(folder):
-            sweep(folder)
-            sweep_partial(folder / "checkpoints")
-        self.snapshot = load_newest(folder / "checkpoints")
+        self.snapshot = run_folder.newest_snapshot(folder)
         if self.snapshot is not None:
             self.rows = list(self.snapshot.values["rows"])
             found = grouped(self.snapshot.arrays)  # files give arrays back in any order
@@ -73,7 +67,11 @@ class _Run:
             regressor = self._regressor(variant)
             self._train(regressor, variant)
             self._measure(regressor, variant)
-        self._record()
+        recorder = self.task.recorder or next(iter(self.spec.observers), None)
+        if recorder is not None and self.protocol.recorded:
+            self._report("recording", "recording", 0)
+            path = run_folder.recording_path(self.folder)
+            registry.load(recorder)(self.evaluations, task=self.task, name=self.spec.agent, path=path)
         finish(self.folder, self.rows, self.evaluations)
         self._report("done", "done", 0)
 
@@ -88,20 +86,12 @@ class _Run:
             device=self.protocol.device,
         )
         regressor = registry.make_regressor(self.spec.agent, context)
-        settings = getattr(regressor, "settings", None)
-        config: dict[str, Any] = {
-            "protocol": self.protocol.as_dict(),
-            "protocol_hash": self.protocol.hash,
-            "agent": self.spec.agent,
-            "seed": self.spec.seed,
-            "settings": {} if settings is None else dataclasses.asdict(settings),
-        }
-        run_folder.check_config(self.folder, config)
+        run_folder.check_config(self.folder, self.spec, regressor)
         snapshot = self.snapshot
         self.snapshot = None
         self.train_cpu_s = 0.0
         if snapshot is not None and snapshot.values["variant"] == variant:
-            with reading(self.folder / "checkpoints", f"a checkpoint of {self.spec.agent!r}"):
+            with reading(self.folder / run_folder.CHECKPOINTS, f"a checkpoint of {self.spec.agent!r}"):
                 regressor.restore(snapshot.agent)
             self.train_cpu_s = snapshot.values["train_cpu_s"]
         return regressor
@@ -118,7 +108,7 @@ class _Run:
                 if time.monotonic() - self.saved_s >= self.spec.checkpoint_every_s:
                     self._save(regressor, variant)
         except DivergedError as error:
-            where = save_snapshot(self.folder / "diverged", self._snapshot(regressor, variant))
+            where = self._save(regressor, variant, "diverged")
             raise DivergedError(f"{error} The state lies in {where}.") from error
         self._save(regressor, variant)
 
@@ -141,28 +131,23 @@ class _Run:
         write_rows(self.folder, self.rows)
         self._save(regressor, "")
 
-    def _record(self) -> None:
-        """Record beside the results; the file appears whole or not at all."""
-        own = () if self.task.recorder is None else (self.task.recorder,)
-        for recorder in own or self.spec.observers:
-            if self.protocol.recorded:
-                self._report("recording", "recording", 0)
-                path = run_folder.recording_path(self.folder)
-                registry.load(recorder)(self.evaluations, task=self.task, name=self.spec.agent, path=path)
-
-    def _snapshot(self, regressor: Regressor, variant: str) -> Snapshot:
+    def _save(self, regressor: Regressor, variant: str, folder: str = run_folder.CHECKPOINTS) -> Path:
+        """Save everything that is needed to go on with ``variant``, empty where it is measured; where it lies."""
         values = {"variant": variant, "rows": self.rows, "train_cpu_s": self.train_cpu_s}
         arrays = flattened(self.evaluations)
-        return Snapshot(episode=regressor.epoch, agent=regressor.state(), arrays=arrays, values=values)
-
-    def _save(self, regressor: Regressor, variant: str) -> None:
-        save_snapshot(self.folder / "checkpoints", self._snapshot(regressor, variant))
+        snapshot = Snapshot(episode=regressor.epoch, agent=regressor.state(), arrays=arrays, values=values)
         self.saved_s = time.monotonic()
+        return save_snapshot(self.folder / folder, snapshot)
 
     def _report(self, phase: Phase, detail: str, done: int) -> None:
-        done = min((TRAINING + MEASURING) * len(self.evaluations) + done, self.spec.work)
-        agent, seed, bench = self.spec.agent, self.spec.seed, self.protocol.hash
-        work = self.spec.work
-        self.on_progress(
-            Progress(agent=agent, seed=seed, bench=bench, phase=phase, done=done, work=work, detail=detail)
+        """Tell how far the run is: ``done`` counts within the running variant."""
+        progress = Progress(
+            agent=self.spec.agent,
+            seed=self.spec.seed,
+            bench=self.protocol.hash,
+            phase=phase,
+            done=(TRAINING + MEASURING) * len(self.evaluations) + done,
+            work=self.spec.work,
+            detail=detail,
         )
+        self.on_progress(progress)

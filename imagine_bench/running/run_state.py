@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,11 +25,10 @@ from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.running.evaluation import AsDict, EvaluationCounts, StartFrom
 from imagine_bench.running.queries import Teacher, demonstrator, require_able
 from imagine_bench.store import encoders, run_folder
-from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot, sweep_partial
+from imagine_bench.store.checkpoints import Snapshot, save_snapshot
 from imagine_bench.store.codec import pack, unpack
-from imagine_bench.store.files import reading, sweep, writing
+from imagine_bench.store.files import reading
 from imagine_bench.store.results import Checkpoint
-from imagine_bench.values import Json
 
 _RECENT = 100
 """Training episodes whose success is shown while running."""
@@ -166,13 +164,10 @@ class Run:
         self.teacher = Teacher(self.task.rules, wanted.feedback, wanted.feedback_error) if wanted.feedback else None
         self.counters = Counters()
         self._on_progress = on_progress
-        with writing(folder):
-            sweep(folder)
-            sweep_partial(folder / "checkpoints")
-        run_folder.check_config(folder, self._config())
+        run_folder.check_config(folder, spec, self.agent)
         if self.entry.external_training_loop:
             run_folder.forget(folder)  # an earlier attempt cannot be gone on with
-        snapshot = load_newest(folder / "checkpoints")
+        snapshot = run_folder.newest_snapshot(folder)
         if snapshot is not None:
             with reading(folder / "checkpoints", f"a checkpoint of {spec.agent!r}"):
                 self.agent.restore(snapshot.agent)
@@ -199,16 +194,6 @@ class Run:
                 f"{self.spec.dataset} is dataset {found.identity}, and this bench is of {self.protocol.dataset}."
             )
         return found.episodes
-
-    def _config(self) -> Mapping[str, Json]:
-        settings = getattr(self.agent, "settings", None)
-        return {
-            "protocol": self.protocol.as_dict(),
-            "protocol_hash": self.protocol.hash,
-            "agent": self.protocol.written_name(self.spec.agent),
-            "seed": self.spec.seed,
-            "settings": {} if settings is None else dataclasses.asdict(settings),
-        }
 
     @cached_property
     def demonstrator(self) -> Agent:

@@ -19,7 +19,6 @@ from imagine_bench.protocols.runs import OnProgress, RunSpec
 from imagine_bench.running import phases
 from imagine_bench.running.run_state import Run, environments
 from imagine_bench.store import run_folder
-from imagine_bench.store.files import lock, make_folder
 from imagine_bench.store.results import Checkpoint, ComparedRollout, OpenLoop, PolicyTable
 
 
@@ -58,9 +57,8 @@ def run(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, observer
         DivergedError: NaN in physics or learning; the message says where the state lies.
         SetupError: The folder cannot be written, or there is no GL.
     """
-    make_folder(folder)
-    with lock(folder / ".lock", f"The run folder {folder}", patience_s=5.0):  # a killed parent's child may be dying
-        if not run_folder.is_done(folder):
+    with run_folder.unfinished(folder) as left:
+        if left:
             with environments(spec.protocol) as (env, test_env):
                 _go_on(Run(spec, folder, on_progress, env, test_env), observers)
 

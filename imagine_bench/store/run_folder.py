@@ -11,7 +11,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,23 @@ import numpy as np
 from imagine_bench.arrays import Arrays
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.data import ProtocolData, digest
+from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.registry.old_names import agent_label
-from imagine_bench.store.checkpoints import load_newest
+from imagine_bench.store.checkpoints import Snapshot, load_newest, sweep_partial
 from imagine_bench.store.codec import pack, read_arrays, table_rows, table_text, unpack, write_arrays
-from imagine_bench.store.files import first_difference, read_sealed, reading, sealed, sha256, write_bytes, write_json
+from imagine_bench.store.files import (
+    first_difference,
+    lock,
+    make_folder,
+    read_sealed,
+    reading,
+    sealed,
+    sha256,
+    sweep,
+    write_bytes,
+    write_json,
+    writing,
+)
 from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RunResult
 from imagine_bench.values import Json
 
@@ -61,15 +75,55 @@ def reached(folder: Path) -> int:
         return int(rows[-1]["episodes"]) if rows else 0
 
 
-def check_config(folder: Path, config: Mapping[str, Json]) -> None:
+@contextmanager
+def unfinished(folder: Path) -> Iterator[bool]:
+    """Hold a run's folder for this process; yields whether there is anything left to do.
+
+    Raises:
+        BusyError: Another process is at this run.
+        SetupError: The folder cannot be written.
+    """
+    make_folder(folder)
+    with lock(folder / ".lock", f"The run folder {folder}", patience_s=5.0):  # a killed parent's child may be dying
+        yield not is_done(folder)
+
+
+def newest_snapshot(folder: Path) -> Snapshot | None:
+    """Return the newest checkpoint of a run, None before the first; what a killed process left half done goes.
+
+    Raises:
+        ArtefactError: The checkpoint is damaged.
+        SetupError: The folder cannot be written.
+    """
+    with writing(folder):
+        sweep(folder)
+        sweep_partial(folder / CHECKPOINTS)
+    return load_newest(folder / CHECKPOINTS)
+
+
+def check_config(folder: Path, spec: RunSpec[ProtocolData], learner: object) -> None:
     """Write what is run into a new run folder, or compare it with what an old one holds.
+
+    Args:
+        folder: The run's folder.
+        spec: The run.
+        learner: Its agent or regressor, whose ``settings`` are kept if it has any.
 
     Raises:
         ArtefactError: The folder was begun with something else.
         SetupError: It cannot be written.
     """
+    settings = getattr(learner, "settings", None)
+    config = {
+        "format": FORMAT,
+        "protocol": spec.protocol.as_dict(),
+        "protocol_hash": spec.protocol.hash,
+        "agent": spec.protocol.written_name(spec.agent),
+        "seed": spec.seed,
+        "settings": {} if settings is None else dataclasses.asdict(settings),
+    }
     path = folder / _CONFIG
-    now = json.loads(json.dumps({"format": FORMAT, **config}))
+    now = json.loads(json.dumps(config))
     if not path.exists():
         write_json(path, sealed(now))
         return

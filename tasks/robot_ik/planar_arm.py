@@ -62,15 +62,6 @@ class PlanarArm:
         mujoco.mj_kinematics(self.model, self._data)
         return tuple(self._data.site_xpos[self._site, :2].tolist())
 
-    def tip(self, joints_rad: Floats) -> Floats:
-        """The model's own forward kinematics, without moving: (N, 3) to (N, 2), in metres."""
-        places = np.empty((len(joints_rad), 2))
-        for row, joints in enumerate(joints_rad):
-            self._data.qpos[:] = joints
-            mujoco.mj_kinematics(self.model, self._data)
-            places[row] = self._data.site_xpos[self._site, :2]
-        return places
-
     def solve(self, targets_m: Floats, rng: np.random.Generator) -> Floats:
         """Joint configurations that mink finds for targets in the plane, from up to 8 random starts each.
 

@@ -41,34 +41,17 @@ def arm() -> PlanarArm:
     return planar_arm()
 
 
-def forward(joints_rad: Floats) -> Floats:
-    """Forward kinematics (equation 4.29): joints (..., 3) to the tip's place in the plane (..., 2), in metres."""
-    angles = np.cumsum(joints_rad, axis=-1)
-    return np.stack([(np.cos(angles) * LINKS_M).sum(axis=-1), (np.sin(angles) * LINKS_M).sum(axis=-1)], axis=-1)
-
-
 def distance_to_workspace(points_m: Floats) -> Floats:
     """How far points lie outside of what the arm can reach, in metres; 0 inside. Points (..., 2), result (...).
 
     With the elbow at polar angle t, |t| <= 120 degrees, the two outer links reach the ring of radii 0.1 and 0.5 m
     around it. A point is outside exactly if its nearest elbow is more than 0.5 m away, by what is then missing.
     """
-    radius, angle = np.linalg.norm(points_m, axis=-1), np.arctan2(points_m[..., 1], points_m[..., 0])
+    radius = np.linalg.norm(points_m, axis=-1)
+    angle = np.arctan2(points_m[..., 1], points_m[..., 0])
     elbow = np.clip(angle, LOW_RAD[0], HIGH_RAD[0])
     nearest = np.sqrt(radius**2 + LINKS_M[0] ** 2 - 2 * radius * LINKS_M[0] * np.cos(angle - elbow))
     return np.maximum(nearest - LINKS_M[1] - LINKS_M[2], 0.0)
-
-
-def require_reachable(points_m: Floats, tolerance_m: float = 0.0) -> None:
-    """Raise InvalidValueError where a point (N, 2) lies further outside of the workspace than that, by how much."""
-    missing_m = distance_to_workspace(points_m)
-    if (missing_m > tolerance_m).any():
-        row = int(missing_m.argmax())
-        raise InvalidValueError(
-            f"{int((missing_m > tolerance_m).sum())} of {len(points_m)} targets are unreachable; the farthest, "
-            f"{np.round(points_m[row], 3).tolist()} m, lies {missing_m[row]:.3f} m outside of the workspace. "
-            "Choose targets whose distance_to_workspace is 0."
-        )
 
 
 def draw_targets(rng: np.random.Generator, count: int) -> Floats:
@@ -84,7 +67,8 @@ def draw_targets(rng: np.random.Generator, count: int) -> Floats:
 
 def draw_places(rng: np.random.Generator, count: int) -> Floats:
     """Points drawn uniformly from the disc of the stretched arm, within reach or not. Shape (count, 2), in metres."""
-    radius, angle = sum(LINKS_M) * np.sqrt(rng.random(count)), rng.uniform(-np.pi, np.pi, size=count)
+    radius = sum(LINKS_M) * np.sqrt(rng.random(count))
+    angle = rng.uniform(-np.pi, np.pi, size=count)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
 
 
@@ -129,7 +113,15 @@ def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
         InvalidValueError: A place lies outside of the workspace.
     """
     require_variant(variant)
-    require_reachable(inputs, tolerance_m=1e-6)  # a stretched arm rests on the edge
+    outside_m = distance_to_workspace(inputs)
+    wrong = outside_m > 1e-6  # a stretched arm rests on the edge
+    if wrong.any():
+        farthest = int(outside_m.argmax())
+        raise InvalidValueError(
+            f"{int(wrong.sum())} of {len(inputs)} targets are unreachable; the farthest, "
+            f"{np.round(inputs[farthest], 3).tolist()} m, lies {outside_m[farthest]:.3f} m outside of the workspace. "
+            "Choose targets whose distance_to_workspace is 0."
+        )
     return missed(inputs, predictions)
 
 
@@ -151,44 +143,58 @@ def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arr
         (E, G), and the three uncertainties a joint (E, G, 3). ``babbling``: the first network's places (N, 2).
     """
     count = DECISIONS * CANDIDATES
-    parts = {"map": _map(variant, predict, len(seeds))}
-    points = np.stack([draw_targets(node.child("candidates").generator(), count) for node in seeds])
-    parts["decision"] = {**_decide(points, predict, "decisions"), "mink_error": _mink_errors(points, seeds)}
-    points = np.stack([draw_places(node.child("disc").generator(), count) for node in seeds])
-    parts["disc"] = _decide(points, predict, "disc")
+    within = np.stack([draw_targets(node.child("candidates").generator(), count) for node in seeds])
+    anywhere = np.stack([draw_places(node.child("disc").generator(), count) for node in seeds])
+    parts = {
+        "map": _map(variant, predict, len(seeds)),
+        "decision": _decide(within, predict, "decisions"),
+        "disc": _decide(anywhere, predict, "disc"),
+    }
     measured = {f"{part}/{name}": values for part, found in parts.items() for name, values in found.items()}
-    return {**measured, "babbling": training(variant, seeds[0].child("data").generator()).inputs}
+    measured["decision/mink_error"] = _mink_errors(measured["decision/points"][:, :, 0], seeds)
+    measured["babbling"] = training(variant, seeds[0].child("data").generator()).inputs
+    return measured
 
 
 def _decide(points_m: Floats, predict: Predict, purpose: str) -> Arrays:
-    """Candidates (E, DECISIONS CANDIDATES, 2): how far each would be missed, and what every score says of it."""
+    """Candidates (E, DECISIONS CANDIDATES, 2): how far each would be missed, and every score of it."""
     shape = (len(points_m), DECISIONS, CANDIDATES)
-    said = predict(points_m, purpose)
-    reached = np.stack([arm().execute(joints_rad) for joints_rad in said.prediction])  # [E, DECISIONS CANDIDATES, 2]
-    wrong = np.linalg.norm(reached - points_m, axis=-1)
-    result = {"points": points_m.reshape(*shape, 2), "error": wrong.reshape(shape)}
-    result |= {"reached": reached.reshape(*shape, 2)}
-    result |= {"joints": said.prediction.reshape(*shape, 3), "outside_m": distance_to_workspace(result["points"])}
-    return result | {name: score(said).reshape(shape) for name, score in SCORES.items()}
+    predicted = predict(points_m, purpose)
+    reached = np.stack([arm().execute(joints_rad) for joints_rad in predicted.prediction])
+    measured = {
+        "points": points_m,
+        "error": np.linalg.norm(reached - points_m, axis=-1),
+        "reached": reached,
+        "joints": predicted.prediction,
+        "outside_m": distance_to_workspace(points_m),
+        **{name: score(predicted) for name, score in SCORES.items()},
+    }
+    return {name: values.reshape(*shape, *values.shape[2:]) for name, values in measured.items()}
 
 
 def _mink_errors(points_m: Floats, seeds: tuple[SeedTree, ...]) -> Floats:
-    """Errors of inverse kinematics with the true arm at the first candidate of each choice. Shape (E, DECISIONS)."""
-    first = points_m.reshape(len(seeds), DECISIONS, CANDIDATES, 2)[:, :, 0]
-    solved = [arm().solve(p, node.child("mink").generator()) for p, node in zip(first, seeds, strict=True)]
-    return np.stack([missed(*pair) for pair in zip(first, solved, strict=True)])
+    """Errors of inverse kinematics with the true arm at places (E, N, 2). Shape (E, N)."""
+    solved = [arm().solve(p, node.child("mink").generator()) for p, node in zip(points_m, seeds, strict=True)]
+    return np.stack([missed(*pair) for pair in zip(points_m, solved, strict=True)])
 
 
 def _map(variant: str, predict: Predict, networks: int) -> Arrays:
     side = np.linspace(-MARGIN_M, MARGIN_M, GRID)
     points = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     outside_m = distance_to_workspace(points)
-    said = predict(np.broadcast_to(points, (networks, *points.shape)), "map")
-    wrong, inside = np.full((networks, len(points)), np.nan), outside_m == 0
-    for row, prediction in enumerate(said.prediction):
-        wrong[row, inside] = errors(variant, points[inside], prediction[inside])
-    parts = {name: getattr(said, name) for name in ("epistemic", "aleatoric", "modal")}
-    return {"points": points, "outside_m": outside_m, "error": wrong, "stationarity": said.stationarity, **parts}
+    inside = outside_m == 0
+    predicted = predict(np.broadcast_to(points, (networks, *points.shape)), "map")
+    error = np.full((networks, len(points)), np.nan)
+    error[:, inside] = [errors(variant, points[inside], each[inside]) for each in predicted.prediction]
+    return {
+        "points": points,
+        "outside_m": outside_m,
+        "error": error,
+        "stationarity": predicted.stationarity,
+        "epistemic": predicted.epistemic,
+        "aleatoric": predicted.aleatoric,
+        "modal": predicted.modal,
+    }
 
 
 SPEC = RegressionSpec(

@@ -84,15 +84,15 @@ def test_networks_err_by_the_sum_of_the_causes(tmp_path: Path) -> None:
     )  # fmt: skip
     done = run(RunSpec(protocol=protocol, agent="mc_dropout", seed=0), tmp_path, lambda _: None)
     result = RegressionResult(protocol=protocol, runs=(done,), environment={}, folder=tmp_path, wall_s=1.0)
-    for variant in protocol.variants:
-        terms = squared_error_terms(result, "mc_dropout", variant)
+    for pair in result.pairs:
+        terms = squared_error_terms(pair)
         rest = terms.pop("measured") - sum(terms.values())
         error = rest.std() / np.sqrt(rest.size)
         assert abs(rest.mean()) < SURE * error
-        found = result.first(("mc_dropout", variant))
+        found = pair.first
         np.testing.assert_allclose(terms["bias²"], (found["true_mean"] - found["mean"]) ** 2, atol=1e-6)
-        np.testing.assert_array_equal(terms["aleatoric"][0], toy.noise_sigma(variant, found["x"]) ** 2)
-        for name in ("modal", "spread"):
+        np.testing.assert_array_equal(terms["true aleatoric"][0], toy.noise_sigma(pair.variant, found["x"]) ** 2)
+        for name in ("true modal", "spread"):
             assert (rest + terms[name]).mean() > SURE * error, f"{name} could be left out"
     (table,) = sections(result)[-1].tables
     assert [row[0] for row in table.rows[:3]] == ["base: data", "base: region", "base: beyond"] and len(table.rows) == 6

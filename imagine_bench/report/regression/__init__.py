@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from imagine_bench import registry
 from imagine_bench.interfaces.regression import SCORES
 from imagine_bench.regression.calibration import CRPS_POINTS
-from imagine_bench.regression.results import RegressionResult
+from imagine_bench.regression.results import PairResult, RegressionResult
 from imagine_bench.regression.scores import LEVELS
-from imagine_bench.report.figures import image
+from imagine_bench.report.figures import REFERENCE, color, image, small_multiples
 from imagine_bench.report.page import made, write_page
 from imagine_bench.report.regression import robot_ik, toy_regression
-from imagine_bench.report.tables import Image, Page, Section, Table, mean_std, number
+from imagine_bench.report.tables import Page, Section, Table, mean_std, number, percent
 from imagine_bench.store.codec import table_text
 
 SECTIONS: dict[str, Callable[[RegressionResult], list[Section]]] = {
@@ -24,8 +24,8 @@ SECTIONS: dict[str, Callable[[RegressionResult], list[Section]]] = {
     "robot_ik": robot_ik.sections,
 }
 """Sections of the suite's own tasks; another package's task names the function that makes its own."""
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _DISTRIBUTIONS = {"": "predicts with", "pooled_": "all weight samples"}
+_LINES = {"": "-", "pooled_": ":"}
 _COMPARED = (
     "Every model is a Bayesian mixture density network: it predicts a mixture of Gaussians, and its weights are "
     "uncertain, so that each weight sample predicts another mixture. The spread of their means is epistemic "
@@ -45,20 +45,18 @@ def report_page(result: RegressionResult) -> Page:
     own = _of_task(result)
     sections = [*own, _calibration(result), _costs(result)]
     rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
-    files = {"results.csv": table_text(rows)}
-    for section in sections:
-        files |= {f"{table.name}.csv": table.csv for table in section.tables}
+    tables = [table for section in sections for table in section.tables]
     answers = [answer for section in sections for answer in section.answers]
-    tables = [table.text for section in own[:1] for table in section.tables[:1]]
+    first = [part for section in own[:1] for part in (section.title, *(table.text for table in section.tables[:1]))]
     return Page(
         title=f"{spec.title}: does the model know what it does not know?",
         subtitle=f"Preset {protocol.preset} · networks a dataset: {protocol.networks} · protocol {protocol.hash}",
         question=spec.description,
         answers=answers,
         sections=[_compared(result), *sections],
-        files=files,
-        summary="\n\n".join([*(section.title for section in own[:1]), *tables, "\n".join(answers)]),
-        **made(result, {agent: result.title(agent) for agent in protocol.agents}),
+        files={"results.csv": table_text(rows), **{f"{table.name}.csv": table.csv for table in tables}},
+        summary="\n\n".join([*first, "\n".join(answers)]),
+        **made(result, result.titles),
     )
 
 
@@ -88,17 +86,6 @@ def _compared(result: RegressionResult) -> Section:
 def _calibration(result: RegressionResult) -> Section:
     spec = registry.regression(result.protocol.task)
     points = result.protocol.test_points
-    rows: list[list[str]] = []
-    detectors: list[list[str]] = []
-    for pair in result.pairs:
-        for prefix, name in _DISTRIBUTIONS.items():
-            inside = [f"{100 * result.values(pair, f'{prefix}coverage_{level:g}').mean():.1f}" for level in LEVELS]
-            distance = number(float(result.values(pair, f"{prefix}transform_distance").mean()), 2)
-            score = mean_std(result.values(pair, f"{prefix}crps_shared"))
-            rows.append([f"{result.label(pair)}: {name}", *inside, distance, score])
-        found = [_mean(result.values(pair, f"auroc_{name}")) for name in SCORES]
-        wrong = f"{100 * result.values(pair, 'wrong').mean():.1f}"
-        detectors.append([result.label(pair), wrong, *(number(each, 2) for each in found)])
     levels = [f"in {100 * level:g} % interval (%)" for level in LEVELS]
     names = [name.replace("_", " ") for name in SCORES]
     return Section(
@@ -113,53 +100,63 @@ def _calibration(result: RegressionResult) -> Section:
             "second table says how well each uncertainty finds the wrong ones: the probability that a wrong "
             "prediction has the higher uncertainty of two (AUROC; 0.5 is chance, 1 is perfect).",
         ),
-        images=(_coverage_image(result),),
+        images=(
+            image(
+                "coverage",
+                lambda: coverage_figure(result),
+                "Share of outcomes inside each central predictive interval. Below the diagonal the network is surer "
+                "than it may be, above it less sure than it could be.",
+            ),
+        ),
         tables=(
-            Table(name="calibration", header=["", *levels, "PIT distance", "CRPS, mean (std)"], rows=rows),
-            Table(name="auroc", header=["AUROC of", "wrong (%)", *names], rows=detectors),
+            Table(
+                name="calibration",
+                header=["", *levels, "PIT distance", "CRPS, mean (std)"],
+                rows=[_calibration_row(pair, prefix) for pair in result.pairs for prefix in _DISTRIBUTIONS],
+            ),
+            Table(
+                name="auroc",
+                header=["AUROC of", "wrong (%)", *names],
+                rows=[[pair.label, percent(pair.mean("wrong")), *_detection(pair)] for pair in result.pairs],
+            ),
         ),
     )
 
 
-def _mean(values: np.ndarray) -> float:
-    """Mean of those that are numbers; not a number where none is."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if known.size else np.nan
+def _calibration_row(pair: PairResult, prefix: str) -> list[str]:
+    inside = [percent(pair.mean(f"{prefix}coverage_{level:g}")) for level in LEVELS]
+    distance = number(pair.mean(f"{prefix}transform_distance"), 2)
+    return [f"{pair.label}: {_DISTRIBUTIONS[prefix]}", *inside, distance, mean_std(pair.values(f"{prefix}crps_shared"))]
 
 
-def _coverage_image(result: RegressionResult) -> Image:
-    caption = "Below the diagonal the network is surer than it may be, above it less sure than it could be."
-    alt = "Share of outcomes inside each central predictive interval, beside the diagonal of perfect calibration."
-    return image("coverage", lambda: coverage_figure(result), alt=alt, caption=caption)
+def _detection(pair: PairResult) -> list[str]:
+    return [number(pair.mean(f"auroc_{name}"), 2) for name in SCORES]
 
 
 def coverage_figure(result: RegressionResult) -> Figure:
     """Coverage of every central interval (%), a panel a variant: the diagonal is calibration."""
     variants = result.protocol.variants
-    figure = Figure(figsize=(3.1 * len(variants) + 1.2, 3.4), layout="constrained")
-    panels = dict(zip(variants, figure.subplots(1, len(variants), squeeze=False)[0], strict=True))
+    figure, panels = small_multiples(len(variants), len(variants), width=3.1, height=2.9)
     levels = np.linspace(0, 100, 51)
-    for variant, axes in panels.items():
-        axes.plot(levels, levels, color="#8c8c8c", linewidth=1, linestyle="--")
+    for axes, variant in zip(panels, variants, strict=True):
+        axes.plot(levels, levels, **REFERENCE)
         axes.set(title=variant, xlabel="central interval (%)")
-    for pair in result.pairs:
-        color = _COLORS[result.protocol.agents.index(pair[0]) % len(_COLORS)]
-        for (prefix, name), style in zip(_DISTRIBUTIONS.items(), ("-", ":"), strict=True):
-            transform = result.arrays(pair, f"calibration/{prefix}transform").ravel()
-            needed = np.sort(200 * np.abs(transform - 0.5))  # the central interval that just holds each outcome, in %
-            share = np.searchsorted(needed, levels, side="right") / len(needed)
-            label = f"{result.title(pair[0])}, {name}"
-            panels[pair[1]].plot(levels, 100 * share, style, color=color, label=label)
-    figure.axes[0].set_ylabel("outcomes inside (%)")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        for agent, title in result.titles.items():
+            pair = result.by_variant(agent)[variant]
+            for prefix, name in _DISTRIBUTIONS.items():
+                transform = pair.arrays(f"calibration/{prefix}transform").ravel()
+                needed = np.sort(200 * np.abs(transform - 0.5))  # the interval that just holds each outcome, in %
+                share = np.searchsorted(needed, levels, side="right") / len(needed)
+                shade = color(agent, registry.regressors())
+                axes.plot(levels, 100 * share, _LINES[prefix], color=shade, label=f"{title}, {name}")
+    panels[0].set_ylabel("outcomes inside (%)")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
 def _costs(result: RegressionResult) -> Section:
-    rows = []
-    for pair in result.pairs:
-        costs = [float(result.values(pair, name).mean()) for name in ("train_cpu_s", "measure_cpu_s")]
-        rows.append([result.label(pair), *map(number, costs)])
+    costs = ("train_cpu_s", "measure_cpu_s")
+    rows = [[pair.label, *(number(pair.mean(name)) for name in costs)] for pair in result.pairs]
     table = Table(name="costs", header=["CPU seconds a network", "training", "measuring"], rows=rows)
     words = (
         "The networks of a run train together, as one batched computation; its CPU seconds are shared out among them. "

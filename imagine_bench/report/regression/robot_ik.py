@@ -9,16 +9,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imagine_bench import reference, statistics
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Arrays, Floats
 from imagine_bench.interfaces.regression import SCORES
-from imagine_bench.regression.results import Pair, RegressionResult, Values
+from imagine_bench.regression.results import PairResult, RegressionResult
 from imagine_bench.report.figures import image
-from imagine_bench.report.tables import DASH, Image, Section, Table, mean_std
+from imagine_bench.report.tables import DASH, Image, Section, Table, decimals, estimate, mean_std
 
 _INTERVALS = "In brackets: 95 % interval over networks (Fieller). Below 1 a criterion beats chance."
 _HINDSIGHT = ("min", "max", "random")
-_KINDS = ("epistemic", "modal", "aleatoric")
 _ARM = "#d55e00"
+ByCriterion = dict[str, Floats]
+"""Cumulated errors of every network, (E,), by criterion of choice."""
+Rows = Sequence[list[str]]
 
 
 def sections(result: RegressionResult) -> list[Section]:
@@ -26,41 +28,52 @@ def sections(result: RegressionResult) -> list[Section]:
     return [_decisions(result), _beyond_reach(result), _maps(result)]
 
 
-def by_criterion(result: RegressionResult, pair: Pair, part: str, measure: str) -> dict[str, Values]:
-    """A measure of the chosen candidates, summed over the choices of each network, by criterion: (E,) each.
+def by_criterion(pair: PairResult, part: str, measure: str) -> ByCriterion:
+    """A measure of the chosen candidates, summed over the choices of each network.
 
     Each score chooses the candidate of which it is least. ``min`` and ``max`` are the best and the worst choice in
     hindsight, and ``random`` the mean over the candidates, which a choice by chance may expect.
 
     Args:
-        result: The bench.
         pair: Regressor and dataset.
         part: ``"decision"``, whose candidates are within reach, or ``"disc"``, whose candidates need not be.
         measure: ``"error"`` or ``"outside_m"``, in metres.
     """
-    values = result.arrays(pair, f"{part}/{measure}")  # [E, choices, candidates]
+    values = pair.arrays(f"{part}/{measure}")  # [E, choices, candidates]
     chosen = {"min": values.min(axis=-1), "max": values.max(axis=-1), "random": values.mean(axis=-1)}
     for name in SCORES:
-        pick = result.arrays(pair, f"{part}/{name}").argmin(axis=-1)
+        pick = pair.arrays(f"{part}/{name}").argmin(axis=-1)
         chosen[name] = np.take_along_axis(values, pick[..., None], axis=-1)[..., 0]
     return {name: each.sum(axis=1) for name, each in chosen.items()}
 
 
-def ratio_to_random(values: Values, random: Values) -> statistics.Estimate:
+def ratio_to_random(values: Floats, random: Floats) -> statistics.Estimate:
     """Ratio of mean cumulated errors (E,) to those of a random choice (E,) by the same networks, with its interval."""
     return statistics.ratio(values, random, paired=True)
 
 
 def _decisions(result: RegressionResult) -> Section:
-    errors = {pair: by_criterion(result, pair, "decision", "error") for pair in result.pairs}
-    for pair, found in errors.items():
-        found["mink"] = result.arrays(pair, "decision/mink_error").sum(axis=1)
+    errors = {}
+    answers = []
+    for pair in result.pairs:
+        found = by_criterion(pair, "decision", "error")
+        ratios = {name: ratio_to_random(found[name], found["random"]).value for name in SCORES}
+        best = min(ratios, key=lambda name: ratios[name])
+        answers.append(
+            f"{pair.label} samples: choosing the least epistemic uncertainty leaves {ratios['epistemic']:.2f} of "
+            f"the error of a random choice; best is {_words(best)} with {ratios[best]:.2f}."
+        )
+        errors[pair.label] = found | {"mink": pair.arrays("decision/mink_error").sum(axis=1)}
+    columns = (*SCORES, *_HINDSIGHT, "mink")
+    thesis_sums = []
+    thesis_ratios = []
     printed = reference.load("robot_ik")["cumulative_error"]["criteria"]
-    thesis: dict[str, dict[str, tuple[float, float]]] = {}
-    for variant in result.protocol.variants:
-        if variant in printed["random"]:
-            thesis[variant] = {name: rows[variant] for name, rows in printed.items() if variant in rows}
-    table, ratios = _tables(result, errors, ("table_4_1", "ratio_to_random"), (*SCORES, *_HINDSIGHT, "mink"), thesis)
+    for variant in (each for each in result.protocol.variants if each in printed["random"]):
+        means = {name: rows[variant][0] for name, rows in printed.items() if variant in rows}
+        texts = {name: "{:.2f} ({:.2f})".format(*printed[name][variant]) for name in means}
+        ratios = {name: mean / means["random"] for name, mean in means.items()}
+        thesis_sums.append([f"thesis, {variant}", *(texts.get(name, DASH) for name in columns)])
+        thesis_ratios.append([f"thesis, {variant}", *(decimals(ratios.get(name, np.nan)) for name in SCORES)])
     return Section(
         title="Table 4.1: which place can the robot trust itself to reach?",
         words=(
@@ -71,22 +84,24 @@ def _decisions(result: RegressionResult) -> Section:
             "The simulated arm carries out every predicted configuration, and the place its tip comes to rest at is "
             "measured. Here no place outside of the workspace is asked for; the maps below show where it ends.",
         ),
-        tables=(table, ratios),
-        answers=[_answer(result, pair, found) for pair, found in errors.items()],
-    )
-
-
-def _answer(result: RegressionResult, pair: Pair, errors: Mapping[str, Values]) -> str:
-    ratios = {name: ratio_to_random(errors[name], errors["random"]).value for name in SCORES}
-    best = min(ratios, key=lambda name: ratios[name])
-    return (
-        f"{result.label(pair)} samples: choosing the least epistemic uncertainty leaves {ratios['epistemic']:.2f} of "
-        f"the error of a random choice; best is {_words(best)} with {ratios[best]:.2f}."
+        tables=(
+            _sums("table_4_1", errors, columns, thesis_sums),
+            _ratios("ratio_to_random", errors, thesis_ratios),
+        ),
+        answers=answers,
     )
 
 
 def _beyond_reach(result: RegressionResult) -> Section:
-    errors = {pair: by_criterion(result, pair, "disc", "error") for pair in result.pairs}
+    errors = {pair.label: by_criterion(pair, "disc", "error") for pair in result.pairs}
+    answers = []
+    for pair in result.pairs:
+        outside_m = by_criterion(pair, "disc", "outside_m")
+        answers.append(
+            f"{pair.label} samples, any place on the disc of the stretched arm: choosing the least epistemic "
+            f"uncertainty asks for {outside_m['epistemic'].mean():.2f} m beyond reach in 50 choices (by chance "
+            f"{outside_m['random'].mean():.2f} m)."
+        )
     return Section(
         title="The same among places that may be out of reach",
         words=(
@@ -94,55 +109,26 @@ def _beyond_reach(result: RegressionResult) -> Section:
             "reaches. A place out of reach is missed by its distance from the workspace at least: does the robot know "
             "which places it cannot reach? The thesis draws its points 'over the workspace' and does not say how.",
         ),
-        tables=_tables(result, errors, ("disc", "disc_ratio_to_random"), (*SCORES, *_HINDSIGHT), {}),
-        answers=[_answer_beyond(result, pair) for pair in result.pairs],
+        tables=(_sums("disc", errors, (*SCORES, *_HINDSIGHT)), _ratios("disc_ratio_to_random", errors)),
+        answers=answers,
     )
 
 
-def _answer_beyond(result: RegressionResult, pair: Pair) -> str:
-    outside_m = by_criterion(result, pair, "disc", "outside_m")
-    return (
-        f"{result.label(pair)} samples, any place on the disc of the stretched arm: choosing the least epistemic "
-        f"uncertainty asks for {outside_m['epistemic'].mean():.2f} m beyond reach in 50 choices (by chance "
-        f"{outside_m['random'].mean():.2f} m)."
-    )
+def _sums(name: str, errors: Mapping[str, ByCriterion], columns: Sequence[str], more: Rows = ()) -> Table:
+    """Cumulated errors, a row a regressor and dataset, then more rows."""
+    rows = [[label, *(mean_std(found[column]) for column in columns)] for label, found in errors.items()]
+    header = ["cumulated error (m)", *map(_words, columns)]
+    return Table(name=name, header=header, rows=[*rows, *more], why_dash="not in the thesis")
 
 
-def _tables(
-    result: RegressionResult,
-    errors: Mapping[Pair, Mapping[str, Values]],
-    names: tuple[str, str],
-    columns: Sequence[str],
-    thesis: Mapping[str, Mapping[str, tuple[float, float]]],
-) -> tuple[Table, Table]:
-    """Cumulated errors and their ratios to a random choice, a row a regressor and dataset, then the thesis' rows."""
-    sums: list[list[str]] = []
-    ratios: list[list[str]] = []
-    for pair, found in errors.items():
-        each = [_interval(ratio_to_random(found[name], found["random"])) for name in SCORES]
-        sums.append([result.label(pair), *(mean_std(found[name]) for name in columns)])
-        ratios.append([result.label(pair), *each])
-    for variant, printed in thesis.items():
-        texts = {name: f"{mean:.2f} ({std:.2f})" for name, (mean, std) in printed.items()}
-        shares = {name: f"{mean / printed['random'][0]:.2f}" for name, (mean, _) in printed.items()}
-        sums.append([f"thesis, {variant}", *(texts.get(name, DASH) for name in columns)])
-        ratios.append([f"thesis, {variant}", *(shares.get(name, DASH) for name in SCORES)])
-    why = "not in the thesis"
-    return (
-        Table(name=names[0], header=["cumulated error (m)", *map(_words, columns)], rows=sums, why_dash=why),
-        Table(
-            name=names[1],
-            header=["ratio to random", *map(_words, SCORES)],
-            rows=ratios,
-            caption=_INTERVALS,
-            why_dash=why,
-        ),
-    )
-
-
-def _interval(found: statistics.Estimate) -> str:
-    interval = "" if np.isnan(found.low) else f" [{found.low:.2f}, {found.high:.2f}]"
-    return f"{found.value:.2f}{interval}"
+def _ratios(name: str, errors: Mapping[str, ByCriterion], more: Rows = ()) -> Table:
+    """Their ratios to those of a random choice."""
+    rows = []
+    for label, found in errors.items():
+        ratios = [ratio_to_random(found[score], found["random"]) for score in SCORES]
+        rows.append([label, *(str(estimate(each, decimals)) for each in ratios)])
+    header = ["ratio to random", *map(_words, SCORES)]
+    return Table(name=name, header=header, rows=[*rows, *more], caption=_INTERVALS, why_dash="not in the thesis")
 
 
 def _words(name: str) -> str:
@@ -150,7 +136,7 @@ def _words(name: str) -> str:
 
 
 def _maps(result: RegressionResult) -> Section:
-    outside_m = result.first(result.pairs[0])["map/outside_m"]
+    outside_m = result.pairs[0].first["map/outside_m"]
     return Section(
         title="Figures 4.2 and 4.3: the workspace",
         words=(
@@ -158,26 +144,26 @@ def _maps(result: RegressionResult) -> Section:
             f"{outside_m.max():.2f} m: the arm is not sent there (white in the error map), and the uncertainties show "
             "what the networks would say of them.",
         ),
-        images=[image for pair in result.pairs for image in _maps_of(result, pair)],
+        images=[image for pair in result.pairs for image in _maps_of(pair)],
     )
 
 
-def _maps_of(result: RegressionResult, pair: Pair) -> tuple[Image, Image]:
-    data = result.first(pair)
-    label = f"{result.label(pair)} samples (first network)"
-    errs = (
-        f"{label}, after figure 4.2: where the arm's tip was while babbling, how far it misses a place that it reaches "
-        "for, and the stationarity score."
-    )
-    unsure = (
-        f"{label}, after figure 4.3: standard deviation of each joint by cause, in radians. No place outside of the "
-        "line can be reached."
-    )
-    name = "_".join(pair)
-    return (
-        image(f"figure_4_2_{name}", lambda: figure_4_2(data), alt=errs, caption=errs),
-        image(f"figure_4_3_{name}", lambda: figure_4_3(data), alt=unsure, caption=unsure),
-    )
+def _maps_of(pair: PairResult) -> list[Image]:
+    label = f"{pair.label} samples (first network)"
+    return [
+        image(
+            f"figure_4_2_{pair.agent}_{pair.variant}",
+            lambda: figure_4_2(pair.first),
+            f"{label}, after figure 4.2: where the arm's tip was while babbling, how far it misses a place that it "
+            "reaches for, and the stationarity score.",
+        ),
+        image(
+            f"figure_4_3_{pair.agent}_{pair.variant}",
+            lambda: figure_4_3(pair.first),
+            f"{label}, after figure 4.3: standard deviation of each joint by cause, in radians. No place outside of "
+            "the line can be reached.",
+        ),
+    ]
 
 
 def figure_4_2(data: Arrays) -> Figure:
@@ -196,7 +182,9 @@ def figure_4_3(data: Arrays) -> Figure:
     figure = Figure(figsize=(11.0, 9.8))  # its layout by rule would take longer than the figure
     figure.subplots_adjust(left=0.05, right=0.96, bottom=0.06, top=0.96)
     inside = data["map/outside_m"] == 0
-    for row, kind in zip(figure.subplots(3, 3, sharex=True, sharey=True), _KINDS, strict=True):
+    for row, kind in zip(
+        figure.subplots(3, 3, sharex=True, sharey=True), ("epistemic", "modal", "aleatoric"), strict=True
+    ):
         for joint, axes in enumerate(row):
             field = np.sqrt(data[f"map/{kind}"][0, :, joint])
             top = float(np.percentile(field[inside], 99))
@@ -204,7 +192,7 @@ def figure_4_3(data: Arrays) -> Figure:
     return figure
 
 
-def _field(axes: Axes, data: Arrays, values: Values, title: str, top: float | None = None) -> None:
+def _field(axes: Axes, data: Arrays, values: Floats, title: str, top: float | None = None) -> None:
     """Values (G,) over the map, in colors up to ``top``."""
     x, y = _grid(data)
     half = 0.5 * (x[0, 1] - x[0, 0])
@@ -223,7 +211,7 @@ def _arena(axes: Axes, data: Arrays, title: str) -> None:
     axes.grid(visible=False)
 
 
-def _grid(data: Arrays) -> Values:
+def _grid(data: Arrays) -> Floats:
     """Places of the map. Shape (2, side, side)."""
     side = round(len(data["map/points"]) ** 0.5)
     return data["map/points"].reshape(side, side, 2).transpose(2, 0, 1)

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.uncertainty import decompose
 from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
@@ -47,13 +46,6 @@ def test_a_network_among_others_is_the_network_alone(precision: str) -> None:
             torch.stack(losses)[:, index], torch.stack(own)[:, 0], rtol=tolerance, atol=tolerance
         )
     assert losses[-1].mean() < losses[0].mean()  # they learned meanwhile
-
-
-def test_networks_differ_from_one_another() -> None:
-    model = BayesianMDN(2, 2, _SMALL, [generator(i) for i in range(2)])
-    x, y = data(1)
-    losses = model.update(x.expand(2, -1, -1), y.expand(2, -1, -1))
-    assert losses[0] != losses[1]
 
 
 def test_clipping_one_member_leaves_the_others() -> None:
@@ -102,36 +94,22 @@ def test_dropped_units_are_dropped_after_folding_too() -> None:
     torch.testing.assert_close(sample_outputs(network.folded(), x[0], mask)[0], expected[0], rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("rows", "dropout", "sizes"),
-    [
-        (1, 0.2, (2, 32, 32, 32, 9)), (7, 0.2, (2, 32, 32, 32, 9)), (300, 0.2, (2, 32, 32, 32, 9)),
-        (300, 0.6, (2, 32, 24, 32, 9)), (300, 0.2, (2, 32, 9)), (3, 0.2, (2, 32, 9)),
-    ],
-)  # fmt: skip
-def test_weight_samples_in_one_pass_are_those_of_a_loop(rows: int, dropout: float, sizes: tuple[int, ...]) -> None:
-    """Few rows and many, few units dropped, which are then gathered, and more than half, which are not."""
-    network = MemberMLP(sizes, members=1, dropout=dropout, generator=generator())
+@pytest.mark.parametrize("rows", [1, 300])
+@pytest.mark.parametrize("sizes", [(2, 32, 24, 16, 9), (2, 32, 9)])
+def test_weight_samples_in_one_pass_are_those_of_a_loop(rows: int, sizes: tuple[int, ...]) -> None:
+    """Layers beyond the masks drop nothing."""
+    network = MemberMLP(sizes, members=1, dropout=0.25, generator=generator())
     x = torch.randn(rows, 2, generator=generator(1))
-    masks = [dropout_mask((50, units), dropout, generator(2 + layer)) for layer, units in enumerate(sizes[1:-1])]
-    loop = [network(x[None], tuple(m[t].expand(1, rows, -1) for m in masks))[0] for t in range(50)]
-    torch.testing.assert_close(sample_outputs(network, x, masks), torch.stack(loop), rtol=1e-4, atol=1e-5)
-    ensemble = MemberMLP((2, 32, 9), members=5, dropout=0.0, generator=generator())
-    torch.testing.assert_close(sample_outputs(ensemble, x, None), ensemble(x.expand(5, -1, -1)), rtol=1e-4, atol=1e-5)
-
-
-def test_weight_samples_keep_the_layers_that_have_no_mask() -> None:
-    """Masks of the first two of three hidden layers, against the formula written out for every sample."""
-    network = MemberMLP((2, 32, 32, 32, 9), members=1, dropout=0.25, generator=generator())
-    x = torch.randn(7, 2, generator=generator(1))
-    masks = [dropout_mask((5, 32), 0.25, generator(2 + layer)) for layer in range(2)]
-    layers = [(w[0], b[0]) for w, b in zip(network.weights, network.biases, strict=True)]
+    masks = [dropout_mask((50, 32), 0.25, generator(2))]
+    layers = [(weight[0], bias[0]) for weight, bias in zip(network.weights, network.biases, strict=True)]
     for t, found in enumerate(sample_outputs(network, x, masks)):
         h = x
         for layer, (weight, bias) in enumerate(layers[:-1]):
             h = (h @ weight + bias).relu()
-            h = h * (masks[layer][t] != 0) / 0.75 if layer < 2 else h
+            h = h * masks[layer][t] if layer < len(masks) else h
         torch.testing.assert_close(found, h @ layers[-1][0] + layers[-1][1], rtol=1e-4, atol=1e-5)
+    ensemble = MemberMLP((2, 32, 9), members=5, dropout=0.0, generator=generator())
+    torch.testing.assert_close(sample_outputs(ensemble, x, None), ensemble(x.expand(5, -1, -1)), rtol=1e-4, atol=1e-5)
 
 
 def test_units_right_before_the_output_are_never_dropped() -> None:
@@ -194,14 +172,6 @@ def test_divergence_sees_what_the_variance_of_means_does_not() -> None:
     samples = Mixture(weights, means, torch.full((2, 1, 2, 1), -1.0))
     assert decompose(samples).epistemic.item() == 0.0
     assert jensen_shannon(samples, 100, generator())[0].item() > 0.6
-
-
-def test_sigmas_stay_between_floor_and_ceiling() -> None:
-    outputs = torch.tensor([[0.0, 0.0, -1e4], [0.0, 0.0, 1e4], [0.0, 0.0, 0.0]])
-    read = mdn.from_outputs(outputs, 1, 1, math.log(0.01), math.log(10.0))
-    sigmas = read.log_sigmas.exp().view(-1)
-    assert sigmas[0].item() == pytest.approx(0.01, rel=1e-3) and sigmas[1].item() == pytest.approx(10.0, rel=1e-3)
-    assert sigmas[2].item() == pytest.approx(1.0, rel=0.1)  # in between hardly touched
 
 
 def test_a_likelihood_that_is_not_finite_changes_nothing() -> None:
