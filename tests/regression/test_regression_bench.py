@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
@@ -16,7 +17,7 @@ from recordings import contents, times
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.cli.observers import observers_of
-from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.interfaces.regression import SCORES, Mixtures, Prediction, RegressionData, RegressorContext
 from imagine_bench.protocols.runs import Progress, RunSpec
@@ -29,10 +30,8 @@ from imagine_bench.report.regression import robot_ik, toy_regression, write_repo
 from imagine_bench.report.tables import number
 from imagine_bench.report.why import why_report
 from imagine_bench.running.bench import plan
-from imagine_bench.running.task_types import task_types
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SeedTree
-from imagine_bench.store.files import read_json
 
 _TINY = (("components", 3), ("epochs", 4), ("hidden", [16, 16]), ("members", 2), ("weight_samples", 5))
 
@@ -62,16 +61,6 @@ def silent(_: Progress) -> None:
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> RegressionRun:
     return run(TOY, tmp_path_factory.mktemp("toy"), silent)
-
-
-def test_every_kind_has_learners_and_all_names_load() -> None:
-    names = [name for kind in task_types().values() for name in kind.tasks()]
-    assert len(names) == len(set(names))
-    for kind in task_types().values():
-        assert kind.tasks() and kind.learners() and kind.presets
-    for name in registry.REGRESSIONS:
-        spec = registry.regression(name)
-        assert spec.id == name
 
 
 def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> None:
@@ -201,18 +190,14 @@ def test_what_regressors_leave_is_not_planned_with(toy: RegressionRun, tmp_path:
         why_report(None, root=tmp_path, task="toy_regression", encoder=None)
 
 
-def test_a_finished_run_is_only_read(toy: RegressionRun, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "make_regressor", lambda *_: pytest.fail("a finished run was run again"))
-    again = run(TOY, toy.folder, silent)
-    assert again.rows == toy.rows
+def test_a_finished_run_is_only_read(toy: RegressionRun) -> None:
+    told: list[Progress] = []
+    assert run(TOY, toy.folder, told.append).rows == toy.rows
+    assert told == []
 
 
 def test_a_damaged_result_is_named(toy: RegressionRun, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    copy.mkdir()
-    for path in toy.folder.iterdir():
-        if path.is_file():
-            (copy / path.name).write_bytes(path.read_bytes())
+    copy = shutil.copytree(toy.folder, tmp_path / "copy")
     (copy / "metrics.csv").write_text("variant,network\n")
     with pytest.raises(ArtefactError, match=r"metrics.csv is not as the run left it"):
         run(TOY, copy, silent)
@@ -265,19 +250,11 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
         (["--task", "toy_regression", "--agents", "dqn"], "No regressor 'dqn'. Known: mc_dropout, ensemble."),
         (["--task", "toy_regression", "--networks", "0"], "networks is 0; it must lie in [1, 1000]."),
         (["--task", "toy_regression", "--budgets", "5"], "toy_regression takes no --budgets; leave it out."),
-        (["--task", "arrow_puzzle", "--networks", "5"], "arrow_puzzle takes no --networks; leave it out."),
         (["--task", "toy_regression", "--set", "weight_samples=1"], "Setting weight_samples is 1; it must lie in [2,"),
-        (["--task", "toy_regression", "--set", "components=0"], "Setting components is 0; it must lie in [1, 1000]."),
         (["--task", "toy_regression", "--set", "dropout=0.96"], "Setting dropout is 0.96; it must be 0 or lie in"),
-        (["--task", "toy_regression", "--set", "dropout=0.001"], "Setting dropout is 0.001; it must be 0 or lie"),
-        (["--task", "toy_regression", "--set", "epochs=0"], "Setting epochs is 0; it must lie in [1, 5e+06]."),
-        (["--task", "toy_regression", "--set", "learning_rate=0"], "Setting learning_rate is 0.0; it must lie in (0,"),
         (["--task", "toy_regression", "--set", "batch_size=1"], "batch_size is 1; it must lie in [8, 1e+06]: "),
-        (["--task", "toy_regression", "--set", "epochs=1.5"], "Setting 'epochs' was given 1.5; it takes int."),
         (["--task", "toy_regression", "--set", "members=1"], "Settings members is 1 and dropout is 0: all weight"),
-        (["--task", "toy_regression", "--set", "precision=half"], "No value of setting precision: 'half'."),
         (["--task", "toy_regression", "--set", "hidden=[64]"], "dropout acts between hidden layers, so it needs at"),
-        (["--task", "toy_regresion"], "No task 'toy_regresion'. Did you mean 'toy_regression'? Known: arrow_puzzle"),
     ],
 )  # fmt: skip
 def test_wrong_words_get_one_line_and_write_nothing(
@@ -290,9 +267,13 @@ def test_wrong_words_get_one_line_and_write_nothing(
 
 
 @pytest.mark.parametrize(("name", "epochs"), [("minimal", 4), ("fast", 120), ("published", 300)])
-def test_an_ensemble_never_costs_more_than_the_one_network(name: str, epochs: int) -> None:
-    one, ensemble = regressor_settings.resolve_all(name, {})
+def test_an_ensemble_is_compared_fairly_with_one_network(name: str, epochs: int) -> None:
+    """It never costs more; dropout is of the one, members of the other; published, both sample as many values."""
+    one, ensemble = regressor_settings.resolve_all(name, {"dropout": 0.1})
     assert ensemble.epochs == epochs and ensemble.epochs * ensemble.members <= one.epochs
+    assert (one.dropout, one.members, ensemble.dropout) == (0.1, 1, 0.0)
+    if name == "published":
+        assert ensemble.members * ensemble.divergence_draws == one.weight_samples * one.divergence_draws
 
 
 @pytest.mark.parametrize(("batch_size", "updates"), [(None, 1), (600, 1), (250, 3), (8, 75)])
@@ -303,17 +284,6 @@ def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int 
     regressor = registry.make_regressor("mc_dropout", context)
     regressor.train(2)
     assert regressor.state().values["batches"] == 2 * updates
-
-
-def test_dropout_is_of_one_network_and_members_of_the_ensemble() -> None:
-    one, ensemble = regressor_settings.resolve_all("fast", {"dropout": 0.1, "members": 3})
-    assert (one.dropout, one.members) == (0.1, 1)
-    assert (ensemble.dropout, ensemble.members) == (0.0, 3)
-
-
-def test_an_ensemble_samples_as_many_values_as_dropout_does() -> None:
-    one, ensemble = regressor_settings.resolve_all("published", {})
-    assert ensemble.members * ensemble.divergence_draws == one.weight_samples * one.divergence_draws
 
 
 def test_an_ensembles_two_distributions_are_one_and_score_alike(tmp_path: Path) -> None:
@@ -327,24 +297,25 @@ def test_an_ensembles_two_distributions_are_one_and_score_alike(tmp_path: Path) 
     assert not np.allclose(pair.values("crps"), pooled, rtol=1e-3), "all 80 points are others than the first 50"
 
 
-def test_a_regressor_refuses_data_it_cannot_learn_from() -> None:
-    good = RegressionData(inputs=np.zeros((5, 1)), targets=np.ones((5, 1)))
-    seeds = (SeedTree(0).child("a"), SeedTree(0).child("b"))
-    for bad, words in (
-        (
-            RegressionData(inputs=np.zeros((4, 1)), targets=np.ones((4, 1))),
-            "Dataset 1 has inputs and targets of shapes",
-        ),
-        (
-            RegressionData(inputs=np.zeros((5, 1)), targets=np.full((5, 1), np.nan)),
-            "Dataset 1 holds values that are not finite",
-        ),
-    ):
-        with pytest.raises(InvalidValueError, match=words):
-            registry.make_regressor("mc_dropout", RegressorContext(datasets=(good, bad), seeds=seeds))
-    with pytest.raises(InvalidValueError, match="a seed for each, not 1 and 2"):
-        registry.make_regressor("mc_dropout", RegressorContext(datasets=(good,), seeds=seeds))
-    sound = registry.make_regressor("mc_dropout", RegressorContext(datasets=(good,), seeds=seeds[:1]))
+def data(rows: int, value: float = 1.0) -> RegressionData:
+    return RegressionData(inputs=np.zeros((rows, 1)), targets=np.full((rows, 1), value))
+
+
+@pytest.mark.parametrize(
+    ("datasets", "sentence"),
+    [
+        ((data(5), data(4)), "Dataset 1 has inputs and targets of shapes"),
+        ((data(5), data(5, np.nan)), "Dataset 1 holds values that are not finite"),
+        ((data(5),), "a seed for each, not 1 and 2"),
+    ],
+)
+def test_a_regressor_refuses_data_it_cannot_learn_from(datasets: tuple[RegressionData, ...], sentence: str) -> None:
+    with pytest.raises(InvalidValueError, match=sentence):
+        registry.make_regressor("mc_dropout", RegressorContext(datasets=datasets, seeds=(SeedTree(0), SeedTree(1))))
+
+
+def test_a_regressor_refuses_inputs_of_another_shape() -> None:
+    sound = registry.make_regressor("mc_dropout", RegressorContext(datasets=(data(5),), seeds=(SeedTree(0),)))
     with pytest.raises(InvalidValueError, match=r"N at least 1, not \(1, 0, 1\)"):
         sound.predict(np.zeros((1, 0, 1)), np.random.default_rng(0))
 
@@ -412,11 +383,5 @@ def test_one_regressor_with_two_settings_in_one_bench(tmp_path: Path) -> None:
         recorded=False,
     )
     assert protocol.agents == ("mc_dropout:epochs=6", "mc_dropout")
-    spent = {}
-    for agent in protocol.agents:
-        run(RunSpec(protocol=protocol, agent=agent, seed=0), tmp_path / agent[-1], lambda _: None)
-        spent[agent] = read_json(tmp_path / agent[-1] / "config.json", "the settings")["settings"]["epochs"]
-    assert spent == {"mc_dropout:epochs=6": 6, "mc_dropout": 4}
-    assert registry.regressor_entry("mc_dropout:epochs=6").title == "MC dropout (epochs 6)"
-    with pytest.raises(UnknownNameError, match=r"No setting 'epoch'\. Did you mean 'epochs'"):
-        plan("toy_regression", "smoke", agents=("mc_dropout:epoch=6",))
+    runs = [run(RunSpec(protocol=protocol, agent=a, seed=0), tmp_path / a[-1], silent) for a in protocol.agents]
+    assert [each.settings["epochs"] for each in runs] == [6, 4]
