@@ -18,11 +18,21 @@ from imagine_bench.testing.of_options import (
 )
 
 TASK = "arrow_puzzle:horizon=3"
+_HEAVY = ("dqn_", "dreamer_", "drqn", "imagination_exact", "lewm", "sb3_")
+"""Guests that train networks or load a library for longer than a fast test may last; those with tables are fast."""
 AGENTS = [
     *sorted(registry.AGENTS),
-    *(pytest.param(name, marks=pytest.mark.slow) for name in sorted(registry.agents().keys() - registry.AGENTS.keys())),
+    *(
+        pytest.param(name, marks=[pytest.mark.slow] * name.startswith(_HEAVY))
+        for name in sorted(registry.agents().keys() - registry.AGENTS.keys())
+    ),
 ]
-"""Packages' agents may load a library for longer than a fast test may last."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def what_runs_share() -> None:
+    """The dataset, the environments and the encoders are made once, in no test's time."""
+    CheckedOptions("dqn", TASK).check("dataset")
 
 
 def test_every_field_of_a_protocol_has_a_row_or_a_reason() -> None:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
+import fake_codes
 import numpy as np
-from fake_codes import ACTIONS
+from fake_codes import ACTIONS, starts
 from imagine_bench.agents.factored.learned import LearnedPerception, LearnedPerceptionAgent
 from imagine_bench.agents.factored.settings import LEARNED
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces import Frame, Observation, Transition
+from imagine_bench.interfaces.capabilities import begin_episode
 from imagine_bench.seeding import SeedTree
 
 Code = tuple[int, ...]
+HIDDEN = 2
+"""Value of the lamp where it is covered."""
 
 
 def shape(kind: int) -> NDArray[np.float64]:
@@ -35,3 +41,32 @@ def agent(seed: int = 0, **overrides: object) -> LearnedPerceptionAgent:
     settings = LEARNED.resolve("fast", named, "chapter_5")
     perception = LearnedPerception(settings.perception, factored=settings.dynamics.factored)
     return LearnedPerceptionAgent(perception, ACTIONS, settings, SeedTree(seed))
+
+
+def hidden(code: Code) -> Code:
+    """A code whose lamp is covered: in every frame of an episode but its first, where tests cover it."""
+    return (*code[:2], HIDDEN)
+
+
+def played(
+    learner: LearnedPerceptionAgent, rng: np.random.Generator, *, explore: bool, covered: bool = False, steps: int = 6
+) -> Iterator[Transition]:
+    """One episode in pictures of the world, cut after so many macro-actions; nothing is learned from it here."""
+    begin_episode(learner)
+    code = starts()[int(rng.integers(len(starts())))]
+    seen = Observation(frame=picture(code, rng))
+    for step in range(steps):
+        action = learner.act(seen, explore=explore)
+        code, reward, ended = fake_codes.step(code, action)
+        after = Observation(frame=picture(hidden(code) if covered else code, rng))
+        yield Transition(
+            observation=seen,
+            action=action,
+            reward=reward,
+            next_observation=after,
+            terminated=ended,
+            truncated=not ended and step == steps - 1,
+        )
+        seen = after
+        if ended:
+            return
