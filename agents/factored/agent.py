@@ -40,7 +40,8 @@ class CodeAgent(Generic[PerceptionT]):
     """Learns from codes alone; every transition is replayed, and the model is a function of the replay memory."""
 
     def __init__(self, perception: PerceptionT, n_actions: int, settings: FactoredSettings, seeds: SeedTree) -> None:
-        self.n_actions, self.settings = n_actions, settings
+        self.n_actions = n_actions
+        self.settings = settings
         self.rng = seeds.child("exploration").generator()
         self.perception = perception
         self.replay = CodeReplay(len(self.perception.sizes))
@@ -153,7 +154,8 @@ class CodeAgent(Generic[PerceptionT]):
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
         began = self.tasks[-1] if self.tasks else 0
-        real, labels = self.replay.count_real(began), self.replay.count_labels(began)
+        real = self.replay.count_real(began)
+        labels = self.replay.count_labels(began)
         outcomes = len(self.model.outcomes.outcomes)
         counters = {
             "real_transitions": real, "gradient_updates": 0, "oracle/labels": labels, "model/outcomes": outcomes

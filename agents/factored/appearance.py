@@ -39,24 +39,29 @@ _CHANGES = (2, 0.03)  # times, and share of the steps, that a pixel must change 
 _STARTS = (3, 0.2)  # the same of the starts of episodes: what no action changes may change there alone
 _ENOUGH = 500  # steps that a share is taken of at most: the more things there are, the more rarely each changes
 _LEAST_PX = 36  # pixels of a factor
-_LEAST_INNER_PX = 16  # the same of what is all in the inner of the picture: at its border, slivers come into view
+_LEAST_INNER_PX = 16  # the same of what is all in the inner of the image: at its border, slivers come into view
 _FLAT = 0.1  # of a crop's energy, as most have it: what a crop without contours counts as
-_SAME, _OTHER = 0.15, 0.2  # distance that jitter makes; the least distance of two values
+_SAME = 0.15  # distance that jitter makes; the least distance of two values
+_OTHER = 0.2
 _ROUND = 0.05  # added to heights where gaps are compared by their ratio
 _EVIDENCE = 10.0  # how much more likely, as a logarithm, finer values must make what follows
 _EXEMPLARS = 6  # most crops a value that are kept
 _COMPARED = 160  # most crops a factor that are grouped; the others take the value of the most alike
 _TOGETHER = 0.45  # share of the changes of either of two neighbouring pixels of a region that are changes of both
 _TOLD = 8  # times that either of two pixels must change in half of the time for that half to tell
-_TELLING, _NOISE = 20, 0.5  # in so many frames, the share of looks seen once beyond which a region is noise
-_USUAL, _COLORS = 0.25, 8  # share of the frames in which a pixel shows a color that is no noise; most such colors
+_TELLING = 20  # in so many frames, the share of looks seen once beyond which a region is noise
+_NOISE = 0.5
+_FREQUENT = 0.25  # share of the frames in which a pixel shows a color that is no noise; most such colors
+_COLORS = 8
 _RESTS = 0.1  # the same of a color that stays
 _STAYS = 0.2  # how much likelier such a color is where it was a step before: 0 as chance has it, 1 for sure
-_NOTHING = 1.0  # what a pixel shows in place of noise: the median color
+_MEDIAN_COLOR = 1.0  # what a pixel shows in place of noise: the median color
 _SEEN = 3  # times that a value must have been seen to tell whether it varies freely
 _MOST = 0.7  # share of the pixels that hang together
 _EXPECTED = 5.0  # times that joint values that were never seen would have been seen by chance
-_ALL, _NEXT, _LAST = slice(None), slice(1, None), slice(None, -1)
+_ALL = slice(None)
+_NEXT = slice(1, None)
+_LAST = slice(None, -1)
 _NEIGHBOURS = (
     ((_ALL, _LAST), (_ALL, _NEXT)), ((_LAST, _ALL), (_NEXT, _ALL)),
     ((_LAST, _LAST), (_NEXT, _NEXT)), ((_LAST, _NEXT), (_NEXT, _LAST)),
@@ -93,7 +98,8 @@ class SeenFactor(NamedTuple):
     def read(self, shapes: Images, still: Images) -> tuple[NDArray[np.int64], Mask]:
         """As of a part, ``still``: without noise; of joint values not seen the one that differs in the fewest parts."""
         pairs = [part.read(shapes if part.rests is None else still) for part in self.parts]
-        found, known = np.stack([value for value, _ in pairs], axis=1), np.stack([sure for _, sure in pairs], axis=1)
+        found = np.stack([value for value, _ in pairs], axis=1)
+        known = np.stack([sure for _, sure in pairs], axis=1)
         wrong = (found[:, None] != self.joint).sum(axis=2)  # [N, K]
         return wrong.argmin(axis=1), known.all(axis=1) & (wrong.min(axis=1) == 0)
 
@@ -123,7 +129,8 @@ def find(frames: Frame, begins: Mask | None = None, actions: NDArray[np.int64] |
     factors = [((part,), values[:, None]) for part, values in parts]
     while (pair := _first_bound([_numbers(joint) for _, joint in factors])) is not None:
         one, other = pair
-        (parts_1, joint_1), (parts_2, joint_2) = factors[one], factors.pop(other)
+        parts_1, joint_1 = factors[one]
+        parts_2, joint_2 = factors.pop(other)
         factors[one] = ((*parts_1, *parts_2), np.concatenate([joint_1, joint_2], axis=1))
     return [SeenFactor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
 
@@ -142,7 +149,8 @@ def _parts(
     if noise.any():
         rests = _resting(images, change, noise)
         still = quiet(images, rests)
-        change, shapes = changes(still), contours(still)
+        change = changes(still)
+        shapes = contours(still)
         hiding = [_part(shapes, mask, actions) for mask in regions(change, noise & _often(change, begins))]
         seen = [part._replace(rests=rests) for part, singles in hiding if part is not None and singles <= _NOISE]
         parts += [(part, part.read(shapes)[0]) for part in seen]
@@ -158,13 +166,15 @@ def _often(change: Mask, begins: Mask) -> Mask:
 
 def _resting(images: Images, change: Mask, noise: Mask) -> Images:
     """Colors that each pixel of ``noise`` (64, 64) shows often, and then mostly for a while; see :func:`quiet`."""
-    colors, left = images[:-1, noise], ~change[:, noise]  # [N - 1, pixels, 3], [N - 1, pixels]
+    colors = images[:-1, noise]  # [N - 1, pixels, 3], [N - 1, pixels]
+    left = ~change[:, noise]
     rests = np.full((_COLORS, *images.shape[1:]), np.nan, dtype=np.float32)
     for each in rests:
         one = np.take_along_axis(colors, left.argmax(axis=0)[None, :, None], axis=0)
         like = (np.abs(colors - one) <= _CHANGE).all(axis=-1)
-        share, again = like.mean(axis=0), (like[1:] & like[:-1]).sum(axis=0) / np.maximum(like[:-1].sum(axis=0), 1)
-        kept = (share >= _USUAL) | (share >= _RESTS) & (again >= share + _STAYS * (1.0 - share))
+        share = like.mean(axis=0)
+        again = (like[1:] & like[:-1]).sum(axis=0) / np.maximum(like[:-1].sum(axis=0), 1)
+        kept = (share >= _FREQUENT) | (share >= _RESTS) & (again >= share + _STAYS * (1.0 - share))
         each[noise] = np.where(kept[:, None], one[0], np.inf)
         left &= ~like
     return rests
@@ -176,10 +186,11 @@ def quiet(images: Images, rests: Images) -> Images:
     ``rests``: colors (K, 64, 64, 3) that a pixel may keep, infinite where it has fewer, no numbers beside the noise.
     """
     noise = ~np.isnan(rests[0, ..., 0])
-    colors, shown = images[:, noise], np.ones(images.shape[:3], dtype=np.bool_)
+    colors = images[:, noise]
+    shown = np.ones(images.shape[:3], dtype=np.bool_)
     shown[:, noise] = np.any([(np.abs(colors - one[noise]) <= _CHANGE).all(axis=-1) for one in rests], axis=0)
     shown |= scipy.ndimage.binary_closing(shown, np.ones((1, 3, 3)))
-    return np.where(shown[..., None], images, np.float32(_NOTHING))
+    return np.where(shown[..., None], images, np.float32(_MEDIAN_COLOR))
 
 
 def _numbers(joint: Codes) -> NDArray[np.int64]:
@@ -231,7 +242,8 @@ def changed(before: Images, after: Images) -> Mask:
 def _beyond(one: Images, other: Images) -> Images:
     """How far ``other`` lies outside of what ``one`` shows there and a pixel around."""
     around = (1, 3, 3, 1)
-    low, high = scipy.ndimage.minimum_filter(one, around), scipy.ndimage.maximum_filter(one, around)
+    low = scipy.ndimage.minimum_filter(one, around)
+    high = scipy.ndimage.maximum_filter(one, around)
     return np.maximum(np.maximum(other - high, low - other), 0.0)
 
 
@@ -251,10 +263,13 @@ def regions(change: Mask, pixels: Mask) -> list[Mask]:
     """
     place = np.cumsum(pixels).reshape(pixels.shape) - 1
     change = change[:, pixels].astype(np.float32)  # [N - 1, pixels]
-    spans, told, links = (change, *np.array_split(change, 2)), np.array([[0], [_TOLD], [_TOLD]]), []
+    spans = (change, *np.array_split(change, 2))
+    told = np.array([[0], [_TOLD], [_TOLD]])
+    links = []
     for one, other in _NEIGHBOURS:
         near = pixels[one] & pixels[other]
-        rows, columns = place[one][near], place[other][near]
+        rows = place[one][near]
+        columns = place[other][near]
         both = np.stack([(span[:, rows] * span[:, columns]).sum(axis=0) for span in spans])
         either = np.stack([span[:, rows].sum(axis=0) + span[:, columns].sum(axis=0) for span in spans]) - both
         together = (both > _TOGETHER * either) | (either < told)
@@ -292,7 +307,8 @@ def _thick(pixels: Mask) -> float:
 
 def crops(shapes: Images, mask: Mask) -> Images:
     """The part of contours (N, 64, 64, 2) at and beside ``mask``, in the window around it. Shape (N, D)."""
-    grown, (rows, columns) = scipy.ndimage.binary_dilation(mask), _window(mask)
+    grown = scipy.ndimage.binary_dilation(mask)
+    rows, columns = _window(mask)
     own = np.moveaxis(shapes[:, rows, columns] * grown[rows, columns, None], -1, 1)
     return own.reshape(len(shapes), -1)
 

@@ -31,7 +31,8 @@ def query(
     """
     if model.outcomes.causes is None:
         return None
-    best, chosen = settings.exploration_threshold, None
+    best = settings.exploration_threshold
+    chosen = None
     front: list[tuple[Code, tuple[int, ...]]] = [(start, ())]  # codes, and the actions that lead to them
     seen = {start}
     for _ in range(settings.depth):
@@ -44,7 +45,8 @@ def query(
         for row, action in np.argwhere(sure >= _SURE).tolist():
             code, actions = front[row]
             if uncertainty[row, action] > best and (code, action) not in without:
-                best, chosen = float(uncertainty[row, action]), (*actions, action)
+                best = float(uncertainty[row, action])
+                chosen = (*actions, action)
             after = tuple(following[row, action].tolist())
             if after not in seen:
                 seen.add(after)
@@ -55,10 +57,12 @@ def query(
 
 def last_step(model: FactoredModel, start: Code, actions: NDArray[np.int64]) -> tuple[Code, int, Code]:
     """The imagined transition that the last of ``actions`` (D,) would be: code, action and code after."""
-    code, after = start, start
+    code = start
+    after = start
     for action in actions.tolist():
         following, _ = likeliest(model, as_codes(after)[None])
-        code, after = after, tuple(following[0, action].tolist())
+        code = after
+        after = tuple(following[0, action].tolist())
     return code, int(actions[-1]), after
 
 

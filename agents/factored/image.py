@@ -1,4 +1,4 @@
-"""What an agent has learned to see, for people: a colour a factor, and beside it a look of each of its values."""
+"""What an agent has learned to see, for people: a color a factor, and beside it a look of each of its values."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from imagine_bench.interfaces import Frame
 
 from . import appearance
 
-_SCALE, _CELL_PX, _GAP_PX, _MOST = 5, 56, 8, 8
+_SCALE = 5
+_CELL_PX = 56
+_GAP_PX = 8
+_MOST = 8
 """Times that frames are drawn larger; edge of a look; space between them; most factors, and values, that are drawn."""
 _COLORS = np.array(
     [[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [213, 94, 0], [86, 180, 233], [240, 228, 66]]
 )
-"""Told apart by the colour-blind (Okabe and Ito 2008)."""
+"""Told apart by the color-blind (Okabe and Ito 2008)."""
 
 
 def image(found: Sequence[appearance.SeenFactor], frames: Frame) -> NDArray[np.uint8]:
@@ -28,11 +31,13 @@ def image(found: Sequence[appearance.SeenFactor], frames: Frame) -> NDArray[np.u
     for index, (factor, color) in enumerate(zip(found, _COLORS, strict=False)):
         mask = np.any([part.mask for part in factor.parts], axis=0)
         gray[mask] = 0.55 * gray[mask] + 0.45 * color
-        high, wide = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        high = np.flatnonzero(mask.any(axis=1))
+        wide = np.flatnonzero(mask.any(axis=0))
         box = slice(high[0], high[-1] + 1), slice(wide[0], wide[-1] + 1)
         for place, value in enumerate(np.unique(codes[:, index])[:_MOST]):
             look = frames[np.flatnonzero(codes[:, index] == value)[0]][box]
-            top, left = index * (_CELL_PX + _GAP_PX), _SCALE * 64 + _GAP_PX + place * (_CELL_PX + _GAP_PX)
+            top = index * (_CELL_PX + _GAP_PX)
+            left = _SCALE * 64 + _GAP_PX + place * (_CELL_PX + _GAP_PX)
             cell = sheet[top : top + _CELL_PX, left : left + _CELL_PX]
             cell[:] = color
             at = [(np.arange(_CELL_PX - 6) * size) // (_CELL_PX - 6) for size in look.shape[:2]]

@@ -66,18 +66,19 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Remember what was seen, see anew if that is due, and learn as from any codes."""
-        eyes = self.perception
+        perception = self.perception
         self._observed += 1
         if transition.truncated:
             self._longest = max(self._observed, self._longest or 0)
-        if not eyes.full:
+        if not perception.full:
             with self.meters.cpu_time("time/perception_s"):
-                before, after = transition.observation.frame, transition.next_observation.frame
-                eyes.remember(before, transition.action, after, begins=self._observed == 1)
-                found = (eyes.found, eyes.found_in)
-                if eyes.renew():
+                before = transition.observation.frame
+                after = transition.next_observation.frame
+                perception.remember(before, transition.action, after, begins=self._observed == 1)
+                found = (perception.found, perception.found_in)
+                if perception.renew():
                     self._recode(*found)
-                    eyes.history += [eyes.found_in] if eyes.found_in not in eyes.history else []
+                    perception.history += [perception.found_in] if perception.found_in not in perception.history else []
             self.meters.count("time/perception_s")
         super().observe(transition, episode=episode)
         if transition.terminated or transition.truncated:
@@ -88,24 +89,28 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
 
         What was ``found`` before is kept where outcomes contradict what is found now and did not contradict that.
         """
-        eyes, count = self.perception, len(self.replay)
+        perception = self.perception
+        count = len(self.replay)
         of_task = slice(self.tasks[-1] if self.tasks else 0, count)  # other tasks have other outcomes
-        rows, few = self._rows(), _CONTRADICTIONS * (count - of_task.start)
+        rows = self._rows()
+        few = _CONTRADICTIONS * (count - of_task.start)
         if found and contradictions(rows[of_task]) > few:
-            now = (eyes.found, eyes.found_in)
-            eyes.take(found, found_in)
+            now = (perception.found, perception.found_in)
+            perception.take(found, found_in)
             earlier = self._rows()
             if contradictions(earlier[of_task]) > few:
-                eyes.take(*now)
+                perception.take(*now)
             else:
                 rows = earlier
-        eyes.memory = choose(rows[of_task], eyes.begins[of_task], eyes.seen_sizes, self.n_actions, self.settings)
-        rows = remembering(rows, eyes.begins[:count], eyes.memory)
-        self.replay.recode([(row.code, row.following) for row in rows], len(eyes.sizes))
+        perception.memory = choose(
+            rows[of_task], perception.begins[of_task], perception.seen_sizes, self.n_actions, self.settings
+        )
+        rows = remembering(rows, perception.begins[:count], perception.memory)
+        self.replay.recode([(row.code, row.following) for row in rows], len(perception.sizes))
         self._relearn(self.tasks, count)
-        eyes.begin_episode()
-        if rows and eyes.memory and not eyes.begins[count]:
-            eyes.recall(rows[-1].following[-1])
+        perception.begin_episode()
+        if rows and perception.memory and not perception.begins[count]:
+            perception.recall(rows[-1].following[-1])
 
     def _rows(self) -> list[CodeTransition]:
         """What is replayed, with the codes that its frames have now, as far as they are seen."""
@@ -117,11 +122,11 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
 
     def perceived(self) -> Iterator[Perceived]:
         """What it saw whenever that changed; see :class:`.capabilities.SeeingLearner`."""
-        eyes = self.perception
-        for count in eyes.history:
-            seen = eyes.first(count)
+        perception = self.perception
+        for count in perception.history:
+            seen = perception.first(count)
             found = appearance.find(*seen)
-            begun = sum(compress(eyes.begins, [after < count for _, after in eyes.transitions]))
+            begun = sum(compress(perception.begins, [after < count for _, after in perception.transitions]))
             yield Perceived(begun, tuple(len(factor.joint) for factor in found), image(found, seen[0]))
 
     def diagnostics(self) -> dict[str, float]:
@@ -130,10 +135,12 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
 
     def state(self) -> AgentState:
         """A snapshot: also the frames that it remembers."""
-        eyes, common = self.perception, super().state()
+        perception = self.perception
+        common = super().state()
         values = {key: value for key, value in common.values.items() if key != "code_sizes"}
         return AgentState(
-            arrays={**common.arrays, **eyes.arrays()}, values={**values, **eyes.values(), "longest": self._longest}
+            arrays={**common.arrays, **perception.arrays()},
+            values={**values, **perception.values(), "longest": self._longest},
         )
 
     def restore(self, state: AgentState) -> None:

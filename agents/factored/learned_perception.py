@@ -16,7 +16,8 @@ from . import appearance
 from .factors import Code, Memory
 from .settings import LearnedPerceptionSettings
 
-_FIRST, _RECENT = 4, 4
+_FIRST = 4
+_RECENT = 4
 """Frames after which it looks for factors first; frames whose codes are kept."""
 
 
@@ -24,7 +25,8 @@ class LearnedPerception:
     """Frames seen so far, and the codes that they have by what was found in the first ``looked_at`` of them."""
 
     def __init__(self, settings: LearnedPerceptionSettings, *, factored: bool) -> None:
-        self._settings, self._factored = settings, factored
+        self._settings = settings
+        self._factored = factored
         self.frames: list[Frame] = []
         self.transitions: list[tuple[int, int]] = []
         """Frames before and after of each transition, as long as all are remembered."""
@@ -106,7 +108,8 @@ class LearnedPerception:
 
     def renew(self) -> bool:
         """Look for factors anew if it is time; whether codes may now be others."""
-        seen, settings = len(self.frames), self._settings
+        seen = len(self.frames)
+        settings = self._settings
         growth = settings.growth if self.unknown else settings.growth_if_known
         if seen < max(_FIRST, growth * self.looked_at):
             return False
@@ -116,7 +119,8 @@ class LearnedPerception:
     def look(self, count: int) -> None:
         """Find factors in the first ``count`` frames remembered."""
         self.take(appearance.find(*self.first(count)) if count else [], count)
-        self.looked_at, self.unknown = count, False
+        self.looked_at = count
+        self.unknown = False
 
     def first(self, count: int) -> tuple[Frame, NDArray[np.bool_], NDArray[np.int64]]:
         """The first ``count`` frames remembered, which begin an episode, and what was done then: as ``find`` asks."""
@@ -129,7 +133,9 @@ class LearnedPerception:
 
     def take(self, found: list[appearance.SeenFactor], found_in: int) -> None:
         """See these factors from now on."""
-        self.found, self.found_in, self.memory = found, found_in, None
+        self.found = found
+        self.found_in = found_in
+        self.memory = None
         self._recent.clear()
 
     def arrays(self) -> Arrays:
@@ -160,8 +166,10 @@ class LearnedPerception:
         self.begins = state.arrays["replay/begins"].tolist()
         self.actions = state.arrays["replay/action"][: len(self.transitions)].tolist()
         self.look(state.values["found_in"])
-        self.looked_at, self.unknown = state.values["looked_at"], state.values["unknown"]
-        memory, self.history = state.values["memory"], list(state.values["history"])
+        self.looked_at = state.values["looked_at"]
+        self.unknown = state.values["unknown"]
+        memory = state.values["memory"]
+        self.history = list(state.values["history"])
         self.memory = Memory(*memory) if memory else None
 
     def diagnostics(self) -> dict[str, float]:

@@ -32,7 +32,8 @@ def remembering(rows: Sequence[CodeTransition], begins: Sequence[bool], memory: 
     """Transitions whose codes end with what is remembered; ``begins`` tells which are the first of an episode."""
     if memory is None:
         return list(rows)
-    found, remembered = [], memory.hidden
+    found = []
+    remembered = memory.hidden
     for row, first in zip(rows, begins, strict=True):
         before = memory.after(memory.hidden if first else remembered, row.code)
         remembered = memory.after(before, row.following)

@@ -100,7 +100,9 @@ class FactoredModel:
     def results(self, codes: Codes, moves: Moves) -> Results:
         """What the moves of every action from ``codes`` (N, P) would bring."""
         chance = moves.chance
-        reward, ends, untested = np.zeros(chance.shape), np.zeros(chance.shape), np.zeros(chance.shape)
+        reward = np.zeros(chance.shape)
+        ends = np.zeros(chance.shape)
+        untested = np.zeros(chance.shape)
         count, action, branch = comes = np.nonzero(chance)
         outcomes, untested[comes] = self.outcomes.predict(codes[count], action, moves.following[count, action, branch])
         reward[comes] = (outcomes * self.outcomes.rewards).sum(axis=1)
@@ -117,7 +119,8 @@ class FactoredModel:
 
         Returns the code, and the probability of the likeliest one.
         """
-        following, p_likeliest = [], 1.0
+        following = []
+        p_likeliest = 1.0
         for factor in self.dynamics.factors:
             (chance,), _ = factor.happens(as_codes(code)[None], np.array([action]))
             following.append(int(rng.choice(len(chance), p=chance)))
@@ -129,16 +132,20 @@ class FactoredModel:
     def _branches(self, factors: list[Floats]) -> tuple[Floats, Codes]:
         """The likeliest joint values of factors (N, A, K) each: probabilities (N, A, B) and codes (N, A, B, P)."""
         count, actions = factors[0].shape[:2]
-        most, pairs = self._planning.branches, np.arange(count * actions)[:, None]
-        chance, numbers = np.ones((len(pairs), 1)), np.zeros((len(pairs), 1), dtype=np.int64)
+        most = self._planning.branches
+        pairs = np.arange(count * actions)[:, None]
+        chance = np.ones((len(pairs), 1))
+        numbers = np.zeros((len(pairs), 1), dtype=np.int64)
         for factor in factors:
-            values, ways = factor.shape[2], chance.shape[1]
+            values = factor.shape[2]
+            ways = chance.shape[1]
             joint = (chance[:, :, None] * factor.reshape(-1, 1, values)).reshape(len(pairs), -1)
             order = np.argsort(-joint, axis=1, kind="stable")[:, :most]
             chance = joint.ravel()[order + pairs * joint.shape[1]]
             before, value = np.divmod(order, values)
             numbers = numbers.ravel()[before + pairs * ways] * values + value
-        spare, shape = ((0, 0), (0, most - chance.shape[1])), (count, actions, most)
+        spare = ((0, 0), (0, most - chance.shape[1]))
+        shape = (count, actions, most)
         least = np.minimum(self._planning.least_probability, chance.max(axis=1, keepdims=True))
         chance = np.pad(np.where(chance < least, 0.0, chance), spare)
         codes = np.stack(np.unravel_index(np.pad(numbers, spare), self.sizes[: self._moving]), axis=-1)

@@ -41,7 +41,8 @@ class _Templates:
 
     def __init__(self, sizes: tuple[int, ...]) -> None:
         self._sizes = sizes
-        self._first, self._multipliers = np.zeros(0, dtype=np.int64), np.zeros((len(sizes), 0))
+        self._first = np.zeros(0, dtype=np.int64)
+        self._multipliers = np.zeros((len(sizes), 0))
 
     def append(self, factors: tuple[int, ...], first: int) -> None:
         """One more set; ``first`` is its first number."""
@@ -70,7 +71,8 @@ class Conjunctions:
         most = min(settings.order, count)
         orders = sorted({*range(1, most + 1), *([count - 1] if most > 1 else []), count})
         sets = [factors for order in orders for factors in itertools.combinations(range(count), order)]
-        self._next, self._choice = _Templates(sizes), _Templates((*sizes, n_actions))
+        self._next = _Templates(sizes)
+        self._choice = _Templates((*sizes, n_actions))
         members: list[NDArray[np.int64]] = []
         groups: dict[tuple[bool, int], int] = {}
         first = 0
@@ -133,7 +135,8 @@ class _Evidence:
 
     def __init__(self, active: NDArray[np.int64], outcome: NDArray[np.int64], count: Floats, group: NDArray[np.int64],
                  groups: int, outcomes: int) -> None:  # fmt: skip
-        self.outcome, self.all = outcome, _Cases.of(active, count, len(group))
+        self.outcome = outcome
+        self.all = _Cases.of(active, count, len(group))
         place = np.zeros(len(group), dtype=np.int64)
         place[self.all.met] = np.arange(len(self.all.met))
         among = place[active]
@@ -172,7 +175,8 @@ class _Seen:
     def read(self, choice: NDArray[np.int64], following: NDArray[np.int64], at_choice: NDArray[np.int64],
              at: NDArray[np.int64]) -> Floats:  # fmt: skip
         """Those of N transitions, whose choices and next codes stand ``at`` these places of the numbers: (N, O)."""
-        first, second = _places(self.choices, choice)[at_choice], _places(self.following, following)[at]
+        first = _places(self.choices, choice)[at_choice]
+        second = _places(self.following, following)[at]
         both = np.where((first < 0) | (second < 0), -1, first * len(self.following) + second)
         return np.asarray(self.counts[_places(self.both, both)])
 
@@ -229,7 +233,8 @@ class OutcomeModel:
             return
         codes, actions, following, outcome = (np.array(column) for column in zip(*self._counts, strict=True))
         active = self.conjunctions.active(codes, actions, following)
-        count, group = np.array(list(self._counts.values()), dtype=np.float64), self.conjunctions.group
+        count = np.array(list(self._counts.values()), dtype=np.float64)
+        group = self.conjunctions.group
         evidence = _Evidence(active, outcome, count, group, len(self.conjunctions.prior), len(self.outcomes))
         self._priors = {each: self._kept(each, earlier, evidence) for each, earlier in self._earlier.items()}
         explanations = [self._explain(evidence, default) for default in range(len(self.outcomes))]
@@ -252,7 +257,8 @@ class OutcomeModel:
             order = [causes.default, *(index for index in range(len(causes.outcomes)) if index != causes.default)]
             self.outcomes = [causes.outcomes[index] for index in order] if weight else []
             self._earlier = {causes.outcomes[index]: causes.strength[index] for index in order} if weight else {}
-        self._counts, self.causes = {}, None
+        self._counts = {}
+        self.causes = None
 
     def _kept(self, outcome: Outcome, earlier: Floats, evidence: _Evidence) -> Floats:
         """Priors of an earlier task's causes (J,), believed as far as those that were tested bring it about here, too.
@@ -264,7 +270,8 @@ class OutcomeModel:
             evidence.tests((evidence.outcome == each).astype(np.float64))[causes] > 0.0
             for each in (self.outcomes.index(outcome), 0)
         )
-        good, tested = holds.sum(), (holds | fails).sum()
+        good = holds.sum()
+        tested = (holds | fails).sum()
         pseudo = self.settings.pseudo_causes
         return earlier * (pseudo * self.settings.transfer_weight + good) / (pseudo + tested)
 
@@ -273,7 +280,8 @@ class OutcomeModel:
 
         ``groups`` (G,) is that of each group, of which there are ``each`` (G,) many.
         """
-        earlier, own = self._priors.get(self.outcomes[outcome]), np.repeat(groups, each)
+        earlier = self._priors.get(self.outcomes[outcome])
+        own = np.repeat(groups, each)
         return own if earlier is None else np.maximum(own, earlier[which])
 
     @property
@@ -292,10 +300,8 @@ class OutcomeModel:
         assert causes is not None, "fit before predicting"
         nexts, which, at = _distinct(following, self._strides)
         choices, how, at_choice = _distinct(np.column_stack([codes, actions]), self._strides_of_choice)
-        of_next, of_choice = (
-            self.conjunctions.of_next(following[which]),
-            self.conjunctions.of_choice(codes[how], actions[how]),
-        )
+        of_next = self.conjunctions.of_next(following[which])
+        of_choice = self.conjunctions.of_choice(codes[how], actions[how])
         of_next, of_choice = (self._spared.take(active.T, axis=0).sum(axis=0) for active in (of_next, of_choice))
         *none, tested = np.exp(of_next[at] + of_choice[at_choice]).T
         probability = _by_causes(np.array(none), causes.default).T  # [N, O]
@@ -308,7 +314,8 @@ class OutcomeModel:
         """Causes of every outcome but ``default``."""
         others = [outcome for outcome in range(len(self.outcomes)) if outcome != default]
         strength = np.zeros((len(self.outcomes), len(evidence.all.met)))
-        priors, cost = np.zeros((len(self.outcomes), len(evidence.tried))), 0.0
+        priors = np.zeros((len(self.outcomes), len(evidence.tried)))
+        cost = 0.0
         for outcome in others:
             strength[outcome], priors[outcome] = self._causes_of(outcome, evidence, default, len(others))
             prior = self._prior(outcome, priors[outcome], evidence.tried, evidence.all.met)
@@ -321,13 +328,16 @@ class OutcomeModel:
 
     def _causes_of(self, outcome: int, evidence: _Evidence, default: int, rivals: int) -> tuple[Floats, Floats]:
         """Expectation maximisation for one outcome: strengths (M,) and how likely each group holds causes (G,)."""
-        settings, tried = self.settings, evidence.tried
-        cases, met = evidence.of[outcome], evidence.all.met
+        settings = self.settings
+        tried = evidence.tried
+        cases = evidence.of[outcome]
+        met = evidence.all.met
         seen = (evidence.outcome == outcome) | (evidence.outcome == default)
         tests = settings.pseudo_tests + evidence.tests(np.where(seen, 1.0, settings.masked_weight))
         first = np.cumsum(tried) - tried
         base = self.conjunctions.prior / rivals
-        prior, strength = base, self._prior(outcome, base, tried, met)
+        prior = base
+        strength = self._prior(outcome, base, tried, met)
         for _ in range(settings.sweeps):
             responsibility = cases.responsibility(strength.take(cases.met), settings.leak)
             strength = self._prior(outcome, prior, tried, met)
@@ -343,9 +353,12 @@ class OutcomeModel:
 
         Tests are where nothing happened, and where a conjunction was itself what decided.
         """
-        settings, all_of, met = self.settings, self.conjunctions.of_each, evidence.all.met
+        settings = self.settings
+        all_of = self.conjunctions.of_each
+        met = evidence.all.met
         pseudo = settings.pseudo_conjunctions
-        strength, tests = np.zeros((len(self.outcomes), all_of.sum())), np.zeros(all_of.sum())
+        strength = np.zeros((len(self.outcomes), all_of.sum()))
+        tests = np.zeros(all_of.sum())
         tests[met] = evidence.tests(evidence.outcome == best.default)
         rate = 0.5 * pseudo * self.conjunctions.prior / (pseudo + evidence.tried)
         for outcome, cases in enumerate(evidence.of):

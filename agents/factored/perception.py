@@ -42,7 +42,9 @@ class CodePerception:
     """
 
     def __init__(self, encoder: Encoder, *, factored: bool) -> None:
-        self._encoder, self._factored, self._encoded = encoder, factored, encoder.card.code_sizes
+        self._encoder = encoder
+        self._factored = factored
+        self._encoded = encoder.card.code_sizes
         self.sizes = self._encoded if factored else (int(np.prod(self._encoded)),)
         self._last: tuple[bytes, Code] | None = None
 

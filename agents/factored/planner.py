@@ -38,7 +38,8 @@ class Planner:
     """
 
     def __init__(self, model: FactoredModel, settings: PlanningSettings) -> None:
-        self._model, self._settings = model, settings
+        self._model = model
+        self._settings = settings
         self.expanded = 0
         """Codes of the newest plan whose successors are predicted."""
         self._forget()
@@ -63,14 +64,16 @@ class Planner:
         if len(self._predictions) > _KEPT * self._settings.states:
             self._forget()
         depth = self._settings.depth if left is None else max(1, min(left, self._settings.depth))
-        root, known = self._predictions.row(code), self._known.setdefault((objective, depth), {})
+        root = self._predictions.row(code)
+        known = self._known.setdefault((objective, depth), {})
         if root not in known:
             known.update(self._plan(root, objective, depth))
         return known[root].copy()
 
     def outcome(self, code: Code) -> tuple[Floats, Floats, Floats]:
         """Expected reward of each action, P(it ends the episode), and how much it does is unknown: three (A,)."""
-        row, predictions = self._predictions.row(code), self._predictions
+        row = self._predictions.row(code)
+        predictions = self._predictions
         predictions.expand(np.array([row]))
         return predictions.reward[row], predictions.ends[row], predictions.unknown[row]
 
@@ -80,7 +83,8 @@ class Planner:
         self.expanded = steps = 0
         while len(front) and len(rows) <= self._settings.states and steps < depth:
             self._predictions.expand(front)
-            self.expanded, steps = len(rows), steps + 1
+            self.expanded = len(rows)
+            steps = steps + 1
             front = np.setdiff1d(self._predictions.following(front), rows)
             rows = np.concatenate([rows, front])
             if objective == "novelty" and len(front) and (found := self._discovery(rows, depth)) is not None:
@@ -96,17 +100,18 @@ class Planner:
 
     def _back_up(self, rows: Rows, objective: Objective, depth: int, beyond: float = 0.0) -> Floats:
         """Action values of the expanded rows, which come first, (expanded, A); all others are worth ``beyond``."""
-        settings, predictions, inside = self._settings, self._predictions, rows[: self.expanded]
+        settings = self._settings
+        predictions = self._predictions
+        inside = rows[: self.expanded]
         best = self._model.outcomes.rewards.max()
         place = np.zeros(len(predictions), dtype=np.int64)
         place[rows] = np.arange(len(rows))
-        reward, unknown, continues = (
-            predictions.reward[inside],
-            predictions.unknown[inside],
-            predictions.continues[inside],
-        )
+        reward = predictions.reward[inside]
+        unknown = predictions.unknown[inside]
+        continues = predictions.continues[inside]
         following = place[predictions.next[inside]]
-        state, action = np.zeros(len(rows)), reward
+        state = np.zeros(len(rows))
+        action = reward
         state[self.expanded :] = beyond
         for _ in range(depth):
             ahead = (continues * state[following]).sum(axis=2)

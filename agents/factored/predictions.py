@@ -36,13 +36,19 @@ class PredictedTransitions:
         self._model = model
         self._index: dict[int, int] = {}
         self._numbers: list[int] = []
-        pairs, triples = (0, model.n_actions), (0, model.n_actions, branches)
-        self.reward, self.unknown, self.ends = np.zeros(pairs), np.zeros(pairs), np.zeros(pairs)
-        self.continues, self.next = np.zeros(triples), np.zeros(triples, dtype=np.int64)
-        self._chance, self._following = np.zeros(triples), np.zeros(triples, dtype=np.int64)
+        pairs = (0, model.n_actions)
+        triples = (0, model.n_actions, branches)
+        self.reward = np.zeros(pairs)
+        self.unknown = np.zeros(pairs)
+        self.ends = np.zeros(pairs)
+        self.continues = np.zeros(triples)
+        self.next = np.zeros(triples, dtype=np.int64)
+        self._chance = np.zeros(triples)
+        self._following = np.zeros(triples, dtype=np.int64)
         self._certain = np.zeros(pairs)
         self._pooled_at = model.dynamics.pooled_at
-        self._moved, self._known = np.zeros(pairs, dtype=np.bool_), np.zeros(0, dtype=np.bool_)
+        self._moved = np.zeros(pairs, dtype=np.bool_)
+        self._known = np.zeros(0, dtype=np.bool_)
 
     def __len__(self) -> int:
         return len(self._index)
@@ -76,8 +82,12 @@ class PredictedTransitions:
         continues = np.where(found.p_continues > _HAPPENS, found.p_continues, 0.0)
         following = self._met(self._following[rows], continues > 0.0)
         self._grow()
-        self.reward[rows], self.unknown[rows], self.ends[rows] = found.reward, found.unknown, found.p_terminated
-        self.next[rows], self.continues[rows], self._known[rows] = following, continues, True
+        self.reward[rows] = found.reward
+        self.unknown[rows] = found.unknown
+        self.ends[rows] = found.p_terminated
+        self.next[rows] = following
+        self.continues[rows] = continues
+        self._known[rows] = True
 
     def following(self, rows: Rows) -> Rows:
         """Rows that may follow from ``rows``, which are expanded; each once."""
@@ -90,8 +100,10 @@ class PredictedTransitions:
             if len(some):
                 moves = self._model.moves(self._codes_of(some), actions)
                 following = np.ravel_multi_index(tuple(np.moveaxis(moves.following, -1, 0)), self._model.sizes)
-                self._following[some, actions], self._chance[some, actions] = following, moves.chance
-                self._certain[some, actions], self._moved[some, actions] = moves.known, True
+                self._following[some, actions] = following
+                self._chance[some, actions] = moves.chance
+                self._certain[some, actions] = moves.known
+                self._moved[some, actions] = True
 
     def _stale(self, rows: Rows) -> list[tuple[Rows, slice]]:
         """Of which actions the moves of which ``rows`` are not known."""
