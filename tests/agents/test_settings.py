@@ -19,7 +19,7 @@ from imagine_bench.protocols.control import PRESETS
 from imagine_bench.regression.protocol import PRESETS as REGRESSION_PRESETS
 
 ALL: dict[str, Hyperparameters[Any]] = {
-    **{name: registry.load(entry.settings) for name, entry in registry.agents().items() if entry.learns},
+    **{name: registry.load(entry.settings) for name, entry in registry.agents().items() if entry.settings},
     "regressors": regressor_settings.HYPERPARAMETERS,
 }
 SETS_OF_ALL = [(agent, group, name) for agent in ALL for group in ALL[agent].groups for name in SETS]

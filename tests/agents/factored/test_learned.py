@@ -316,10 +316,10 @@ def test_remembered_transitions_get_the_codes_that_their_frames_have_now(trained
 
 def test_with_as_many_frames_as_it_may_remember_it_sees_as_before_and_resumes() -> None:
     whole, first, resumed = (agent(seed=seed, perception__frames=20) for seed in (0, 0, 5))
-    assert live(whole, range(6), seed=0) == live(first, range(6), seed=0)
+    assert live(whole, range(12), seed=0) == live(first, range(12), seed=0)
     resumed.restore(first.state())
     assert whole.perception.full and len(whole.perception.frames) <= 21
-    assert live(whole, range(6, 12), seed=0) == live(resumed, range(6, 12), seed=0)
+    assert live(whole, range(12, 16), seed=0) == live(resumed, range(12, 16), seed=0)
     assert same(whole.state(), resumed.state())
     before = first.state()
     with pytest.raises(ArtefactError, match="settings"):

@@ -169,8 +169,8 @@ def test_from_pictures_it_learns_to_remember_and_then_acts_as_well_as_if_nothing
     for each in (learner, forgetful):
         success(each, range(60), explore=True)
     assert learner.perception.memory is not None and forgetful.perception.memory is None
-    assert success(learner, range(30), explore=False, steps=3) >= 0.9
-    assert success(forgetful, range(30), explore=False) <= 0.7, "what is hidden matters"
+    assert success(learner, range(50), explore=False, steps=3) >= 0.9
+    assert success(forgetful, range(50), explore=False) <= 0.7, "what is hidden matters"
     assert most_without_memory(3) == 0.8, "which nothing can do that forgets"
     assert learner.replay.rows() == remembering(
         [row._replace(code=row.code[:-1], following=row.following[:-1]) for row in learner.replay.rows()],
