@@ -164,10 +164,19 @@ def well(code: Code, first: list[int], policy: dict[Code, int], steps: int) -> b
     return False
 
 
-def test_from_pictures_it_learns_to_remember_and_then_acts_as_well_as_if_nothing_was_hidden() -> None:
-    learner, forgetful = agent(seed=0), agent(seed=0, memory_evidence=1e6)
-    for each in (learner, forgetful):
+@pytest.fixture(scope="module")
+def trained() -> tuple[LearnedPerceptionAgent, LearnedPerceptionAgent]:
+    """An agent after sixty episodes in which the lamp was covered, and one that must not remember."""
+    agents = (agent(seed=0), agent(seed=0, memory_evidence=1e6))
+    for each in agents:
         success(each, range(60), explore=True)
+    return agents
+
+
+def test_from_pictures_it_learns_to_remember_and_then_acts_as_well_as_if_nothing_was_hidden(
+    trained: tuple[LearnedPerceptionAgent, LearnedPerceptionAgent],
+) -> None:
+    learner, forgetful = trained
     assert learner.perception.memory is not None and forgetful.perception.memory is None
     assert success(learner, range(50), explore=False, steps=3) >= 0.9
     assert success(forgetful, range(50), explore=False) <= 0.7, "what is hidden matters"
