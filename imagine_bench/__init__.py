@@ -10,14 +10,24 @@ from imagine_bench.registry.moved import keep_old_paths
 from imagine_bench.version import __version__ as __version__
 
 MOVED = {
+    "imagine_bench.agents.factored_own": "imagine_bench.agents.factored",
+    "imagine_bench.agents.factored_own.agent": "imagine_bench.agents.factored.learned",
     "imagine_bench.agents.library": "imagine_bench.agents.encoders",
     "imagine_bench.agents.library.latent_observation": "imagine_bench.agents.encoders.latent_observation",
+    "imagine_bench.bench": "imagine_bench.running",
+    "imagine_bench.bench.bench": "imagine_bench.running.bench",
+    "imagine_bench.bench.launchers": "imagine_bench.running.launchers",
+    "imagine_bench.bench.launchers.jobs": "imagine_bench.running.launchers.jobs",
     "imagine_bench.capabilities": "imagine_bench.interfaces.capabilities",
+    "imagine_bench.certificates": "imagine_bench.exact",
+    "imagine_bench.certificates.certificate": "imagine_bench.exact.certificate",
     "imagine_bench.data.episodes": "imagine_bench.interfaces.episodes",
     "imagine_bench.entrants": "imagine_bench.registry.entries",
     "imagine_bench.judge.models.outcomes": "imagine_bench.judge.truth",
     "imagine_bench.machine": "imagine_bench.registry.machine",
     "imagine_bench.regression.interfaces": "imagine_bench.interfaces.regression",
+    "imagine_bench.report.plots": "imagine_bench.report.figures",
+    "imagine_bench.report.radar": "imagine_bench.report.figures",
     "imagine_bench.studies": "imagine_bench.sweep.catalogue",
     "imagine_bench.studies.catalogue": "imagine_bench.sweep.catalogue",
     "imagine_bench.studies.study": "imagine_bench.sweep.grid",
@@ -28,7 +38,15 @@ MOVED = {
     "imagine_bench.world_models": "imagine_bench.interfaces.model",
 }
 """Where each module lies now, by the path that it had."""
+MOVED_NAMES = {
+    "imagine_bench.agents.factored_own.agent:OwnPerceptionAgent": (
+        "imagine_bench.agents.factored.learned:LearnedPerceptionAgent"
+    ),
+    "imagine_bench.registry:OBSERVERS": "imagine_bench.cli.observers:OBSERVERS",
+    "imagine_bench.registry:TASK_TYPES": "imagine_bench.running.task_types:TASK_TYPES",
+}
+"""Where each name lies now, by the place that it had: names of moved modules, and of those loaded here."""
 
-keep_old_paths(MOVED)
+keep_old_paths(MOVED, MOVED_NAMES)
 for _entry in TASKS.values():
     register_env(_entry)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import warnings
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -184,3 +186,16 @@ class CodeAgent(Generic[PerceptionT]):
         self._relearn(state.values["tasks"], state.values["learned"])
         self.meters.restore(state.values["meters"])
         self.rng.bit_generator.state = state.values["exploration"]
+
+
+def __getattr__(name: str) -> object:
+    """The names that moved to :mod:`.given`; they warn, and go in version 1.0."""
+    moved = {"FactoredAgent": "GivenPerceptionAgent", "make": "make"}
+    if name not in moved:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    new = importlib.import_module(".given", __package__)
+    message = f"{__name__}:{name} is now {new.__name__}:{moved[name]}; import it from there."
+    warnings.warn(message, DeprecationWarning, stacklevel=2)
+    found: object = getattr(new, moved[name])
+    globals()[name] = found
+    return found

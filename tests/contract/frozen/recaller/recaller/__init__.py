@@ -1,0 +1,1 @@
+"""Recalls what followed a macro-action, and imagines by that."""

@@ -1,0 +1,122 @@
+"""Two packages of others, written against the state of November 27 and never edited since: they work unmodified.
+
+``five_cubes`` has two tasks, one of which hides something; ``recaller`` an agent with a model, and a world model.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from fake_reader import BlindReader
+from guest_packages import install
+from small_runs import Inline
+
+from imagine_bench import registry
+from imagine_bench.cli import main
+from imagine_bench.judge import judgement
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.trained import load_trained
+from imagine_bench.store.results import RunResult
+
+FROZEN = Path(__file__).parent / "frozen"
+DIGESTS = {
+    "five_cubes": "8943f952891d1c5b66f97e09516492b62ca87b0decb8bb6a46308d9cab511471",
+    "recaller": "2d7058650b54f25b78266a75390719ac50ac611fd649ee59f609484bd072c656",
+}
+"""SHA-256 of each package's files. A package that has to be edited is a contract that was broken."""
+TEN = {"evaluation_episodes": 10, "open_loop_starts": 0, "recorded_episodes": 0}
+
+
+def digest(folder: Path) -> str:
+    files = sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".toml"))
+    content = b"".join(path.relative_to(folder).as_posix().encode() + path.read_bytes() for path in files)
+    return hashlib.sha256(content).hexdigest()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Both packages, as pip would leave them."""
+    site = tmp_path_factory.mktemp("site")
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # old paths warn
+        for name in DIGESTS:
+            folder = shutil.copytree(FROZEN / name, site / name, ignore=shutil.ignore_patterns("__pycache__"))
+            patch.syspath_prepend(install(folder))
+        registry.offers.cache_clear()
+        registry.offers(registry.AGENT_GROUP)
+        registry.offers(registry.WORLD_MODEL_GROUP)
+        for module in ("recaller.agent", "recaller.model"):
+            registry.load(module)
+        yield
+    for module in [name for name in sys.modules if name.partition(".")[0] in DIGESTS]:
+        sys.modules.pop(module)
+    for env in [env for env in gymnasium.registry if env.startswith("five_cubes/")]:
+        gymnasium.registry.pop(env)
+    registry.offers.cache_clear()
+
+
+@pytest.mark.parametrize("name", DIGESTS)
+def test_a_frozen_package_is_as_it_was_written(name: str) -> None:
+    assert digest(FROZEN / name) == DIGESTS[name]
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["--task five_cubes", "--task five_cubes_covered", "--agent recaller", "--model recall --task five_cubes"],
+)
+def test_a_frozen_package_passes_check(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", *words.split()]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) >= 3 and all(line.startswith("ok ") for line in lines)
+
+
+@pytest.mark.parametrize("task", ["five_cubes", "five_cubes_covered"])
+def test_the_frozen_worlds_are_benched(task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wanted, paths = plan(task, "smoke", agents=("random", "oracle"), budgets=(5,), **TEN)
+    result = bench(wanted, paths, root=tmp_path, launcher=Inline())
+    solved = {run.agent: run.checkpoints[-1].success_rate for run in result.runs}
+    assert solved["oracle"] > 0.8 > solved["random"], "the optimum is at least 0.95, chance 0.15"
+    assert main(["report", str(result.folder)]) == 0
+    assert "chance level" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """The frozen agent after twelve episodes, with one setting of its own."""
+    few: dict[str, Any] = {"budgets": (12,), "evaluation_episodes": 2, "open_loop_starts": 2, "recorded_episodes": 1}
+    agent = "recaller:recalling.depth=5"
+    wanted, paths = plan("arrow_puzzle", "smoke", agents=(agent,), seeds=(0,), execution="kinematic", **few)
+    (run,) = bench(wanted, paths, root=tmp_path_factory.mktemp("runs"), launcher=Inline()).runs
+    return run
+
+
+def test_the_frozen_agent_is_benched_with_what_it_imagines(learned: RunResult) -> None:
+    row = learned.checkpoints[-1]
+    assert row.diagnostics["imagination/transitions"] > 0.0 and row.diagnostics["known_states"] > 10.0
+    assert row.open_loop is not None
+    assert (learned.folder / "recording.rrd").stat().st_size > 10_000
+    assert load_trained(learned.folder).agent.settings.recalling.depth == 5
+
+
+def test_the_frozen_model_and_agent_are_judged(
+    learned: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def read_nothing(spec: object, appearance: str, folder: Path) -> BlindReader:
+        names = ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read")
+        (folder / "reader.json").write_text(json.dumps(dict.fromkeys(names, 0.0)))
+        return BlindReader(3)
+
+    monkeypatch.setattr(judgement, "_reader", read_nothing)
+    few = ["--sizes", "30", "--seeds", "1000", "--samples", "2", "--workers", "1", "--out", str(tmp_path)]
+    models = ["recall", "copy", str(learned.folder)]
+    assert main(["judge", "--task", "arrow_puzzle", "--models", *models, *few]) == 0
+    assert "recall" in capsys.readouterr().out
