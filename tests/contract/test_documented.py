@@ -20,7 +20,12 @@ NAMES: Mapping[str, list[str]] = {
     module: [line.partition(":")[2] for line in LINES if line.startswith(f"{module}:")]
     for module in dict.fromkeys(line.partition(":")[0] for line in LINES)
 }
-OLD = {*MOVED, *MOVED_NAMES, "imagine_bench.agents.factored.agent:FactoredAgent", "imagine_bench.agents.factored.agent:make"}
+OLD = {
+    *MOVED,
+    *MOVED_NAMES,
+    "imagine_bench.agents.factored.agent:FactoredAgent",
+    "imagine_bench.agents.factored.agent:make",
+}
 
 
 def has(found: object, dotted: str) -> bool:

@@ -1,7 +1,7 @@
 """Five cubes in a row, each of another color. A gripper swaps two neighbours; the row shall become a rainbow.
 
-With probability 0.1 a swap fails and leaves both cubes where they are. In the covered world a cloth falls over the two
-cubes on the right after the first frame.
+With probability 0.1 a swap fails and leaves both cubes where they are. In the covered world a cloth falls over the
+last cube after the first frame.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from imagine_bench.rules import facts
 CUBES = 5
 HORIZON = 15
 FAILS = 0.1
-HIDDEN = (3, 4)
+HIDDEN = (4,)
 COLORS = ("red", "yellow", "green", "blue", "violet")
 GOAL = tuple(range(CUBES))
 _RGB = np.array([(220, 40, 40), (230, 210, 50), (50, 170, 70), (50, 90, 220), (150, 60, 190)], dtype=np.uint8)
@@ -67,7 +67,7 @@ class SortingRules:
 
 
 class Cloth:
-    """What frames show of the covered world: every cube at first, later all but the two under the cloth."""
+    """What frames show of the covered world: every cube at first, later all but the one under the cloth."""
 
     lag = 0
 
