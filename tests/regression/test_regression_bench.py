@@ -30,6 +30,7 @@ from imagine_bench.report.regression import robot_ik, toy_regression, write_repo
 from imagine_bench.report.tables import number
 from imagine_bench.report.why import why_report
 from imagine_bench.running.bench import plan
+from imagine_bench.running.task_types import task_types
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SeedTree
 
@@ -61,6 +62,12 @@ def silent(_: Progress) -> None:
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> RegressionRun:
     return run(TOY, tmp_path_factory.mktemp("toy"), silent)
+
+
+def test_a_task_has_one_type_and_every_type_has_learners() -> None:
+    names = [name for kind in task_types().values() for name in kind.tasks()]
+    assert len(names) == len(set(names))
+    assert all(kind.tasks() and kind.learners() and kind.presets for kind in task_types().values())
 
 
 def test_a_run_measures_every_network_of_every_variant(toy: RegressionRun) -> None:

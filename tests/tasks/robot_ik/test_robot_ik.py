@@ -58,6 +58,8 @@ def test_a_movement_is_sampled_to_its_end(hz: float) -> None:
     timestep_s = ik.arm().model.opt.timestep
     gaps_s = np.diff(motion.time_s)
     assert gaps_s[:-1].min() >= 1 / hz - 1e-9 and gaps_s.max() <= 1 / hz + 2 * timestep_s
+    still = ik.arm().movement(q[0], 1e6).poses_in_world[-1]
+    np.testing.assert_allclose(motion.poses_in_world[-1], still, atol=1e-12)
 
 
 def test_distance_to_the_workspace_against_brute_force() -> None:
