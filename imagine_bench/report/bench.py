@@ -9,10 +9,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from imagine_bench import reference
@@ -36,6 +35,7 @@ from imagine_bench.report.tables import (
     Page,
     Section,
     Table,
+    by_budget,
     count,
     decimals,
     estimate,
@@ -44,15 +44,11 @@ from imagine_bench.report.tables import (
     seconds,
     signed_percent,
 )
-from imagine_bench.statistics import Estimate
 from imagine_bench.store.archive import archive_files
 from imagine_bench.store.results import BenchResult
 
 V = TypeVar("V")
 _NAMED = 4  # unfinished runs that are named; the others are counted
-_DIAMONDS: dict[str, Any] = {
-    "marker": "D", "markersize": 5, "markerfacecolor": "none", "linestyle": ":", "linewidth": 1.0, "label": "_"
-}  # fmt: skip
 
 
 def bench_page(result: BenchResult) -> Page:
@@ -74,7 +70,7 @@ def bench_page(result: BenchResult) -> Page:
         answers=verdict(data),
         sections=[section for section in found if section is not None],
         files=files,
-        colors={title: figures.color(agent) for agent, title in titles.items()},
+        colors=figures.colors(data.agents),
         summary=terminal_text(data),
         **made(result, titles),
     )
@@ -112,14 +108,13 @@ def _unfinished(result: BenchResult) -> list[str]:
     if not result.missing:
         return []
     part = result.protocol
-    first = f"One of these benches is not finished: shown are {len(part.seeds)} seeds up to {part.budgets[-1]:,}"
-    if result.whole is not None:
-        seeds = f"{len(part.seeds)} of {len(result.whole.seeds)} seeds"
-        first = f"This bench is not finished: shown are {seeds} up to {part.budgets[-1]:,} of "
-        first += f"{result.whole.budgets[-1]:,}"
-    more = len(result.missing) - _NAMED
-    named = [*result.missing[:_NAMED], *([f"{more} more"] if more > 0 else [])]
-    return [f"{first} real episodes. Missing are {'; '.join(named)}. The same bench command goes on."]
+    whole = f" of {result.whole.budgets[-1]:,}" if result.whole else ""
+    which = "This bench" if result.whole else "One of these benches"
+    named = "; ".join(result.missing[:_NAMED])
+    return [
+        f"{which} is not finished: shown are {len(part.seeds)} seeds up to {part.budgets[-1]:,}{whole} real episodes. "
+        f"Missing are {named}{'; …' if len(result.missing) > _NAMED else ''}. The same bench command goes on."
+    ]
 
 
 def _not_installed(data: ReportData) -> list[str]:
@@ -154,17 +149,11 @@ def _interval_words(data: ReportData) -> str:
 # Tables ------------------------------------------------------------------------------------------------------------
 
 
-def _by_budget(
-    data: ReportData, name: str, first: str, values: Mapping[str, Mapping[int, V]], words: Callable[[V], str | Cell],
-    caption: str = "", why_dash: str = "",
-) -> Table:  # fmt: skip
-    """A table of a row an agent and a column a budget, each value put into words."""
-    rows = [[agent_title(agent), *map(words, row.values())] for agent, row in values.items()]
-    return Table(name, [first, *_columns(data.budgets)], rows, caption, why_dash)
-
-
-def _columns(budgets: Sequence[int]) -> list[str]:
-    return [f"{budget:,}" for budget in budgets]
+def _table(
+    name: str, first: str, values: Mapping[str, Mapping[int, V]], words: Callable[[V], str | Cell], *texts: str
+) -> Table:
+    """A row an agent and a column a budget, each value put into words."""
+    return by_budget(name, first, {agent_title(agent): row for agent, row in values.items()}, words, *texts)
 
 
 def compared(data: ReportData) -> Section:
@@ -187,7 +176,8 @@ def success(data: ReportData) -> Section:
     """Success of every agent at every budget, with its price."""
     caption = (
         "Test episodes solved after so many real training episodes; the axis is logarithmic. Points are interquartile "
-        f"means over seeds (independent trainings); bands: {_interval_words(data)}."
+        f"means over seeds (independent trainings); bands: {_interval_words(data)}; dashed: chance level and optimum; "
+        "diamonds: the thesis, with standard deviations."
     )
     image = figures.plot("success", lambda: success_figure(data), caption)
     tables = [_scores(data), _prices(data), *_excess(data), *_thesis_only(data), _seeds(data)]
@@ -198,7 +188,7 @@ def _scores(data: ReportData) -> Table:
     caption = f"Columns: real training episodes; in brackets: {_interval_words(data)}."
     if data.thesis:
         caption += f" Thesis: {reference.success_source(str(data.spec.reference))}."
-    table = _by_budget(data, "scores", "solved (%) after", data.scores, _score, caption)
+    table = _table("scores", "solved (%) after", data.scores, _score, caption)
     levels = {"chance level": data.facts.chance_level, "optimum": data.facts.optimum}
     more = [[name, *[percent(share)] * len(data.budgets)] for name, share in levels.items()]
     return dataclasses.replace(table, rows=[*table.rows, *more])
@@ -208,8 +198,10 @@ def _score(score: Score) -> Cell:
     return estimate(score.success, note=f"thesis {_thesis_text(score.thesis)}" if score.thesis else "")
 
 
-def _thesis_text(printed: tuple[float, float]) -> str:
+def _thesis_text(printed: tuple[float, float] | None) -> str:
     """Mean and standard deviation as the thesis prints them; the mean alone where it gives no other."""
+    if printed is None:
+        return DASH
     mean, std = printed
     return percent(mean) if math.isnan(std) else f"{percent(mean)} ({percent(std)})"
 
@@ -235,7 +227,7 @@ def _excess(data: ReportData) -> list[Table]:
         return []
     caption = "Means over the solved tests; the shortest plan from each start is exact, from the rules."
     first = "macro-actions beyond the shortest plan, after"
-    return [_by_budget(data, "excess", first, data.excess, decimals, caption, "nothing was solved")]
+    return [_table("excess", first, data.excess, decimals, caption, "nothing was solved")]
 
 
 def _thesis_only(data: ReportData) -> list[Table]:
@@ -243,22 +235,19 @@ def _thesis_only(data: ReportData) -> list[Table]:
     budgets = sorted({budget for printed in data.thesis.values() for budget in printed} - set(data.budgets))
     if not budgets:
         return []
-    rows = [
-        [agent_title(agent), *(_thesis_text(printed[b]) if b in printed else DASH for b in budgets)]
-        for agent, printed in data.thesis.items()
-    ]
-    header = ["the thesis, solved (%) after", *_columns(budgets)]
-    caption = "At budgets that this run does not have."
-    return [Table("thesis", header, rows, caption, "not tested in the thesis")]
+    printed = {agent: {budget: row.get(budget) for budget in budgets} for agent, row in data.thesis.items()}
+    texts = ("At budgets that this run does not have.", "not tested in the thesis")
+    return [_table("thesis", "the thesis, solved (%) after", printed, _thesis_text, *texts)]
 
 
 def _seeds(data: ReportData) -> Table:
-    rows = [
-        [agent_title(agent), str(seed), *map(percent, shares)]
-        for agent in data.agents
-        for seed, shares in zip(data.result.protocol.seeds, data.result.success_rates(agent), strict=True)
-    ]
-    return Table("seeds", ["agent", "seed", *_columns(data.budgets)], rows, folded="Every seed by itself")
+    rows = []
+    for agent in data.agents:
+        shares = data.result.success_rates(agent)
+        for seed, each in zip(data.result.protocol.seeds, shares, strict=True):
+            rows.append([agent_title(agent), str(seed), *map(percent, each)])
+    header = ["agent", "seed", *(f"{budget:,}" for budget in data.budgets)]
+    return Table("seeds", header, rows, folded="Every seed by itself")
 
 
 def area(data: ReportData) -> Section | None:
@@ -269,7 +258,7 @@ def area(data: ReportData) -> Section | None:
         "Mean success (%) over all real episodes up to each budget: straight lines between the tests, from the chance "
         "level at episode 0. It is the area under the curve with a linear axis, so early learning counts."
     )
-    table = _by_budget(data, "areas", "mean success (%) up to", data.areas, estimate)
+    table = _table("areas", "mean success (%) up to", data.areas, estimate)
     return Section("Area under the success curve", [words], tables=[table])
 
 
@@ -280,23 +269,19 @@ def gain(data: ReportData) -> Section | None:
         return None
     every = [each for by_budget in found.values() for each in by_budget.values()]
     shown = _detectable([each.detectable for each in every])
-    told = _detectable([each.paired_detectable for each in every])
     words = (
         "Difference: percentage points of test episodes solved. Gain: the same relative to DQN, (agent − DQN) / DQN, "
         "the thesis' measure. One seed has no interval, nor has a gain over a DQN that may have solved nothing. "
         "Solved alone: tests that one of two agents solved and the other did not, from the same starts and seeds, with "
         "McNemar's exact test (Holm-corrected); it compares these trained agents, not two ways of training."
     )
-    caption = "Gain of the means over seeds; bands: 95 % interval over seeds (Fieller). Diamonds: the thesis' means."
-    image = figures.plot("gain", lambda: gain_figure(data), caption)
     alone = "which tests were solved was not kept"
     tables = [
-        _by_budget(data, "differences", "difference (points) after", found, _difference, shown),
-        _by_budget(data, "gains", "gain (%) after", found, _gain, why_dash="DQN solved nothing to compare with"),
-        _by_budget(data, "paired", "solved alone : by DQN alone, after", found, _alone, told, alone),
+        _table("differences", "difference (points) after", found, _difference, shown),
+        _table("gains", "gain (%) after", found, _gain, "", "DQN solved nothing to compare with"),
+        _table("paired", "solved alone : by DQN alone, after", found, _alone, "", alone),
     ]
-    drawn = any(_near(data, printed) for printed in data.thesis_gains.values())
-    return Section("Gain over DQN", [words], [image] if drawn else [], tables)
+    return Section("Gain over DQN", [words], tables=tables)
 
 
 def _detectable(sizes: Sequence[float]) -> str:
@@ -325,6 +310,25 @@ def _alone(versus: Comparison) -> Cell:
         return Cell(DASH, note=note)
     text = f"{versus.paired.first:,} : {versus.paired.second:,}"
     return Cell(text, f"({p_value(versus.paired_p)})", note)
+
+
+def acceptance(data: ReportData) -> Section | None:
+    """Imagined transitions that the filter kept."""
+    if not data.acceptance:
+        return None
+    words = (
+        "An imagined rollout is a chain of transitions that the agent's world model predicts, starting from a real "
+        "image; depth counts its macro-actions. The uncertainty filter cuts a rollout at the first transition whose "
+        "epistemic uncertainty (what the model does not know for want of data) is too high. Two other kinds are shown "
+        "beside it: aleatoric (noise) and modal (several outcomes are possible)."
+    )
+    caption = (
+        "Share of the transitions imagined while training, up to each budget, that went into the replay memory of "
+        "imagined transitions. Mean over seeds."
+    )
+    why = "nothing was imagined"
+    table = _table("acceptance", "imagined transitions kept (%) up to", data.acceptance, percent, caption, why)
+    return Section("Imagined transitions kept", [words], tables=[table])
 
 
 def threshold(data: ReportData) -> Section | None:
@@ -381,57 +385,26 @@ def _cost_row(data: ReportData, agent: str) -> list[str]:
     return [agent_title(agent), count(price.env_steps), *map(seconds, times), f"{faults} of {played:,}"]
 
 
-# Figures -----------------------------------------------------------------------------------------------------------
-
-
 def success_figure(data: ReportData) -> Figure:
     """Success (%) by real training episodes, with 95 % intervals, chance level, optimum and the thesis' points."""
-    levels = {"optimum": data.facts.optimum, "chance level": data.facts.chance_level}
-    curves = {agent: {b: each.success for b, each in row.items()} for agent, row in data.scores.items()}
-    figure, axes = _against_episodes(data, curves, data.thesis, levels)
-    axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
-    return figure
-
-
-def gain_figure(data: ReportData) -> Figure:
-    """Gain over DQN (%) by real training episodes, beside the thesis' (figures 5.5 and 5.7).
-
-    Only agents of which the thesis gives a gain are shown: others' may be tens of times as large.
-    """
-    printed = {agent: {b: (gain, 0.0) for b, gain in rows.items()} for agent, rows in data.thesis_gains.items()}
-    curves = {agent: {b: each.gain for b, each in data.comparisons[agent].items()} for agent in printed}
-    figure, axes = _against_episodes(data, curves, printed, {"as DQN": 0.0})
-    axes.set(ylabel="gain over DQN (%)")
-    return figure
-
-
-def _against_episodes(
-    data: ReportData, curves: Mapping[str, Mapping[int, Estimate]],
-    printed: Mapping[str, Mapping[int, tuple[float, float]]], levels: Mapping[str, float],
-) -> tuple[Figure, Axes]:  # fmt: skip
-    """Curves in percent by real episodes, the thesis' points near them, and lines at some levels."""
-    figure, axes = figures.panel(max(4.9, 0.5 * len(curves)))
-    for level in levels.values():
-        axes.axhline(100.0 * level, **figures.REFERENCE)
-    marks = {"this run, band: 95 % interval": {"marker": "o"}}
-    marks[" and ".join(levels)] = figures.REFERENCE
+    figure, axes = figures.panel(max(4.9, 0.5 * len(data.agents)))
     ticks = set(data.budgets)
-    for agent, values in curves.items():
-        figures.curve(axes, values, scale=100.0, color=figures.color(agent), label=agent_title(agent))
-        if shown := _near(data, printed.get(agent, {})):
-            means, stds = 100.0 * np.array([printed[agent][budget] for budget in shown]).T
-            axes.errorbar(shown, means, stds, color=figures.color(agent), elinewidth=0.8, capsize=2, **_DIAMONDS)
-            marks["thesis, bar: standard deviation"] = _DIAMONDS
-            ticks |= {shown[0], shown[-1]}
+    for level in (data.facts.optimum, data.facts.chance_level):
+        axes.axhline(100.0 * level, **figures.REFERENCE)
+    for agent, rows in data.scores.items():
+        color = figures.color(agent)
+        curve = {budget: each.success for budget, each in rows.items()}
+        figures.curve(axes, curve, scale=100.0, color=color, label=agent_title(agent))
+        printed = data.thesis.get(agent, {})
+        near = [budget for budget in printed if budget <= 2.0 * data.budgets[-1]]  # others would leave the run no room
+        if near:
+            means, stds = 100.0 * np.array([printed[budget] for budget in near]).T
+            axes.errorbar(near, means, stds, fmt="D:", color=color, markerfacecolor="none", linewidth=1.0, label="_")
+            ticks |= {near[0], near[-1]}
     figures.log_axis(axes, sorted(ticks))
-    figures.names_right(figure, axes)
-    figures.meanings(axes, marks)
-    return figure, axes
-
-
-def _near(data: ReportData, printed: Mapping[int, object]) -> list[int]:
-    """Budgets of the thesis' values that stand near those of this run; further ones would leave it no room."""
-    return [budget for budget in printed if budget <= 2.0 * data.budgets[-1]]
+    axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
+    figures.names_below(figure)
+    return figure
 
 
 SECTIONS: tuple[Callable[[ReportData], Section | None], ...] = (
@@ -442,7 +415,7 @@ SECTIONS: tuple[Callable[[ReportData], Section | None], ...] = (
     gain,
     exact.policies,
     exact.causes,
-    imagination.acceptance,
+    acceptance,
     imagination.open_loop,
     imagination.sampled_rollouts,
     imagination.filmstrips,

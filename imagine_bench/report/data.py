@@ -8,9 +8,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.errors import SetupError, UnknownNameError
@@ -22,6 +23,7 @@ from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
 from imagine_bench.store.results import BenchResult, Checkpoint, OpenLoop, RunResult
 
+V = TypeVar("V")
 BASE_AGENT = "dqn"  # what gains are measured against, as in the thesis
 _ABSENT = (UnknownNameError, SetupError)
 _SUMMARY_COLUMNS = (
@@ -97,7 +99,6 @@ class Comparison:
     thesis_gain: float | None  # the thesis' gain at this budget, or None
     paired: statistics.PairedTests | None  # of the same starts; None where it is not known which were solved
     paired_p: float  # of these, by Holm over all comparisons
-    paired_detectable: float  # the smallest difference that they would have shown with probability 80 %
     improvement: float  # probability that a run of the agent scores more than one of DQN
 
     @property
@@ -153,33 +154,33 @@ class ReportData:
     @cached_property
     def scores(self) -> dict[str, dict[int, Score]]:
         """Success of every agent; with one seed, the interval is over test episodes (Wilson)."""
-        return {agent: self._scores(agent) for agent in self.agents}
-
-    def _scores(self, agent: str) -> dict[int, Score]:
-        runs = self.result.of(agent)
         found = {}
-        for index, budget in enumerate(self.budgets):
-            shares = self.result.success_rates(agent)[:, index]  # [seeds]
-            row = runs[0].checkpoints[index]
-            ends = statistics.interval(shares, trials=self.result.protocol.evaluation_episodes)
-            if len(runs) == 1:
-                ends = statistics.wilson(row.successes, row.test_episodes)
-            success = Estimate(statistics.iqm(shares), *ends)
-            found[budget] = Score(success, self.thesis.get(agent, {}).get(budget))
+        for agent in self.agents:
+            means = self._estimates(self.result.success_rates(agent))
+            (run, *others) = self.result.of(agent)
+            if not others:
+                for row in run.checkpoints:
+                    ends = statistics.wilson(row.successes, row.test_episodes)
+                    means[row.episodes] = Estimate(means[row.episodes].value, *ends)
+            printed = self.thesis.get(agent, {})
+            found[agent] = {budget: Score(each, printed.get(budget)) for budget, each in means.items()}
         return found
 
     @cached_property
     def areas(self) -> dict[str, dict[int, Estimate]]:
         """Mean success of each learner from episode 0, where it is at the chance level, to each budget."""
-        trials = self.result.protocol.evaluation_episodes
-        found: dict[str, dict[int, Estimate]] = {agent: {} for agent in self.learners}
+        found = {}
         for agent in self.learners:
             shares = self.result.success_rates(agent)
-            means = statistics.running_means(self.budgets, shares, self.facts.chance_level)  # [seeds, B]
-            for budget, each in zip(self.budgets, means.T, strict=True):
-                ends = statistics.interval(each, trials=trials)
-                found[agent][budget] = Estimate(statistics.iqm(each), *ends)
+            means = statistics.running_means(self.budgets, shares, self.facts.chance_level)
+            found[agent] = self._estimates(means)
         return found
+
+    def _estimates(self, shares: NDArray[np.float64]) -> dict[int, Estimate]:
+        """Interquartile means over seeds of shares (seeds, budgets), with intervals."""
+        trials = self.result.protocol.evaluation_episodes
+        columns = zip(self.budgets, shares.T, strict=True)
+        return {b: Estimate(statistics.iqm(each), *statistics.interval(each, trials=trials)) for b, each in columns}
 
     @cached_property
     def reached(self) -> dict[str, tuple[int | None, ...]]:
@@ -214,7 +215,6 @@ class ReportData:
         trials = result.protocol.evaluation_episodes
         shares, base = (result.success_rates(name)[:, index] for name in (agent, BASE_AGENT))
         difference = statistics.difference(shares, base, trials=trials)
-        tests = trials * len(result.protocol.seeds)
         paired = _paired(result.of(agent), result.of(BASE_AGENT), index)
         return Comparison(
             difference=difference,
@@ -224,7 +224,6 @@ class ReportData:
             thesis_gain=self.thesis_gains.get(agent, {}).get(self.budgets[index]),
             paired=paired,
             paired_p=paired.p if paired else math.nan,
-            paired_detectable=statistics.detectable_paired(paired, tests, cells=cells) if paired else math.nan,
             improvement=statistics.probability_of_improvement(shares, base),
         )
 
@@ -243,15 +242,15 @@ class ReportData:
 
         return {agent: self.means(agent, beyond) for agent in self.agents}
 
-    @cached_property
+    def said(self, agent: str, name: str) -> dict[int, float]:
+        """Mean of one of the agent's diagnostics, by budget."""
+        return self.means(agent, lambda row: [row.diagnostics.get(name, math.nan)])
+
+    @property
     def acceptance(self) -> dict[str, dict[int, float]]:
         """Share of imagined transitions that were kept while training to each budget from the one before."""
-        found = {}
-        for agent in self.agents:
-            rates = self.means(agent, lambda row: [row.diagnostics.get("imagination/acceptance_rate", math.nan)])
-            if known := {budget: rate for budget, rate in rates.items() if not math.isnan(rate)}:
-                found[agent] = known
-        return found
+        found = {agent: self.said(agent, "imagination/acceptance_rate") for agent in self.agents}
+        return {agent: rates for agent, rates in found.items() if not all(map(math.isnan, rates.values()))}
 
     def means(self, agent: str, values: Callable[[Checkpoint], Sequence[float]]) -> dict[int, float]:
         """Mean of the finite values of all seeds, by budget; NaN where there is none."""
@@ -264,7 +263,7 @@ class ReportData:
     def prices(self, agent: str) -> dict[int, Price]:
         """What an agent had had, by budget."""
         steps = self.means(agent, lambda row: [row.env_steps])
-        updates = self.means(agent, lambda row: [row.diagnostics.get("gradient_updates", math.nan)])
+        updates = self.said(agent, "gradient_updates")
         cpu_s = self.means(agent, lambda row: [row.train_cpu_s])
         return {budget: Price(steps[budget], updates[budget], cpu_s[budget]) for budget in self.budgets}
 
@@ -291,16 +290,17 @@ class ReportData:
     @cached_property
     def thesis(self) -> dict[str, dict[int, tuple[float, float]]]:
         """Mean and standard deviation of success in the thesis."""
-        source = self.spec.reference
-        found = {agent: reference.success(source, agent) if source else {} for agent in self.agents}
-        return {agent: rows for agent, rows in found.items() if rows}
+        return self._printed(reference.success)
 
     @cached_property
     def thesis_gains(self) -> dict[str, dict[int, float]]:
         """Gains over DQN in the thesis."""
+        return self._printed(reference.gain)
+
+    def _printed(self, lookup: Callable[[str, str], dict[int, V]]) -> dict[str, dict[int, V]]:
         source = self.spec.reference
-        found = {agent: reference.gain(source, agent) if source else {} for agent in self.agents}
-        return {agent: gains for agent, gains in found.items() if gains}
+        found = {agent: lookup(source, agent) for agent in self.agents} if source else {}
+        return {agent: rows for agent, rows in found.items() if rows}
 
 
 def collect(result: BenchResult) -> ReportData:
@@ -335,23 +335,28 @@ def open_loop_csv(result: BenchResult) -> str:
 def summary_csv(data: ReportData) -> str:
     """One row an agent and budget: score, interval, thesis, difference to DQN, gain."""
     rows = [_summary_row(data, agent, budget) for agent in data.agents for budget in data.budgets]
-    return csv_text([list(_SUMMARY_COLUMNS), *rows])
+    return csv_text([_SUMMARY_COLUMNS, *rows])
 
 
 def _summary_row(data: ReportData, agent: str, budget: int) -> list[object]:
     seeds = len(data.result.protocol.seeds)
-    score = data.scores[agent][budget]
-    row: list[object] = [agent, budget, seeds, *score.success[:3], "episodes" if seeds == 1 else "seeds"]
-    row += score.thesis or ["", ""]
-    versus = data.comparisons.get(agent, {}).get(budget)
-    if versus is None:
-        row += [""] * 15
-    else:
-        row += [*versus.difference, versus.p_adjusted, versus.detectable, *versus.gain[:3], versus.thesis_gain]
-        row += [*(versus.paired or [""] * 3), versus.paired_p, versus.improvement]
+    success, thesis = data.scores[agent][budget]
     excess = data.excess.get(agent, {}).get(budget, math.nan)
-    row.append("" if math.isnan(excess) else excess)
-    return row + list(data.areas[agent][budget][:3] if agent in data.areas else [""] * 3)
+    areas = data.areas.get(agent)
+    versus = data.comparisons.get(agent, {}).get(budget)
+    compared: list[object] = [""] * 15
+    if versus is not None:
+        compared = [*versus.difference, versus.p_adjusted, versus.detectable, *versus.gain[:3], versus.thesis_gain]
+        compared += [*(versus.paired or [""] * 3), versus.paired_p, versus.improvement]
+    return [
+        *(agent, budget, seeds),
+        *success[:3],
+        "episodes" if seeds == 1 else "seeds",
+        *(thesis or ["", ""]),
+        *compared,
+        "" if math.isnan(excess) else excess,
+        *(areas[budget][:3] if areas else [""] * 3),
+    ]
 
 
 def _paired(treated: tuple[RunResult, ...], base: tuple[RunResult, ...], index: int) -> statistics.PairedTests | None:

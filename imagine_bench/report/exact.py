@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from imagine_bench.exact.certificate import certificate_rows
 from imagine_bench.interfaces import State, TaskSpec
@@ -47,23 +46,9 @@ def world(data: ReportData) -> Section | None:
         "optimum": f"{percent(found.optimum)} % by perfect play that remembers all that frames showed",
         **certificate_rows(found),
     }
-    lengths = found.plan_lengths
-    caption = "Fewest macro-actions after which a success is possible, by start."
     words = ["Nothing here is measured: all of it follows from the rules, by enumeration."]
-    images = [figures.plot("plans", lambda: _plan_lengths(lengths), caption)]
     table = Table("certificate", ["", "certificate"], [*map(list, rows.items())], prose=True)
-    return Section("The world", words, images, [table])
-
-
-def _plan_lengths(lengths: Sequence[tuple[int, int]]) -> Figure:
-    """Starts by the fewest macro-actions that they need; those that need -1 cannot be solved."""
-    figure, axes = figures.panel(2.4)
-    names = ["none" if length < 0 else str(length) for length, _ in lengths]
-    bars = axes.bar(names, [starts for _, starts in lengths], color=figures.COLORS[2], width=0.5)
-    axes.bar_label(bars, fmt="{:,.0f}")
-    axes.margins(y=0.2)
-    axes.set(xlabel="macro-actions of the shortest plan", ylabel="starts")
-    return figure
+    return Section("The world", words, tables=[table])
 
 
 # Policies ----------------------------------------------------------------------------------------------------------
@@ -95,42 +80,33 @@ def policies(data: ReportData) -> Section | None:
         return None
     starts = _starts(data)
     optimal = optimal_length(data.spec, starts)
+    needs = optimal.round().astype(int)
     titles = list(map(agent_title, found))
     solved = np.array([np.mean([one.success for one in seeds], axis=0) for seeds in found.values()])  # [agents, starts]
+    worst = np.min([one.success for seeds in found.values() for one in seeds], axis=0)  # [starts]
+    missed = [at for at in np.argsort(solved.mean(axis=0), kind="stable") if worst[at] < _SURE]
     rows = []
     for title, seeds in zip(titles, found.values(), strict=True):
         shares = [mean_text([float(getattr(one, name).mean()) for one in seeds]) for name in _SHARES]
-        length = mean_text([float(one.length.mean()) for one in seeds], decimals)
-        rows.append([title, *shares, length])
+        rows.append([title, *shares, mean_text([float(one.length.mean()) for one in seeds], decimals)])
+    lengths = []
+    for need in np.unique(needs):
+        here = needs == need
+        lengths.append([str(need), str(here.sum()), *map(percent, solved[:, here].mean(axis=1))])
+    listed = []
+    for at in missed[:_LISTED]:
+        listed.append([_start_words(data.spec, starts[at]), decimals(optimal[at]), *map(percent, solved[:, at])])
     header = ["agent, %", *_SHARES.values(), f"macro-actions (optimal: {optimal.mean():.2f})"]
     caption = f"After {data.budgets[-1]:,} real episodes, from all {len(starts)} starts. Means over seeds [95 %]."
-    needs = optimal.round().astype(int)
-    by_need = [
-        [str(need), str((needs == need).sum()), *map(percent, solved[:, needs == need].mean(axis=1))]
-        for need in np.unique(needs)
-    ]
+    missing = f"Solved, %. {len(missed)} starts are not always solved by every run."
+    words = "Each policy is followed by the rules: no episode is sampled, and no frame misread that can be read right."
     tables = [
         Table("policies", header, rows, caption),
-        Table(
-            "policies_by_length",
-            ["optimal macro-actions", "starts", *titles],
-            by_need,
-            "Solved, %, by what an optimal agent needs.",
-            folded="By the length of the optimal plan",
-        ),
+        Table("policies_by_length", ["optimal macro-actions", "starts", *titles], lengths, "Solved, %."),
+        Table("policies_missed", ["start", "optimal macro-actions", *titles], listed, missing),
     ]
-    worst = np.min([one.success for seeds in found.values() for one in seeds], axis=0)  # [starts]
-    missed = [at for at in np.argsort(solved.mean(axis=0), kind="stable") if worst[at] < _SURE]
-    if missed:
-        listed = [
-            [_start_words(data.spec, starts[at]), decimals(optimal[at]), *map(percent, solved[:, at])]
-            for at in missed[:_LISTED]
-        ]
-        header = ["start", "optimal macro-actions", *titles]
-        caption = f"Solved, %. {len(missed)} starts are not always solved by every run."
-        tables.append(Table("policies_missed", header, listed, caption, folded="The starts that are solved least"))
-    words = "Each policy is followed by the rules: no episode is sampled, and no frame misread that can be read right."
-    return Section("Where the greedy policies lead", [words], tables=tables)
+    shown = [table for table in tables if table.rows]
+    return Section("Where the greedy policies lead", [words], tables=shown)
 
 
 def _start_words(spec: TaskSpec, state: State) -> str:

@@ -70,9 +70,7 @@ _LONG = 32  # letters of a title that stand in one line beside a figure
 _EPISODES = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000)
 
 
-def image(
-    name: str, draw: Callable[[], Figure], caption: str, *, alt: str = "", svg: bool = False, dpi: int = 150
-) -> Image:
+def image(name: str, draw: Callable[[], Figure], caption: str, *, svg: bool = False, dpi: int = 150) -> Image:
     """A figure in the style of all reports, as PNG of so many pixels an inch and, with ``svg``, as inline SVG too."""
 
     def drawn() -> tuple[bytes, str]:
@@ -86,9 +84,9 @@ def image(
             if svg:
                 figure.savefig(vector, format="svg", metadata={"Date": None})
             figure.savefig(png, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
-        return png.getvalue(), _inline(vector.getvalue(), name, alt or caption) if svg else ""
+        return png.getvalue(), _inline(vector.getvalue(), name, caption) if svg else ""
 
-    return Image(name, drawn, caption, alt or caption)
+    return Image(name, drawn, caption)
 
 
 def plot(name: str, draw: Callable[[], Figure], caption: str) -> Image:
@@ -118,6 +116,11 @@ def color(agent: str, known: Iterable[str] | None = None) -> str:
     place = names.index(base) if base in names else sum(base.encode())
     other = 1 + crc32(agent.encode()) % (len(COLORS) - 1) if agent != base else 0  # never that of the agent as it is
     return COLORS[(place + other) % len(COLORS)]
+
+
+def colors(agents: Iterable[str]) -> dict[str, str]:
+    """The colors of agents by title."""
+    return {agent_title(agent): color(agent) for agent in agents}
 
 
 def wrapped(title: str) -> str:
@@ -156,6 +159,24 @@ def curve(axes: Axes, values: Mapping[Any, float | Estimate], *, scale: float = 
     axes.fill_between(list(values), table[:, 1], table[:, 2], color=line.get_color(), alpha=0.18, linewidth=0)
 
 
+def lines(
+    panels: Mapping[str, Mapping[str, Mapping[Any, float]]], by_name: Mapping[str, str], xlabel: str, ylabel: str = "",
+    columns: int = 3,
+) -> Figure:  # fmt: skip
+    """A curve a name in each panel, by title; names have the same color everywhere and stand below."""
+    columns = min(columns, len(panels))
+    figure, every = small_multiples(len(panels), columns, width=9.0 / columns, height=max(2.2, 6.0 / columns))
+    for axes, (title, curves) in zip(every, panels.items(), strict=True):
+        for name, values in curves.items():
+            curve(axes, values, color=by_name[name], label=name)
+        axes.set_title(title, fontsize=9.5)
+        axes.margins(y=0.06)  # lines along an axis are seen whole
+    figure.supxlabel(xlabel)
+    figure.supylabel(ylabel)
+    names_below(figure)
+    return figure
+
+
 def log_axis(
     axes: Axes, ticks: Mapping[float, str] | Sequence[int], label: str = "real training episodes (logarithmic)"
 ) -> None:
@@ -167,18 +188,9 @@ def log_axis(
     axes.set_xlabel(label)
 
 
-def names_right(figure: Figure, axes: Axes) -> None:
-    """The names of a panel's lines right of it, in the order in which the lines end."""
-    lines = {str(line.get_label()): line for line in axes.get_lines() if not str(line.get_label()).startswith("_")}
-    ends = {name: np.nan_to_num(np.asarray(line.get_ydata(), dtype=float)[-1]) for name, line in lines.items()}
-    ranked = sorted(lines, key=lambda name: -ends[name])
-    figure.legend([lines[name] for name in ranked], list(map(wrapped, ranked)), loc="outside right center")
-
-
-def meanings(axes: Axes, styles: Mapping[str, dict[str, Any]]) -> None:
-    """The meanings of kinds of line, above a panel."""
-    shown = [axes.plot([], [], **{"color": INK, "label": "_", **style})[0] for style in styles.values()]
-    axes.legend(shown, list(styles), loc="lower left", bbox_to_anchor=(-0.06, 1.0), ncols=len(styles))
+def names_below(figure: Figure) -> None:
+    """The names of the first panel's lines or bars, below all panels."""
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
 
 class Rung(NamedTuple):
@@ -254,9 +266,9 @@ def causes_figure(found: Failures) -> Figure:
         axes.set_title(agent_title(agent), fontsize=9.5)
         axes.tick_params(axis="x", rotation=45)
         axes.set_ylim(0, 100)
-    figure.supxlabel("real training episodes", fontsize=10.5)
-    figure.supylabel("test episodes that failed (%)", fontsize=10.5)
-    figure.legend(*every[0].get_legend_handles_labels(), loc="outside upper center", ncols=max(1, len(shown)))
+    figure.supxlabel("real training episodes")
+    figure.supylabel("test episodes that failed (%)")
+    names_below(figure)
     return figure
 
 
@@ -264,16 +276,12 @@ def radar_figure(spokes: Sequence[str], scores: Mapping[str, Sequence[Estimate]]
     """Scores of agents, 0 in the middle and 1 at the rim, by spoke; NaN is a gap, and below 0 is drawn at 0."""
     figure = Figure(figsize=(8.4, 6.8), layout="constrained")
     axes = figure.add_subplot(projection="polar", theta_offset=np.pi / 2.0, theta_direction=-1)
-    angles = np.linspace(0.0, 2.0 * np.pi, len(spokes), endpoint=False)
-    for number, (agent, estimates) in enumerate(scores.items()):
-        values, low, high = np.clip(np.array([each[:3] for each in estimates]).T, 0.0, 1.0)
-        around = angles + 0.05 * (number - (len(scores) - 1) / 2.0)  # apart, so that no interval covers another
-        style: dict[str, Any] = {"color": color(agent), "linewidth": 1.8}
-        axes.plot([*around, around[0]], [*values, values[0]], label=agent_title(agent), alpha=0.8, **style)
-        axes.vlines(around, low, high, alpha=0.5, **style)
-        axes.plot(around, values, "o", color=color(agent))
-    axes.set(ylim=(0.0, 1.0), yticks=(0.25, 0.5, 0.75, 1.0), yticklabels=("0.25", "0.5", "0.75", "1"))
-    axes.set_xticks(angles, [spoke.replace("_", " ") for spoke in spokes])
-    axes.tick_params(axis="x", pad=12)
-    figure.legend(loc="outside lower center", ncols=4)
+    angles = np.linspace(0.0, 2.0 * np.pi, len(spokes) + 1)
+    for agent, estimates in scores.items():
+        ends = np.clip([each[:3] for each in (*estimates, estimates[0])], 0.0, 1.0)
+        around = {angle: Estimate(*each) for angle, each in zip(angles, ends, strict=True)}
+        curve(axes, around, color=color(agent), label=agent_title(agent))
+    axes.set(ylim=(0.0, 1.0), yticks=(0.25, 0.5, 0.75, 1.0))
+    axes.set_xticks(angles[:-1], [spoke.replace("_", " ") for spoke in spokes])
+    names_below(figure)
     return figure

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.recording.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
@@ -35,7 +32,7 @@ _MEASURES = (
     ("aleatoric", "aleatoric", "{:.3g}"),
     ("modal", "modal", "{:.3g}"),
 )
-_KINDS = {"epistemic": "-", "aleatoric": "--", "modal": ":"}
+_KINDS = ("epistemic", "aleatoric", "modal")
 _CARD_NAMES = {
     "code_sizes": "values of each factor",
     "cpu_s": "CPU seconds",
@@ -46,35 +43,6 @@ _CARD_NAMES = {
     "probe": "probe accuracy",
 }
 _CARD_HIDDEN = {"format", "cardinalities"}
-
-
-def acceptance(data: ReportData) -> Section | None:
-    """Imagined transitions that the filter kept."""
-    if not data.acceptance:
-        return None
-    words = (
-        "An imagined rollout is a chain of transitions that the agent's world model predicts, starting from a real "
-        "image; depth counts its macro-actions. The uncertainty filter cuts a rollout at the first transition whose "
-        "epistemic uncertainty (what the model does not know for want of data) is too high. Two other kinds are shown "
-        "beside it: aleatoric (noise) and modal (several outcomes are possible)."
-    )
-    caption = (
-        "Share of the transitions imagined while training, up to each budget, that went into the replay memory of "
-        "imagined transitions. Mean over seeds."
-    )
-    image = figures.plot("acceptance", lambda: acceptance_figure(data), caption)
-    return Section("Imagined transitions kept", [words], [image])
-
-
-def acceptance_figure(data: ReportData) -> Figure:
-    """Share of imagined transitions kept (%) while training up to each budget."""
-    figure, axes = figures.panel(2.9)
-    for agent, rates in data.acceptance.items():
-        figures.curve(axes, rates, scale=100.0, color=figures.color(agent), label=agent_title(agent))
-    axes.set(xlabel="real training episodes", ylabel="transitions kept (%)", ylim=(-3, 106))
-    axes.set_xlim(left=0)
-    figures.names_right(figure, axes)
-    return figure
 
 
 def open_loop(data: ReportData) -> Section | None:
@@ -112,31 +80,14 @@ def _value(value: float, form: str) -> str:
 
 
 def open_loop_figure(data: ReportData) -> Figure:
-    """Four panels by imagined depth: correct share, reward error, termination error, uncertainties."""
-    figure, panels = figures.small_multiples(4, 2, width=4.2, height=3.0)
-    uncertainty = panels[3]
+    """The measures of the tables by imagined depth, a panel each; an agent that knows no such uncertainty says 0."""
+    panels: dict[str, dict[str, dict[int, float]]] = {words: {} for _, words, _ in _MEASURES[1:]}
     for agent, loop in data.open_loop.items():
-        color = figures.color(agent)
-        _line(panels[0], 100.0 * loop.correct, color, label=agent_title(agent))
-        if (loop.accepted < 1.0).any():
-            _line(panels[0], 100.0 * loop.correct_accepted, color, linestyle="--")
-        _line(panels[1], loop.reward_mae, color)
-        _line(panels[2], 100.0 * loop.termination_error, color)
-        for name, style in _KINDS.items():
-            if getattr(loop, name).any():  # an agent that knows no such kind says 0
-                _line(uncertainty, getattr(loop, name), color, linestyle=style)
-    labels = ("right macrostates (%), dashed: kept", "error of the reward", "wrong about the end (%)", "variance")
-    for axes, label in zip(panels, labels, strict=True):
-        axes.set(xlabel="imagined depth (macro-actions)", ylabel=label)
-        axes.margins(y=0.06)  # lines of zeros are seen whole
-    uncertainty.set_yscale("symlog", linthresh=1e-4)
-    figures.meanings(uncertainty, {name: {"linestyle": style} for name, style in _KINDS.items()})
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    return figure
-
-
-def _line(axes: Axes, values: NDArray[np.float64], color: str, **style: Any) -> None:
-    figures.curve(axes, dict(enumerate(values, 1)), **{"color": color, "label": "_", "markersize": 3.5, **style})
+        for name, words, form in _MEASURES[1:]:
+            values = (100.0 if form == "%" else 1.0) * getattr(loop, name)
+            if name not in _KINDS or values.any():
+                panels[words][agent_title(agent)] = dict(enumerate(values, 1))
+    return figures.lines(panels, figures.colors(data.agents), "imagined depth (macro-actions)")
 
 
 def sampled_rollouts(data: ReportData) -> Section | None:

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.change import FALSE_ALARMS, LENGTH, SLIP
 from imagine_bench.judge.judgement import Judgement, kept, prepare, shown
@@ -91,7 +91,10 @@ _SHARES = {
     *(name for name in COLUMNS if name.startswith("auroc")),
 }
 _WHY_DASH = "not offered by the model, or nothing to tell apart"
-_TELLING = 0.1  # total variation
+Series = dict[str, dict[Any, float]]
+Panels = dict[str, Series]
+Pixels = NDArray[np.uint8]
+Rows = Sequence[tuple[str, Sequence[Pixels], Sequence[bool] | None]]
 
 
 @dataclass(frozen=True)
@@ -130,9 +133,17 @@ class Judged:
         return f" after {self.last:,} transitions" if self.judgement.learning else ""
 
     @cached_property
-    def images(self) -> dict[str, dict[str, Any]]:
+    def images(self) -> dict[str, Arrays]:
         """Arrays of the images that are kept, by model."""
         return shown(self.folder, self.judgement)
+
+    def means(self, name: str, places: Sequence[float], size: int, models: Iterable[str]) -> Series:
+        """Means over seeds of a curve that models have at these places, by model."""
+        found = {}
+        for model in models:
+            if own := [cell[name] for cell in self.cells.get((model, size), []) if cell[name]]:
+                found[model] = dict(zip(places, np.mean(own, axis=0).tolist(), strict=True))
+        return found
 
     def scores(self, model: str, size: int, name: str) -> list[float]:
         """A score of each seed, by name; ``tv_5`` is the total variation at depth 5. NaN where there is none."""
@@ -252,22 +263,23 @@ def by_start(found: Judged) -> Section:
 
 
 def compared(found: Judged) -> Section:
-    """Each pair's difference in total variation at the most transitions, and a line on the two best."""
-    pairs = list(itertools.combinations(found.models, 2))
+    """Each pair's difference in total variation at the most transitions, and a line on the two best that learned."""
     values = {model: found.scores(model, found.last, "total_variation") for model in found.models}
-    differences = [difference(values[a], values[b]) for a, b in pairs]
-    adjusted = holm([each.p for each in differences])
-    rows: list[list[str | Cell]] = []
-    answers = []
     learned = [model for model in found.models if not model_entry(model).privileged]
     best = sorted(learned, key=lambda model: iqm(values[model]))[:2]
-    for (a, b), each, p in zip(pairs, differences, adjusted, strict=True):
+    pairs = list(itertools.combinations(found.models, 2))
+    differences = [difference(values[a], values[b]) for a, b in pairs]
+    rows: list[list[str | Cell]] = []
+    answers = []
+    for pair, each, p in zip(pairs, differences, holm([each.p for each in differences]), strict=True):
         cell = estimate(each, number)
-        rows.append([_title(a), _title(b), cell, number(p)])
-        if {a, b} == set(best):
+        rows.append([*map(_title, pair), cell, number(p)])
+        if set(pair) == set(best):
             first, second = (f"{_title(model)} ({number(iqm(values[model]))})" for model in best)
-            shown = f"{p_value(p)}, Holm-corrected: {'no difference is shown' if p >= 0.05 else 'it is better'}"
-            verdict = "one seed does not show which is better" if math.isnan(p) else f"difference {cell}, {shown}"
+            shown = "it is better" if p < 0.05 else "no difference is shown"
+            verdict = f"difference {cell}, {p_value(p)}, Holm-corrected: {shown}"
+            if math.isnan(p):
+                verdict = "one seed does not show which is better"
             answers.append(f"Smallest total variation{found.after}: {first}, then {second}; {verdict}.")
     header = ["model", "against", "difference of total variation", "p"]
     caption = f"Total variation of one step{found.after}; Yuen's test over seeds, p by Holm."
@@ -278,103 +290,70 @@ def compared(found: Judged) -> Section:
 # Figures -----------------------------------------------------------------------------------------------------------
 
 
-def _draw(axes: Axes, x: Sequence[float], series: Mapping[str, Sequence[float]], **settings: Any) -> None:
-    """A line a model, each in the color that it has in every figure."""
-    for model, values in series.items():
-        color = figures.color(model, registry.world_models())
-        figures.curve(axes, dict(zip(x, values, strict=True)), color=color, label=_title(model))
-    axes.set(**settings)
-
-
-def _lines(x: Sequence[float], series: Mapping[str, Sequence[float]], **settings: Any) -> tuple[Figure, Axes]:
-    figure, axes = figures.panel()
-    _draw(axes, x, series, ylim=(-0.03, 1.05), **settings)
-    figures.names_right(figure, axes)
-    return figure, axes
+def _plot(name: str, panels: Panels, xlabel: str, ylabel: str, caption: str) -> Image:
+    """Panels by title, each a curve a model, in the color that it has in every figure."""
+    models = {model for series in panels.values() for model in series}
+    known = registry.world_models()
+    colors = {_title(model): figures.color(model, known) for model in models}
+    shown = {}
+    for title, series in panels.items():
+        shown[title] = {_title(model): values for model, values in series.items()}
+    return figures.plot(name, lambda: figures.lines(shown, colors, xlabel, ylabel), caption)
 
 
 def curve(found: Judged) -> Section | None:
     """Two scores by the transitions that models learned from."""
-    sizes = found.judgement.sizes
-
-    def draw() -> Figure:
-        figure, panels = figures.small_multiples(2, 2, width=4.2, height=3.3)
-        names = {"total_variation": "total variation, 1 step", "value_loss": "value loss"}
-        for axes, (name, label) in zip(panels, names.items(), strict=True):
-            series = {}
-            for model in found.judgement.learning:
-                series[model] = [float(np.mean(found.scores(model, size, name) or math.nan)) for size in sizes]
-            _draw(axes, sizes, series, ylabel=label)
-            figures.log_axis(axes, sizes, "transitions of the same data")
-        figure.legend(*panels[0].get_legend_handles_labels(), ncols=4, loc="outside lower center")
-        return figure
-
-    if not found.judgement.learning:
+    learning = found.judgement.learning
+    if not learning:
         return None
-    caption = "Total variation and value loss by transitions; mean over seeds. Every model learns from the same ones."
-    return Section("How much data does it need?", images=[figures.plot("curve", draw, caption)])
+    panels: Panels = {COLUMNS[name]: {model: {} for model in learning} for name in ("total_variation", "value_loss")}
+    for name, (model, size) in itertools.product(("total_variation", "value_loss"), found.cells):
+        if model in learning:
+            panels[COLUMNS[name]][model][f"{size:,}"] = float(np.mean(found.scores(model, size, name)))
+    caption = "Means over seeds. Every model learns from the same transitions."
+    image = _plot("curve", panels, "transitions", "0 is best", caption)
+    return Section("How much data does it need?", images=[image])
 
 
 def depth(found: Judged) -> Section:
     """Total variation by imagined depth."""
     samples = found.judgement.samples
     truth = prepare(found.judgement, found.folder).rollouts.truth
-    noise = [[sampling_noise_floor(shares(outcomes), samples) for outcomes in steps] for steps in truth]
-    series = {}
-    for model in found.models:
-        series[model] = np.mean([cell["tv_by_depth"] for cell in found.cells[model, found.last]], axis=0).tolist()
-    steps = range(1, 1 + len(noise[0]))
-
-    def draw() -> Figure:
-        figure, axes = _lines(steps, series, xlabel="imagined macro-actions", ylabel="total variation")
-        axes.plot(steps, np.mean(noise, axis=0), ":", color=figures.GRAY)
-        return figure
-
-    caption = (
-        f"Total variation to the exact distribution by depth{found.after}; dotted: the part that comes from drawing "
-        f"only {samples} samples."
-    )
-    return Section("How far ahead?", images=[figures.plot("depth", draw, caption)])
+    noise = np.mean([[sampling_noise_floor(shares(each), samples) for each in steps] for steps in truth], axis=0)
+    steps = range(1, 1 + len(noise))
+    series = found.means("tv_by_depth", steps, found.last, found.models)
+    floor = ", ".join(f"{share:.2f}" for share in noise)
+    caption = f"Means over seeds{found.after}. Drawing only {samples} samples adds at most {floor}, by depth."
+    image = _plot("depth", {"": series}, "imagined macro-actions", "total variation", caption)
+    return Section("How far ahead?", images=[image])
 
 
 def risk(found: Judged) -> Section | None:
-    """Risk against coverage, where more than one model errs in a tenth of all; nothing where none is uncertain."""
-    risks = {size: _risks(found, size) for size in found.judgement.sizes}
-    telling = [size for size, each in risks.items() if sum(curve[-1] > _TELLING for curve in each.values()) > 1]
-    known = [size for size, each in risks.items() if each]
-    if not known:
+    """Risk against coverage of the models that learned and say how sure they are."""
+    learned = [model for model in found.models if not model_entry(model).privileged]
+    answered = [100.0 * share for share in COVERAGES]
+    panels = {}
+    for size in found.judgement.sizes:
+        if series := found.means("risk", answered, size, learned):
+            panels[f"{size:,} transitions"] = series
+    if not panels:
         return None
-    size = telling[-1] if telling else known[0]
-    percentages = [100.0 * share for share in COVERAGES]
-    labels = {"xlabel": "questions answered, the surest first (%)", "ylabel": "total variation of those answered"}
-    caption = (
-        "A model that knows its errors has a curve that is low on the left. Models without an uncertainty are not "
-        f"here. Mean over seeds{f' after {size:,} transitions' if found.judgement.learning else ''}."
-    )
-    image = figures.plot("risk_coverage", lambda: _lines(percentages, risks[size], **labels)[0], caption)
+    caption = "A model that knows its errors has a curve that is low on the left. Means over seeds."
+    image = _plot("risk_coverage", panels, "answered, the surest first (%)", "total variation", caption)
     return Section("The errors of the surest answers", images=[image])
-
-
-def _risks(found: Judged, size: int) -> dict[str, list[float]]:
-    """Mean risk by coverage of each model that learned and says how sure it is."""
-    curves = {}
-    for model in found.models:
-        own = [cell["risk"] for cell in found.cells.get((model, size), []) if cell["risk"]]
-        if own and not model_entry(model).privileged:
-            curves[model] = np.mean(own, axis=0).tolist()
-    return curves
 
 
 # Images ------------------------------------------------------------------------------------------------------------
 
 
-def _sheet(name: str, caption: str, titles: Sequence[str], rows: Sequence[tuple[str, Any, Any]]) -> Image:
-    """Rows of images below titles: a name, the images, and whether each may happen (None: it is real)."""
-    return Image.of(name, png(transition_sheet(titles, list(rows))), caption)
+def _sheet(name: str, caption: str, titles: Sequence[str], real: Rows, imagined: Rows) -> Image:
+    """Images below titles, real ones above and imagined ones with whether each may happen."""
+    rows = [*real, *((title, [_rgb(each) for each in images], right) for title, images, right in imagined)]
+    return Image.of(name, png(transition_sheet(titles, rows)), caption)
 
 
-def _rgb(images: Any) -> list[Any]:
-    return [each if each.ndim == 3 else np.repeat(each[:, :, None], 3, axis=2) for each in images]
+def _rgb(image: Pixels) -> Pixels:
+    return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
 def futures(found: Judged) -> Section | None:
@@ -385,12 +364,13 @@ def futures(found: Judged) -> Section | None:
     one = next(iter(found.images.values()))
     start = one["futures_before"][0]
     titles = ["start", *(f"{step}. {names[action]}" for step, action in enumerate(one["futures_actions"][0], 1))]
-    rows: list[tuple[str, Any, Any]] = [("real", [start, *one["futures_real"][0]], None)]
+    real = [("real", [start, *one["futures_real"][0]], None)]
+    imagined = []
     for model, arrays in found.images.items():
-        imagined = [start, *_rgb(arrays["futures_imagined"][0])]
-        rows.append((_title(model), imagined, [True, *arrays["futures_right"][0].tolist()]))
+        right = [True, *arrays["futures_right"][0].tolist()]
+        imagined.append((_title(model), [start, *arrays["futures_imagined"][0]], right))
     caption = "One real start and the same macro-actions, real and as each model imagines them."
-    return Section("One future", images=[_sheet("futures", caption, titles, rows)])
+    return Section("One future", images=[_sheet("futures", caption, titles, real, imagined)])
 
 
 def where(found: Judged) -> Section:
@@ -401,10 +381,9 @@ def where(found: Judged) -> Section:
             for kind, each in cell["where"].items():
                 for name, value in each.items():
                     groups.setdefault((kind, name), {}).setdefault(model, []).append(value)
-    rows: list[list[str | Cell]] = [
-        [kind, name, *(mean_cell(values.get(model, []), share=True) for model in found.models)]
-        for (kind, name), values in groups.items()
-    ]
+    rows: list[list[str | Cell]] = []
+    for group, values in groups.items():
+        rows.append([*group, *(mean_cell(values.get(model, []), share=True) for model in found.models)])
     header = ["by", "which", *map(_title, found.models)]
     caption = f"Total variation of one step{found.after}; of a coordinate, that of it alone."
     table = Table("where", header, rows, caption, "no such transition")
@@ -420,15 +399,15 @@ def where(found: Judged) -> Section:
     return Section("Where it fails", tables=[table], images=images)
 
 
-def _transitions(found: Judged, name: str, caption: str, kind: str, imagined: Mapping[str, dict[str, Any]]) -> Image:
+def _transitions(found: Judged, name: str, caption: str, kind: str, models: Mapping[str, Arrays]) -> Image:
     """Transitions of a kind before and after, real and imagined."""
-    one = next(iter(imagined.values()))
+    one = next(iter(models.values()))
     titles = [found.spec.action_names[action] for action in one[f"{kind}_actions"][:, 0]]
-    rows: list[tuple[str, Any, Any]] = [("before", list(one[f"{kind}_before"]), None)]
-    rows.append(("real", list(one[f"{kind}_real"][:, 0]), None))
-    for title, arrays in imagined.items():
-        rows.append((title, _rgb(arrays[f"{kind}_imagined"][:, 0]), arrays[f"{kind}_right"][:, 0].tolist()))
-    return _sheet(name, caption, titles, rows)
+    real = [("before", list(one[f"{kind}_before"]), None), ("real", list(one[f"{kind}_real"][:, 0]), None)]
+    imagined = []
+    for title, arrays in models.items():
+        imagined.append((title, list(arrays[f"{kind}_imagined"][:, 0]), arrays[f"{kind}_right"][:, 0].tolist()))
+    return _sheet(name, caption, titles, real, imagined)
 
 
 SECTIONS: tuple[Callable[[Judged], Section | None], ...] = (

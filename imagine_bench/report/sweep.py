@@ -141,7 +141,7 @@ def suite_page(result: SuiteResult) -> Page:
             "scores.csv": scores_csv(result),
             "suite.json": json_text({**definition, "made": dict(made)}),
         },
-        colors={agent_title(agent): figures.color(agent) for agent in result.agents},
+        colors=figures.colors(result.agents),
         summary="\n".join([scores.tables[0].text, *result.failures]),
     )
 
@@ -191,23 +191,17 @@ def _levels(result: SuiteResult) -> Section:
     header = ["experiment", "level", "world", "real episodes", "chance, %", "optimum, %"]
     caption = "Test episodes solved, or AUROC, in %: means over seeds."
     table = Table("levels", [*header, *map(agent_title, result.agents)], rows, caption, "not run")
-    image = figures.plot("levels", lambda: _levels_figure(result), "Scores by level: 0 is chance, 1 the optimum.")
+    panels = {}
+    for each in result.suite.experiments:
+        by_agent = {agent: result.levels[each.name, agent] for agent in result.agents}
+        curves = {agent_title(agent): {one.level.name: _mean(one) for one in by_agent[agent]} for agent in by_agent}
+        panels[f"{each.name}: {each.dial}"] = curves
+    caption = "Scores by level: 0 is chance, 1 the optimum."
+    image = figures.plot(
+        "levels", lambda: figures.lines(panels, figures.colors(result.agents), "level", columns=4), caption
+    )
     questions = [f"{each.name}: {each.question}" for each in result.suite.experiments]
     return Section("Level by level", questions, [image], [table])
-
-
-def _levels_figure(result: SuiteResult) -> Figure:
-    experiments = result.suite.experiments
-    figure, panels = figures.small_multiples(len(experiments), 4, width=2.4, height=2.0, sharey=True)
-    for axes, each in zip(panels, experiments, strict=True):
-        for height in (0.0, 1.0):
-            axes.axhline(height, **figures.REFERENCE)
-        for agent in result.agents:
-            found = {level.level.name: _mean(level) for level in result.levels[each.name, agent]}
-            figures.curve(axes, found, color=figures.color(agent), label=agent_title(agent))
-        axes.set(title=each.name, xlabel=each.dial, ylim=(-0.15, 1.1))
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    return figure
 
 
 def _mean(found: LevelResult) -> float:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from html import escape
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from imagine_bench import statistics
 from imagine_bench.store.files import csv_text
 
+V = TypeVar("V")
 DASH = "–"  # printed where there is no number; the table's caption says why
 
 
@@ -57,7 +60,13 @@ class Table:
     @property
     def text(self) -> str:
         """The table for a terminal."""
-        return "\n".join(aligned([list(self.header), *([str(cell) for cell in row] for row in self.rows)]))
+        rows = [list(map(str, row)) for row in (self.header, *self.rows)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = []
+        for first, *others in rows:
+            cells = [f"{cell:>{width}}" for cell, width in zip(others, widths[1:], strict=True)]
+            lines.append("  ".join([first.ljust(widths[0]), *cells]).rstrip())
+        return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
 
     @property
     def csv(self) -> str:
@@ -67,7 +76,18 @@ class Table:
     @property
     def markdown(self) -> str:
         """The table as Markdown."""
-        return "\n".join(markdown(self.header, self.rows))
+        first, *others = (f"| {' | '.join(map(str, row))} |" for row in (self.header, *self.rows))
+        return "\n".join([first, f"|{'---|' * len(self.header)}", *others])
+
+
+def by_budget(
+    name: str, first: str, values: Mapping[str, Mapping[int, V]], words: Callable[[V], str | Cell], caption: str = "",
+    why_dash: str = "",
+) -> Table:  # fmt: skip
+    """A table of a row a learner, by title, and a column a budget, each value put into words."""
+    budgets = next(iter(values.values()), {})
+    rows = [[title, *map(words, row.values())] for title, row in values.items()]
+    return Table(name, [first, *(f"{budget:,}" for budget in budgets)], rows, caption, why_dash)
 
 
 @dataclass(frozen=True)
@@ -77,7 +97,6 @@ class Image:
     name: str  # file name without ending
     draw: Callable[[], tuple[bytes, str]]  # draws ``png`` and ``svg``
     caption: str  # the text below it
-    alt: str = ""  # what it shows, for a reader who does not see it
 
     @classmethod
     def of(cls, name: str, png: bytes, caption: str) -> Image:
@@ -85,23 +104,21 @@ class Image:
         return cls(name, lambda: (png, ""), caption)
 
     @cached_property
-    def _drawn(self) -> tuple[bytes, str]:
+    def drawn(self) -> tuple[bytes, str]:
+        """The image on white, and the same as inline SVG whose text takes the page's color, or an empty text."""
         return self.draw()
 
     @property
     def png(self) -> bytes:
         """The image, on white."""
-        return self._drawn[0]
+        return self.drawn[0]
 
     @property
-    def svg(self) -> str:
-        """The same as inline SVG whose text takes the page's color; empty where there is none."""
-        return self._drawn[1]
-
-    @property
-    def base64(self) -> str:
-        """The image for a data URL."""
-        return base64.b64encode(self.png).decode()
+    def html(self) -> str:
+        """The element that shows it in a page, and needs no other file."""
+        png, svg = self.drawn
+        data = base64.b64encode(png).decode()
+        return svg or f'<img alt="{escape(self.caption)}" src="data:image/png;base64,{data}">'
 
 
 @dataclass(frozen=True)
@@ -199,20 +216,3 @@ def mean_std(values: Sequence[float] | NDArray[np.float64]) -> str:
     if math.isnan(mean):
         return DASH
     return f"{mean:.2f}" if len(values) < 2 else f"{mean:.2f} ({np.std(values, ddof=1):.2f})"
-
-
-def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
-    """The lines of a table in Markdown."""
-    first, *others = (f"| {' | '.join(map(str, row))} |" for row in (head, *rows))
-    return [first, f"|{'---|' * len(head)}", *others]
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Columns padded to the width of their widest cell, the first to the left and the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row in rows:
-        cells = [f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)]
-        cells[0] = row[0].ljust(widths[0])
-        lines.append("  ".join(cells).rstrip())
-    return [lines[0], "-" * max(map(len, lines)), *lines[1:]]

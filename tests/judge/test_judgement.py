@@ -201,7 +201,7 @@ def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tm
     assert "imaginer, seed 0  " in judgement_report(folder, one)
     page = (folder / "report/report.md").read_text()
     assert "Smallest total variation" in page and "imaginer, seed 0 (1.00)" in page
-    assert "by depth after 40 transitions" in page
+    assert "over seeds after 40 transitions" in page
     folder, other = _judged(tmp_path, "copy", seeds=(1001,))
     assert [shown(folder, each)["copy"]["seed"] for each in (one, other)] == [1000, 1001], "images of the first seed"
 

@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import figures
-from imagine_bench.report.bench import gain, gain_figure, success_figure
+from imagine_bench.report.bench import success_figure
 from imagine_bench.report.data import ReportData, collect
 from imagine_bench.report.imagination import open_loop_figure
 from imagine_bench.statistics import Estimate
@@ -52,32 +52,14 @@ def test_the_success_figure_draws_scores_and_bands(data: ReportData) -> None:
     for scores in data.scores.values():
         assert [(budget, 100.0 * each.success.value) for budget, each in scores.items()] in lines(axes)
     assert len(axes.collections) >= len(data.scores)
-
-
-def test_the_gain_figure_draws_the_table_and_the_thesis(data: ReportData) -> None:
-    assert set(data.thesis_gains) == {"imagination", "imagination_uncertainty"} < set(data.agents)
-    drawn = lines(gain_figure(data).axes[0])
-    for agent, printed in data.thesis_gains.items():
-        thesis = [(budget, 100.0 * share) for budget, share in printed.items()]
-        assert any(np.allclose(each, thesis) for each in drawn if len(each) == len(thesis))
-        assert [(budget, 100.0 * row.gain.value) for budget, row in data.comparisons[agent].items()] in drawn
+    thesis = [(budget, 100.0 * mean) for budget, (mean, _) in data.thesis["dqn"].items()]
+    assert any(np.allclose(each, thesis) for each in lines(axes) if len(each) == len(thesis))
 
 
 def test_far_points_of_the_thesis_do_not_stretch_the_figures(short_run: ReportData) -> None:
     assert min(short_run.thesis["dqn"]) == 2000
     axes = success_figure(short_run).axes[0]
     assert axes.get_xlim()[1] < 25
-    assert not any("thesis" in label.get_text() for label in axes.get_legend().get_texts())
-    section = gain(short_run)
-    assert section is not None and not section.images
-
-
-def test_names_stand_in_the_order_in_which_curves_end(data: ReportData) -> None:
-    figure = success_figure(data)
-    ends = {name: scores[6000].success.value for name, scores in data.scores.items()}
-    (legend,) = figure.legends
-    ranked = [figures.agent_title(agent) for agent in sorted(ends, key=lambda agent: -ends[agent])]
-    assert [text.get_text() for text in legend.get_texts()] == ranked
 
 
 def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(data: ReportData) -> None:
@@ -86,20 +68,17 @@ def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(data: ReportDat
     for each in (loop, dataclasses.replace(loop, aleatoric=np.zeros_like(loop.aleatoric))):
         changed = ReportData(data.result)
         vars(changed)["open_loop"] = {"imagination": each}
-        drawn.append(open_loop_figure(changed).axes[3])
-    assert len(lines(drawn[0])) == len(lines(drawn[1])) + 1
-    assert {axes.get_yscale() for axes in drawn} == {"symlog"}, "0 is shown, too"
+        drawn.append({axes.get_title(): lines(axes) for axes in open_loop_figure(changed).axes})
+    assert [len(panels["aleatoric"]) for panels in drawn] == [1, 0]
+    assert all(len(panels["reward error"]) == 1 for panels in drawn)
 
 
-def test_lines_along_an_axis_are_not_clipped(data: ReportData) -> None:
-    loop = data.open_loop["imagination"]
-    loop = dataclasses.replace(loop, reward_mae=0.0 * loop.reward_mae, correct=0.0 * loop.correct + 1.0)
-    changed = ReportData(data.result)
-    vars(changed)["open_loop"] = {"imagination": loop}
-    for axes in open_loop_figure(changed).axes[:3]:
+def test_lines_along_an_axis_are_not_clipped() -> None:
+    panels = {"zeros": {"a": {1: 0.0, 2: 0.0}}, "ones": {"a": {1: 1.0, 2: 1.0}, "b": {1: 0.5, 2: 1.0}}}
+    for axes in figures.lines(panels, {"a": "#000000", "b": "#0072b2"}, "depth").axes:
         low, high = axes.get_ylim()
         values = np.array([y for line in lines(axes) for _, y in line])
-        assert low < np.nanmin(values) and np.nanmax(values) < high
+        assert low < values.min() and values.max() < high
 
 
 # The ladder --------------------------------------------------------------------------------------------------------
