@@ -154,7 +154,7 @@ def small_multiples(
 def curve(axes: Axes, values: Mapping[Any, float | Estimate], *, scale: float = 1.0, **style: Any) -> None:
     """A line through values at their places on the x axis, and a band of their intervals where they are estimates."""
     ends = [each[:3] if isinstance(each, Estimate) else (each, each, each) for each in values.values()]
-    table = scale * np.array(ends, dtype=float)  # [points, 3]
+    table = scale * np.array(ends, dtype=float).reshape(-1, 3)  # [points, 3]
     (line,) = axes.plot(list(values), table[:, 0], **{"marker": "o", "zorder": 3, **style})
     axes.fill_between(list(values), table[:, 1], table[:, 2], color=line.get_color(), alpha=0.18, linewidth=0)
 
