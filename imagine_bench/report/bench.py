@@ -269,6 +269,7 @@ def gain(data: ReportData) -> Section | None:
         return None
     every = [each for by_budget in found.values() for each in by_budget.values()]
     shown = _detectable([each.detectable for each in every])
+    told = _detectable([each.paired_detectable for each in every])
     words = (
         "Difference: percentage points of test episodes solved. Gain: the same relative to DQN, (agent − DQN) / DQN, "
         "the thesis' measure. One seed has no interval, nor has a gain over a DQN that may have solved nothing. "
@@ -279,7 +280,7 @@ def gain(data: ReportData) -> Section | None:
     tables = [
         _table("differences", "difference (points) after", found, _difference, shown),
         _table("gains", "gain (%) after", found, _gain, "", "DQN solved nothing to compare with"),
-        _table("paired", "solved alone : by DQN alone, after", found, _alone, "", alone),
+        _table("paired", "solved alone : by DQN alone, after", found, _alone, told, alone),
     ]
     return Section("Gain over DQN", [words], tables=tables)
 

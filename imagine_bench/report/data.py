@@ -99,6 +99,7 @@ class Comparison:
     thesis_gain: float | None  # the thesis' gain at this budget, or None
     paired: statistics.PairedTests | None  # of the same starts; None where it is not known which were solved
     paired_p: float  # of these, by Holm over all comparisons
+    paired_detectable: float  # the smallest difference that they would have shown with probability 80 %
     improvement: float  # probability that a run of the agent scores more than one of DQN
 
     @property
@@ -215,6 +216,7 @@ class ReportData:
         trials = result.protocol.evaluation_episodes
         shares, base = (result.success_rates(name)[:, index] for name in (agent, BASE_AGENT))
         difference = statistics.difference(shares, base, trials=trials)
+        tests = trials * len(result.protocol.seeds)
         paired = _paired(result.of(agent), result.of(BASE_AGENT), index)
         return Comparison(
             difference=difference,
@@ -224,6 +226,7 @@ class ReportData:
             thesis_gain=self.thesis_gains.get(agent, {}).get(self.budgets[index]),
             paired=paired,
             paired_p=paired.p if paired else math.nan,
+            paired_detectable=statistics.detectable_paired(paired, tests, cells=cells) if paired else math.nan,
             improvement=statistics.probability_of_improvement(shares, base),
         )
 

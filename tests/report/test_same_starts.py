@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_results import bench_result
+from scipy import stats
+from scipy.optimize import brentq
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Rules
@@ -94,6 +96,13 @@ def test_the_same_starts_are_compared(seeds: tuple[int, ...], tmp_path: Path) ->
     ordered = sorted(found, key=lambda cell: found[cell][2])
     shown = cells(result, "paired")
     assert len(shown) == len(found) >= 4
+    sizes = []
+    for alone, dqn_alone, _ in found.values():
+        z = stats.norm.isf(0.025 / len(found)) + stats.norm.ppf(0.8)
+        pairs = 60 * len(seeds)
+        apart = (alone + dqn_alone) / pairs
+        sizes.append(brentq(lambda d: pairs * d**2 - z**2 * (max(apart, d) - d**2), 1e-6, 1.0))  # noqa: B023 - called at once
+    assert f"{percent(min(sizes))} to {percent(max(sizes))} points" in caption(result, "paired")
     for place, (agent, budget) in enumerate(ordered):
         alone, dqn_alone, _ = found[agent, budget]
         holm = min(1.0, max((len(ordered) - i) * found[each][2] for i, each in enumerate(ordered[: place + 1])))
