@@ -231,6 +231,15 @@ def test_every_import_goes_down_and_every_draw_has_a_generator() -> None:
     assert {file: said for file, said in found.items() if said} == {}
 
 
+def test_no_class_name_is_defined_twice() -> None:
+    where: dict[str, list[str]] = {}
+    for path in _MODULES.values():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                where.setdefault(node.name, []).append(str(path.relative_to(_TOP)))
+    assert {name: files for name, files in where.items() if len(files) > 1} == {}
+
+
 @pytest.mark.parametrize("path", _GUESTS, ids=lambda path: path.name)
 def test_guests_import_documented_modules_only(path: Path) -> None:
     assert guest_offences(path, path.read_text()) == []
