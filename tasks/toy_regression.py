@@ -21,8 +21,10 @@ REGION = (-10.0, 10.0)
 """Where the variants differ: little data, or much noise."""
 TEST_DOMAIN = (-30.0, 40.0)
 """Where the networks are asked: beyond 30 they extrapolate."""
-SAMPLES, DECIMATION = 2000, 50
-SIGMA, SIGMA_HIGH = 1.0, 3.0
+SAMPLES = 2000
+DECIMATION = 50
+SIGMA = 1.0
+SIGMA_HIGH = 3.0
 GRID = 1000
 """Test inputs of figure 4.1."""
 VARIANTS = ("base", "low_data", "high_noise")
@@ -90,7 +92,8 @@ def _with_targets(variant: str, x: Floats, rng: np.random.Generator) -> Regressi
 
 def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
     """Distance to the nearest branch in standard deviations of the noise there. Shape (N,)."""
-    x, y = inputs[:, 0], predictions[:, 0]
+    x = inputs[:, 0]
+    y = predictions[:, 0]
     nearest: Floats = np.abs(branches(x) - y[:, None]).min(axis=1)
     return nearest / noise_sigma(variant, x)
 

@@ -46,7 +46,8 @@ class BayesianMDN:
     def mixture(self, outputs: Tensor) -> Mixture:
         """Network outputs (..., out) as mixtures."""
         settings = self.settings
-        floor, ceiling = math.log(settings.sigma_floor), math.log(settings.sigma_ceiling)
+        floor = math.log(settings.sigma_floor)
+        ceiling = math.log(settings.sigma_ceiling)
         return mdn.from_outputs(outputs, settings.components, self.n_outputs, floor, ceiling)
 
     def update(self, x: Tensor, y: Tensor) -> Tensor:

@@ -169,7 +169,8 @@ class MixtureRegressor:
             shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
             masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
         samples = self._model.mixture(sample_outputs(part, x, masks))
-        shift, scale = self._shift[network], self._scale[network]
+        shift = self._shift[network]
+        scale = self._scale[network]
         means = samples.means * scale + shift
         return dataclasses.replace(samples, means=means, log_sigmas=samples.log_sigmas + scale.log())
 

@@ -19,7 +19,8 @@ from imagine_bench.store.files import write_bytes
 from imagine_bench.store.results import require_every_run
 from imagine_bench.values import Setting
 
-METRICS, EVALUATION = "metrics.csv", "evaluation.npz"
+METRICS = "metrics.csv"
+EVALUATION = "evaluation.npz"
 Row = dict[str, float | str]
 """One network of one variant: ``variant``, ``network``, and every measure by name."""
 

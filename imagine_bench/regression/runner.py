@@ -24,7 +24,8 @@ from imagine_bench.store.checkpoints import Snapshot, save_snapshot
 from imagine_bench.store.codec import grouped
 from imagine_bench.store.files import reading
 
-TRAINING, MEASURING = 100, 10
+TRAINING = 100
+MEASURING = 10
 """Steps of progress of a variant."""
 
 

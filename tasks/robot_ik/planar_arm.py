@@ -22,7 +22,9 @@ _REMEMBERED = 50_000
 """Movements whose end is kept: every variant of a network's data begins with the same ones."""
 _START_RAD = np.zeros(3)
 _TIP = "tip"
-_IK_TOLERANCE_M, _IK_STEPS, _IK_STARTS = 1e-4, 60, 8
+_IK_TOLERANCE_M = 1e-4
+_IK_STEPS = 60
+_IK_STARTS = 8
 
 
 class PlanarArm:
@@ -87,10 +89,12 @@ class PlanarArm:
         Samples are whole timesteps apart, at most ``hz`` a second but for the last: it is where the arm has come to
         rest.
         """
-        data, every = self._data, max(1, math.ceil(1.0 / (hz * self.model.opt.timestep) - 1e-9))
+        data = self._data
+        every = max(1, math.ceil(1.0 / (hz * self.model.opt.timestep) - 1e-9))
         mujoco.mj_resetData(self.model, data)
         data.ctrl[:] = joints_rad
-        positions, times = [data.qpos.copy()], [0.0]
+        positions = [data.qpos.copy()]
+        times = [0.0]
         for step in range(0, self._steps, every):
             mujoco.mj_step(self.model, data, min(every, self._steps - step))
             positions.append(data.qpos.copy())
@@ -119,7 +123,8 @@ def _solve_one(
         for _ in range(_IK_STEPS):
             missing_m = float(np.linalg.norm(task.compute_error(configuration)[:3]))
             if missing_m < best_m:
-                best_m, best_rad = missing_m, configuration.q.copy()
+                best_m = missing_m
+                best_rad = configuration.q.copy()
             if best_m < _IK_TOLERANCE_M:
                 return best_rad
             configuration.integrate_inplace(mink.solve_ik(configuration, [task], 1.0, "daqp", limits=limits), 1.0)

@@ -25,9 +25,11 @@ LOW_RAD = np.array([-2 * np.pi / 3, -3.6, -3.6])
 HIGH_RAD = -LOW_RAD
 NOISE_RAD = 0.01
 """Standard deviation of the noise on the joint positions that are learned."""
-CANDIDATES, DECISIONS = 20, 50
+CANDIDATES = 20
+DECISIONS = 50
 """Points to choose from, and choices cumulated (table 4.1)."""
-MIN_SAMPLES, MAX_SAMPLES = 20, 1_000_000
+MIN_SAMPLES = 20
+MAX_SAMPLES = 1_000_000
 GRID = 45
 """Points a side of the maps of figures 4.2 and 4.3, over the square that holds the workspace and a margin."""
 MARGIN_M = 1.1

@@ -16,7 +16,8 @@ from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.seeding import SeedTree
 
-LENGTH, LEFT = 6, 0
+LENGTH = 6
+LEFT = 0
 
 
 def agent(
@@ -29,7 +30,8 @@ def agent(
 
 def live(learner: CodeCountTableAgent, steps: int, seed: int = 1) -> None:
     """Train on the tiny world of wheels."""
-    rng, code = np.random.default_rng(seed), fake_codes.starts()[0]
+    rng = np.random.default_rng(seed)
+    code = fake_codes.starts()[0]
     for _ in range(steps):
         action = learner.act(Observation(frame=fake_codes.frame(code)), explore=True)
         learner.observe(fake_codes.transition(code, action), episode=0)
@@ -43,13 +45,15 @@ def test_a_complete_table_has_the_exact_values(task: str) -> None:
     """Outcomes of chance are counted in proportion to their probabilities, so the counts are the rules."""
     spec = registry.task(task)
     tables = rules.tabulate(spec.rules)
-    index, table = {state: i for i, state in enumerate(spec.rules.states)}, CountTable(spec.n_actions)
+    index = {state: i for i, state in enumerate(spec.rules.states)}
+    table = CountTable(spec.n_actions)
     for state, i in index.items():
         for action in range(0 if spec.rules.is_terminal(state) else spec.n_actions):
             for outcome in spec.rules.outcomes(state, action):
                 for _ in range(round(outcome.probability * 360)):
                     table.add(i, action, index[outcome.macrostate], outcome.reward, outcome.terminated)
-    exact, found = rules.optimal_values(tables), table.action_values(1.0, untried=0.0)
+    exact = rules.optimal_values(tables)
+    found = table.action_values(1.0, untried=0.0)
     going_on = [i for state, i in index.items() if not spec.rules.is_terminal(state)]
     np.testing.assert_allclose([found[i].max() for i in going_on], exact.max(axis=0)[going_on], atol=1e-3)
 

@@ -35,13 +35,16 @@ def agent(planning: int, *, read: ReadState = CODES, seed: int = 0, **settings: 
 
 def live(learner: DynaQAgent, steps: int, seed: int = 1) -> None:
     """Train on the tiny world of wheels, episodes of at most 6 steps."""
-    rng, code, length = np.random.default_rng(seed), fake_codes.starts()[0], 0
+    rng = np.random.default_rng(seed)
+    code = fake_codes.starts()[0]
+    length = 0
     for _ in range(steps):
         action = learner.act(Observation(frame=fake_codes.frame(code)), explore=True)
         learner.observe(fake_codes.transition(code, action), episode=0)
         (code, _, ended), length = fake_codes.step(code, action), length + 1
         if ended or length == 6:
-            code, length = fake_codes.starts()[int(rng.integers(len(fake_codes.starts())))], 0
+            code = fake_codes.starts()[int(rng.integers(len(fake_codes.starts())))]
+            length = 0
 
 
 def transition(at: int, action: int, reward: float, then: int, *, terminated: bool = False) -> Transition:
@@ -74,8 +77,8 @@ def test_one_plan_is_one_update_of_a_pair_that_was_tried() -> None:
 
 def exact_values() -> dict[int, np.ndarray]:
     """Value iteration on the whole world of wheels, discount 0.95, by the code's number."""
-    table, number = CountTable(fake_codes.ACTIONS), {code: int(np.ravel_multi_index(code, fake_codes.SIZES))
-                                                     for code in np.ndindex(*fake_codes.SIZES)}  # fmt: skip
+    table = CountTable(fake_codes.ACTIONS)
+    number = {code: int(np.ravel_multi_index(code, fake_codes.SIZES)) for code in np.ndindex(*fake_codes.SIZES)}
     for code in fake_codes.starts():
         for action in range(fake_codes.ACTIONS):
             following, reward, ended = fake_codes.step(code, action)
@@ -86,7 +89,8 @@ def exact_values() -> dict[int, np.ndarray]:
 
 def steps_to_exact(planning: int, seed: int) -> int:
     """Real steps of a random walk until every value is within 0.1 of the exact one (a goal is worth 10)."""
-    exact, learner = exact_values(), agent(planning, seed=seed, table__step_size=0.5, **ALWAYS_BY_CHANCE)
+    exact = exact_values()
+    learner = agent(planning, seed=seed, table__step_size=0.5, **ALWAYS_BY_CHANCE)
     for step in range(10, 20_001, 10):
         live(learner, 10, seed=1000 * seed + step)
         if all(np.abs(learner.q.get(s, np.zeros(4)) - values).max() < 0.1 for s, values in exact.items()):
@@ -163,7 +167,8 @@ def test_each_reading_sees_its_own_state_alone() -> None:
 
 @pytest.mark.parametrize("name", ["q_learning", "dyna_q"])
 def test_who_reads_the_true_state_says_so(name: str) -> None:
-    own, twin = registry.agents()[name], registry.agents()[f"{name}_macrostate"]
+    own = registry.agents()[name]
+    twin = registry.agents()[f"{name}_macrostate"]
     assert twin.privileged and not twin.needs_encoder and not own.privileged and own.needs_encoder
     assert "true state" in twin.title and "privileged" in twin.description
     assert "true" not in own.title + own.description

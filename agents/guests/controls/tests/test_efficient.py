@@ -11,7 +11,8 @@ from fake_latents import CODES, built, frame, live, transition, with_own_setting
 from imagine_bench.agents.dqn import td_target
 from imagine_bench_controls.efficient import EfficientDQN, EpisodicMemory, make
 
-CPU, GAMMA = torch.device("cpu"), 0.5
+CPU = torch.device("cpu")
+GAMMA = 0.5
 
 
 def agent(**settings: Any) -> EfficientDQN:
@@ -90,7 +91,8 @@ def test_a_reset_keeps_a_share_of_the_hidden_layers_and_nothing_of_the_last() ->
 
 @pytest.mark.parametrize(("every", "resets"), [(0, 0), (5, 4), (4, 5), (100, 0)])
 def test_resets_come_as_often_as_settings_say(every: int, resets: int) -> None:
-    learner, made = agent(reuse__reset_every=every, controller__updates_per_step=2), []
+    learner = agent(reuse__reset_every=every, controller__updates_per_step=2)
+    made = []
     learner.reset_controller = lambda: made.append(learner.updates)  # type: ignore[method-assign]
     for step in range(10):
         learner.observe(transition(step % 6, 0, 0.0, (step + 1) % 6), episode=step)

@@ -23,7 +23,8 @@ from imagine_bench.interfaces import ExactWorld, Outcome, Transition
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.store import encoders
 
-STATES, GOAL = 6, 5
+STATES = 6
+GOAL = 5
 HALF = 2
 """Action 2 moves by two with probability 1/2, and else not at all; others by their number."""
 
@@ -58,7 +59,8 @@ def knowing(**settings: Any) -> ExactImaginationAgent:
 
 
 def live(agent: Any, steps: int, seed: int = 0) -> None:
-    rng, state = np.random.default_rng(seed), 0
+    rng = np.random.default_rng(seed)
+    state = 0
     for step in range(steps):
         action = int(rng.integers(ACTIONS))
         outcome = outcomes((state,), action)[-1]
@@ -95,7 +97,8 @@ def test_a_rollout_goes_on_from_what_it_reached() -> None:
 
 
 def test_imagining_begins_and_ends_when_settings_say() -> None:
-    agent, counts = knowing(start_episode=3, end_episode=6), []
+    agent = knowing(start_episode=3, end_episode=6)
+    counts = []
     for episode in range(9):
         agent.observe(told(transition(0, 1, -1.0, 1)), episode=episode)
         counts.append(agent.imagined.added)

@@ -31,13 +31,17 @@ def agent(
 
 def live(learner: PosteriorSamplingAgent, steps: int, seed: int = 1) -> None:
     """Train on the tiny world of wheels, episodes of at most 6 steps; the last transition of one says so."""
-    rng, code, length = np.random.default_rng(seed), fake_codes.starts()[0], 0
+    rng = np.random.default_rng(seed)
+    code = fake_codes.starts()[0]
+    length = 0
     for _ in range(steps):
-        action, length = learner.act(Observation(frame=fake_codes.frame(code)), explore=True), length + 1
+        action = learner.act(Observation(frame=fake_codes.frame(code)), explore=True)
+        length = length + 1
         learner.observe(replace(fake_codes.transition(code, action), truncated=length == 6), episode=0)
         code, _, ended = fake_codes.step(code, action)
         if ended or length == 6:
-            code, length = fake_codes.starts()[int(rng.integers(len(fake_codes.starts())))], 0
+            code = fake_codes.starts()[int(rng.integers(len(fake_codes.starts())))]
+            length = 0
 
 
 def at(state: int) -> Observation:
@@ -69,7 +73,8 @@ def test_the_posterior_is_the_dirichlet_of_the_counts(concentration: float) -> N
 
 
 def test_many_counts_leave_the_model_of_the_counts() -> None:
-    table, rng = CountTable(2), np.random.default_rng(0)
+    table = CountTable(2)
+    rng = np.random.default_rng(0)
     for state in range(4):
         for action in (0, 1):
             for _ in range(3_000):
@@ -81,7 +86,8 @@ def test_many_counts_leave_the_model_of_the_counts() -> None:
 
 
 def test_what_was_never_tried_may_be_anything_that_was_seen() -> None:
-    table, rng = CountTable(2), np.random.default_rng(0)
+    table = CountTable(2)
+    rng = np.random.default_rng(0)
     assert table.sampled_values(0.9, 0.1, rng) == {}
     table.add(0, 0, 1, 4.0, True)
     table.add(1, 0, 0, -2.0, True)
@@ -102,10 +108,13 @@ def test_it_follows_one_model_to_the_end_of_an_episode() -> None:
 
 def test_it_explores_deeply() -> None:
     """A chain that pays at its far end alone; once it is known that something pays, whatever is untried may."""
-    length, episodes = 12, 60
+    length = 12
+    episodes = 60
 
     def reached(seed: int, *, by_chance: bool) -> int:
-        learner, rng, found = agent(read=read_macrostate, actions=2, seed=seed), np.random.default_rng(seed), 0
+        learner = agent(read=read_macrostate, actions=2, seed=seed)
+        rng = np.random.default_rng(seed)
+        found = 0
         learner.observe(moved(50, 0, 100.0, 51, truncated=True), episode=0)
         for episode in range(episodes):
             state = 0
@@ -114,7 +123,8 @@ def test_it_explores_deeply() -> None:
                 then = state + 1 if action == state % 2 else 0
                 reward = 100.0 if then == length - 1 else -1.0
                 learner.observe(moved(state, action, reward, then, truncated=step == length - 1), episode=episode)
-                found, state = found + (then == length - 1), then
+                found = found + (then == length - 1)
+                state = then
         return found
 
     assert np.mean([reached(seed, by_chance=False) for seed in range(2)]) > 10

@@ -35,7 +35,9 @@ def agent(seed: int = 0, **overrides: Any) -> SwappingDQN:
 
 def live(learner: SwappingDQN, steps: int, seed: int = 1) -> list[tuple[tuple[int, ...], int]]:
     """Train on the tiny world of wheels by chance; what was tried."""
-    rng, code, tried = np.random.default_rng(seed), fake_codes.starts()[0], []
+    rng = np.random.default_rng(seed)
+    code = fake_codes.starts()[0]
+    tried = []
     for _ in range(steps):
         action = int(rng.integers(fake_codes.ACTIONS))
         learner.observe(fake_codes.transition(code, action), episode=0)
@@ -86,7 +88,8 @@ def test_a_swap_by_hand() -> None:
 
 
 def test_an_outcome_that_differs_is_unknown_for_good() -> None:
-    learner, moved = agent(), fake_codes.transition((0, 1, 0), 0)
+    learner = agent()
+    moved = fake_codes.transition((0, 1, 0), 0)
     code = fake_codes.step((0, 1, 0), 0)[0]
     learner.observe(moved, episode=0)
     assert learner.outcomes[code] == (moved.reward, float(moved.terminated))

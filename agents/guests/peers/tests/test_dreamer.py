@@ -100,7 +100,8 @@ def test_tests_change_nothing_and_the_global_generator_is_left_alone() -> None:
 
 @pytest.mark.parametrize("validated", [True, False])
 def test_distributions_of_others_are_validated_as_before(validated: bool) -> None:
-    agent, default = learner(), torch.distributions.Distribution._validate_args
+    agent = learner()
+    default = torch.distributions.Distribution._validate_args
     torch.distributions.Distribution.set_default_validate_args(validated)
     try:
         episode(agent, 0)

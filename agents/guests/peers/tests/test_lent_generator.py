@@ -13,7 +13,8 @@ def drawn(lent: LentGenerator, count: int) -> list[float]:
 
 
 def test_draws_go_on_where_they_stopped() -> None:
-    apart, at_once = LentGenerator(3, "cpu"), LentGenerator(3, "cpu")
+    apart = LentGenerator(3, "cpu")
+    at_once = LentGenerator(3, "cpu")
     before = torch.get_rng_state()
     parts = drawn(apart, 2)
     torch.rand(5)

@@ -85,12 +85,14 @@ def test_goals_are_the_frames_that_earned_most() -> None:
 
 def test_plans_lead_to_the_nearest_goal_at_whichever_step() -> None:
     agent = learner(horizon=3, learning_starts=100)
-    agent._model, agent._goals = Exact(), [seen(GOAL).frame]
+    agent._model = Exact()
+    agent._goals = [seen(GOAL).frame]
     assert agent.act(seen(GOAL - 1), explore=False) == 2
     assert agent.act(seen(GOAL + 1), explore=False) == 0
     two_away = agent.act(seen(0), explore=False)
     assert two_away in {0, 2} and agent.act(seen(moved(0, two_away)), explore=False) == two_away
-    agent._goals, agent._aims = [seen(0).frame, seen(3).frame], None
+    agent._goals = [seen(0).frame, seen(3).frame]
+    agent._aims = None
     assert moved(2, agent.act(seen(2), explore=False)) in {1, 3}, "the one that is one away, or on the way to the other"
 
 

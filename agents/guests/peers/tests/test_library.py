@@ -81,7 +81,8 @@ def test_exploration_does_not_depend_on_the_last_budget(tmp_path: Path) -> None:
     eighty = tuple(sorted({**registry.own_settings(LATENTS, FEW), "sb3.exploration_steps": 80}.items()))
     short = do(tmp_path / "short", budgets=(4,), overrides=eighty)
     longer = do(tmp_path / "longer", overrides=eighty)
-    first, same = short.checkpoints[0], longer.checkpoints[0]
+    first = short.checkpoints[0]
+    same = longer.checkpoints[0]
     assert (first.env_steps, first.diagnostics["epsilon"]) == (same.env_steps, same.diagnostics["epsilon"])
 
 

@@ -34,9 +34,11 @@ def test_one_imagined_episode_passes_gymnasiums_checks() -> None:
 
 def test_one_imagined_episode_ends_as_in_the_vector() -> None:
     uncertain = tuple((state, 0) for state in TASK.rules.start_states)
-    env, world = puzzle(2, uncertain), puzzle(2, uncertain).world
+    env = puzzle(2, uncertain)
+    world = puzzle(2, uncertain).world
     assert np.array_equal(env.reset(seed=3)[0], world.reset(seed=3)[0][0])
-    rng, kinds = np.random.default_rng(0), set()
+    rng = np.random.default_rng(0)
+    kinds = set()
     for _ in range(60):
         action = rng.integers(TASK.n_actions)
         seen, reward, terminated, truncated, info = env.step(action)
@@ -54,7 +56,8 @@ def test_one_imagined_episode_ends_as_in_the_vector() -> None:
 
 def success_rate(model: Any) -> float:
     """Of the greedy policy, from every start, by the rules."""
-    code, solved = RuledModel(TASK), 0
+    code = RuledModel(TASK)
+    solved = 0
     for start in TASK.rules.start_states:
         state: State = start
         for _ in range(TASK.horizon):
@@ -90,7 +93,8 @@ def test_the_same_seed_learns_the_same_in_imagination(algorithm: str) -> None:
         assert any(not torch.equal(before[name], after[name]) for name in before), "it learned"
         return after
 
-    first, again = learned(), learned()
+    first = learned()
+    again = learned()
     assert all(torch.equal(first[name], again[name]) for name in first)
 
 
@@ -103,11 +107,13 @@ class Ring(gymnasium.Env[Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
-        self.state, self.steps = int(self.np_random.integers(6)), 0
+        self.state = int(self.np_random.integers(6))
+        self.steps = 0
         return frame(self.state), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.state, self.steps = (self.state + int(action)) % 6, self.steps + 1
+        self.state = (self.state + int(action)) % 6
+        self.steps = self.steps + 1
         return frame(self.state), float(self.state == 0), False, self.steps == 2, {"is_success": self.state == 0}
 
 
@@ -118,14 +124,19 @@ def test_imagined_episodes_follow_real_ones_once_they_may() -> None:
     learner = built(imagination_agents.make_uncertainty, overrides)
     env = MixedExperience(Ring(), learner, count=3, seed=1)
     start, _ = env.reset(seed=0)
-    rng, kinds, real = np.random.default_rng(0), "", 0
+    rng = np.random.default_rng(0)
+    kinds = ""
+    real = 0
     states = {tuple(row) for row in CODES[:6].tolist()}
     for _ in range(14):
-        over, length, before = False, 0, start
+        over = False
+        length = 0
+        before = start
         while not over:
             action = int(rng.integers(ACTIONS))
             seen, reward, terminated, truncated, info = env.step(action)
-            over, length = terminated or truncated, length + 1
+            over = terminated or truncated
+            length = length + 1
             if not info["imagined"]:
                 real += 1
                 rows = learner.real.arrays()

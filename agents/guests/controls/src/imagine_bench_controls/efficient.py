@@ -43,9 +43,12 @@ class EpisodicMemory(RealMemory):
         discount of the next value has to lose: 1 where the episode terminated, else ``1 - discount ** (k - 1)`` of k
         macro-actions.
         """
-        columns, newest = self._columns, (self.added - 1) % self.capacity
+        columns = self._columns
+        newest = (self.added - 1) % self.capacity
         first = torch.randint(len(self), (count,), generator=generator, device=generator.device)
-        at, reward, factor = first, columns["reward"][first].clone(), torch.ones(count, device=first.device)
+        at = first
+        reward = columns["reward"][first].clone()
+        factor = torch.ones(count, device=first.device)
         for _ in range(steps - 1):
             goes_on = ~columns["last"][at] & (at != newest)
             at = torch.where(goes_on, (at + 1) % self.capacity, at)
@@ -78,12 +81,14 @@ class EfficientDQN(DQN):
 
     def draw_batch(self, memory: Transitions) -> Batch:
         """Transitions over n macro-actions."""
-        settings, steps = self.settings.controller, self.settings.reuse.steps
+        settings = self.settings.controller
+        steps = self.settings.reuse.steps
         return self.real.sample_returns(settings.batch_size, self._replay, steps=steps, discount=settings.discount)
 
     def learn_more(self, z: Tensor, episode: int) -> None:
         """Begin anew where it is time to."""
-        every, made = self.settings.reuse.reset_every, self.settings.controller.updates_per_step
+        every = self.settings.reuse.reset_every
+        made = self.settings.controller.updates_per_step
         if every and self.updates // every > (self.updates - made) // every:
             self.reset_controller()
 

@@ -28,7 +28,8 @@ from imagine_bench.seeding import SeedTree
 
 LOOKS = 8
 """Frames that are rendered of a macrostate."""
-_REWARD, _RELATIVE = 1.0, 0.1
+_REWARD = 1.0
+_RELATIVE = 0.1
 """An imagined reward may be off by so much, or by that share, and is still right."""
 
 
@@ -36,7 +37,9 @@ class Gallery:
     """Latents of macrostates: frames of them, rendered when first asked for, as the encoder sees them."""
 
     def __init__(self, world: ExactWorld, perception: Perception, seeds: SeedTree) -> None:
-        self._world, self._perception, self._seeds = world, perception, seeds
+        self._world = world
+        self._perception = perception
+        self._seeds = seeds
         self._seen: dict[State, tuple[Tensor, Tensor]] = {}
 
     def latents(self, states: Sequence[State], generator: torch.Generator) -> Tensor:
@@ -94,7 +97,8 @@ class ExactImaginationAgent(DQN):
 
     def imagine_rollouts(self) -> None:
         """I_B rollouts of the rules, I_D steps deep, into the imagined memory."""
-        settings, draws = self.settings.imagination, self._draws
+        settings = self.settings.imagination
+        draws = self._draws
         explores = max(epsilon(self.steps, self.settings.controller), settings.exploration)
         states = self._starts()
         z = self._gallery.latents(states, draws)
@@ -199,7 +203,8 @@ def build(
             "whose frames hide nothing; here there is none."
         )
     settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
-    device, perception = prepare_torch(context.device), load_perception(context)
+    device = prepare_torch(context.device)
+    perception = load_perception(context)
     return kind(perception, context.n_actions, settings, context.seeds, device, context.exact_world)
 
 

@@ -49,7 +49,8 @@ class SwappingDQN(DQN):
         z = super().store(transition)
         then = self._codes(self.perception.posterior(transition.next_observation.frame)[0].unsqueeze(0))[0]
         self.touched[transition.action] |= self._codes(z.unsqueeze(0))[0] != then
-        code, outcome = tuple(then.tolist()), (transition.reward, float(transition.terminated))
+        code = tuple(then.tolist())
+        outcome = (transition.reward, float(transition.terminated))
         self.outcomes[code] = outcome if self.outcomes.get(code, outcome) == outcome else _UNSURE
         return z
 
@@ -63,12 +64,15 @@ class SwappingDQN(DQN):
         count = len(others)
         before, after, theirs = map(self._codes, (batch.z[:count], batch.next_z[:count], others))
         touched = self.touched[batch.action[:count]]  # [N, P]
-        before, after = torch.where(touched, before, theirs), torch.where(touched, after, theirs)
+        before = torch.where(touched, before, theirs)
+        after = torch.where(touched, after, theirs)
         outcomes = [self.outcomes.get(tuple(code), _UNSURE) for code in after.tolist()]
         reward, ended = torch.tensor(outcomes, dtype=batch.reward.dtype, device=batch.z.device).reshape(-1, 2).T
         known = ended >= 0.0
-        z, next_z = batch.z.clone(), batch.next_z.clone()
-        rewards, ends = batch.reward.clone(), batch.terminated.clone()
+        z = batch.z.clone()
+        next_z = batch.next_z.clone()
+        rewards = batch.reward.clone()
+        ends = batch.terminated.clone()
         z[:count][known], next_z[:count][known] = self._latents(before[known]), self._latents(after[known])
         rewards[:count][known], ends[:count][known] = reward[known], ended[known]
         self.meters.add("swaps/known", float(known.sum()), count)
@@ -85,7 +89,8 @@ class SwappingDQN(DQN):
 
     def state(self) -> AgentState:
         """A snapshot, with what is known of factors and outcomes."""
-        state, factors = super().state(), len(self._sizes)
+        state = super().state()
+        factors = len(self._sizes)
         known = {
             "touched": self.touched.cpu().numpy().copy(),
             "code": np.array(list(self.outcomes), dtype=np.int64).reshape(-1, factors),
@@ -106,7 +111,8 @@ class SwappingDQN(DQN):
 def make(context: AgentContext) -> SwappingDQN:
     """The ``dqn_swaps`` agent; InvalidValueError if the context's encoder gives no codes."""
     settings = SWAPPING.resolve(context.hyperparameters, context.overrides, context.config_group)
-    device, perception = prepare_torch(context.device), load_perception(context)
+    device = prepare_torch(context.device)
+    perception = load_perception(context)
     if not perception.encoder.card.code_sizes:
         raise InvalidValueError(
             "This agent swaps factors of codes, and the encoder gives continuous latents; give one made with "

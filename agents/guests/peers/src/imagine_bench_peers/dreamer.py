@@ -34,7 +34,8 @@ from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observatio
 from .dreamer_settings import HYPERPARAMETERS, DreamerSettings
 from .lent_generator import LentGenerator
 
-_PIXELS, _LATENTS = "rgb", "latents"
+_PIXELS = "rgb"
+_LATENTS = "latents"
 _CHANNELS_FIRST = (2, 0, 1)
 _LOSSES = {f"Loss/{name}_loss": f"loss/{name}" for name in ("world_model", "observation", "reward", "policy", "value")}
 
@@ -53,11 +54,14 @@ class Dreamer:
     def __init__(
         self, settings: DreamerSettings, n_actions: int, seed: int, device: str, perception: Perception | None = None
     ) -> None:
-        self.settings, self.n_actions, self._perception = settings, n_actions, perception
+        self.settings = settings
+        self.n_actions = n_actions
+        self._perception = perception
         self._config = _config(settings, pixels=perception is None)
         self._fabric = Fabric(accelerator="cuda" if device == "cuda" else "cpu", devices=1)
         self._blank = self._shown(np.zeros((64, 64, 3), np.uint8))
-        self._random, self._test_random = LentGenerator(seed, device), LentGenerator(0, device)
+        self._random = LentGenerator(seed, device)
+        self._test_random = LentGenerator(0, device)
         self._rng = np.random.default_rng([seed, 1])
         with self._drawing():
             shown = spaces.Dict({name: spaces.Box(-np.inf, np.inf, array.shape) for name, array in self._blank.items()})
@@ -117,7 +121,8 @@ class Dreamer:
         self._acted = False
         action = np.eye(self.n_actions, dtype=np.float32)[transition.action]
         self._remember(transition.observation.frame, action)
-        self._arrived, self._first = (transition.reward, transition.terminated, transition.truncated), False
+        self._arrived = (transition.reward, transition.terminated, transition.truncated)
+        self._first = False
         self.steps += 1
         if transition.terminated or transition.truncated:
             self._remember(transition.next_observation.frame, np.zeros_like(action))
@@ -192,7 +197,8 @@ class Dreamer:
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         snapshot.require_fit(state, self.state())
-        arrays, values = state.arrays, state.values
+        arrays = state.arrays
+        values = state.values
         for name, module, optimiser in self._trained():
             snapshot.load_training(module, optimiser, snapshot.below(name, arrays))
         for name, module in (("target", self._target), ("returns", self._moments)):
@@ -201,7 +207,9 @@ class Dreamer:
         self._memory.load(snapshot.below("replay", arrays))
         self._rng.bit_generator.state = values["exploration"]
         self.meters.restore(values["meters"])
-        self.steps, self.updates, self._owed = values["steps"], values["updates"], values["owed"]
+        self.steps = values["steps"]
+        self.updates = values["updates"]
+        self._owed = values["owed"]
         self.begin_episode()
 
     def _trained(self) -> Iterator[tuple[str, nn.Module, Any]]:
@@ -230,7 +238,8 @@ class Sequences:
     """
 
     def __init__(self, capacity: int) -> None:
-        self._capacity, self._rows = capacity, list[dict[str, NDArray[Any]]]()
+        self._capacity = capacity
+        self._rows = list[dict[str, NDArray[Any]]]()
 
     def add(self, row: dict[str, NDArray[Any]]) -> None:
         """Remember a row; the oldest is forgotten where there are too many."""

@@ -41,8 +41,11 @@ class LeWMPlanner:
     """
 
     def __init__(self, settings: LeWMSettings, n_actions: int, seed: int, device: str) -> None:
-        self.settings, self.n_actions, self._device = settings, n_actions, device
-        self._random, self._rng = LentGenerator(seed, device), np.random.default_rng([seed, 1])
+        self.settings = settings
+        self.n_actions = n_actions
+        self._device = device
+        self._random = LentGenerator(seed, device)
+        self._rng = np.random.default_rng([seed, 1])
         with self._random.lent():
             self._model = _network(settings, n_actions).to(device).eval()
         self._optimiser = torch.optim.AdamW(
@@ -100,14 +103,17 @@ class LeWMPlanner:
         if not self._acted:
             self.act(transition.observation, explore=True)
         self._acted = False
-        frame, following = transition.observation.frame, transition.next_observation.frame
+        frame = transition.observation.frame
+        following = transition.next_observation.frame
         for name, value in zip(_ROW, (frame, transition.action, following), strict=True):
             self._rows[name].append(value)
             del self._rows[name][: -self.settings.buffer_size]
         if transition.reward > self._most:
-            self._most, self._goals = transition.reward, []
+            self._most = transition.reward
+            self._goals = []
         if transition.reward == self._most:
-            self._goals, self._aims = [*self._goals, following][-self.settings.goals :], None
+            self._goals = [*self._goals, following][-self.settings.goals :]
+            self._aims = None
         self.steps += 1
         if self.steps >= self.settings.learning_starts:
             self._owed += self.settings.replay_ratio
@@ -132,7 +138,8 @@ class LeWMPlanner:
                 recompute_batchnorm(self._model.eval(), [batch], lambda each: self._model(*each))
         for name in ("pred_loss", "sigreg_loss"):
             self.meters.add(f"loss/{name.removesuffix('_loss')}", losses[name].item())
-        self.updates, self._aims = self.updates + 1, None
+        self.updates = self.updates + 1
+        self._aims = None
 
     def _pixels(self, frames: list[Frame]) -> Tensor:
         """What the model reads of N frames. Shape (N, 1, 3, 64, 64), in [0, 1]."""
@@ -162,17 +169,21 @@ class LeWMPlanner:
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         snapshot.require_fit(state, self.state())
-        arrays, values = state.arrays, state.values
+        arrays = state.arrays
+        values = state.values
         snapshot.load_training(self._model, self._optimiser, snapshot.below("model", arrays))
         for name, value in self._model.named_buffers():
             value.copy_(torch.tensor(arrays[f"buffer/{name}"]))
         self._rows = {name: list(arrays[f"replay/{name}"]) for name in _ROW}
-        self._goals, self._aims = list(arrays["replay/goals"]), None
+        self._goals = list(arrays["replay/goals"])
+        self._aims = None
         self._most = -np.inf if values["most"] is None else values["most"]
         self._random.state = torch.tensor(arrays["generator"])
         self._rng.bit_generator.state = values["exploration"]
         self.meters.restore(values["meters"])
-        self.steps, self.updates, self._owed = values["steps"], values["updates"], values["owed"]
+        self.steps = values["steps"]
+        self.updates = values["updates"]
+        self._owed = values["owed"]
 
 
 def _network(settings: LeWMSettings, n_actions: int) -> LeWM:

@@ -22,7 +22,8 @@ class MixedExperience(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: gymnasium.Env[Frame, Any], learner: ImaginingAgent, *, count: int, seed: int) -> None:
         super().__init__(env)
-        self.learner, self._count = learner, count
+        self.learner = learner
+        self._count = count
         nowhere = np.zeros((1, learner.perception.latent_size), np.float32)  # until there is something to imagine from
         world = ImaginedVectorEnv(learner.imagination, nowhere, horizon=learner.settings.imagination.depth)
         world.reset(seed=seed)
@@ -62,9 +63,11 @@ class MixedExperience(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _remember(self) -> None:
         """Imagine from all that was acted in by now, with the filter's threshold as it should be there."""
-        learner, imagination = self.learner, self.learner.imagination
+        learner = self.learner
+        imagination = self.learner.imagination
         self._imagined.world.starts = learner.real.arrays()["mu"].astype(np.float32)
-        weights, replay = imagination.draw_weights(imagination.generators["dropout"]), imagination.generators["replay"]
+        weights = imagination.draw_weights(imagination.generators["dropout"])
+        replay = imagination.generators["replay"]
         imagination.filter.move_threshold(imagination.model, learner.real, weights.dynamics, replay)
 
     def _latents(self, frame: Frame) -> Latents:

@@ -43,7 +43,8 @@ class LibraryAgent:
 
     def __init__(self, context: AgentContext, algorithm: str) -> None:
         prepare_torch(context.device)
-        self._algorithm, self._device = _load(algorithm), context.device
+        self._algorithm = _load(algorithm)
+        self._device = context.device
         self.settings = self.hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
         self._keywords = self.settings.ppo if algorithm.endswith(":PPO") else self.settings.sb3
         self._seed = context.seeds.child("library").integer() % _SEEDS

@@ -15,7 +15,8 @@ class _EpisodeCounter(BaseCallback):
 
     def __init__(self, on_episode: OnEpisode) -> None:
         super().__init__()
-        self._on_episode, self._length = on_episode, 0
+        self._on_episode = on_episode
+        self._length = 0
 
     def _on_step(self) -> bool:
         (done,), (info,) = self.locals["dones"], self.locals["infos"]
@@ -24,7 +25,8 @@ class _EpisodeCounter(BaseCallback):
         self._length += 1
         if not done:
             return True
-        length, self._length = self._length, 0
+        length = self._length
+        self._length = 0
         return self._on_episode(bool(info["is_success"]), length)
 
 

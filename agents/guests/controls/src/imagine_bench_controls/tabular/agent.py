@@ -22,7 +22,8 @@ from .counts import CountTable
 from .settings import CountTableSettings
 
 _TIE = 1e-9
-_BITS, _COORDINATES = 6, 10
+_BITS = 6
+_COORDINATES = 10
 
 ReadState = Callable[[Observation], int]
 """From an observation to the number of a state."""
@@ -60,9 +61,13 @@ class TabularAgent(ABC):
     directed = False  #: Whether what it explores is left to its values alone
 
     def __init__(self, read: ReadState, n_actions: int, settings: CountTableSettings, seeds: SeedTree) -> None:
-        self.read, self.n_actions, self.settings = read, n_actions, settings
+        self.read = read
+        self.n_actions = n_actions
+        self.settings = settings
         self.rng = seeds.child("exploration").generator()
-        self.table, self.meters, self.steps = CountTable(n_actions), Meters(), 0
+        self.table = CountTable(n_actions)
+        self.meters = Meters()
+        self.steps = 0
 
     @abstractmethod
     def values(self, observation: Observation, *, explore: bool) -> Floats:

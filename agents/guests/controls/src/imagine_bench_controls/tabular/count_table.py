@@ -40,7 +40,8 @@ class CountTableAgent(TabularAgent):
 
     def values(self, observation: Observation, *, explore: bool) -> Floats:
         """Values of every action (A,), from a plan that is made anew where the table predicts otherwise."""
-        discount, optimistic = self.settings.controller.discount, explore and self.directed
+        discount = self.settings.controller.discount
+        optimistic = explore and self.directed
         untried = self.table.largest_reward / max(1.0 - discount, _LEAST) if optimistic else 0.0
         if optimistic not in self._plans:
             with self.meters.cpu_time("time/model_s"):
@@ -49,7 +50,8 @@ class CountTableAgent(TabularAgent):
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Count the transition; if the table then predicts otherwise, plan anew when next asked."""
-        state, following = self.read(transition.observation), self.read(transition.next_observation)
+        state = self.read(transition.observation)
+        following = self.read(transition.next_observation)
         if self.table.add(state, transition.action, following, transition.reward, transition.terminated):
             self._plans.clear()
         self.meters.count("time/model_s")
@@ -74,7 +76,8 @@ class CodeCountTableAgent(CountTableAgent):
         directed: bool,
     ) -> None:  # fmt: skip
         super().__init__(read_codes(perception), n_actions, settings, seeds, directed=directed)
-        self.perception, self.code_sizes = perception, perception.sizes
+        self.perception = perception
+        self.code_sizes = perception.sizes
 
     def read_frames(self, frames: Frame) -> NDArray[np.int64]:
         """What a probe reads; see :class:`imagine_bench.interfaces.capabilities.FrameReader`."""
@@ -90,7 +93,8 @@ class CodeCountTableAgent(CountTableAgent):
         for row, (branches, _) in enumerate(pairs):
             for column, (state, share) in enumerate(branches):
                 following[row, column], p_continues[row, column] = state, share
-        read, shape = self.perception.macrostates([(code,) for code in following.ravel().tolist()]), (len(here), -1)
+        read = self.perception.macrostates([(code,) for code in following.ravel().tolist()])
+        shape = (len(here), -1)
         return ExpectedOutcomes(
             macrostates=read.reshape(*shape, most, read.shape[1]),
             p_continues=p_continues.reshape(*shape, most),

@@ -115,7 +115,8 @@ class CountTable:
             q = expected + np.bincount(pair, follows * values[following], size)
             q[total == 0.0] = untried
             table = q.reshape(-1, self._n_actions)
-            before, values = values, table.max(axis=1)
+            before = values
+            values = table.max(axis=1)
             if np.abs(values - before).max() <= _ACCURACY * max(1.0, np.abs(values).max()):
                 break
         return dict(zip(self._index, table, strict=True))
@@ -131,7 +132,10 @@ class CountTable:
 
     def clear(self) -> None:
         """Forget everything."""
-        self._index, self._rows, self._branches, self.largest_reward = {}, {}, {}, 0.0
+        self._index = {}
+        self._rows = {}
+        self._branches = {}
+        self.largest_reward = 0.0
 
     def load(self, arrays: Arrays) -> None:
         """Take up the rows of :meth:`arrays`."""

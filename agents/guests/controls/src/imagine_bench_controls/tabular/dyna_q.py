@@ -25,7 +25,8 @@ class DynaQAgent(TabularAgent):
 
     def __init__(self, read: ReadState, n_actions: int, settings: DynaQSettings, seeds: SeedTree) -> None:
         super().__init__(read, n_actions, settings, seeds)
-        self.updates, self.planning = settings.table, seeds.child("planning").generator()
+        self.updates = settings.table
+        self.planning = seeds.child("planning").generator()
         self.q: dict[int, Floats] = {}
 
     def values(self, observation: Observation, *, explore: bool) -> Floats:
@@ -35,7 +36,8 @@ class DynaQAgent(TabularAgent):
     def update(self, state: int, action: int, following: int, reward: float, terminated: bool) -> float:
         """Equation 2.16 of the thesis; returns the temporal-difference error, in units of reward."""
         zeros = np.zeros(self.n_actions)
-        values, then = self.q.setdefault(state, zeros), self.q.get(following, zeros)
+        values = self.q.setdefault(state, zeros)
+        then = self.q.get(following, zeros)
         after = 0.0 if terminated else self.settings.controller.discount * then.max()
         error = reward + after - values[action]
         values[action] += self.updates.step_size * error
@@ -43,7 +45,8 @@ class DynaQAgent(TabularAgent):
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Learn from the transition, count it in the model, and plan."""
-        state, following = self.read(transition.observation), self.read(transition.next_observation)
+        state = self.read(transition.observation)
+        following = self.read(transition.next_observation)
         row = (state, transition.action, following, transition.reward, transition.terminated)
         with self.meters.cpu_time("time/controller_s"):
             self.meters.add("loss/bellman", self.update(*row) ** 2)
@@ -59,7 +62,8 @@ class DynaQAgent(TabularAgent):
 
     def state(self) -> AgentState:
         """A snapshot, with values (S, A) and the generator of planning."""
-        common, known = super().state(), {"table/known": np.array(list(self.q), dtype=np.int64)}
+        common = super().state()
+        known = {"table/known": np.array(list(self.q), dtype=np.int64)}
         known["table/values"] = np.array(list(self.q.values())).reshape(-1, self.n_actions)
         own = {"planning": self.planning.bit_generator.state}
         return AgentState(arrays={**common.arrays, **known}, values={**common.values, **own})

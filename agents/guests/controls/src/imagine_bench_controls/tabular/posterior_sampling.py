@@ -27,7 +27,8 @@ class PosteriorSamplingAgent(CountTableAgent):
 
     def __init__(self, read: ReadState, n_actions: int, settings: PosteriorSamplingSettings, seeds: SeedTree) -> None:
         super().__init__(read, n_actions, settings, seeds, directed=True)
-        self.prior, self.drawing = settings.prior, seeds.child("posterior").generator()
+        self.prior = settings.prior
+        self.drawing = seeds.child("posterior").generator()
         self.drawn: dict[int, Floats] | None = None  #: values of this episode's model; None before its first action
 
     def values(self, observation: Observation, *, explore: bool) -> Floats:
@@ -48,7 +49,8 @@ class PosteriorSamplingAgent(CountTableAgent):
 
     def state(self) -> AgentState:
         """A snapshot, with the model that is being followed."""
-        common, drawn = super().state(), self.drawn or {}
+        common = super().state()
+        drawn = self.drawn or {}
         arrays = {"known": np.array(list(drawn), dtype=np.int64)}
         arrays["values"] = np.array(list(drawn.values())).reshape(-1, self.n_actions)
         own = {"drawn": self.drawn is not None, "posterior": self.drawing.bit_generator.state}
