@@ -327,9 +327,15 @@ def acceptance(data: ReportData) -> Section | None:
         "Share of the transitions imagined while training, up to each budget, that went into the replay memory of "
         "imagined transitions. Mean over seeds."
     )
-    why = "nothing was imagined"
-    table = _table("acceptance", "imagined transitions kept (%) up to", data.acceptance, percent, caption, why)
-    return Section("Imagined transitions kept", [words], tables=[table])
+    curves = {}
+    for agent, rates in data.acceptance.items():
+        curves[agent_title(agent)] = {budget: 100.0 * rate for budget, rate in rates.items()}
+
+    def draw() -> Figure:
+        colors = figures.colors(data.agents)
+        return figures.lines({"": curves}, colors, "real training episodes", "transitions kept (%)")
+
+    return Section("Imagined transitions kept", [words], [figures.plot("acceptance", draw, caption)])
 
 
 def threshold(data: ReportData) -> Section | None:

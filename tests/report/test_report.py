@@ -237,7 +237,7 @@ def test_the_page_loads_nothing_and_its_figures_share_no_ids(folder: Path) -> No
         assert address.startswith(("data:image/png;base64,", "#")) or (folder / address).is_file(), address[:80]
     assert any(address.startswith("data:") for address in found)
     assert not re.search(r"@import|url\((?!#)|<script|<link", text)
-    assert text.count("<svg") == 3  # success, open loop, ladder
+    assert text.count("<svg") == 4  # success, acceptance, open loop, ladder
     assert "currentColor" in text and figures.INK not in text
     ids = re.findall(r'\bid="([^"]+)"', text)
     assert len(ids) == len(set(ids))
