@@ -58,7 +58,7 @@ class OpenLoopObserver(RunObserver):
 
 
 class BeliefsObserver(RunObserver):
-    """Asks a learner about every macrostate at every budget, for .imagine-bench verify --causes.."""
+    """Asks a learner about every macrostate at every budget, for ``imagine-bench verify --causes``."""
 
     def __init__(self) -> None:
         self._frames: Frame | None = None

@@ -37,13 +37,13 @@ def test_a_tuning_run_is_shown_tuning_starts_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, purpose: str
 ) -> None:
     asked = []
-    for name in ("examples", "imagine_sampled_rollouts", "open_loop_starts"):
+    for name in ("examples", "imagine_sampled_rollouts", "surviving_actions"):
         real = getattr(observers, name)
         monkeypatch.setattr(
             observers, name, lambda *a, real=real, name=name, **k: asked.append((name, k["purpose"])) or real(*a, **k)
         )
     do(tmp_path / "run", "imaginer", seed, agents=("imaginer",), seeds=(seed,), open_loop_starts=2)
-    assert set(asked) == {("examples", purpose), ("imagine_sampled_rollouts", purpose), ("open_loop_starts", purpose)}
+    assert set(asked) == {("examples", purpose), ("imagine_sampled_rollouts", purpose), ("surviving_actions", purpose)}
 
 
 def test_tests_have_looks_that_training_never_saw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -54,7 +54,7 @@ def test_tests_have_looks_that_training_never_saw(tmp_path: Path, monkeypatch: p
         return reset(env, seed=seed, options=options)
 
     monkeypatch.setattr(MacroEnv, "reset", noted)
-    for name in ("examples", "imagine_sampled_rollouts", "open_loop_starts"):
+    for name in ("examples", "imagine_sampled_rollouts", "surviving_actions"):
         real = getattr(observers, name)
         monkeypatch.setattr(observers, name, lambda *a, real=real, **k: shown.add(k["appearance"]) or real(*a, **k))
     do(tmp_path / "run", "imaginer", 0, agents=("imaginer",), open_loop_starts=2, appearance="photo")
