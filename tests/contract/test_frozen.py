@@ -126,8 +126,8 @@ def _blind(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
     monkeypatch.setattr(judgement, "_reader", read_nothing)
     yield
-    judgement._prepared.cache_clear()
-    judgement._data.cache_clear()
+    judgement.prepare.cache_clear()
+    judgement.data_of.cache_clear()
 
 
 def judged(task: str, model: str, out: Path) -> int:
