@@ -108,11 +108,15 @@ def _unfinished(result: BenchResult) -> list[str]:
     if not result.missing:
         return []
     part = result.protocol
-    whole = f" of {result.whole.budgets[-1]:,}" if result.whole else ""
+    seeds = str(len(part.seeds))
+    episodes = f"{part.budgets[-1]:,}"
+    if result.whole:
+        seeds += f" of {len(result.whole.seeds)}"
+        episodes += f" of {result.whole.budgets[-1]:,}"
     which = "This bench" if result.whole else "One of these benches"
     named = "; ".join(result.missing[:_NAMED])
     return [
-        f"{which} is not finished: shown are {len(part.seeds)} seeds up to {part.budgets[-1]:,}{whole} real episodes. "
+        f"{which} is not finished: shown are {seeds} seeds up to {episodes} real episodes. "
         f"Missing are {named}{'; …' if len(result.missing) > _NAMED else ''}. The same bench command goes on."
     ]
 

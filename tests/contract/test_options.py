@@ -7,6 +7,7 @@ import pytest
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.registry.guests import guests
 from imagine_bench.running.control import plan_control
 from imagine_bench.testing.common import NotOffered
 from imagine_bench.testing.of_agents import checked_agent
@@ -20,13 +21,15 @@ from imagine_bench.testing.of_options import (
 TASK = "arrow_puzzle:horizon=3"
 _HEAVY = ("dqn_", "dreamer_", "drqn", "imagination_exact", "lewm", "sb3_")
 """Guests that train networks or load a library for longer than a fast test may last; those with tables are fast."""
+_GUESTS = {name for guest in guests() for name in guest.names.get(registry.AGENT_GROUP, ())}
 AGENTS = [
-    *sorted(registry.AGENTS),
+    *sorted(name for name, entry in registry.AGENTS.items() if entry.make.startswith("imagine_bench.agents.")),
     *(
         pytest.param(name, marks=[pytest.mark.slow] * name.startswith(_HEAVY))
-        for name in sorted(registry.agents().keys() - registry.AGENTS.keys())
+        for name in sorted(_GUESTS & registry.agents().keys())
     ),
 ]
+"""All of the suite and of its guests; fakes of other tests are registered, too."""
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -167,10 +167,11 @@ def _mjr_alone(scene: gymnasium.Env) -> Callable[[], object]:
     """MuJoCo's drawing and reading of the pixels of the latest frame, with nothing of this suite around it."""
     camera = scene._agent_camera
     pixels = np.empty((camera.view.height, camera.view.width, 3), dtype=np.uint8)
+    rect = mujoco.MjrRect(0, 0, camera.view.width, camera.view.height)
 
     def draw() -> None:
-        mujoco.mjr_render(camera._rect, camera._scene, camera._canvas.mjr)
-        mujoco.mjr_readPixels(pixels, None, camera._rect, camera._canvas.mjr)
+        mujoco.mjr_render(rect, camera._scene, camera._canvas.mjr)
+        mujoco.mjr_readPixels(pixels, None, rect, camera._canvas.mjr)
 
     return draw
 

@@ -15,7 +15,10 @@ def test_a_task_is_described_with_its_exact_facts() -> None:
     # 12 + 24 + 36 + 48 + 30 = 150 macro-actions over 54 starts
     assert "1 (12 starts), 2 (12 starts), 3 (12 starts), 4 (12 starts), 5 (6 starts); mean 2.78" in said
     assert "none: each has one outcome" in said and "arrow_puzzle-photo" in said
-    assert "several outcomes" in describe("pick_place")
+
+
+def test_chance_is_described() -> None:
+    assert "several outcomes" in describe("arrows:cubes=2,slip=0.2")
 
 
 def test_a_regression_task_is_described_too(capsys: pytest.CaptureFixture[str]) -> None:
