@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from importlib.metadata import version
@@ -305,6 +306,8 @@ def test_output_that_cannot_be_written_is_one_line(redirection: str, sentence: s
 def test_a_removed_folder_and_a_strange_backend_are_no_tracebacks(tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
-    line = f"cd {gone} && rmdir {gone} && MPLBACKEND=nonsense {sys.executable} -m imagine_bench doctor"
+    folder = shlex.quote(str(gone))
+    python = shlex.quote(sys.executable)
+    line = f"cd {folder} && rmdir {folder} && MPLBACKEND=nonsense {python} -m imagine_bench doctor"
     done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
     assert "The current folder was removed" in done.stdout and done.stderr == "" and done.returncode == 1
