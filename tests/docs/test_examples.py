@@ -148,8 +148,8 @@ def test_what_an_agent_needs_over_the_floor(
     floor = certificate(registry.task("arrow_puzzle_easy")).floor
     assert floor
     for agent, needed, ratio in (("oracle", [0], 0.0), ("random", [None], np.inf)):
-        words = f"--agent {agent} --cubes 1 --seeds 1000 --tests 20 --runs {tmp_path} --out {tmp_path}/floors.json"
-        example.main(words.split())
+        words = f"--agent {agent} --cubes 1 --seeds 1000 --tests 20".split()
+        example.main([*words, "--runs", str(tmp_path), "--out", str(tmp_path / "floors.json")])
         (row,) = json.loads((tmp_path / "floors.json").read_text())
         assert (row["transitions"], row["floor"]) == (needed, floor.transitions)
         assert f"{ratio:8.2f} arrow_puzzle_easy clean" in capsys.readouterr().out
@@ -198,7 +198,7 @@ def test_the_study_on_a_page_could_be_run(tmp_path: Path) -> None:
     [("own_agent", "random own_agent"), ("own_task", "random oracle")],
 )
 def test_scripts_run(name: str, agents: str, tmp_path: Path) -> None:
-    words = f"--budgets 3 --evaluation-episodes 3 --seeds 1 --out {tmp_path} --agents {agents}".split()
+    words = ["--out", str(tmp_path), *f"--budgets 3 --evaluation-episodes 3 --seeds 1 --agents {agents}".split()]
     script = [sys.executable, EXAMPLES / f"{name}.py", *words]
     done = subprocess.run(script, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
