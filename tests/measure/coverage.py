@@ -1,4 +1,4 @@
-"""``python tests/measure/coverage.py [DRAWS]``: do intervals and tests keep their promises?
+"""``python tests/measure/coverage.py [DRAWS]``: do intervals cover, and do tests err, as often as they state?
 
 Every agent and budget with five kept seeds or more gives a population: its scores, smoothed on the logit scale. Benches
 are drawn from these, with and without one seed in ten that is stuck at chance, and judged by
