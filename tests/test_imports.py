@@ -35,7 +35,6 @@ FOLDERS = (
     "agents/encoders",
     "agents",
     "agents/imagination",
-    "agents/memory",
     "agents/factored",
     "agents/regressors",
     "agents/world_models",

@@ -77,13 +77,6 @@ AGENTS: dict[str, AgentEntry] = {
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
         "the model is uncertain.",
     ),
-    "imagination_memory": AgentEntry(
-        make="imagine_bench.agents.memory.imagination:make",
-        title="imagination + memory",
-        settings="imagine_bench.agents.memory.settings:IMAGINATION_MEMORY",
-        description="Like imagination + uncertainty, but the world model is recurrent (MDN-RNN), and rollouts carry "
-        "what it remembers.",
-    ),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.learned:make",
         needs_encoder=False,
@@ -174,13 +167,6 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         encoder_kind="latents",
         settings=_SETTINGS,
         description="Three mixture density networks between latents, uncertain where they disagree.",
-    ),
-    "mdn_rnn": WorldModelEntry(
-        make=f"{_WORLD_MODELS}.recurrent:make",
-        title="VAE + MDN-RNN",
-        encoder_kind="latents",
-        description="The ensemble on what a recurrent network remembers of all frames of the history.",
-        by_default=False,
     ),
     "mdn_thesis": WorldModelEntry(
         make=f"{_WORLD_MODELS}.latent:make_thesis",

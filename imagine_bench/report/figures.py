@@ -32,8 +32,8 @@ INK = "#2b2b2f"  # in the SVG this becomes the page's own text color
 GRAY = "#8c8c8c"
 # Okabe and Ito's palette, grays, Tol's muted colors and ColorBrewer's, in the order in which agents are registered.
 COLORS = (
-    "#8c8c8c", "#b8860b", "#0072b2", "#d55e00", "#009e73", "#882255",
-    "#e69f00", "#999933", "#332288", "#cc79a7", "#56b4e9", "#661100",
+    "#8c8c8c", "#b8860b", "#0072b2", "#d55e00", "#009e73", "#e69f00",
+    "#999933", "#332288", "#cc79a7", "#56b4e9", "#882255", "#661100",
     "#44aa99", "#aa4499", "#117733", "#cc6677", "#7f5539", "#9aa600",
     "#4d9221", "#5b5ea6", "#c51b7d", "#5ab4ac", "#b35806", "#542788",
     "#01665e", "#bf812d", "#762a83", "#7fbc41", "#2166ac", "#b2182b",

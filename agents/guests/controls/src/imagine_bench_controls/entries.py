@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from imagine_bench.registry import AgentEntry
+from imagine_bench.registry import AgentEntry, WorldModelEntry
 
 _COUNT_TABLE_SETTINGS = "imagine_bench_controls.tabular.settings:HYPERPARAMETERS"
 _POSTERIOR_SETTINGS = "imagine_bench_controls.tabular.settings:POSTERIOR_SAMPLING"
@@ -12,11 +12,18 @@ _CODE = "its state is the code of a frame."
 _TRUE_STATE = "its state is the true macrostate (privileged: other learners see frames)."
 
 DRQN = AgentEntry(
-    make="imagine_bench_controls.drqn:make",
-    settings="imagine_bench_controls.drqn_settings:HYPERPARAMETERS",
+    make="imagine_bench_controls.memory.drqn:make",
+    settings="imagine_bench_controls.memory.settings:DRQN",
     title="DQN + memory",
     description="The DQN with a recurrent network (DRQN), which remembers what the episode showed; replays "
     "sequences as R2D2 does.",
+)
+IMAGINATION_MEMORY = AgentEntry(
+    make="imagine_bench_controls.memory.imagination:make",
+    title="imagination + memory",
+    settings="imagine_bench_controls.memory.settings:IMAGINATION_MEMORY",
+    description="Like imagination + uncertainty, but the world model is recurrent (MDN-RNN), and rollouts carry "
+    "what it remembers.",
 )
 IMAGINATION_EXACT = AgentEntry(
     make="imagine_bench_controls.exact:make",
@@ -132,4 +139,11 @@ DYNA_Q_MACROSTATE = AgentEntry(
     privileged=True,
     title="Dyna-Q (true state)",
     description=f"Q-learning, also from transitions that its model recalls: imagination's ancestor; {_TRUE_STATE}",
+)
+MDN_RNN = WorldModelEntry(
+    make="imagine_bench_controls.memory.world_model:make",
+    title="VAE + MDN-RNN",
+    encoder_kind="latents",
+    description="The ensemble on what a recurrent network remembers of all frames of the history.",
+    by_default=False,
 )

@@ -12,12 +12,11 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from imagine_bench.agents.encoders.encoder import Encoder
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..encoders.encoder import Encoder
-from .recurrence import Recurrence
-from .sequences import SequenceMemory
+from .sequences import Recurrence, SequenceMemory
 
 _EPISODES = 300
 """The newest episodes that a read-out is fitted on."""

@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from imagine_bench.agents.encoders.encoder import Encoder
+from imagine_bench.agents.encoders.perception import Perception
 from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.interfaces import Frame
 
-from ..encoders.encoder import Encoder
-from ..encoders.perception import Perception
-from .recurrence import START, Recurrence
+from .sequences import START, Recurrence
 
 
 class StateEncoder(Encoder):

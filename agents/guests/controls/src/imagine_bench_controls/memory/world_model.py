@@ -7,20 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from imagine_bench.agents.encoders.perception import load_perception, prepare_torch
+from imagine_bench.agents.replay import Batch
+from imagine_bench.agents.world_models import latent
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.arrays import Arrays
-from imagine_bench.interfaces import AgentContext, Frame
+from imagine_bench.interfaces import AgentContext, Arrays, Frame
 from imagine_bench.interfaces.episodes import Episodes
 
-from ..encoders.perception import load_perception, prepare_torch
-from ..memory.imagination import RecurrentImagination
-from ..memory.recurrence import START
-from ..memory.sequences import SequenceMemory
-from ..memory.settings import IMAGINATION_MEMORY, RecurrentSettings
-from ..replay import Batch
-from . import latent
+from .imagination import RecurrentImagination
+from .sequences import START, SequenceMemory
+from .settings import IMAGINATION_MEMORY, RecurrentSettings
 
 
 class RecurrentLatentModel(latent.LatentModel):

@@ -2,7 +2,7 @@
 
 What the recurrence remembers is learned from what the world model predicts: the next latents, reward and end. The
 controller reads the latents and what is remembered, as in that paper, and learns nothing of the recurrence. Imagined
-rollouts begin in real states and remember what they imagine; filter and members are those of :mod:`..imagination`.
+rollouts begin in real states and remember what they imagine; filter and members are those of the imagining agents.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from functools import partial
 from typing import cast
 
 import torch
+from imagine_bench.agents.imagination.agent import ImaginingAgent, build
+from imagine_bench.agents.imagination.rollouts import Imagination
+from imagine_bench.agents.imagination.settings import Settings, WorldModelSettings
+from imagine_bench.agents.imagination.world_model import EnvironmentModel
+from imagine_bench.agents.networks.adam import Adam
+from imagine_bench.agents.replay import Batch
 from torch import Tensor
 
-from ..imagination.agent import ImaginingAgent, build
-from ..imagination.rollouts import Imagination
-from ..imagination.settings import Settings, WorldModelSettings
-from ..imagination.world_model import EnvironmentModel
-from ..networks.adam import Adam
-from ..replay import Batch
 from .agent import RememberingAgent
-from .recurrence import Recurrence
+from .sequences import Recurrence
 from .settings import IMAGINATION_MEMORY, RecurrentSettings
 
 

@@ -9,12 +9,10 @@ import pytest
 import torch
 from agent_states import same
 from fake_latents import ACTIONS, CODES, LATENTS, FakeEncoder, built, frame, transition, with_own_settings
-from imagine_bench.agents.memory import imagination
-from imagine_bench.agents.memory.agent import RememberingAgent
-from imagine_bench.agents.memory.readout import last_seen
-from imagine_bench.agents.memory.recurrence import START, Recurrence
-from imagine_bench.agents.memory.sequences import SequenceMemory
-from imagine_bench_controls import drqn
+from imagine_bench_controls.memory import drqn, imagination
+from imagine_bench_controls.memory.agent import RememberingAgent
+from imagine_bench_controls.memory.readout import last_seen
+from imagine_bench_controls.memory.sequences import START, Recurrence, SequenceMemory
 
 from imagine_bench.interfaces import Observation
 

@@ -9,18 +9,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from imagine_bench.agents.dqn import DQN
+from imagine_bench.agents.encoders.perception import Perception
 from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.interfaces import AgentState, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
-from ..dqn import DQN
-from ..encoders.perception import Perception
 from .perception import Remembering
 from .readout import ReadOut, fit
-from .recurrence import START, Recurrence
-from .sequences import SequenceMemory
+from .sequences import START, Recurrence, SequenceMemory
 from .settings import RecurrentDQNSettings, RecurrentSettings
 
 

@@ -6,10 +6,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from ..dqn_settings import DQNSettings
-from ..imagination.settings import HYPERPARAMETERS as IMAGINATION
-from ..imagination.settings import Settings
-from ..settings import COUNT, ConfigGroup, Hyperparameters, Override, between, flatten, replaced, setting
+from imagine_bench.agents.dqn_settings import HYPERPARAMETERS as PLAIN_DQN
+from imagine_bench.agents.dqn_settings import DQNSettings
+from imagine_bench.agents.imagination.settings import HYPERPARAMETERS as IMAGINATION
+from imagine_bench.agents.imagination.settings import Settings
+from imagine_bench.agents.settings import (
+    COUNT,
+    ConfigGroup,
+    Hyperparameters,
+    Override,
+    between,
+    flatten,
+    replaced,
+    setting,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,16 +53,16 @@ _FAST: Mapping[str, Override] = {
     "recurrence.sequence": Override(10, "as long as most episodes are"),
 }
 _SLOW_TARGET = Override(0.05, "without a target network the values of states that are still being learned swing")
-FAST_DQN = {**_FAST, "controller.target_rate": _SLOW_TARGET}
+_FAST_DQN = {**_FAST, "controller.target_rate": _SLOW_TARGET}
 _FAST_IMAGINATION = {
-    **FAST_DQN,
+    **_FAST_DQN,
     "model.batch_size": Override(32, "CPU time; each row is a sequence of several transitions"),
 }
 _UNUSED = frozenset({"memory.priority", "memory.priority_correction"})
 S = TypeVar("S", RecurrentDQNSettings, RecurrentSettings)
 
 
-def with_memory(
+def _with_memory(
     kind: type[S], base: Hyperparameters[DQNSettings] | Hyperparameters[Settings], fast: Mapping[str, Override]
 ) -> Hyperparameters[S]:
     """The hyper-parameters of an agent without memory, with settings of its memory added.
@@ -71,4 +81,5 @@ def with_memory(
     return Hyperparameters(groups)
 
 
-IMAGINATION_MEMORY = with_memory(RecurrentSettings, IMAGINATION, _FAST_IMAGINATION)
+DRQN = _with_memory(RecurrentDQNSettings, PLAIN_DQN, _FAST_DQN)
+IMAGINATION_MEMORY = _with_memory(RecurrentSettings, IMAGINATION, _FAST_IMAGINATION)

@@ -6,16 +6,16 @@ import torch
 from imagine_bench.agents.dqn import Controller
 from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.encoders.perception import load_perception, prepare_torch
-from imagine_bench.agents.memory.agent import RememberingAgent
-from imagine_bench.agents.memory.recurrence import Recurrence
-from imagine_bench.agents.memory.settings import RecurrentDQNSettings
 from imagine_bench.agents.networks.mlp import mlp
 from imagine_bench.agents.replay import Batch, Transitions
 from torch import Tensor, nn
 
 from imagine_bench.interfaces import AgentContext
 
-from .drqn_settings import HYPERPARAMETERS
+from .agent import RememberingAgent
+from .sequences import Recurrence
+from .settings import DRQN as HYPERPARAMETERS
+from .settings import RecurrentDQNSettings
 
 
 class RecurrentValues(nn.Module):
