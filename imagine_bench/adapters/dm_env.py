@@ -10,15 +10,14 @@ The only module that imports dm_env and dm_control::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.arrays import Action, Info
+from imagine_bench.arrays import Action, Floats, Info
 from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError, SetupError
 
@@ -36,6 +35,9 @@ except ImportError as error:
 
 _STILL_S = 1.0
 """How far the viewer's clock goes on for a macro-action that took no simulated time."""
+_POSE = mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_QPOS
+_POSE |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+"""What is shown of a scene at one moment: the time (s) first, then positions and mocap bodies."""
 
 
 def as_dm_env(env: Env | str, *, seed: int | None = None, motion_hz: float = 0.0, **kwargs: Any) -> DmEnvironment:
@@ -59,16 +61,6 @@ def as_dm_env(env: Env | str, *, seed: int | None = None, motion_hz: float = 0.0
     return DmEnvironment(gymnasium.make(env, **kwargs), seed=seed, motion_hz=motion_hz)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Pose:
-    """A scene at one moment: time (s), positions (nq,), and mocap bodies (nmocap, 3) and (nmocap, 4)."""
-
-    time_s: float
-    qpos: NDArray[np.float64]
-    mocap_pos: NDArray[np.float64]
-    mocap_quat: NDArray[np.float64]
-
-
 class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not typed
     """A Gymnasium environment behind ``dm_env.Environment``; made by :func:`as_dm_env`.
 
@@ -81,10 +73,13 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
     """
 
     def __init__(self, env: Env, *, seed: int | None, motion_hz: float) -> None:
-        space, actions = env.observation_space, env.action_space
+        space = env.observation_space
+        actions = env.action_space
         if not isinstance(space, gymnasium.spaces.Box) or not isinstance(actions, gymnasium.spaces.Discrete):
             raise InvalidValueError(f"No adapter for the spaces {space} and {actions}; give a Box and a Discrete one.")
-        self._env, self._seed, self._motion_hz = env, seed, motion_hz
+        self._env = env
+        self._seed = seed
+        self._motion_hz = motion_hz
         scene: Any = env.unwrapped
         self._scene: Any = scene if hasattr(scene, "replay") else None
         if not motion_hz >= 0 or (motion_hz > 0 and self._scene is None):
@@ -92,14 +87,14 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         if motion_hz > 0:
             scene.capture_motion_hz = motion_hz
         if self._scene is not None:
-            self._scene.agent_view()  # contexts end in reverse order at exit; after ours the display is closed
+            scene.agent_view()  # contexts end in reverse order at exit; after ours the display is closed
         self._observation_spec = specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "observation")
         self._action_spec = specs.DiscreteArray(int(actions.n), name="action")
         self.info: Info = {}
         self._physics: Physics | None = None
         self._time_s = 0.0
         self._shown = self._pose(0.0)
-        self._to_show: list[_Pose | None] = []
+        self._to_show: list[Floats] = []
         self._before = dm_env.restart(None)
         self._latest: dm_env.TimeStep | None = None
 
@@ -116,7 +111,8 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
     def reset(self) -> dm_env.TimeStep:
         """Begin an episode; the first time with the seed."""
         observation, self.info = self._env.reset(seed=self._seed)
-        self._seed, self._to_show = None, []
+        self._seed = None
+        self._to_show = []
         self._latest = dm_env.restart(observation)
         self._show(self._pose(self._time_s))
         return self._latest
@@ -126,7 +122,10 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         if not self._to_show:
             if self._latest is None or self._latest.last():
                 return self.reset()
-            self._before, self._latest = self._latest, self._carry_out(action)
+            self._before = self._latest
+            observation, reward, terminated, truncated, self.info = self._env.step(action)
+            kind = dm_env.termination if terminated else dm_env.truncation if truncated else dm_env.transition
+            self._latest = kind(reward=float(reward), observation=observation)
             self._to_show = self._poses()
         self._show(self._to_show.pop(0))
         if self._to_show:
@@ -136,11 +135,6 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
     def close(self) -> None:
         """Close the Gymnasium environment."""
         self._env.close()
-
-    def _carry_out(self, action: Action) -> dm_env.TimeStep:
-        observation, reward, terminated, truncated, self.info = self._env.step(action)
-        kind = dm_env.termination if terminated else dm_env.truncation if truncated else dm_env.transition
-        return kind(reward=float(reward), observation=observation)
 
     # --- the viewer ----------------------------------------------------------------------------------------------
 
@@ -157,32 +151,32 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
             raise InvalidValueError(f"{self._env} has no MuJoCo scene to show; give a task of imagine_bench.")
         if self._physics is None:
             quality = self._scene.model.vis.quality  # of contexts still to be made; our own renderers bring theirs
-            quality.shadowsize, quality.offsamples, quality.numslices, quality.numstacks = 2048, 4, 28, 14
+            quality.shadowsize = 2048
+            quality.offsamples = 4
+            quality.numslices = 28
+            quality.numstacks = 14
             self._physics = Physics(wrapper.MjData(wrapper.MjModel(self._scene.model)))
             self._show(self._shown)
         return self._physics
 
-    def _pose(self, time_s: float) -> _Pose | None:
-        """The scene as it is now; None without one."""
+    def _pose(self, time_s: float) -> Floats:
+        """The scene as it is now, :data:`_POSE`; empty without one."""
         if self._scene is None:
-            return None
-        data = self._scene.data
-        return _Pose(
-            time_s=time_s, qpos=data.qpos.copy(), mocap_pos=data.mocap_pos.copy(), mocap_quat=data.mocap_quat.copy()
-        )
+            return np.empty(0)
+        pose = np.empty(mujoco.mj_stateSize(self._scene.model, _POSE))
+        mujoco.mj_getState(self._scene.model, self._scene.data, pose, _POSE)
+        pose[0] = time_s
+        return pose
 
-    def _poses(self) -> list[_Pose | None]:
+    def _poses(self) -> list[Floats]:
         """The latest macro-action: its motion, if that is to be shown, and how it ended."""
         begin_s = self._time_s
         self._time_s += self.info.get("sim_time_s") or _STILL_S
         moving = [self._pose(begin_s + time_s) for time_s in self._scene.replay()] if self._motion_hz else []
         return [*moving, self._pose(self._time_s)]
 
-    def _show(self, pose: _Pose | None) -> None:
+    def _show(self, pose: Floats) -> None:
         self._shown = pose
-        if self._physics is None or pose is None:
-            return
-        data = self._physics.data
-        data.time, data.qpos[:] = pose.time_s, pose.qpos
-        data.mocap_pos[:], data.mocap_quat[:] = pose.mocap_pos, pose.mocap_quat
-        self._physics.forward()
+        if self._physics is not None:
+            mujoco.mj_setState(self._scene.model, self._physics.data.ptr, pose, _POSE)
+            self._physics.forward()

@@ -13,7 +13,6 @@ from imagine_bench.errors import InvalidValueError, lacking, require_known
 from imagine_bench.store.codec import table_rows
 from imagine_bench.store.files import make_folder
 
-_METRICS = "metrics.csv"
 Rows = list[dict[str, float]]
 
 
@@ -33,22 +32,20 @@ def track(folder: Path, tool: str) -> Path:
         SetupError: The tool is not installed.
     """
     write = TOOLS[require_known("tracking tool", tool, TOOLS)]
-    runs = {path.parent.relative_to(folder): path for path in sorted(folder.glob(f"*/seed_*/{_METRICS}"))}
+    runs = {path.parent.relative_to(folder): path.read_text() for path in sorted(folder.glob("*/seed_*/metrics.csv"))}
     if not runs:
         raise InvalidValueError(f"No run in {folder} has been tested yet; give the folder of a bench.")
-    if not all(path.read_text().startswith("episodes,") for path in runs.values()):
+    if not all(table.startswith("episodes,") for table in runs.values()):
         raise InvalidValueError(f"{folder} compares no agents by training episodes; give the folder of such a bench.")
     out = folder / tool
     shutil.rmtree(out, ignore_errors=True)
-    for run, path in runs.items():
-        write(make_folder(out), run, [_scalars(row) for row in table_rows(path.read_text(), ("solved",))])
+    for run, table in runs.items():
+        rows = table_rows(table, ("solved",))
+        for row in rows:
+            del row["solved"]
+            row["success_rate"] = row["successes"] / row["test_episodes"]
+        write(make_folder(out), run, rows)
     return out
-
-
-def _scalars(row: dict[str, float]) -> dict[str, float]:
-    """The numbers of a row and the success rate in [0, 1]."""
-    rate = row["successes"] / row["test_episodes"]
-    return {"success_rate": rate, **{name: float(value) for name, value in row.items() if name != "solved"}}
 
 
 def _tensorboard(out: Path, run: Path, rows: Rows) -> None:
@@ -75,7 +72,8 @@ def _wandb(out: Path, run: Path, rows: Rows) -> None:
         project=out.parent.name, group=run.parent.name, name=str(run), dir=out, mode="offline", settings=quiet
     )
     for row in rows:
-        written.log({name: value for name, value in row.items() if name != "episodes"}, step=int(row["episodes"]))
+        episodes = row.pop("episodes")
+        written.log(row, step=int(episodes))
     written.finish()
     wandb.teardown()  # ends its service, which writes the files
 

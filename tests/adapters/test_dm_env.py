@@ -44,8 +44,7 @@ class MotionContractTest(ContractTest):
         return iter([0, 2, 4, 1] * 4)
 
 
-@pytest.mark.parametrize("execution", ["kinematic", "physics"])
-@pytest.mark.parametrize("task", registry.TASKS)
+@pytest.mark.parametrize(("task", "execution"), [("arrow_puzzle", "physics"), ("pick_place", "kinematic")])
 def test_equals_gymnasium_step_for_step(task, execution):
     env_id = registry.TASKS[task].env_id
     ours = gymnasium.make(env_id, execution=execution)

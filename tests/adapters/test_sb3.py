@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import gymnasium
 import numpy as np
 import pytest
@@ -127,14 +124,3 @@ def test_what_cannot_be_is_one_clear_error():
     with pytest.raises(InvalidValueError, match="belong to gymnasium"):
         as_sb3(env, execution="physics")
     env.close()
-
-
-def test_missing_library_is_one_clear_error():
-    code = (
-        "import sys; sys.modules['stable_baselines3'] = None\n"
-        "from imagine_bench.errors import SetupError\n"
-        "try:\n    import imagine_bench.adapters.sb3\n"
-        "except SetupError as error:\n    print(error)"
-    )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60).stdout
-    assert "pip install 'imagine-bench[peers]'" in said
