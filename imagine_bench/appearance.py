@@ -5,7 +5,7 @@ Three levels are points of these factors; ``photo`` is none.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
 
@@ -40,7 +40,8 @@ def appearance_name(given: str | Mapping[str, float], known: Iterable[str] = APP
 def factors_of(given: str | Mapping[str, float]) -> dict[str, float]:
     """The factors above 0, in the order of FACTORS, of a mapping or a text. Raises as :func:`appearance_name`."""
     shares = dict[str, float]()
-    for name, share in given.items() if isinstance(given, Mapping) else _pairs(given):
+    pairs = given.items() if isinstance(given, Mapping) else [pair.partition("=")[::2] for pair in given.split(",")]
+    for name, share in pairs:
         if name not in FACTORS:
             raise UnknownNameError("factor of appearance", name, FACTORS)
         if name in shares:
@@ -52,14 +53,6 @@ def factors_of(given: str | Mapping[str, float]) -> dict[str, float]:
         if not 0.0 <= shares[name] <= 1.0:
             raise InvalidValueError(f"Appearance has {name}={brief(share)}; give a number from 0 to 1.")
     return {name: shares[name] for name in FACTORS if shares.get(name)}
-
-
-def _pairs(text: str) -> Iterator[tuple[str, str]]:
-    for pair in text.split(","):
-        name, equals, share = pair.partition("=")
-        if not equals:
-            raise InvalidValueError(f"Appearance {brief(text)} is not of the form {_EXAMPLE}.")
-        yield name, share
 
 
 def appearance_of_tests(appearance: str) -> str:

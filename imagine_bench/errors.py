@@ -43,17 +43,14 @@ class UnknownNameError(ImagineBenchError, ValueError):
     """
 
     def __init__(self, kind: str, given: object, known: Iterable[object]) -> None:
-        names = [str(name) for name in known]
+        super().__init__(kind, given, [str(name) for name in known])
+
+    def __str__(self) -> str:
+        kind, given, names = self.args
         word = str(given) if isinstance(given, str | int | float | None) else brief(given)
         closest = difflib.get_close_matches(word, names, n=1, cutoff=0.4) if len(word) <= _LONGEST else []
         hint = f" Did you mean {closest[0]!r}?" if closest else ""
-        super().__init__(f"No {kind} {brief(word)}.{hint} Known: {', '.join(names) or 'none'}.")
-        self.kind = kind
-        self.given = given
-        self.known = tuple(names)
-
-    def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, object, tuple[str, ...]]]:
-        return type(self), (self.kind, self.given, self.known)  # worker processes send errors back
+        return f"No {kind} {brief(word)}.{hint} Known: {', '.join(names) or 'none'}."
 
 
 class InvalidValueError(ImagineBenchError, ValueError):

@@ -91,16 +91,9 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 
 def first_lasting(budgets: Sequence[int], scores: ArrayLike, threshold: float) -> int | None:
-    """The first of ascending budgets from which on every score (B,) is at least ``threshold``; None where none is.
-
-    Raises:
-        InvalidValueError: Not one score a budget.
-    """
-    values = _finite(scores)
-    if values.shape != (len(budgets),):
-        raise InvalidValueError(f"{len(budgets)} budgets need as many scores, not an array of shape {values.shape}.")
-    below = np.flatnonzero(values < threshold)
-    first = 0 if not len(below) else int(below[-1]) + 1
+    """The first of ascending budgets from which on every score (B,) is at least ``threshold``; None where none is."""
+    below = np.flatnonzero(_runs(scores) < threshold)
+    first = int(below[-1]) + 1 if len(below) else 0
     return budgets[first] if first < len(budgets) else None
 
 
@@ -109,18 +102,11 @@ def running_means(budgets: Sequence[int], scores: ArrayLike, at_zero: float) -> 
 
     Curves are straight between tests at ascending budgets, and from ``at_zero`` at episode 0 to the first test.
     Scores and result have shape (runs, B).
-
-    Raises:
-        InvalidValueError: Not one score a budget.
     """
     table = _finite(scores)
-    if table.ndim != 2 or table.shape[1] != len(budgets):
-        count = len(budgets)
-        raise InvalidValueError(f"{count} budgets need scores of shape (runs, {count}), not {table.shape}.")
-    episodes = np.array([0, *budgets], dtype=np.float64)
-    values = np.concatenate([np.full((len(table), 1), at_zero), table], axis=1)  # [runs, B + 1]
-    pieces = np.diff(episodes) * (values[:, 1:] + values[:, :-1]) / 2.0
-    return np.asarray(pieces.cumsum(axis=1) / episodes[1:])
+    values = np.insert(table, 0, at_zero, axis=1)  # [runs, B + 1]
+    areas = scipy.integrate.cumulative_trapezoid(values, [0, *budgets], axis=1)
+    return np.asarray(areas / budgets)
 
 
 class PairedTests(NamedTuple):
@@ -141,9 +127,11 @@ def mcnemar(first: str, second: str) -> PairedTests:
     """
     if len(first) != len(second):
         raise InvalidValueError(f"{len(first)} and {len(second)} tests are no pairs; give those of the same starts.")
-    alone = [sum((a, b) == pair for a, b in zip(first, second, strict=True)) for pair in (("1", "0"), ("0", "1"))]
-    p = float(scipy.stats.binomtest(alone[0], sum(alone)).pvalue) if any(alone) else 1.0
-    return PairedTests(alone[0], alone[1], p)
+    pairs = list(zip(first, second, strict=True))
+    alone = pairs.count(("1", "0"))
+    other = pairs.count(("0", "1"))
+    p = float(scipy.stats.binomtest(alone, alone + other).pvalue) if alone + other else 1.0
+    return PairedTests(alone, other, p)
 
 
 def detectable_paired(found: PairedTests, pairs: int, *, cells: int) -> float:
@@ -163,9 +151,7 @@ def probability_of_improvement(treated: ArrayLike, base: ArrayLike) -> float:
 
     Over all pairs of their runs, (n,) and (m,).
     """
-    a = _runs(treated)[:, None]
-    b = _runs(base)[None]
-    return float(((a > b) + 0.5 * (a == b)).mean())
+    return _chance_of_more(_runs(treated), _runs(base))
 
 
 def difference(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None, trim: float = _TRIM) -> Estimate:
@@ -240,15 +226,13 @@ def ratio(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None, pai
     under = _location(b, trials, 0.0)
     shared = float(np.cov(a, b)[0, 1]) / len(a) if paired else 0.0
     freedom = len(a) - 1 if paired else _welch(over, under)
-    t = float(scipy.stats.t.ppf(0.5 + LEVEL / 2.0, freedom))
-    g = (t * under.error / mean_b) ** 2
-    if g >= 1.0:
+    square = float(scipy.stats.t.ppf(0.5 + LEVEL / 2.0, freedom)) ** 2
+    lead = mean_b**2 - square * under.error**2
+    if lead <= 0.0:
         return Estimate(value, math.nan, math.nan)
-    inner = over.error**2 - 2.0 * value * shared + (value * under.error) ** 2
-    inner -= g * (over.error**2 - (shared / under.error) ** 2 if under.error > 0.0 else 0.0)
-    middle = value - (g * shared / under.error**2 if under.error > 0.0 else 0.0)
-    half = t / abs(mean_b) * math.sqrt(max(inner, 0.0))
-    return Estimate(value, (middle - half) / (1.0 - g), (middle + half) / (1.0 - g))
+    middle = (mean_a * mean_b - square * shared) / lead
+    half = math.sqrt(max(middle**2 - (mean_a**2 - square * over.error**2) / lead, 0.0))
+    return Estimate(value, middle - half, middle + half)
 
 
 def _location(values: Floats, trials: int | None, trim: float) -> _Location:
@@ -257,7 +241,7 @@ def _location(values: Floats, trials: int | None, trim: float) -> _Location:
     cut = int(trim * count)
     ordered = np.sort(values)
     kept = ordered[cut : count - cut]
-    winsorised = np.concatenate([np.full(cut, kept[0]), kept, np.full(cut, kept[-1])])
+    winsorised = np.clip(ordered, kept[0], kept[-1])
     error = float(winsorised.std(ddof=1)) * math.sqrt((count - 1) / (len(kept) * (len(kept) - 1)))
     if trials is not None:
         tests = count * trials
@@ -303,9 +287,10 @@ def auroc(scores: NDArray[np.floating], wrong: NDArray[np.bool_]) -> float:
     """
     if scores.shape != wrong.shape or np.isnan(scores).any():
         raise InvalidValueError(f"AUROC needs one number a prediction, not {scores.shape} for {wrong.shape}, or NaN.")
-    n_wrong, n_right = int(wrong.sum()), int((~wrong).sum())
-    if not n_wrong or not n_right:
-        return math.nan
-    _, places, counts = np.unique(scores, return_inverse=True, return_counts=True)
-    ranks = (counts.cumsum() - (counts - 1) / 2)[places]  # equal scores share the mean of their ranks
-    return float((ranks[wrong].sum() - n_wrong * (n_wrong + 1) / 2) / (n_wrong * n_right))
+    return math.nan if wrong.all() or not wrong.any() else _chance_of_more(scores[wrong], scores[~wrong])
+
+
+def _chance_of_more(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+    """Probability that one of (n,) is larger than one of (m,), ties counting half: Mann and Whitney's U of all pairs."""
+    found = scipy.stats.mannwhitneyu(a.astype(np.float64), b.astype(np.float64), method="asymptotic")
+    return float(found.statistic / (len(a) * len(b)))

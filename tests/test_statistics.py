@@ -44,11 +44,6 @@ def test_who_learns_earlier_has_the_larger_running_mean() -> None:
     assert (early > late).all()
 
 
-def test_running_means_need_one_score_a_budget() -> None:
-    with pytest.raises(InvalidValueError, match=r"2 budgets need scores of shape \(runs, 2\), not \(1, 3\)"):
-        statistics.running_means((10, 30), [[0.1, 0.2, 0.3]], 0.0)
-
-
 FIVE, OTHERS = [0.2, 0.5, 0.55, 0.6, 0.9], [0.1, 0.15, 0.3, 0.2, 0.8, 0.25, 0.2, 0.35]
 
 

@@ -68,7 +68,8 @@ def test_names_are_read_back_as_the_factors_they_say():
             "No factor of appearance 'ligth'. Did you mean 'light'? Known: light, colors, camera, pose, hand.",
         ),
         ("light=0.5,light=0.5", "names light twice; give it once."),
-        ("light=0.5,strong", "is not of the form light=0.5,camera=0.2."),
+        ("light=0.5,strong", "No factor of appearance 'strong'. Known: light, colors, camera, pose, hand."),
+        ("light=0.5,hand", "Appearance has hand=''; give a number from 0 to 1."),
         (3, "No appearance '3'."),
     ],
 )
