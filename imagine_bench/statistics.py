@@ -291,6 +291,6 @@ def auroc(scores: NDArray[np.floating], wrong: NDArray[np.bool_]) -> float:
 
 
 def _chance_of_more(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-    """Probability that one of (n,) is larger than one of (m,), ties counting half: Mann and Whitney's U of all pairs."""
+    """Share of all pairs in which one of (n,) is larger than one of (m,), ties for half (Mann and Whitney 1947)."""
     found = scipy.stats.mannwhitneyu(a.astype(np.float64), b.astype(np.float64), method="asymptotic")
     return float(found.statistic / (len(a) * len(b)))

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 
 from imagine_bench import registry
@@ -24,7 +23,7 @@ from imagine_bench.errors import InvalidValueError, SetupError
 try:
     registry.load("imagine_bench.tasks.graphics:choose_platform")()  # dm_control chooses another one while it loads
     import dm_env
-    from dm_control.mujoco import Physics, wrapper
+    from dm_control import mujoco
     from dm_env import specs
 except ImportError as error:
     raise SetupError(
@@ -91,7 +90,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         self._observation_spec = specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "observation")
         self._action_spec = specs.DiscreteArray(int(actions.n), name="action")
         self.info: Info = {}
-        self._physics: Physics | None = None
+        self._physics: mujoco.Physics | None = None
         self._time_s = 0.0
         self._shown = self._pose(0.0)
         self._to_show: list[Floats] = []
@@ -139,7 +138,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
     # --- the viewer ----------------------------------------------------------------------------------------------
 
     @property
-    def physics(self) -> Physics:
+    def physics(self) -> mujoco.Physics:
         """dm_control's ``Physics`` of what is shown: the task's own model, and data of its own.
 
         What is done to the data, such as by the viewer's mouse, does not reach the task.
@@ -155,7 +154,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
             quality.offsamples = 4
             quality.numslices = 28
             quality.numstacks = 14
-            self._physics = Physics(wrapper.MjData(wrapper.MjModel(self._scene.model)))
+            self._physics = mujoco.Physics(mujoco.wrapper.MjData(mujoco.wrapper.MjModel(self._scene.model)))
             self._show(self._shown)
         return self._physics
 

@@ -1,8 +1,11 @@
-"""The commands that run and report comparisons."""
+"""The commands that run benches, sweeps and judgements, report them, and put questions to trained agents."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+import os
+import sys
+import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,22 +14,26 @@ import tyro
 from imagine_bench import registry
 from imagine_bench.adapters.tracking import track
 from imagine_bench.cli.options import (
-    FolderOrTask,
+    Count,
+    Counts,
+    EncoderWord,
+    File,
     Launch,
-    MaybeInt,
+    ManyWords,
     MaybeTaskWord,
-    OfTask,
+    Number,
+    OfBench,
     Repeated,
     TaskWord,
+    Word,
+    Words,
     added_up,
-    listed,
-    only,
-    path_or_task,
-    require_values,
     shown,
 )
 from imagine_bench.errors import InvalidValueError, RunFailedError
-from imagine_bench.interfaces import DEVICES
+from imagine_bench.interfaces import APPEARANCES, DEVICES
+from imagine_bench.judge.judgement import Judgement, judge
+from imagine_bench.judge.verify import cost
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.protocols.runs import Encoders, Result
 from imagine_bench.registry.entries import file_name, parse_settings
@@ -48,42 +55,44 @@ if TYPE_CHECKING:
 class WorldOptions:
     """Options of the world."""
 
-    execution: Annotated[str | None, shown("STR", "(default: physics)")] = None
-    """How macro-actions happen: physics, or kinematic (their outcome is set)."""
-    appearance: Annotated[str | None, shown("STR", "(default: clean)")] = None
-    """How much frames vary: clean, mild, strong, photo (a finite pool), or factors such as light=0.5,camera=0.2."""
-    physics: Annotated[Repeated[str], listed("STR", "(default: none)")] = ()
+    execution: Word = None
+    """How macro-actions happen: physics (the default), or kinematic (their outcome is set)."""
+    appearance: Word = None
+    """How much frames vary: clean (the default), mild, strong, photo (a finite pool), or factors such as
+    light=0.5,camera=0.2."""
+    physics: ManyWords = ()
     """What decides whether a grasp holds, as name=value, such as pad_friction=0.5."""
-    observation: Annotated[str | None, shown("STR", "(default: frame)")] = None
-    """What agents see: frame, human, state (privileged) or proprio, several separated by commas."""
-    observation_size: Annotated[int | None, shown("INT", "(default: 64)")] = None
-    """Edge of images that agents see, 32 to 256 pixels."""
+    observation: Word = None
+    """What agents see: frame (the default), human, state (privileged) or proprio, several separated by commas."""
+    observation_size: Count = None
+    """Edge of images that agents see, 32 to 256 pixels; 64 by default."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Learner:
     """Options of the agents and of what they learn from."""
 
-    agents: Annotated[tuple[str, ...] | None, listed("STR")] = None
-    """Agents to compare; one with settings of its own is written 'dqn:controller.discount=0.99'."""
-    set: Annotated[Repeated[str], listed("STR", "(default: none)")] = ()
+    agents: Words = None
+    """Agents to compare, by default the preset's; one with settings of its own is written
+    'dqn:controller.discount=0.99'."""
+    set: ManyWords = ()
     """Agent settings that replace the preset's, as name=value, such as controller.discount=0.9."""
-    encoder: Annotated[str | None, shown("NAME|FILE", "(default: the task's own)")] = None
-    """Another encoder: a bundled name or a .safetensors file."""
-    after: Annotated[tuple[str, ...] | None, listed("STR", "(default: none)")] = None
+    encoder: EncoderWord = None
+    """Another encoder than the task's own: a bundled name or a .safetensors file."""
+    after: Words = None
     """Tasks of the same world to be trained on before, in this order; the model of the world is carried over."""
-    after_episodes: Annotated[int | None, shown("INT", "(default: 100)")] = None
-    """Real training episodes on each of them."""
-    demonstrations: Annotated[int | None, shown("INT", "(default: 0)")] = None
-    """First training episodes that the oracle plays and learners watch; budgets count them."""
-    dataset: Annotated[Path | None, shown("PATH", "(default: none)")] = None
+    after_episodes: Count = None
+    """Real training episodes on each of them; 100 by default."""
+    demonstrations: Count = None
+    """First training episodes, 0 by default, that the oracle plays and learners watch; budgets count them."""
+    dataset: File = None
     """Folder of a dataset whose episodes come first in training; budgets count them, and are them alone by default."""
-    queries: Annotated[int | None, shown("INT", "(default: 0)")] = None
-    """Most oracle queries of a learner in a training episode."""
-    feedback: Annotated[float | None, shown("FLOAT", "(default: 0)")] = None
-    """Reward that a teacher adds for an optimal macro-action, and takes off for another, in training."""
-    feedback_error: Annotated[float | None, shown("FLOAT", "(default: 0)")] = None
-    """Probability with which the teacher says the opposite."""
+    queries: Count = None
+    """Most oracle queries of a learner in a training episode; 0 by default."""
+    feedback: Number = None
+    """Reward that a teacher adds for an optimal macro-action, and takes off for another, in training; 0 by default."""
+    feedback_error: Number = None
+    """Probability with which the teacher says the opposite; 0 by default."""
     device: str = DEVICES[0]
     """Where agents compute: cpu or cuda."""
 
@@ -92,25 +101,25 @@ class Learner:
 class Budget:
     """Options of how much is run."""
 
-    seeds: Annotated[tuple[int, ...] | None, listed("INT")] = None
-    """Seeds; each agent has one run a seed."""
-    budgets: Annotated[tuple[int, ...] | None, listed("INT")] = None
-    """Real training episodes at which agents are tested, ascending."""
-    variants: Annotated[Repeated[str], listed("STR")] = ()
-    """Of regression tasks: datasets, or numbers of samples, to learn from."""
-    networks: MaybeInt = None
-    """Of regression tasks: networks a run, each on data of its own."""
+    seeds: Counts = None
+    """Seeds, by default the preset's; each agent has one run a seed."""
+    budgets: Counts = None
+    """Real training episodes at which agents are tested, ascending; by default the preset's."""
+    variants: ManyWords = ()
+    """Of regression tasks: datasets, or numbers of samples, to learn from; by default all."""
+    networks: Count = None
+    """Of regression tasks: networks a run, by default the preset's, each on data of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tests:
     """Options of the tests."""
 
-    evaluation_episodes: MaybeInt = None
-    """Test episodes at each budget."""
-    test_appearance: Annotated[str | None, shown("STR", "(default: the training's)")] = None
-    """The appearance in tests."""
-    split: Annotated[str | None, shown("STR", "(default: none)")] = None
+    evaluation_episodes: Count = None
+    """Test episodes at each budget; by default the preset's."""
+    test_appearance: Word = None
+    """The appearance in tests; the training's by default."""
+    split: Word = None
     """Tests start where training never does, such as plan_length=2: after at most 2 macro-actions training can end."""
 
 
@@ -122,30 +131,21 @@ class Bench:
     """Task to compare on, also as --task TASK; 'imagine-bench describe' names them."""
     preset: str = "quick"
     """Size of the comparison; 'imagine-bench describe' names them."""
-    world: WorldOptions = field(default_factory=WorldOptions)
-    learner: Learner = field(default_factory=Learner)
-    budget: Budget = field(default_factory=Budget)
-    tests: Tests = field(default_factory=Tests)
-    launch: Launch = field(default_factory=Launch)
+    world: WorldOptions
+    learner: Learner
+    budget: Budget
+    tests: Tests
+    launch: Launch
 
     def asked(self) -> tuple[str, str, dict[str, Any]]:
         """The task, the preset and the options that replace values of the preset, by name."""
-        given: dict[str, Any] = {}
-        for section in (self.world, self.learner, self.budget, self.tests):
-            for option in fields(section):
-                value = getattr(section, option.name)
-                if value is not None:
-                    given[option.name] = value
-        for name in ("agents", "seeds", "budgets", "after"):
-            require_values(name, given.get(name))
-        overrides = parse_settings(added_up("set", given.pop("set")))
-        physics = parse_settings(added_up("physics", given.pop("physics")), "--physics")
-        variants = added_up("variants", given.pop("variants"))
-        if physics:
-            given["physics"] = physics
-        if variants:
-            given["variants"] = variants
-        return self.task, self.preset, {"overrides": overrides, **given}
+        sections = (self.world, self.learner, self.budget, self.tests)
+        given: dict[str, Any] = {name: value for section in sections for name, value in vars(section).items()}
+        overrides = parse_settings(added_up(given.pop("set")))
+        given["physics"] = parse_settings(added_up(self.world.physics), "--physics")
+        given["variants"] = added_up(self.budget.variants)
+        options = {name: value for name, value in given.items() if value not in (None, ())}
+        return self.task, self.preset, {"overrides": overrides, **options}
 
     def planned(self) -> tuple[ProtocolData, Encoders]:
         """The protocol of the comparison, and the encoders, checked."""
@@ -160,29 +160,23 @@ class Bench:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class Report(OfBench):
     """Write a bench's report again, from its files, and show its table; of agents' unfinished ones, what there is."""
 
-    folder: FolderOrTask = None
-    """The bench's folder, or a task whose newest bench is taken."""
-    task: OfTask = None
-    """Task whose newest bench is taken."""
-    merge: Annotated[Repeated[Path], listed("PATH", "(default: none)")] = ()
+    merge: Annotated[Repeated[Path], shown("PATH [PATH ...]")] = ()
     """Folders of other benches, or of results that were kept, whose agents are added, or where those are the same,
     whose seeds; all else in their protocols must be the same."""
-    track: Annotated[str | None, shown("STR", "(default: no tool)")] = None
+    track: Word = None
     """Write the metrics so far for a tool instead: tensorboard, or wandb (offline)."""
-    out: Path = Path("runs")
-    """Folder of all benches, where the newest is looked for."""
 
     def __call__(self) -> None:
         """Load and write."""
-        given, task = path_or_task(self.folder, self.task)
-        folder = given or newest_bench(self.out, only(task))
+        given, task = self.meant()
+        folder = given or newest_bench(self.out, [task] if task else [])
         if self.track is not None:
             print(f"Metrics: {track(folder, self.track)}")
             return
-        others = added_up("merge", self.merge)
+        others = added_up(self.merge)
         if others:
             _show(merge([load_bench_of_agents(each) for each in (folder, *others)], self.out))
         else:
@@ -197,20 +191,20 @@ class Sweep:
     """Task of a study, also as --task TASK; without one the suite is run."""
     name: Annotated[
         str | None,
-        tyro.conf.arg(metavar="NAME|FILE", aliases=["--file"], help_behavior_hint="(default: factors, suite)"),
+        tyro.conf.arg(metavar="NAME|FILE", aliases=["--file"], help_behavior_hint="(optional)"),
     ] = None
-    """Which grid; 'imagine-bench describe' names them. Or one of your own, a .toml or .json file."""
-    variants: Annotated[Repeated[str], listed("STR", "(default: all)")] = ()
-    """Of a study: only these variants and those they are compared with."""
-    experiment: Annotated[Repeated[str], listed("STR", "(default: all)")] = ()
-    """Of a suite: only these experiments, such as memory."""
-    agents: Annotated[
-        tuple[str, ...] | None, listed("STR", "(default: dqn imagination_uncertainty factored:given)")
-    ] = None
-    """Of a suite: agents to compare, also of other packages."""
-    seeds: Annotated[tuple[int, ...] | None, listed("INT", "(default: the suite's)")] = None
-    """Of a suite: seeds; each agent has one run a seed and level."""
-    launch: Launch = field(default_factory=Launch)
+    """Which grid, by default the study factors, or the suite; 'imagine-bench describe' names them. Or one of your own,
+    a .toml or .json file."""
+    variants: ManyWords = ()
+    """Of a study: only these variants, by default all, and those they are compared with."""
+    experiment: ManyWords = ()
+    """Of a suite: only these experiments, such as memory; by default all."""
+    agents: Words = None
+    """Of a suite: agents to compare, also of other packages; by default dqn, imagination_uncertainty and
+    factored:given."""
+    seeds: Counts = None
+    """Of a suite: seeds, by default its own; each agent has one run a seed and level."""
+    launch: Launch
 
     def __call__(self) -> None:
         """Run, compare or score, write."""
@@ -220,12 +214,10 @@ class Sweep:
         for option, value in foreign.items():
             if value:
                 raise InvalidValueError(f"{grid.name} takes no --{option}; leave it out.")
-        for option in ("agents", "seeds"):
-            require_values(option, getattr(self, option))
         if isinstance(grid, Study):
-            self._study(grid.only(added_up("variants", self.variants)))
+            self._study(grid.only(added_up(self.variants)))
         else:
-            suite = grid.only(added_up("experiment", self.experiment))
+            suite = grid.only(added_up(self.experiment))
             self._suite(replace(suite, seeds=tuple(sorted(self.seeds))) if self.seeds else suite)
 
     def _study(self, study: Study) -> None:
@@ -244,6 +236,124 @@ class Sweep:
         _write(page, self.launch.out / "suite" / f"{suite.name}-{suite.hash}" / "report")
         if result.failures:
             raise RunFailedError(f"{len(result.failures)} runs failed; the same command tries them again.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan(OfBench):
+    """Imagine whole plans from one frame each and let the arm carry them out blindly; leaves figures, a recording.
+
+    The first word may also be a run's folder; of a bench, the best imagining run is taken.
+    """
+
+    count: int = 100
+    """Plans."""
+    recorded: int = 5
+    """Plans that are recorded too; 0 for none."""
+    execution: Word = None
+    """How macro-actions happen: physics, or kinematic (their outcome is set)."""
+    max_epistemic: Number = None
+    """A plan with an imagined step of more epistemic uncertainty is refused; by default the agent's filter decides."""
+    encoder: EncoderWord = None
+    """The encoder the run saw through, where it is not bundled."""
+
+    def __call__(self) -> None:
+        """Find, plan, report."""
+        from imagine_bench.recording.plans import record_plans  # noqa: PLC0415 - Rerun, fonts and pillow load slowly
+        from imagine_bench.report.plans import plan_report  # noqa: PLC0415 - as below
+
+        run, task = self.meant()
+        print(
+            plan_report(
+                run,
+                root=self.out,
+                task=task,
+                count=self.count,
+                recorded=self.recorded,
+                record=record_plans,
+                execution=self.execution,
+                max_epistemic=self.max_epistemic,
+                encoder=self.encoder,
+            )
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judge:
+    """Judge world models, of this suite and of other packages, against the exact truth of a task's rules."""
+
+    task: TaskWord = "arrow_puzzle"
+    """Task whose world is imagined, also as --task TASK."""
+    models: Words = None
+    """World models, as 'imagine-bench describe' names them, or folders of a finished run or of all of an agent's; by
+    default all of this suite but slow ones."""
+    sizes: tuple[int, ...] = (100, 300, 1000, 3000, 10000)
+    """Transitions of the same data after which models are compared, ascending."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds, each of data and of models."""
+    samples: int = 8
+    """Futures imagined of each question."""
+    appearance: str = APPEARANCES[0]
+    """How much frames vary: a level, or factors such as light=0.5,camera=0.2."""
+    policy: str = "random"
+    """Who collects the data: random, uniform, oracle or mixed."""
+    encoder: EncoderWord = None
+    """What models see through that read what it gives, latents or codes; by default the task's own."""
+    workers: Count = None
+    """Processes at a time; one a core by default."""
+    out: Path = Path("runs/judge")
+    """Folder in which judgements are kept; the same command again goes on."""
+
+    def __call__(self) -> None:
+        """Judge and report."""
+        from imagine_bench.recording.judgement import record_judgement  # noqa: PLC0415 - as below
+        from imagine_bench.report.judge import judgement_report  # noqa: PLC0415 - as below
+
+        usual = tuple(name for name, entry in registry.WORLD_MODELS.items() if entry.by_default)
+        judgement = Judgement(
+            task=self.task,
+            models=self.models or usual,
+            sizes=self.sizes,
+            seeds=self.seeds,
+            samples=self.samples,
+            appearance=self.appearance,
+            policy=self.policy,
+            encoder=self.encoder,
+        )
+        folder, failed = judge(judgement, self.out, workers=self.workers or os.cpu_count() or 1)
+        print(judgement_report(folder, judgement))
+        print(f"Recording: {record_judgement(folder, judgement)}")
+        if failed:
+            raise RunFailedError("\n".join(failed))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify(OfBench):
+    """Play every test episode of a bench again, and say in a line a run whether its tables follow from them.
+
+    With --causes, every failed test episode gets the one cause that it has instead; the report then shows them.
+    """
+
+    causes: bool = False
+    """Find the causes of failures: play, swap truth in for each part of the agent, report."""
+    encoder: EncoderWord = None
+    """With --causes: the encoder the runs saw through, where it is not bundled."""
+
+    def __call__(self) -> None:
+        """Play and compare."""
+        from imagine_bench.report import page, verify, why  # noqa: PLC0415 - matplotlib loads slowly
+
+        given, task = self.meant()
+        if self.causes:
+            print(why.why_report(given, root=self.out, task=task, encoder=self.encoder))
+            return
+        if self.encoder is not None:
+            raise InvalidValueError("--encoder goes with --causes; replaying episodes needs none.")
+        folder = page.chosen(given, self.out, task)
+        begun_s = time.process_time()
+        verdicts = verify.verify(folder)
+        print(*verdicts, cost(folder, verdicts, time.process_time() - begun_s), sep="\n")
+        if any(verdict.complaint for verdict in verdicts):
+            sys.exit(1)
 
 
 _PAGES = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
+from typing import TypedDict
 
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.capabilities import Imaginer
@@ -20,116 +20,86 @@ from imagine_bench.judge.open_loop import (
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.runs import Failure, Job, Launcher, OnProgress, RunSpec
+from imagine_bench.protocols.runs import Failure, Job, Launcher, OnProgress
 from imagine_bench.rules import states_of
-from imagine_bench.running.control import run_control
 from imagine_bench.running.run_state import Run, make_env
 from imagine_bench.running.runner import AtBudget, AtEnd, RunObserver
-from imagine_bench.seeding import SeedTree, evaluation_split
+from imagine_bench.seeding import Purpose, SeedTree, evaluation_split
 from imagine_bench.store import run_folder
-from imagine_bench.store.results import RunResult
 
 
-class OpenLoopObserver(RunObserver):
-    """Compares open-loop imagination with the rules at every budget."""
+class _InTests(TypedDict):
+    """How a run's tests look and what they are for, as the judge's functions take it."""
+
+    appearance: str
+    purpose: Purpose
+
+
+def _in_tests(run: Run) -> _InTests:
+    return {"appearance": run.protocol.appearance_in_tests, "purpose": evaluation_split(run.spec.seed)}
+
+
+class BenchObserver(RunObserver):
+    """Compares open-loop imagination with the rules, asks learners about every macrostate, keeps rollouts, records."""
 
     def __init__(self) -> None:
         self._begun = False
         self._questions: EvalSet | None = None
-
-    def at_budget(self, run: Run, budget: int) -> AtBudget:
-        """``open_loop`` of an agent that imagines."""
-        if not isinstance(run.agent, Imaginer) or not run.protocol.shows_frames_alone:
-            return {}
-        if not self._begun:  # the same at every budget
-            self._begun = True
-            self._questions = surviving_actions(
-                run.task,
-                starts=run.protocol.open_loop_starts,
-                depth=OPEN_LOOP_DEPTH,
-                appearance=run.protocol.appearance_in_tests,
-                purpose=evaluation_split(run.spec.seed),
-            )
-        if self._questions is None:
-            return {}
-        run.tell("imagining", at_once=True)
-        seeds = SeedTree(run.spec.seed).child("open_loop", budget)
-        return {"open_loop": open_loop(run.agent, self._questions, seeds)}
-
-
-class BeliefsObserver(RunObserver):
-    """Asks a learner about every macrostate at every budget, for ``imagine-bench verify --causes``."""
-
-    def __init__(self) -> None:
         self._frames: Frame | None = None
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
-        """``beliefs`` of an agent that learns, in a task of not too many macrostates, each of which frames show."""
-        task = run.task
-        entry = run.entry
-        frames_tell_all = run.protocol.shows_frames_alone and task.sight is None
-        if not entry.learns or not frames_tell_all or len(states_of(task.rules)) > MOST_STATES:
-            return {}
-        if self._frames is None:  # the same at every budget
-            appearance = run.protocol.appearance_in_tests
-            purpose = evaluation_split(run.spec.seed)
-            self._frames = frames_to_ask_with(run.agent, task, appearance=appearance, purpose=purpose)
-        rng = SeedTree(run.spec.seed).child("beliefs", budget).generator()
-        return {"beliefs": beliefs(run.agent, task.rules, self._frames, rng, privileged=entry.privileged)}
-
-
-class ExamplesObserver(RunObserver):
-    """Keeps a few imagined rollouts of the agent as it is at its end."""
-
-    def at_end(self, run: Run) -> AtEnd:
-        """``imagined`` from several starts, and ``sampled_rollouts`` from one."""
-        if not isinstance(run.agent, Imaginer) or not run.protocol.shows_frames_alone:
-            return {}
-        run.tell("imagining", at_once=True)
-        agent = run.agent
-        task = run.task
-        appearance = run.protocol.appearance_in_tests
-        seeds = SeedTree(run.spec.seed)
-        purpose = evaluation_split(run.spec.seed)
-        several = seeds.child("sampled_rollouts")
-        return {
-            "imagined": examples(agent, task, appearance=appearance, seeds=seeds.child("examples"), purpose=purpose),
-            "sampled_rollouts": imagine_sampled_rollouts(
-                agent, task, appearance=appearance, seeds=several, purpose=purpose
-            ),
-        }
-
-
-class RecordingObserver(RunObserver):
-    """Records some greedy episodes beside the results; the file appears whole or not at all."""
+        """``open_loop`` of an agent that imagines, and of a learner ``beliefs``, for ``verify --causes``."""
+        found: AtBudget = {}
+        if not run.protocol.shows_frames_alone:
+            return found
+        if isinstance(run.agent, Imaginer):
+            if not self._begun:  # the same at every budget
+                self._begun = True
+                starts = run.protocol.open_loop_starts
+                self._questions = surviving_actions(run.task, starts=starts, depth=OPEN_LOOP_DEPTH, **_in_tests(run))
+            if self._questions is not None:
+                run.tell("imagining", at_once=True)
+                seeds = SeedTree(run.spec.seed).child("open_loop", budget)
+                found["open_loop"] = open_loop(run.agent, self._questions, seeds)
+        if run.entry.learns and run.task.sight is None and len(states_of(run.task.rules)) <= MOST_STATES:
+            if self._frames is None:  # likewise
+                self._frames = frames_to_ask_with(run.agent, run.task, **_in_tests(run))
+            rng = SeedTree(run.spec.seed).child("beliefs", budget).generator()
+            found["beliefs"] = beliefs(run.agent, run.task.rules, self._frames, rng, privileged=run.entry.privileged)
+        return found
 
     def at_end(self, run: Run) -> AtEnd:
-        """Nothing that the result holds."""
-        protocol = run.protocol
-        if protocol.recorded_episodes == 0:
-            return {}
-        from imagine_bench.recording.episodes import record_run  # noqa: PLC0415 - loading Rerun costs a second
+        """``imagined`` from several starts and ``sampled_rollouts`` from one, of an agent that imagines; a recording.
 
-        run.tell("recording", at_once=True)
-        with closing(make_env(protocol, protocol.task, testing=True)) as env:
-            record_run(
-                protocol.task,
-                run.agent,
-                name=run.spec.agent,
-                seed=run.spec.seed,
-                env=env,
-                appearance=protocol.appearance_in_tests,
-                episodes=protocol.recorded_episodes,
-                path=run_folder.recording_path(run.folder),
-            )
-        return {}
+        The recording, of some greedy episodes, lies beside the results; the file appears whole or not at all.
+        """
+        found: AtEnd = {}
+        if isinstance(run.agent, Imaginer) and run.protocol.shows_frames_alone:
+            run.tell("imagining", at_once=True)
+            seeds = SeedTree(run.spec.seed)
+            found["imagined"] = examples(run.agent, run.task, seeds=seeds.child("examples"), **_in_tests(run))
+            seeds = seeds.child("sampled_rollouts")
+            found["sampled_rollouts"] = imagine_sampled_rollouts(run.agent, run.task, seeds=seeds, **_in_tests(run))
+        if run.protocol.recorded_episodes > 0:
+            from imagine_bench.recording.episodes import record_run  # noqa: PLC0415 - loading Rerun costs a second
+
+            run.tell("recording", at_once=True)
+            with closing(make_env(run.protocol, run.protocol.task, testing=True)) as env:
+                record_run(
+                    run.protocol.task,
+                    run.agent,
+                    name=run.spec.agent,
+                    seed=run.spec.seed,
+                    env=env,
+                    appearance=run.protocol.appearance_in_tests,
+                    episodes=run.protocol.recorded_episodes,
+                    path=run_folder.recording_path(run.folder),
+                )
+        return found
 
 
-OBSERVERS = tuple(
-    f"{__name__}:{observer.__name__}"
-    for observer in (OpenLoopObserver, BeliefsObserver, ExamplesObserver, RecordingObserver)
-)
-"""What looks at every run of a control task, in this order, each as ``"module:attr"``."""
+OBSERVERS = (f"{__name__}:{BenchObserver.__name__}",)
+"""What looks at every run of a control task, each as ``"module:attr"``."""
 RECORDERS = {
     "toy_regression": "imagine_bench.recording.toy_regression:record",
     "robot_ik": "imagine_bench.recording.robot_ik:record",
@@ -154,12 +124,3 @@ class Observed:
         """Carry out every job by the launcher within; see :class:`.Launcher`."""
         observed = [replace(job, spec=replace(job.spec, observers=observers_of(job.spec.protocol))) for job in jobs]
         return self._launcher.launch(observed, on_progress)
-
-
-def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> RunResult | None:
-    """Do a run in this process, looked at by :data:`OBSERVERS`; returns its result, None if it pauses before its end.
-
-    Raises as :func:`.runner.run`.
-    """
-    run_control(replace(spec, observers=OBSERVERS), folder, on_progress)
-    return run_folder.load_run(folder) if run_folder.is_done(folder) else None

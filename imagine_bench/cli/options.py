@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, is_dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -20,36 +21,36 @@ from imagine_bench.store.bench_folder import require_either
 T = TypeVar("T")
 Repeated = tyro.conf.UseAppendAction[tuple[tuple[T, ...], ...]]
 """An option that takes one or more values, and may be given several times."""
-PRESETS_OWN = "(default: the preset's)"
 
 
-def shown(metavar: str, hint: str = PRESETS_OWN) -> object:
-    """How the help shows an option that takes a value."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
-
-
-def listed(kind: str, hint: str = PRESETS_OWN) -> object:
-    """How the help shows an option that takes one or more values of a kind."""
-    return shown(f"{kind} [{kind} ...]", hint)
+def shown(metavar: str) -> object:
+    """How the help shows an option that may be left out; its description says what happens then."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="(optional)")
 
 
 TaskWord = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
 """A task as the first word; ``--task TASK`` is the same."""
-MaybeTaskWord = Annotated[str | None, tyro.conf.Positional, shown("[TASK]", "(default: none)")]
+MaybeTaskWord = Annotated[str | None, tyro.conf.Positional, shown("[TASK]")]
 """The same for commands that may have none."""
-FolderOrTask = Annotated[Path | None, tyro.conf.Positional, shown("[PATH|TASK]", "(default: the newest)")]
+FolderOrTask = Annotated[Path | None, tyro.conf.Positional, shown("[PATH|TASK]")]
 """A path as the first word, or a task."""
-OfTask = Annotated[str | None, shown("STR", "(default: any)")]
-MaybeInt = Annotated[int | None, shown("INT")]
-MaybeEncoder = Annotated[str | None, shown("NAME|FILE", "(default: the run's, if bundled)")]
+Word = Annotated[str | None, shown("STR")]
+Words = Annotated[tuple[str, ...] | None, shown("STR [STR ...]")]
+ManyWords = Annotated[Repeated[str], shown("STR [STR ...]")]
+Number = Annotated[float | None, shown("FLOAT")]
+Count = Annotated[int | None, shown("INT")]
+Counts = Annotated[tuple[int, ...] | None, shown("INT [INT ...]")]
+File = Annotated[Path | None, shown("PATH")]
+EncoderWord = Annotated[str | None, shown("NAME|FILE")]
+"""Options that may be left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Launch:
     """Options of where runs are carried out."""
 
-    workers: Annotated[int | None, shown("INT", "(default: one a core)")] = None
-    """Processes at a time."""
+    workers: Count = None
+    """Processes at a time; one a core by default."""
     launcher: str = "local"
     """Where runs are carried out: local, ray (the cluster at RAY_ADDRESS, else one started here) or slurm."""
     out: Path = Path("runs")
@@ -60,37 +61,51 @@ class Launch:
         return Observed(launcher(self.launcher, self.workers))
 
 
-def require_values(name: str, values: Sequence[object] | None) -> None:
-    """Raise InvalidValueError for an option that takes a list and was given without a value."""
-    if values is not None and (not values or "" in values):
-        raise InvalidValueError(f"--{name} has no value; give at least one behind it, or leave it out.")
+@dataclass(frozen=True, kw_only=True)
+class OfBench:
+    """Options of the bench that is meant."""
+
+    folder: FolderOrTask = None
+    """The bench's folder, or a task whose newest bench is taken."""
+    task: Word = None
+    """Task whose newest bench is taken; without it and a folder, the newest of all."""
+    out: Path = Path("runs")
+    """Folder of all benches, where the newest is looked for."""
+
+    def meant(self) -> tuple[Path | None, str | None]:
+        """The path that was given, and the task, by its canonical name; a first word that is a task is that.
+
+        Raises:
+            UnknownNameError: No such task.
+            InvalidValueError: A path and a task are given.
+        """
+        word = self.folder
+        task = self.task
+        if word is not None and task is None and not word.exists() and _is_task(str(word)):
+            word = None
+            task = str(self.folder)
+        require_either(word, task)
+        if task is not None:
+            task_type(task)  # knows every name
+            task = registry.task_name(task)
+        return word, task
 
 
-def added_up(name: str, each: Sequence[Sequence[T]]) -> tuple[T, ...]:
-    """All values of an option that may be given several times, or InvalidValueError if it has none."""
-    for values in each:
-        require_values(name, values)
-    return tuple(value for values in each for value in values)
+def _is_task(word: str) -> bool:
+    return registry.has_task(word) or word in registry.regressions()
 
 
-def path_or_task(word: Path | None, task: str | None) -> tuple[Path | None, str | None]:
-    """A command's first word as a path or as a task, whichever it names, and the task of ``--task``.
-
-    Raises:
-        UnknownNameError: No such task.
-        InvalidValueError: A path and a task are given.
-    """
-    is_task = (
-        word is not None and not word.exists() and (registry.has_task(str(word)) or str(word) in registry.regressions())
-    )
-    if is_task and task is None:
-        return None, str(word)
-    require_either(word, task)
-    if task is not None:
-        task_type(task)  # knows every name
-    return word, task
+def require_values(command: object) -> None:
+    """Raise InvalidValueError for an option of a command that takes a list and was given without a value."""
+    for name, value in vars(command).items():
+        if is_dataclass(value):
+            require_values(value)
+        elif isinstance(value, tuple) and value != getattr(type(command), name):
+            each = value if value and isinstance(value[0], tuple) else (value,)
+            if any(not values or "" in values for values in each):
+                raise InvalidValueError(f"--{name} has no value; give at least one behind it, or leave it out.")
 
 
-def only(task: str | None) -> tuple[str, ...]:
-    """A task's canonical name by itself, or nothing for any task."""
-    return () if task is None else (registry.task_name(task),)
+def added_up(each: Iterable[Iterable[T]]) -> tuple[T, ...]:
+    """All values of an option that may be given several times."""
+    return tuple(chain.from_iterable(each))

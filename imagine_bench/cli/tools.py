@@ -1,4 +1,4 @@
-"""The commands beside benches: viewing, playing, describing, checking, and what this machine has."""
+"""The commands beside benches: data and encoders, viewing, playing, describing, checking, and what this machine has."""
 
 from __future__ import annotations
 
@@ -9,40 +9,123 @@ from typing import Annotated
 
 import tyro
 
-from imagine_bench.cli.options import (
-    FolderOrTask,
-    MaybeTaskWord,
-    OfTask,
-    listed,
-    only,
-    path_or_task,
-    require_values,
-    shown,
-)
+from imagine_bench import registry
+from imagine_bench.cli.options import Count, EncoderWord, File, MaybeTaskWord, OfBench, TaskWord, Word
+from imagine_bench.data.folder import read_dataset, require_format, require_new, write_dataset
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import APPEARANCES
+from imagine_bench.interfaces import APPEARANCES, DEVICES
+from imagine_bench.registry.entries import file_name
+from imagine_bench.running.collect import collect, describe, policy_of
 from imagine_bench.store.bench_folder import newest_recording
-from imagine_bench.tools.describe import describe, names
+from imagine_bench.store.files import require_writable
+from imagine_bench.tools.describe import describe_task, names
 from imagine_bench.tools.doctor import examine
+from imagine_bench.tools.standard_data import standard_sets
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewCommand:
-    """Open a recording in the Rerun viewer."""
+class DatasetCommand:
+    """Collect episodes of a task as a dataset, or say what one holds."""
 
-    file: FolderOrTask = None
-    """The .rrd file, or a task whose newest recording is taken."""
-    task: OfTask = None
-    """Task whose newest recording is taken."""
-    out: Path = Path("runs")
-    """Folder of all benches, where the newest is looked for."""
+    task: MaybeTaskWord = None
+    """Task that is played, also as --task TASK; none with --describe and --standard."""
+    policy: str = "random"
+    """Who plays: random; uniform (one random macro-action from any macrostate); oracle; mixed (random and oracle in
+    turn); or a run's folder, whose trained agent acts greedily."""
+    episodes: int = 200
+    """Episodes."""
+    format: str = "npz"
+    """Format of the files: npz, lerobot, or minari (both of the extra 'data')."""
+    out: File = None
+    """Folder of the dataset, by default datasets/TASK-POLICY; never overwritten."""
+    seed: int = 0
+    """Seed of starts and of chance."""
+    execution: Word = None
+    """How macro-actions happen: physics, or kinematic (their outcome is set)."""
+    appearance: str = APPEARANCES[0]
+    """How much frames vary: clean, mild, strong, photo, or factors such as light=0.5,camera=0.2."""
+    motion_hz: float = 0.0
+    """Samples a second of the arm's motion and commands, kept in a file apart; 0 keeps none."""
+    encoder: EncoderWord = None
+    """The encoder the agent of a run saw through, where it is not bundled."""
+    describe: File = None
+    """Folder of a dataset to check and describe, instead of collecting one."""
+    standard: bool = False
+    """Make random, medium and optimal sets of three control tasks, kinematic, below --out (default: datasets)."""
+
+    def __call__(self) -> None:
+        """Collect, or describe."""
+        if (self.task is None) == (self.describe is None and not self.standard):
+            raise InvalidValueError("Give a task to collect episodes of, or one of --describe and --standard.")
+        if self.describe is not None:
+            print(describe(read_dataset(self.describe)))
+            return
+        require_format(self.format)
+        if self.task is None:
+            for folder in standard_sets(self.out or Path("datasets"), self.format, self.episodes):
+                print(f"{folder}\n{describe(read_dataset(folder))}\n")
+            return
+        spec = registry.task(self.task)
+        policy = policy_of(self.policy, spec, self.seed, self.encoder)
+        folder = self.out or Path("datasets") / f"{file_name(spec.id)}-{policy.name}"
+        require_new(folder)
+        require_writable(folder.parent)
+        episodes, files, card = collect(
+            spec,
+            policy,
+            episodes=self.episodes,
+            seed=self.seed,
+            execution=spec.execution(self.execution),
+            appearance=self.appearance,
+            motion_hz=self.motion_hz,
+        )
+        print(f"{folder}\n{describe(write_dataset(folder, episodes, files, card, self.format))}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderCommand:
+    """Train an encoder anew and say how it compares to the bundled one."""
+
+    task: TaskWord
+    """Task whose frames it learns, also as --task TASK."""
+    appearance: str = APPEARANCES[0]
+    """Appearance of the frames: a level, or factors such as light=0.5,camera=0.2."""
+    recipe: str = "default"
+    """How it is trained: default, thesis, joint (the arrow puzzles: eight latents of the whole image), or codes,
+    for agents that read factors and their values."""
+    seed: int = 0
+    """Seed of data and training."""
+    steps: Count = None
+    """Gradient steps, at least 1; by default the recipe's."""
+    batch: Count = None
+    """Images a gradient step, at least 1; by default the recipe's."""
+    latents: Count = None
+    """Latents of the image, or of each strip, at least 1; by default the recipe's."""
+    device: str = DEVICES[0]
+    """Where gradient steps are made: cpu, or cuda (an NVIDIA GPU)."""
+    out: Path = Path("encoders")
+    """Folder for artefact, card and figure; never overwritten."""
+
+    def __call__(self) -> None:
+        """Train."""
+        retrain = registry.load("imagine_bench.agents.encoders.cli:retrain")
+        spec = registry.task(self.task)
+        require_writable(self.out)
+        names = ("recipe", "appearance", "steps", "batch", "latents", "device")
+        choices = {name: getattr(self, name) for name in names}
+        print(retrain(spec, **choices, seed=self.seed, out=self.out))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewCommand(OfBench):
+    """Open a recording in the Rerun viewer: the .rrd file of the first word, or the newest of a task, or of all."""
 
     def __call__(self) -> None:
         """Find and open."""
         from imagine_bench.recording.stream import open_in_viewer  # noqa: PLC0415 - Rerun loads slowly
 
-        file, task = path_or_task(self.file, self.task)
-        open_in_viewer(file or newest_recording(self.out, *only(task)))
+        file, task = self.meant()
+        open_in_viewer(file or newest_recording(self.out, task))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +137,7 @@ class Describe:
 
     def __call__(self) -> None:
         """Describe, or list."""
-        print(names() if self.task is None else describe(self.task))
+        print(names() if self.task is None else describe_task(self.task))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,13 +146,13 @@ class Play:
 
     task: MaybeTaskWord = None
     """Task to play, also as --task TASK; by default that of --model."""
-    model: Annotated[Path | None, shown("PATH", "(default: none)")] = None
+    model: File = None
     """A run's folder, whose agent imagines the same keys beside the real scene."""
-    execution: Annotated[str | None, shown("STR", "(default: the model's, else the task's)")] = None
-    """physics or kinematic."""
-    appearance: Annotated[str | None, shown("STR", "(default: the model's, else the task's)")] = None
-    """Appearance: a level, or factors."""
-    encoder: Annotated[str | None, shown("STR", "(default: the bundled one)")] = None
+    execution: Word = None
+    """physics or kinematic; by default the model's, else the task's."""
+    appearance: Word = None
+    """Appearance: a level, or factors; by default likewise."""
+    encoder: EncoderWord = None
     """Name or file of the encoder that the model used."""
     seed: int = 0
     """Chooses the episodes."""
@@ -97,9 +180,9 @@ class CheckCommand:
 
     task: MaybeTaskWord = None
     """Task to check, also as --task TASK; with --agent or --model, the one that these are checked in."""
-    agent: Annotated[str | None, shown("STR", "(default: none)")] = None
+    agent: Word = None
     """Agent to check."""
-    model: Annotated[str | None, shown("STR", "(default: none)")] = None
+    model: Word = None
     """World model to check."""
     physics: bool = False
     """Measure the task's contact physics instead: fidelity to the rules at random, then how far friction, force, mass
@@ -108,7 +191,7 @@ class CheckCommand:
     """With --physics: macro-actions of the fidelity measurement; 0 for none."""
     trials: int = 200
     """With --physics: macro-actions of each value of each setting; 0 for none."""
-    appearances: Annotated[tuple[str, ...], listed("STR", "(default: clean)")] = APPEARANCES[:1]
+    appearances: tuple[str, ...] = APPEARANCES[:1]
     """With --physics: appearance levels at which fidelity is measured."""
     out: Path = Path("runs/margins.json")
     """With --physics: the file in which the figures are kept, with the machine's description."""
@@ -122,7 +205,6 @@ class CheckCommand:
         elif self.task is None:
             raise InvalidValueError("Physics is measured of a task; give one.")
         else:
-            require_values("appearances", self.appearances)
             failed = not physics.check_physics(
                 self.task, self.out, turns=self.turns, trials=self.trials, appearances=self.appearances
             )

@@ -20,7 +20,7 @@ _MOST = 10
 """Plan lengths that are listed one by one."""
 
 
-def describe(name: str) -> str:
+def describe_task(name: str) -> str:
     """A control or regression task in words and numbers. Raises as :func:`.registry.task`."""
     if name in registry.regressions():
         data = registry.regression(name)

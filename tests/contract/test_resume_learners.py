@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_runs import final_arrays, measured, small
+from small_runs import final_arrays, measured, run_observed, small
 
 from imagine_bench import registry
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.running import run_state
 from imagine_bench.store import encoders

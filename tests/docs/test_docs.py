@@ -21,8 +21,7 @@ from matplotlib import pyplot
 from small_runs import do
 
 from imagine_bench import registry
-from imagine_bench.cli import Bench, parsed
-from imagine_bench.cli.words import ELSEWHERE
+from imagine_bench.cli import ELSEWHERE, Bench, parsed
 from imagine_bench.registry import REGRESSIONS, has_task
 
 WRITTEN = [*PAGES, ROOT / "CHANGELOG.md"]

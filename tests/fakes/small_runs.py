@@ -13,14 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.cli.observers import run_observed
+from imagine_bench.cli.observers import OBSERVERS
 from imagine_bench.data.folder import Apart, Dataset, write_dataset
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.protocols.runs import Failure, Job, OnProgress, RunSpec
 from imagine_bench.running.collect import collect, policy_of
+from imagine_bench.running.control import run_control
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store import run_folder
 from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import Checkpoint, RunResult
 
@@ -38,6 +40,12 @@ def small(**changes: Any) -> Protocol:
         "recorded_episodes": 0,
     }
     return protocol("arrow_puzzle", "smoke", **{**few, **changes})
+
+
+def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> RunResult | None:
+    """A run in this process, looked at as those of a command are; None if it pauses before its end."""
+    run_control(dataclasses.replace(spec, observers=OBSERVERS), folder, on_progress)
+    return run_folder.load_run(folder) if run_folder.is_done(folder) else None
 
 
 def do(folder: Path, agent: str = "table", seed: int = 0, every_s: float = 20.0, **changes: Any) -> RunResult:

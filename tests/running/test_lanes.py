@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from bench_fakes import Rememberer
 from imagine_bench.tasks.motion.executor import MacroExecutor
-from small_runs import same_but_for_time, small
+from small_runs import run_observed, same_but_for_time, small
 
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import DivergedError
 from imagine_bench.protocols.runs import Job, RunSpec
 from imagine_bench.running import lanes

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from bench_fakes import Pupil
-from small_runs import FORMATS, Inline, collected, final_arrays, measured, written
+from small_runs import FORMATS, Inline, collected, final_arrays, measured, run_observed, written
 
 from imagine_bench import registry
 from imagine_bench.cli import main
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.runs import OnProgress, RunSpec

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from bench_fakes import Pupil
 from imagine_bench.tasks.arrows.rules import ArrowRules
-from small_runs import final_arrays, measured, small
+from small_runs import final_arrays, measured, run_observed, small
 
 from imagine_bench import registry
 from imagine_bench.cli import main
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.interfaces.capabilities import Label, QueryingAgent, TransferLearner

@@ -17,12 +17,11 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.macro_env import MacroEnv
-from small_runs import context, do, final_arrays, same_but_for_time, small
+from small_runs import context, do, final_arrays, run_observed, same_but_for_time, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
 from imagine_bench.cli import observers
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.runs import Progress, RunSpec

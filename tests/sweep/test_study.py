@@ -17,11 +17,10 @@ import pytest
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
 from imagine_bench.agents.settings import flatten
 from numpy.typing import NDArray
-from small_runs import do
+from small_runs import do, run_observed
 
 from imagine_bench import registry
 from imagine_bench.cli import main
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.causes import true_model

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from imagine_bench.cli import main
-from imagine_bench.tools.describe import describe
+from imagine_bench.tools.describe import describe_task
 
 
 def test_a_task_is_described_with_its_exact_facts() -> None:
-    said = describe("arrow_puzzle")
+    said = describe_task("arrow_puzzle")
     assert "6: turn the left cube clockwise; turn" in said and "192, 54 of them starts" in said
     assert "left arrow (toward the human, right, toward the agent, left)" in said
     # 12 + 24 + 36 + 48 + 30 = 150 macro-actions over 54 starts
@@ -18,7 +18,7 @@ def test_a_task_is_described_with_its_exact_facts() -> None:
 
 
 def test_chance_is_described() -> None:
-    assert "several outcomes" in describe("arrows:cubes=2,slip=0.2")
+    assert "several outcomes" in describe_task("arrows:cubes=2,slip=0.2")
 
 
 def test_a_regression_task_is_described_too(capsys: pytest.CaptureFixture[str]) -> None:

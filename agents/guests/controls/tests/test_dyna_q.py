@@ -14,10 +14,9 @@ from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_mac
 from imagine_bench_controls.tabular.counts import CountTable
 from imagine_bench_controls.tabular.dyna_q import DynaQAgent
 from imagine_bench_controls.tabular.settings import DYNA_Q, Q_LEARNING
-from small_runs import small
+from small_runs import run_observed, small
 
 from imagine_bench import registry, rules
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.protocols.runs import RunSpec

@@ -14,10 +14,9 @@ from fake_latents import ACTIONS, CODES, FakeEncoder, built, frame, transition
 from imagine_bench.agents.imagination.rollouts import ImaginedStep
 from imagine_bench_controls import exact
 from imagine_bench_controls.exact import LOOKS, ExactFilterAgent, ExactImaginationAgent
-from small_runs import small
+from small_runs import run_observed, small
 
 from imagine_bench import registry, rules
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import ExactWorld, Outcome, Transition
 from imagine_bench.protocols.runs import RunSpec

@@ -8,11 +8,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from small_runs import measured, small
+from small_runs import measured, run_observed, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
-from imagine_bench.cli.observers import run_observed
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.interfaces.capabilities import ExternalTrainer
