@@ -18,7 +18,7 @@ VERDICTS = {
     "built": "it is there and tested; there is nothing to compare",
     "agrees": "as in the thesis",
     "contradicts": "otherwise than in the thesis",
-    "cannot be told": "measured; at this number of seeds nothing is shown",
+    "cannot be told": "measured, and nothing is shown: too few seeds, one encoder, or a base with nothing left to gain",
     "open": "not measured as the thesis means it",
     "missing": "not there",
     "not used": "the thesis speaks of it and does not use it",
