@@ -57,7 +57,7 @@ def learn(dials: dict[str, float], spec: TaskSpec, seed: int, budgets: Sequence[
     agent = make(
         AgentContext(
             n_actions=spec.rules.n_actions, preprocessing=spec.preprocessing, seeds=seeds.child("agent"),
-            encoder=encoders.resolve(spec, "clean", kind="codes"),
+            encoder=encoders.own(spec, "clean", kind="codes"),
         )
     )  # fmt: skip
     every = np.array(states_of(spec.rules))

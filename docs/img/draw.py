@@ -17,7 +17,7 @@ from imagine_bench.exact.certificate import certificate
 from imagine_bench.registry.old_names import label_today
 from imagine_bench.report import figures
 from imagine_bench.report.data import collect
-from imagine_bench.store.archive import load_archive
+from imagine_bench.store.loading import load_so_far
 
 mpl.use("agg")
 from matplotlib import pyplot as plt
@@ -76,7 +76,7 @@ SETTINGS = {"replay_ratio": " tuned", "discount": " defaults"}
 
 def peers() -> None:
     """Area under the success curve to 500 episodes of our agents and of libraries', and its price."""
-    rows = [(data, agent) for kept in PEERS for data in [collect(load_archive(RESULTS / kept))] for agent in data.areas]
+    rows = [(data, agent) for kept in PEERS for data in [collect(load_so_far(RESULTS / kept))] for agent in data.areas]
     rows.sort(key=lambda row: row[0].areas[row[1]][500].value)
     figure, axes = plt.subplots(figsize=(9, 0.9 + 0.28 * len(rows)), layout="constrained")
     columns = {1.14: "frames\nbefore", 1.28: "updates", 1.40: "CPU s"}

@@ -10,8 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from imagine_bench.errors import InvalidValueError, lacking, require_known
-from imagine_bench.store.codec import table_rows
-from imagine_bench.store.files import make_folder
+from imagine_bench.store.files import make_folder, table_rows
 
 Rows = list[dict[str, float]]
 

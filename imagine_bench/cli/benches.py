@@ -38,10 +38,9 @@ from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.protocols.runs import Encoders, Result
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, plan
-from imagine_bench.running.control import load_bench_of_agents
 from imagine_bench.running.task_types import load_so_far
+from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import newest_bench
-from imagine_bench.store.merge import merge
 from imagine_bench.store.results import BenchResult
 from imagine_bench.sweep.catalogue import SUITE, grid_named
 from imagine_bench.sweep.grid import SUITE_AGENTS, Study, Suite
@@ -172,13 +171,13 @@ class Report(OfBench):
     def __call__(self) -> None:
         """Load and write."""
         given, task = self.meant()
-        folder = given or newest_bench(self.out, [task] if task else [])
+        folder = given or newest_bench(self.out, task)
         if self.track is not None:
             print(f"Metrics: {track(folder, self.track)}")
             return
         others = added_up(self.merge)
         if others:
-            _show(merge([load_bench_of_agents(each) for each in (folder, *others)], self.out))
+            _show(loading.merge([loading.load_so_far(each) for each in (folder, *others)], self.out))
         else:
             _show(load_so_far(folder))
 
@@ -351,7 +350,7 @@ class Verify(OfBench):
         folder = page.chosen(given, self.out, task)
         begun_s = time.process_time()
         verdicts = verify.verify(folder)
-        print(*verdicts, cost(folder, verdicts, time.process_time() - begun_s), sep="\n")
+        print(*verdicts, cost(verdicts, time.process_time() - begun_s), sep="\n")
         if any(verdict.complaint for verdict in verdicts):
             sys.exit(1)
 

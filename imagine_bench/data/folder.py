@@ -16,8 +16,7 @@ from imagine_bench.arrays import Array, Arrays
 from imagine_bench.errors import ArtefactError, InvalidValueError, require_known
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.episodes import Episodes, content_hash
-from imagine_bench.store.codec import write_arrays
-from imagine_bench.store.files import make_folder, read_sealed, reading, sealed, write_json, writing
+from imagine_bench.store.files import make_folder, read_sealed, reading, sealed, write_arrays, write_json, writing
 from imagine_bench.values import Json
 
 FORMATS = {name: f"imagine_bench.data.{name}" for name in ("npz", "lerobot", "minari")}

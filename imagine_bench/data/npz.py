@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.store.codec import write_arrays
-from imagine_bench.store.files import reading
+from imagine_bench.store.files import reading, write_arrays
 from imagine_bench.values import Json
 
 

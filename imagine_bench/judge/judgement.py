@@ -40,14 +40,15 @@ from imagine_bench.rules import states_of
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
-from imagine_bench.store.codec import read_arrays, write_arrays
 from imagine_bench.store.files import (
     lock,
     make_folder,
+    read_arrays,
     read_sealed,
     reading,
     sealed,
     with_null,
+    write_arrays,
     write_bytes,
     write_json,
 )

@@ -77,12 +77,9 @@ def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
     return found
 
 
-def cost(folder: Path, found: Sequence[Verdict], cpu_s: float) -> str:
-    """What keeping test episodes costs in bytes, and playing them again in CPU seconds, in a sentence."""
-    size = sum(path.stat().st_size for path in folder.glob("*/*/episodes.npz"))
-    episodes = sum(each.episodes for each in found)
-    more = f", {size / episodes:.1f} bytes each" if episodes else ""
-    return f"{episodes:,} test episodes in {size / 1024:,.1f} KiB{more}; checked in {cpu_s:,.1f} CPU s."
+def cost(found: Sequence[Verdict], cpu_s: float) -> str:
+    """What playing test episodes again cost, in a sentence."""
+    return f"{sum(each.episodes for each in found):,} test episodes; checked in {cpu_s:,.1f} CPU s."
 
 
 class Replays:

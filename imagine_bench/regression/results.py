@@ -14,8 +14,7 @@ from imagine_bench.arrays import Arrays, Floats
 from imagine_bench.regression.protocol import RegressionProtocol
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_protocol_as
-from imagine_bench.store.codec import grouped, read_arrays, table_rows, table_text, write_arrays
-from imagine_bench.store.files import write_bytes
+from imagine_bench.store.files import grouped, read_arrays, table_rows, table_text, write_arrays, write_bytes
 from imagine_bench.store.results import require_every_run
 from imagine_bench.values import Setting
 

@@ -20,9 +20,8 @@ from imagine_bench.regression.protocol import RegressionProtocol, overrides_of
 from imagine_bench.regression.results import RegressionRun, Row, finish, flattened, load_run, write_rows
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
-from imagine_bench.store.checkpoints import Snapshot, save_snapshot
-from imagine_bench.store.codec import grouped
-from imagine_bench.store.files import reading
+from imagine_bench.store.checkpoints import Snapshot, load_newest, save_snapshot
+from imagine_bench.store.files import grouped, reading
 
 TRAINING = 100
 MEASURING = 10
@@ -56,7 +55,7 @@ class _Run:
         self.rows: list[Row] = []
         self.evaluations: dict[str, Arrays] = {}
         self.train_cpu_s = 0.0
-        self.snapshot = run_folder.newest_snapshot(folder)
+        self.snapshot = load_newest(folder / run_folder.CHECKPOINTS)
         if self.snapshot is not None:
             self.rows = list(self.snapshot.values["rows"])
             found = grouped(self.snapshot.arrays)  # files give arrays back in any order

@@ -44,7 +44,7 @@ from imagine_bench.report.tables import (
     seconds,
     signed_percent,
 )
-from imagine_bench.store.archive import archive_files
+from imagine_bench.store.loading import archive_files
 from imagine_bench.store.results import BenchResult
 
 V = TypeVar("V")

@@ -101,7 +101,7 @@ def chosen(given: Path | None, root: Path, task: str | None) -> Path:
     if task is not None:
         task_type(task)  # knows every name
         require_control(task, f"Task {task!r}")
-    return given or newest_bench(root, tuple(registry.tasks()) if task is None else (task,))
+    return given or newest_bench(root, *(registry.tasks() if task is None else (task,)))
 
 
 def provenance(protocol_hash: str) -> dict[str, object]:

@@ -11,7 +11,7 @@ from imagine_bench.errors import brief
 from imagine_bench.judge.verify import Verdict, verify_runs
 from imagine_bench.report.bench import bench_page
 from imagine_bench.report.page import texts
-from imagine_bench.store.merge import load_so_far
+from imagine_bench.store.loading import load_so_far
 
 _LINES = {"report.md": r"^\|.*$", "index.html": r"<t[dh][^>]*>(.*?)</t[dh]>"}
 """What is compared of a report's pages: the cells of their tables; of other files it is every line."""

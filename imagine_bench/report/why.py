@@ -15,7 +15,7 @@ from imagine_bench.running.progress import counted
 from imagine_bench.running.trained import learners, load_trained, protocol_of_agents
 from imagine_bench.seeding import evaluation_split
 from imagine_bench.store.files import csv_text, lock, make_folder, write_bytes, write_json
-from imagine_bench.store.merge import load_so_far
+from imagine_bench.store.loading import load_so_far
 
 
 def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:

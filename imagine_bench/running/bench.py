@@ -12,15 +12,13 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.errors import RunFailedError, SetupError, plain, require_modules
 from imagine_bench.exact.certificate import Certificate, certificate
-from imagine_bench.protocols.control import Protocol, spec_of
+from imagine_bench.protocols.control import spec_of
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import Encoders, Failure, Job, Launcher, OnProgress, Progress, Result, RunSpec
 from imagine_bench.registry.machine import describe_environment, gl_renderer
-from imagine_bench.running.progress import ProgressBars, RunKey
+from imagine_bench.running.progress import ProgressBar
 from imagine_bench.running.task_types import load_bench, require_options, task_type
-from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_folder
-from imagine_bench.store.files import sweep
 
 _SAVE_EVERY_S = 10.0
 
@@ -74,9 +72,7 @@ def carry_out(
         missing = 0
         for wanted, paths in planned:
             store = BenchStore(bench_folder(root, wanted), wanted)
-            store.open()
-            held.enter_context(store.lock())
-            sweep(store.folder)
+            held.enter_context(store.held())
             if store.missing():
                 missing += len(store.missing())
                 work.append((store, paths))
@@ -84,26 +80,20 @@ def carry_out(
             gl_renderer()  # fails here, in one sentence, rather than in every run
         environment = describe_environment() if work else {}
         for store, _ in work:
-            _warn(store.begin_session(environment), store.folder)
-            if isinstance(store.protocol, Protocol):
-                store.keep_certificate(certificate_of)
+            _warn(store.begin_session(environment, certificate_of), store.folder)
         return _in_stages(work, launcher), missing
 
 
+@functools.cache
 def certificate_of(task: str, split: str | None) -> Certificate | None:
     """Return the exact facts of a task from the starts that tests have; None for a package's whose rules fail."""
-    if registry.is_own(task):
-        return _own_certificate(task, split)
     try:
         return certificate(spec_of(task, split, testing=True))
     except Exception as error:
+        if registry.is_own(task):
+            raise
         print(f"Note: {task} has no certificate ({type(error).__name__}: {plain(error)}).")
         return None
-
-
-@functools.cache
-def _own_certificate(task: str, split: str | None) -> Certificate:
-    return certificate(spec_of(task, split, testing=True))
 
 
 _Bench = tuple[BenchStore, Encoders]
@@ -113,7 +103,7 @@ def _in_stages(work: Sequence[_Bench], launcher: Launcher) -> list[Failure]:
     """Take all runs as far as their protocol's next stage, again and again; one that failed goes no further."""
     failures: list[Failure] = []
     specs = [_job(store, paths, *pair, None).spec for store, paths in work for pair in store.missing()]
-    with ProgressBars(specs, dict(pair for store, _ in work for pair in _done_before(store).items())) as show:
+    with ProgressBar(specs) as show:
         for index in range(max((len(store.protocol.stages) for store, _ in work), default=0)):
             jobs: list[Job] = []
             for store, paths in work:
@@ -133,15 +123,6 @@ def _next_jobs(store: BenchStore, paths: Encoders, index: int, failed: Collectio
     pairs = sorted(store.missing(until), key=lambda pair: (pair[1], -order.index(pair[0])))
     jobs = [_job(store, paths, *pair, until) for pair in pairs]
     return [job for job in jobs if job.folder not in failed]
-
-
-def _done_before(store: BenchStore) -> dict[RunKey, int]:
-    """How much of each unfinished run lies before its last test; only runs that act are tested on the way."""
-    if not registry.has_task(store.protocol.task):
-        return {}
-    reached = {pair: run_folder.reached(store.run_folder(*pair)) for pair in store.missing()}
-    known = {pair: until for pair, until in reached.items() if until}
-    return {(store.protocol.hash, *pair): store.protocol.work(pair[0], until) for pair, until in known.items()}
 
 
 def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int | None) -> Job:

@@ -21,10 +21,7 @@ from imagine_bench.running import runner
 from imagine_bench.running.queries import require_able
 from imagine_bench.running.run_state import make_env
 from imagine_bench.store import encoders
-from imagine_bench.store.archive import load_archive
-from imagine_bench.store.bench_folder import is_archive, read_control
-from imagine_bench.store.merge import load_so_far
-from imagine_bench.store.results import BenchResult
+from imagine_bench.store.loading import load_so_far
 from imagine_bench.values import Json
 
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
@@ -142,12 +139,6 @@ def _encoders(wanted: Protocol, given: str | None) -> Encoders:
 def run_control(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> None:
     """Do a run, looked at by its observers; see :func:`.runner.run`."""
     runner.run(spec, folder, on_progress, [registry.load(name)() for name in spec.observers])
-
-
-def load_bench_of_agents(folder: Path) -> BenchResult:
-    """Read a bench of agents, finished or not, or in the form it is kept in; raises as :func:`.merge.load_so_far`."""
-    read_control(folder)
-    return load_archive(folder) if is_archive(folder) else load_so_far(folder)
 
 
 CONTROL = TaskType(

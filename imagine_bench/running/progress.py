@@ -1,10 +1,10 @@
-"""Work on the screen: of a bench one bar for everything with the time left, and a line for each run that goes on."""
+"""Work on the screen: one bar, with the time left and what was last heard of a run."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import TypeVar
 
@@ -21,62 +21,47 @@ _LINE_EVERY_S = 15.0
 """Between two lines where nobody watches a terminal."""
 
 
-class ProgressBars(AbstractContextManager["ProgressBars"]):
-    """Shows :class:`~imagine_bench.protocols.runs.Progress` on a terminal as bars, elsewhere as a line now and then.
+class ProgressBar(AbstractContextManager["ProgressBar"]):
+    """Shows :class:`~imagine_bench.protocols.runs.Progress` on a terminal as a bar, elsewhere as a line now and then.
 
-    ``specs`` are the runs to come, to their ends even where they pause on the way; ``done`` is how much of each run
-    earlier sessions did, by bench, agent and seed, as far as is known before it goes on.
+    ``specs`` are the runs to come, to their ends even where they pause on the way.
     """
 
-    def __init__(self, specs: Sequence[RunSpec[ProtocolData]], done: Mapping[RunKey, int] | None = None) -> None:
+    def __init__(self, specs: Sequence[RunSpec[ProtocolData]]) -> None:
         self._works = {(spec.protocol.hash, spec.agent, spec.seed): spec.work for spec in specs}
+        self._done = dict.fromkeys(self._works, 0)
+        self._before = dict[RunKey, int]()
         self._finished = set[RunKey]()
-        self._done = dict(done or {})
-        self._before = dict(self._done)
-        self._seen = set[RunKey]()
-        self._began_s = self._shown_s = time.monotonic()
-        self._total: tqdm | None = None
-        self._lines: list[tuple[RunKey | None, tqdm]] = []
-        if sys.stderr.isatty():
-            form = "{desc} |{bar:30}| {percentage:3.0f} %{postfix}"
-            self._total = tqdm(total=sum(self._works.values()), desc=self._description(), bar_format=form, leave=False)
+        self._began_s = time.monotonic()
+        self._shown_s = self._began_s
+        form = "{percentage:3.0f} % |{bar:20}| {desc}"
+        total = sum(self._works.values())
+        self._bar = tqdm(total=total, bar_format=form, leave=False, disable=not sys.stderr.isatty())
 
     def __exit__(self, *error: object) -> None:
-        for _, line in self._lines:
-            line.close()
-        if self._total is not None:
-            self._total.close()
+        self._bar.close()
 
     def __call__(self, progress: Progress) -> None:
         """Show how far a run is."""
         run = (progress.bench, progress.agent, progress.seed)
-        pauses = progress.phase == "done"
-        if progress.phase == "failed":
-            self._drop(run, f"{progress.agent} seed {progress.seed} failed: {progress.detail}")
+        if progress.phase == "failed":  # what it lacks will not be done
+            self._works[run] = self._done[run]
+            tqdm.write(f"{progress.agent} seed {progress.seed} failed: {progress.detail}", file=sys.stderr)
             return
-        work = self._works[run]
-        if run not in self._seen:  # what an earlier session did took no time now and foretells nothing
-            self._seen.add(run)
-            self._before[run] = progress.done
+        self._before.setdefault(run, progress.done)  # what an earlier session did took no time now
         self._done[run] = progress.done
-        if pauses and progress.done >= work:
+        pauses = progress.phase == "done"
+        if pauses and progress.done >= self._works[run]:
             self._finished.add(run)
-        if self._total is not None:
-            self._show_on_bars(self._total, run, "" if pauses else _sentence(progress, work))
+        shown = f"{len(self._finished)} of {len(self._works)} runs done, {self._times()}"
+        sentence = f"{shown}; {_sentence(progress, self._works[run])}"
+        if not self._bar.disable:
+            self._bar.total = sum(self._works.values())
+            self._bar.n = sum(self._done.values())
+            self._bar.set_description_str(sentence)
         elif pauses or time.monotonic() - self._shown_s > _LINE_EVERY_S:
             self._shown_s = time.monotonic()
-            print(f"{self._description()},{self._times()}; {_sentence(progress, work)}", file=sys.stderr, flush=True)
-
-    def _drop(self, run: RunKey, sentence: str) -> None:
-        """Say that a run failed; what it lacks will not be done."""
-        self._works[run] = self._done.get(run, 0)
-        if self._total is not None:
-            self._total.total = sum(self._works.values())
-            self._show_on_bars(self._total, run, "")
-        tqdm.write(sentence, file=sys.stderr)
-
-    def _description(self) -> str:
-        return f"{len(self._finished)} of {len(self._works)} runs done"
+            print(sentence, file=sys.stderr, flush=True)
 
     def _times(self) -> str:
         """Time gone and, once there is something to judge by, time left."""
@@ -85,25 +70,7 @@ class ProgressBars(AbstractContextManager["ProgressBars"]):
         played = done - sum(self._before.values())
         missing = sum(self._works.values()) - done
         left = f", {tqdm.format_interval(gone_s * missing / played)} left" if played else ""
-        return f" {tqdm.format_interval(gone_s)} gone{left}"
-
-    def _show_on_bars(self, total: tqdm, run: RunKey, text: str) -> None:
-        total.n = sum(self._done.values())
-        total.set_description_str(self._description(), refresh=False)
-        total.set_postfix_str(self._times(), refresh=True)
-        row = self._row(run)
-        line = self._lines[row][1]
-        line.set_description_str(text)
-        self._lines[row] = (run if text else None, line)
-
-    def _row(self, run: RunKey) -> int:
-        """The run's line, else one that a finished run has left, else a new one below."""
-        owners = [owner for owner, _ in self._lines]
-        for wanted in (run, None):
-            if wanted in owners:
-                return owners.index(wanted)
-        self._lines.append((run, tqdm(bar_format="{desc}", position=len(owners) + 1, leave=False)))
-        return len(owners)
+        return f"{tqdm.format_interval(gone_s)} gone{left}"
 
 
 def counted(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.arrays import Action, Arrays, Info, Observed, State
+from imagine_bench.arrays import Action, Info, Observed, State
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import ArtefactError
@@ -25,8 +25,7 @@ from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
 from imagine_bench.running.evaluation import AsDict, EvaluationCounts, StartFrom
 from imagine_bench.running.queries import Teacher, demonstrator, require_able
 from imagine_bench.store import encoders, run_folder
-from imagine_bench.store.checkpoints import Snapshot, save_snapshot
-from imagine_bench.store.codec import pack, unpack
+from imagine_bench.store.checkpoints import Snapshot, load_newest, pack, save_snapshot, unpack
 from imagine_bench.store.files import reading
 from imagine_bench.store.results import Checkpoint
 
@@ -63,21 +62,6 @@ class Counters:
     def try_out(self, macrostate: Sequence[int], action: int) -> None:
         """Count a macro-action of the training episode that goes on."""
         self.tried.setdefault(" ".join(map(str, (*macrostate, action))), self.episode)
-
-    def training(self) -> Arrays:
-        """What ``training.npz`` holds.
-
-        ``success``, ``length`` and ``queries`` of every training episode, shape (episodes,); ``starts`` of those that
-        were played, (played, M); and ``tried``, a row a macrostate, macro-action and first episode, (pairs, M + 2).
-        """
-        pairs = [[*map(int, pair.split()), episode] for pair, episode in self.tried.items()]
-        return {
-            "success": np.array(self.success, dtype=np.bool_),
-            "length": np.array(self.length, dtype=np.int64),
-            "queries": np.array(self.queries, dtype=np.int64),
-            "starts": np.array(self.starts[: self.episode], dtype=np.int16),  # a library begins one more at its end
-            "tried": np.array(pairs, dtype=np.int32),
-        }
 
     def snapshot(self, agent: AgentState) -> Snapshot:
         """Everything, with the agent's state, as a checkpoint."""
@@ -167,9 +151,9 @@ class Run:
         run_folder.check_config(folder, spec, self.agent)
         if self.entry.external_training_loop:
             run_folder.forget(folder)  # an earlier attempt cannot be gone on with
-        snapshot = run_folder.newest_snapshot(folder)
+        snapshot = load_newest(folder / run_folder.CHECKPOINTS)
         if snapshot is not None:
-            with reading(folder / "checkpoints", f"a checkpoint of {spec.agent!r}"):
+            with reading(folder / run_folder.CHECKPOINTS, f"a checkpoint of {spec.agent!r}"):
                 self.agent.restore(snapshot.agent)
                 self.counters = Counters.of(snapshot)
             if self.counters.rows:  # a kill between a test's checkpoint and its table would leave the table behind

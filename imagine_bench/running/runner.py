@@ -80,7 +80,7 @@ def _go_on(run: Run, observers: Sequence[RunObserver]) -> None:
         measured = AtEnd()
         for observer in observers:
             measured.update(observer.at_end(run))
-        run_folder.finish(run.folder, run.counters.rows, run.counters.training(), **measured)
+        run_folder.finish(run.folder, **measured)
     run.tell("done", at_once=True)
 
 

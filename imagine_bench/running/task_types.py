@@ -15,7 +15,7 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import Result, TaskType
-from imagine_bench.store.archive import load_archive
+from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import is_archive, read_protocol_as, read_protocol_values
 from imagine_bench.values import Setting
 
@@ -80,10 +80,10 @@ def load_so_far(folder: Path) -> Result:
     """Read a bench as far as it can be reported, finished or not, or in the form in which it is kept for good.
 
     Raises:
-        ArtefactError: It is no bench, there is nothing to report yet, or a file is damaged.
-        InvalidValueError: It is kept for good and of a regression task, whose tables are files of their own.
+        ArtefactError: It is no bench, there is nothing to report yet, a file is damaged, or it is kept for good and of
+            a regression task, whose tables are files of their own.
     """
-    return load_archive(folder) if is_archive(folder) else bench_type(folder).load_so_far(folder)
+    return loading.load_so_far(folder) if is_archive(folder) else bench_type(folder).load_so_far(folder)
 
 
 def load_bench(folder: Path) -> Result:

@@ -2,7 +2,7 @@
 
 ``protocol.json`` holds what is compared, ``environment.json`` what the first session ran on, and ``sessions.json`` when
 and with which command work went on. Nothing is ever overwritten by another protocol, for its hash is in the name. A
-bench that is kept for good is one file, ``bench.json``, and a table: see :mod:`.archive`.
+bench that is kept for good is one file, ``bench.json``, and a table: see :mod:`.loading`.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from __future__ import annotations
 import dataclasses
 import re
 import time
-from collections.abc import Callable, Collection, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypeVar
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.exact.certificate import Certificate, from_json
@@ -22,31 +22,21 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.registry.entries import file_name
 from imagine_bench.store import run_folder
-from imagine_bench.store.files import lock, make_folder, read_json, read_sealed, reading, sealed, write_json
+from imagine_bench.store.files import lock, make_folder, read_json, read_sealed, reading, sealed, sweep, write_json
 from imagine_bench.values import Json
 
 P = TypeVar("P", bound=ProtocolData)
 L = TypeVar("L")
+Certify = Callable[[str, str | None], Certificate | None]
 
 KEPT = "bench.json"
-"""Protocol, environment and sessions in one file, as :mod:`.archive` keeps them for good."""
+"""Protocol, environment and sessions in one file, as :mod:`.loading` keeps them for good."""
 _PROTOCOL = "protocol.json"
 _ENVIRONMENT = "environment.json"
 _SESSIONS = "sessions.json"
 _CERTIFICATE = "certificate.json"
 _NAME = re.compile("-([0-9a-f]{12})$")
 """The hash in a folder's name; whoever moves a bench elsewhere may leave it out."""
-_IDENTITY = ("commit", "versions", "gl_renderer", "cpu")
-"""Facts that decide the bits of a result."""
-
-
-class _Session(TypedDict):
-    """One command that worked on a bench."""
-
-    started: str
-    wall_s: float
-    command: Json
-    changed: dict[str, Json]
 
 
 class BenchStore:
@@ -56,30 +46,29 @@ class BenchStore:
         self.protocol = protocol
         self.folder = folder
         self._began_s = time.monotonic()
-        self._sessions: list[_Session] = []
+        self._sessions: list[dict[str, Json]] = []
 
     @property
     def pairs(self) -> list[tuple[str, int]]:
         """Agent and seed of every run, seed by seed."""
         return [(agent, seed) for seed in self.protocol.seeds for agent in self.protocol.agents]
 
-    def open(self) -> None:
-        """Make the folder.
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Make the folder, and hold it for this process.
 
         Raises:
             ArtefactError: It is of another protocol.
+            BusyError: Another bench works there.
             SetupError: It cannot be written.
         """
         make_folder(self.folder)
-        path = self.folder / _PROTOCOL
-        if not path.exists():
-            write_json(path, self.protocol.as_dict())
-        elif read_protocol_as(self.folder, type(self.protocol)).as_dict() != self.protocol.as_dict():
-            raise ArtefactError(f"{path} is of another protocol than its folder's name says. It was left untouched.")
-
-    def lock(self) -> AbstractContextManager[None]:
-        """Hold the folder for this process. Raises BusyError: another bench works there."""
-        return lock(self.folder / ".lock", f"The bench folder {self.folder}")
+        with lock(self.folder / ".lock", f"The bench folder {self.folder}"):
+            sweep(self.folder)
+            if not (self.folder / _PROTOCOL).exists():
+                write_json(self.folder / _PROTOCOL, self.protocol.as_dict())
+            read_protocol_values(self.folder)
+            yield
 
     def run_folder(self, agent: str, seed: int) -> Path:
         """Return the folder of one run."""
@@ -98,40 +87,35 @@ class BenchStore:
         unfinished = [pair for pair in self.pairs if not run_folder.is_done(self.run_folder(*pair))]
         return [pair for pair in unfinished if until is None or run_folder.reached(self.run_folder(*pair)) < until]
 
-    def begin_session(self, environment: Mapping[str, Json]) -> list[str]:
-        """Note that work starts now, in what :func:`.describe_environment` says; returns :meth:`changed`."""
+    def begin_session(self, environment: Mapping[str, Json], certify: Certify = lambda task, split: None) -> list[str]:
+        """Note that work starts now, in what :func:`.describe_environment` says; returns :meth:`changed`.
+
+        The first time, the exact facts of the protocol's world are kept too, which ``certify`` gives for its task and
+        split.
+        """
         path = self.folder / _ENVIRONMENT
         begun = path.exists()
         if begun:
-            self._sessions = _sessions(self.folder)
-        self._began_s = time.monotonic()
+            self._sessions = read_sealed(self.folder / _SESSIONS, "a bench's sessions")["sessions"]
+        elif isinstance(self.protocol, Protocol):
+            found = certify(self.protocol.task, self.protocol.split)
+            if found is not None:
+                write_json(self.folder / _CERTIFICATE, sealed(dataclasses.asdict(found)))
         changed = self.changed(environment)
-        self._sessions.append(
-            {
-                "started": datetime.now(UTC).isoformat(timespec="seconds"),
-                "wall_s": 0.0,
-                "command": environment["command"],
-                "changed": {name: _fact(environment, name) for name in changed},
-            }
-        )
+        facts = _identity(environment)
+        session = {"started": datetime.now(UTC).isoformat(timespec="seconds"), "command": environment["command"]}
+        self._sessions.append({**session, "changed": {name: facts[name] for name in changed}})
+        self._began_s = time.monotonic()
         self.save_time()
         if not begun:
             write_json(path, sealed(environment))  # last, so that a bench with an environment has sessions too
         return changed
 
-    def keep_certificate(self, certify: Callable[[str, str | None], Certificate | None]) -> None:
-        """Keep the exact facts of the protocol's world, which ``certify`` gives for its task and split, once."""
-        path = self.folder / _CERTIFICATE
-        if isinstance(self.protocol, Protocol) and not path.exists():
-            found = certify(self.protocol.task, self.protocol.split)
-            if found is not None:
-                write_json(path, sealed(dataclasses.asdict(found)))
-
     def changed(self, environment: Mapping[str, Json]) -> list[str]:
         """Return names of facts that decide the bits and differ from the first session's; none before there was one."""
         path = self.folder / _ENVIRONMENT
-        first = read_sealed(path, "a bench's environment") if path.exists() else environment
-        return [name for name in _IDENTITY if _fact(first, name) != _fact(environment, name)]
+        first = _identity(read_sealed(path, "a bench's environment") if path.exists() else environment)
+        return [name for name, fact in _identity(environment).items() if fact != first[name]]
 
     def save_time(self) -> None:
         """Note how long this session has lasted, so that a kill loses little of the count."""
@@ -139,11 +123,10 @@ class BenchStore:
         write_json(self.folder / _SESSIONS, sealed({"sessions": self._sessions}))
 
 
-def _fact(environment: Mapping[str, Json], name: str) -> Json:
-    if name != "cpu":
-        return environment.get(name)
-    machine = environment.get("machine")
-    return machine.get("cpu") if isinstance(machine, Mapping) else None
+def _identity(environment: Mapping[str, Any]) -> dict[str, Json]:
+    """Facts that decide the bits of a result."""
+    facts = {name: environment.get(name) for name in ("commit", "versions", "gl_renderer")}
+    return facts | {"cpu": environment.get("machine", {}).get("cpu")}
 
 
 def bench_folder(root: Path, protocol: ProtocolData) -> Path:
@@ -152,37 +135,30 @@ def bench_folder(root: Path, protocol: ProtocolData) -> Path:
 
 
 def bench_facts(folder: Path) -> dict[str, Any]:
-    """Return ``environment``, ``folder``, ``wall_s`` and, where it was kept, ``certificate`` of a bench's result.
+    """Return ``environment``, ``folder``, ``wall_s`` and, where kept, ``certificate`` and ``made_with`` of a bench.
 
     Raises ArtefactError: a file is missing or damaged.
     """
     if is_archive(folder):
         found = read_json(folder / KEPT, "a kept bench")
     else:
-        found = {"environment": read_sealed(folder / _ENVIRONMENT, "a bench's environment")}
-        found["sessions"] = _sessions(folder)
+        found = {
+            "environment": read_sealed(folder / _ENVIRONMENT, "a bench's environment"),
+            **read_sealed(folder / _SESSIONS, "a bench's sessions"),
+        }
         if (folder / _CERTIFICATE).exists():
             found["certificate"] = read_sealed(folder / _CERTIFICATE, "a world's certificate")
-    path = folder / KEPT if is_archive(folder) else folder / _CERTIFICATE
-    with reading(path, "the facts of a bench"):
-        sessions = [{**session, "wall_s": float(session["wall_s"])} for session in found["sessions"]]
+    with reading(folder, "a bench with environment and sessions"):
         facts = {
-            "environment": {**found["environment"], "sessions": sessions},
+            "environment": {**found["environment"], "sessions": found["sessions"]},
             "folder": folder,
-            "wall_s": sum(session["wall_s"] for session in sessions),
+            "wall_s": sum(float(session["wall_s"]) for session in found["sessions"]),
         }
-        certificate = found.get("certificate")
-        return facts if certificate is None else {**facts, "certificate": from_json(certificate)}
-
-
-def _sessions(folder: Path) -> list[_Session]:
-    path = folder / _SESSIONS
-    sessions = read_sealed(path, "a bench's sessions")
-    with reading(path, "a bench's sessions"):
-        found: list[_Session] = sessions["sessions"]
-        for session in found:
-            session["wall_s"] = float(session["wall_s"])
-        return found
+        if found.get("certificate") is not None:
+            facts["certificate"] = from_json(found["certificate"])
+        if "protocol_hash" in found:
+            facts["made_with"] = str(found["protocol_hash"])
+        return facts
 
 
 def require_either(given: Path | None, task: str | None) -> None:
@@ -191,47 +167,33 @@ def require_either(given: Path | None, task: str | None) -> None:
         raise InvalidValueError(f"Both {given} and --task {task} were given; leave one of them out.")
 
 
-def newest(root: Path, pattern: str, tasks: Collection[str] = ()) -> Path | None:
-    """Return the file by ``pattern`` below the folders of some tasks, or of all, that was written last; None without.
+def newest_bench(root: Path, *tasks: str | None) -> Path:
+    """Return the bench folder below ``root`` that was worked on last, of any task or of those that are given, or ArtefactError."""
+    return _newest(root, f"*/{_SESSIONS}", "bench", [task for task in tasks if task]).parent
+
+
+def newest_recording(root: Path, *tasks: str | None) -> Path:
+    """Return the recording below ``root`` that was written last, of any task or of those that are given, or ArtefactError."""
+    return _newest(root, "**/recording.rrd", "recording", [task for task in tasks if task])
+
+
+def _newest(root: Path, pattern: str, what: str, tasks: Sequence[str]) -> Path:
+    """The file by ``pattern`` below the folders of some tasks, or of all, that was written last.
 
     A task's name without options also means it with any.
     """
     names = [file_name(task) for task in tasks]
-    folders = [
-        folder
-        for folder in root.glob("*/")
-        if not names or any(folder.name == name or folder.name.startswith(f"{name}-") for name in names)
-    ]
-    found = (path for folder in folders for path in folder.glob(pattern))
-    return max(found, key=lambda path: path.stat().st_mtime, default=None)
-
-
-def newest_bench(root: Path, tasks: Collection[str] = ()) -> Path:
-    """Return the bench folder below ``root`` that was worked on last, of any task or of some, or ArtefactError."""
-    found = newest(root, f"*/{_SESSIONS}", tasks)
-    if found is None:
+    wanted = [f"{name}{options}" for name in names for options in ("", "-*")] or ["*"]
+    found = [path for name in wanted for path in root.glob(f"{name}/{pattern}")]
+    if not found:
+        of = f" of {' or '.join(tasks)}" if tasks else ""
         some = next(iter(tasks), "arrow_puzzle")
-        where = root / file_name(some) if len(tasks) == 1 else root
-        raise ArtefactError(
-            f"There is no {'such ' if tasks else ''}bench below {where}; "
-            f"run one with 'imagine-bench bench --task {some}'."
-        )
-    return found.parent
-
-
-def newest_recording(root: Path, task: str | None = None) -> Path:
-    """Return the recording below ``root`` that was written last, of any task or of one, or ArtefactError."""
-    found = newest(root, "**/recording.rrd", () if task is None else (task,))
-    if found is None:
-        raise ArtefactError(
-            f"There is no recording below {root / file_name(task or '')}; run a bench with 'imagine-bench bench --task "
-            f"{task or 'arrow_puzzle'}'."
-        )
-    return found
+        raise ArtefactError(f"There is no {what}{of} below {root}; run 'imagine-bench bench --task {some}' first.")
+    return max(found, key=lambda path: path.stat().st_mtime)
 
 
 def is_archive(folder: Path) -> bool:
-    """Return whether a folder holds a bench that is kept for good, see :mod:`.archive`."""
+    """Return whether a folder holds a bench that is kept for good, see :mod:`.loading`."""
     return (folder / KEPT).is_file()
 
 
@@ -252,13 +214,8 @@ def read_protocol_values(folder: Path) -> dict[str, Any]:
 def read_protocol_as(folder: Path, kind: type[P]) -> P:
     """Return the protocol of a bench folder, of a known class. Raises ArtefactError: it is missing or damaged."""
     values = read_protocol_values(folder)
-    with reading(folder / (KEPT if is_archive(folder) else _PROTOCOL), "a bench's protocol"):
+    with reading(folder, f"a bench with a {kind.__name__}"):
         return kind.from_dict(values)
-
-
-def is_of_regression(values: Mapping[str, Json]) -> bool:
-    """Return whether a protocol's values are those of a regression task, in which no agent acts."""
-    return "variants" in values
 
 
 def read_control(folder: Path) -> Protocol:
@@ -266,6 +223,9 @@ def read_control(folder: Path) -> Protocol:
 
     Raises ArtefactError: the bench is of a regression task, or its protocol is missing or damaged.
     """
-    if is_of_regression(read_protocol_values(folder)):
-        raise ArtefactError(f"{folder} is of a regression task, in which no agent acts; give one of agents.")
+    values = read_protocol_values(folder)
+    if "variants" in values:
+        raise ArtefactError(
+            f"{folder} is of the regression task {values.get('task')}, in which no agent acts; give one of agents."
+        )
     return read_protocol_as(folder, Protocol)

@@ -14,7 +14,7 @@ import platformdirs
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
-from imagine_bench.interfaces import APPEARANCES, TaskSpec, bundled_name
+from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec, bundled_name
 from imagine_bench.registry.entries import file_name
 from imagine_bench.rules import states_of
 from imagine_bench.store.files import lock, make_folder, read_json, sha256
@@ -37,11 +37,20 @@ def cache_folder() -> Path:
     return Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("imagine_bench"))
 
 
+def _frames(spec: TaskSpec, appearance: str) -> Frame:
+    """What a task looks like: some of its macrostates."""
+    return spec.render_macrostates(np.array(states_of(spec.rules)[:8]), appearance, np.random.default_rng(0))
+
+
+def _place(made_for: bytes, name: str) -> Path:
+    """Where an encoder that is made for ``made_for`` belongs, be it there or not."""
+    return cache_folder() / "encoders" / hashlib.sha256(made_for).hexdigest()[:12] / f"{name}{_SUFFIX}"
+
+
 def cached(spec: TaskSpec, appearance: str, kind: str) -> Path:
     """Where the trained encoder of a task's looks belongs, be it there or not; other looks are another folder."""
-    frames = spec.render_macrostates(np.array(states_of(spec.rules)[:8]), appearance, np.random.default_rng(0))
-    looks = hashlib.sha256(f"{spec.preprocessing}/{spec.config_group}/".encode() + frames.tobytes()).hexdigest()[:12]
-    return cache_folder() / "encoders" / looks / f"{bundled_name(spec.encoder, appearance, kind)}{_SUFFIX}"
+    looks = f"{spec.preprocessing}/{spec.config_group}/".encode() + _frames(spec, appearance).tobytes()
+    return _place(looks, bundled_name(spec.encoder, appearance, kind))
 
 
 def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
@@ -53,21 +62,18 @@ def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
         BusyError: Another process makes it, for longer than an hour.
     """
     entry = registry.offered(name, {}, registry.ENCODER_GROUP)
-    frames = spec.render_macrostates(np.array(states_of(spec.rules)[:8]), appearance, np.random.default_rng(0))
+    frames = _frames(spec, appearance)
     try:
         features = np.asarray(registry.load(entry.make)().encode(frames), dtype=np.float64)
-        shape_is_right = features.ndim == 2 and len(features) == len(frames) and np.isfinite(features).all()
+        if features.ndim != 2 or len(features) != len(frames) or not np.isfinite(features).all():
+            wanted = f"it must give finite numbers of shape ({len(frames)}, Z)"
+            raise ValueError(f"{len(frames)} frames have latents of shape {features.shape}; {wanted}")
     except Exception as error:  # whatever a package does wrong is one sentence
         raise InvalidValueError(
             f"The encoder {name} ({entry.make}) failed: {type(error).__name__}: {error}."
         ) from error
-    if not shape_is_right:
-        raise InvalidValueError(
-            f"Encoder {name} ({entry.make}) gave latents of shape {features.shape} for {len(frames)} frames; it must "
-            f"give finite numbers of shape ({len(frames)}, Z)."
-        )
-    known = hashlib.sha256(f"{entry.make}/{spec.preprocessing}/".encode() + np.round(features, 3).tobytes()).hexdigest()
-    path = cache_folder() / "encoders" / known[:12] / f"{name}-{file_name(spec.id)}-{appearance}{_SUFFIX}"
+    known = f"{entry.make}/{spec.preprocessing}/".encode() + np.round(features, 3).tobytes()
+    path = _place(known, f"{name}-{file_name(spec.id)}-{appearance}")
     what = f"The scale and the probe of {name} for {spec.id} at {appearance} are made"
     _once(path, what, lambda: registry.load(_FIT)(spec, name=name, offer=entry.make, appearance=appearance, path=path))
     return path
@@ -76,51 +82,49 @@ def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
 def find(used: str) -> Path | None:
     """The bundled or trained encoder of an identity; None where there is none."""
     name = used.partition("@")[0]
-    there = [bundled()[name]] if name in bundled() else []
-    there += sorted((cache_folder() / "encoders").glob(f"*/{name}{_SUFFIX}"))
+    trained = sorted((cache_folder() / "encoders").glob(f"*/{name}{_SUFFIX}"))
+    there = [bundled()[name], *trained] if name in bundled() else trained
     return next((path for path in there if identity(path) == used), None)
 
 
-def resolve(spec: TaskSpec, appearance: str, given: str | None = None, kind: str = "latents") -> Path:
-    """The encoder file to use: ``given``, a bundled name or a path, or the task's own of a kind (latents or codes).
+def resolve(spec: TaskSpec, appearance: str, given: str) -> Path:
+    """The encoder file that is meant by ``given``: a bundled name, one that a package offers, or a path.
 
-    Raises:
-        UnknownNameError: ``given`` is neither.
-        ArtefactError: The task has no bundled encoder at this appearance level.
+    Raises UnknownNameError: it is none of them.
     """
-    known = {**bundled(), **registry.offers(registry.ENCODER_GROUP)}
-    if given is None:
-        name = bundled_name(spec.encoder, appearance, kind)
-        if name not in known:
-            raise ArtefactError(
-                f"No encoder {name!r} is bundled; train one with "
-                f"'imagine-bench encoder --task {spec.id} --appearance {appearance}"
-                f"{' --recipe codes' if kind == 'codes' else ''}' and give it with --encoder."
-            )
-        return known[name]
-    if given in known:
-        return bundled()[given] if given in bundled() else offered(spec, appearance, given)
+    if given in bundled():
+        return bundled()[given]
+    offers = registry.offers(registry.ENCODER_GROUP)
+    if given in offers:
+        return offered(spec, appearance, given)
     path = Path(given).expanduser()
     if (os.sep in given or given.endswith(_SUFFIX)) and path.is_file():
         return path.resolve()
-    raise UnknownNameError("encoder", given, known)
+    raise UnknownNameError("encoder", given, [*bundled(), *offers])
 
 
-def own(spec: TaskSpec, appearance: str, kind: str) -> Path:
-    """The task's own encoder of a kind; one of looks that none is bundled for is trained once.
+def own(spec: TaskSpec, appearance: str, kind: str = "latents") -> Path:
+    """The task's own encoder of a kind, latents or codes: the bundled one, else one that is trained once for its looks.
 
-    Raises as :func:`resolve`, and BusyError: another process trains it, for longer than an hour.
+    Raises:
+        ArtefactError: One of these looks is bundled, but not at this named appearance.
+        BusyError: Another process trains it, for longer than an hour.
     """
-    named = registry.is_own(spec.id) and appearance in APPEARANCES
-    looks_bundled = named and any(name.startswith(f"{spec.encoder}-") for name in bundled())
-    if not looks_bundled and bundled_name(spec.encoder, appearance, kind) not in bundled():
-        path = cached(spec, appearance, kind)
-        recipe = "codes" if kind == "codes" else "default"
-        settings = {"recipe": recipe, "appearance": appearance, "seed": 0, "out": path.parent}
-        what = f"{spec.id} has no encoder for {kind} at {appearance}; one is trained"
-        _once(path, what, lambda: registry.load(_TRAIN)(spec, **settings))
-        return path
-    return resolve(spec, appearance, kind=kind)
+    name = bundled_name(spec.encoder, appearance, kind)
+    if name in bundled():
+        return bundled()[name]
+    has_others = any(other.startswith(f"{spec.encoder}-") for other in bundled())
+    if has_others and registry.is_own(spec.id) and appearance in APPEARANCES:
+        raise ArtefactError(
+            f"No encoder {name!r} is bundled; train one with 'imagine-bench encoder --task {spec.id} --appearance "
+            f"{appearance}' (for codes with --recipe codes) and give it with --encoder."
+        )
+    path = cached(spec, appearance, kind)
+    recipe = "codes" if kind == "codes" else "default"
+    what = f"{spec.id} has no encoder for {kind} at {appearance}; one is trained"
+    settings = {"recipe": recipe, "appearance": appearance, "seed": 0, "out": path.parent}
+    _once(path, what, lambda: registry.load(_TRAIN)(spec, **settings))
+    return path
 
 
 def _once(path: Path, what: str, make: Callable[[], object]) -> None:
@@ -134,8 +138,7 @@ def _once(path: Path, what: str, make: Callable[[], object]) -> None:
 
 def kind(path: Path) -> str:
     """Whether an encoder gives ``"latents"`` or ``"codes"``, by its card. Raises ArtefactError: the card is damaged."""
-    card = path.with_suffix(".json")
-    return "codes" if card.is_file() and read_json(card, "an encoder's card").get("code_sizes") else "latents"
+    return "codes" if (_card(path) or {}).get("code_sizes") else "latents"
 
 
 def identity(path: Path) -> str:
@@ -146,6 +149,9 @@ def identity(path: Path) -> str:
 def card(used: str | None) -> dict[str, Any] | None:
     """The card of an encoder that :func:`find` finds; None where it finds none. Raises ArtefactError: damaged."""
     path = None if used is None else find(used)
-    if path is None or not path.with_suffix(".json").is_file():
-        return None
-    return read_json(path.with_suffix(".json"), "an encoder's card")
+    return None if path is None else _card(path)
+
+
+def _card(path: Path) -> dict[str, Any] | None:
+    beside = path.with_suffix(".json")
+    return read_json(beside, "an encoder's card") if beside.is_file() else None

@@ -1,4 +1,4 @@
-"""Writing so that a file is either whole or absent, and saying in one sentence why it could not be written."""
+"""Files of JSON, tables and named arrays: each is whole or absent, and one sentence says why it cannot be used."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import errno
 import hashlib
 import io
 import json
-import math
 import os
 import socket
 import stat
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
+import numpy as np
 from filelock import FileLock, Timeout
 
+from imagine_bench.arrays import Array, Arrays
 from imagine_bench.errors import ArtefactError, BusyError, SetupError, brief
 from imagine_bench.values import Json
 
@@ -30,14 +31,10 @@ _REASONS = {
     errno.EPERM: "you may not write there; choose another folder or change its permissions",
     errno.EROFS: "that file system is read-only; choose another folder",
     errno.ENOSPC: "the disk is full; free some space and run the same command again",
-    errno.EDQUOT: "your disk quota is used up; free some space and run the same command again",
     errno.ENOTDIR: "a part of that path is a file, not a folder; choose another folder",
     errno.EEXIST: "a part of that path is a file, not a folder; choose another folder",
-    errno.ENAMETOOLONG: "that name is too long for the file system; choose a shorter one",
-    errno.ELOOP: "a part of that path is a link; remove it or choose another folder",
-    errno.ENOLCK: "that file system cannot lock files; choose a local folder",
-    errno.ENOTSUP: "that file system cannot lock files; choose a local folder",
 }
+"""What to do about refusals of the operating system; of others its own words are shown."""
 
 
 @contextmanager
@@ -104,12 +101,8 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def with_null(value: Any) -> Any:
-    """NaN as None, all the way down: JSON has a word for what is unknown, and none for what is no number."""
-    if isinstance(value, dict):
-        return {name: with_null(part) for name, part in value.items()}
-    if isinstance(value, list):
-        return [with_null(part) for part in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
+    """What JSON gives back of ``value``, None for NaN and infinities, for which JSON has no word."""
+    return json.loads(json.dumps(value), parse_constant=lambda _: None)
 
 
 def json_text(value: Any) -> str:
@@ -127,6 +120,44 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
+
+
+def table_text(rows: Sequence[Mapping[str, float | str]]) -> str:
+    """Rows as CSV under the names of all of them; what one lacks is an empty cell."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    return csv_text([names, *([row.get(name, "") for name in names] for row in rows)])
+
+
+def table_rows(text: str, texts: Collection[str] = ()) -> list[dict[str, Any]]:
+    """The inverse of :func:`table_text`: all columns but ``texts`` hold numbers, or ValueError is raised."""
+    rows = csv.DictReader(io.StringIO(text))
+    return [{name: cell if name in texts else _number(cell) for name, cell in row.items() if cell} for row in rows]
+
+
+def _number(text: str) -> float:
+    return int(text) if text.lstrip("-").isdigit() else float(text)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
+    """Write named arrays, atomically. Raises SetupError: they cannot be written."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    write_bytes(path, buffer.getvalue())
+
+
+def read_arrays(path: Path, what: str = "an array file of a run") -> Arrays:
+    """The inverse of :func:`write_arrays`. Raises ArtefactError: the file is missing, damaged or not ``what``."""
+    with reading(path, what), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def grouped(arrays: Mapping[str, Array]) -> dict[str, Arrays]:
+    """Arrays by the first part of their slashed names."""
+    groups: dict[str, Arrays] = {}
+    for name, array in arrays.items():
+        group, _, rest = name.partition("/")
+        groups.setdefault(group, {})[rest] = array
+    return groups
 
 
 def read_json(path: Path, what: str, holds: type = dict) -> Any:
@@ -167,8 +198,6 @@ def reading(path: Path, what: str) -> Iterator[None]:
         why: object = error.strerror if isinstance(error, OSError) and error.strerror else error
         if isinstance(error, KeyError):
             why = f"{error} is missing"
-        elif isinstance(error, RecursionError):
-            why = "it is nested too deep"
         text = str(why).strip().rstrip(".") or type(error).__name__
         raise ArtefactError(f"{path} is not {what}: {text[:_LONGEST]}. It was left untouched.") from error
 
@@ -176,15 +205,12 @@ def reading(path: Path, what: str) -> Iterator[None]:
 def first_difference(then: Json, now: Json, name: str = "") -> tuple[str, Json, Json] | None:
     """Where two JSON values differ first, by sorted name: the dotted name and both values; None where they are equal.
 
-    What one has and the other lacks is given as None in the other.
+    What one of them lacks is None there.
     """
     if not (isinstance(then, Mapping) and isinstance(now, Mapping)):
         return None if then == now else (name, then, now)
     for key in sorted({*then, *now}):
-        dotted = f"{name}.{key}" if name else key
-        if (key in then) != (key in now):
-            return dotted, then.get(key), now.get(key)
-        difference = first_difference(then[key], now[key], dotted)
+        difference = first_difference(then.get(key), now.get(key), f"{name}.{key}" if name else key)
         if difference is not None:
             return difference
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -128,10 +129,12 @@ class RunResult:
     agent: str  #: Registered agent
     seed: int  #: The run's seed
     checkpoints: tuple[Checkpoint, ...]  #: One a budget, in the protocol's order
-    settings: Mapping[str, Setting]  #: The agent's settings as run
-    training_success: NDArray[np.bool_]  #: Whether each training episode succeeded. Shape (episodes,).
-    training_length: NDArray[np.int64]  #: Macro-actions of each training episode. Shape (episodes,).
     folder: Path  #: Where the run's files lie
+    settings: Mapping[str, Setting] = field(default_factory=dict)  #: The agent's settings as run; none if it was kept
+    #: Whether each training episode succeeded. Shape (episodes,), or (0,) if the run was kept for good.
+    training_success: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    #: Macro-actions of each training episode. Shape (episodes,), or (0,) likewise.
+    training_length: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     #: Where the training episodes began that were played. Shape (played, M). None in results of before 2026-11-24.
     training_starts: NDArray[np.int16] | None = None
     #: Macrostate, macro-action and the first episode in which it was tried there. Shape (pairs, M + 2). None likewise.
@@ -149,31 +152,24 @@ def require_every_run(
 
     Runs are agent, seed, folder and settings; kept results have no settings and pass.
     """
-    wanted = {(agent, seed) for agent in protocol.agents for seed in protocol.seeds}
-    found = [(agent, seed) for agent, seed, _, _ in runs]
-    missing = sorted(wanted - set(found))
-    if missing or len(found) != len(wanted):
+    wanted = sorted(itertools.product(protocol.agents, protocol.seeds))
+    found = sorted((agent, seed) for agent, seed, _, _ in runs)
+    if found != wanted:
         raise ArtefactError(
-            f"{folder} should hold one run for each of {len(wanted)} agents and seeds and holds {len(found)}; "
-            f"missing: {missing or 'none'}. Run the same bench command again to complete it."
+            f"{folder} should hold the runs {wanted} and holds {found}. Run the same bench command again for those "
+            "that are missing."
         )
     first: dict[str, tuple[Path, Mapping[str, Setting]]] = {}
     for agent, _, where, settings in runs:
-        if settings:
-            known, wanted_settings = first.setdefault(agent, (where, settings))
-            _require_same_settings(known, wanted_settings, where, settings)
-
-
-def _require_same_settings(
-    known: Path, wanted: Mapping[str, Setting], other: Path, given: Mapping[str, Setting]
-) -> None:
-    difference = first_difference(wanted, given)
-    if difference is not None:
-        name, value, differs = difference
-        raise ArtefactError(
-            f"{known} ran with {name} {value!r} and {other} with {differs!r}, as another kind of machine may choose. "
-            f"Runs that are compared need one value: give it with --set {name}=..., or use one kind of machine."
-        )
+        known, theirs = first.setdefault(agent, (where, settings))
+        difference = first_difference(theirs, settings) if settings and theirs else None
+        if difference is not None:
+            name, value, differs = difference
+            raise ArtefactError(
+                f"{known} ran with {name} {value!r} and {where} with {differs!r}, as another kind of machine may "
+                f"choose. Runs that are compared need one value: give it with --set {name}=..., or use one kind of "
+                "machine."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

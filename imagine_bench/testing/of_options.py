@@ -271,10 +271,12 @@ class _WatchedAgent:
     def left(self, counters: Counters) -> _Left:
         """Digests of what it was shown, and of actions, rewards and learned arrays; times are in none of them."""
         found = self._lived.copy()
-        for arrays in (self._agent.state().arrays, counters.training()):
-            for name in sorted(arrays):
-                found.update(f"{name} {arrays[name].shape}".encode())
-                found.update(arrays[name].tobytes())
+        arrays = self._agent.state().arrays
+        for name in sorted(arrays):
+            found.update(f"{name} {arrays[name].shape}".encode())
+            found.update(arrays[name].tobytes())
+        lived = (counters.success, counters.length, counters.queries, counters.starts, counters.tried)
+        found.update(repr(lived).encode())
         return _Left(self._shown.hexdigest(), found.hexdigest())
 
 

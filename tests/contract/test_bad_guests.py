@@ -15,7 +15,7 @@ from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, RunFailedError
 from imagine_bench.running.bench import bench, plan
-from imagine_bench.store.merge import load_so_far
+from imagine_bench.store.loading import load_so_far
 from imagine_bench.tools.new import new_package
 
 _FEW = {"budgets": (2,), "evaluation_episodes": 2, "open_loop_starts": 0, "recorded_episodes": 0}

@@ -134,7 +134,7 @@ def test_one_that_is_none_is_refused_in_a_sentence() -> None:
         (
             "blind",
             InvalidValueError,
-            r"blind \(their_things:Blind\) gave latents of shape \(8, 3\) for 8 frames; it mu",
+            r"blind \(their_things:Blind\) failed: .* 8 frames have latents of shape \(8, 3\); it mu",
         ),
         ("broken", SetupError, "and no EncoderEntry"),
     ):

@@ -23,7 +23,7 @@ from imagine_bench.report import summary_table
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.trained import learners, load_trained
 from imagine_bench.store import encoders
-from imagine_bench.store.archive import archive_files, load_archive
+from imagine_bench.store.loading import archive_files, load_so_far
 from imagine_bench.tools.new import new_package
 
 
@@ -99,7 +99,7 @@ def test_results_are_read_without_the_package(guest: Path, tmp_path: Path, capsy
     kept.mkdir()
     for name, content in archive_files(result).items():
         (kept / name).write_text(content)
-    assert "chance" in summary_table(load_archive(kept)) and "–" not in summary_table(load_archive(kept))
+    assert "chance" in summary_table(load_so_far(kept)) and "–" not in summary_table(load_so_far(kept))
     (guest / "lights_out-0.1.dist-info" / "entry_points.txt").unlink()
     registry.offers.cache_clear()
     for folder in (kept, result.folder):

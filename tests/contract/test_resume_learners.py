@@ -32,7 +32,7 @@ def do(folder: Path, agent: str, every_s: float) -> RunResult:
     overrides = {"imagination.model_only_episodes": 5, "imagination.start_episode": 3, "reuse.reset_every": 70}
     own = tuple(registry.own_settings(agent, overrides).items())
     protocol = small(agents=(agent,), budgets=(6, 12), evaluation_episodes=4, open_loop_starts=3, overrides=own)
-    encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=registry.agents()[agent].encoder_kind)
+    encoder = encoders.own(registry.task("arrow_puzzle"), "clean", kind=registry.agents()[agent].encoder_kind)
     spec = RunSpec(protocol=protocol, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
     return run_observed(spec, folder, lambda progress: None)
 

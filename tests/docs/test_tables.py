@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench.registry import TASKS
 from imagine_bench.running.task_types import read_protocol
-from imagine_bench.store.archive import load_archive
+from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult
 
 KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json") if path.parent.name != "report")
@@ -57,7 +57,7 @@ def test_kept_benches_are_read(folder: Path) -> None:
     read = read_protocol(folder).as_dict()
     assert {field: read[field] for field in facts["protocol"]} == facts["protocol"]
     if facts["protocol"]["task"] in TASKS:
-        result = load_archive(folder)
+        result = load_so_far(folder)
         assert isinstance(result, BenchResult) and result.protocol_hash == facts["protocol_hash"]
 
 

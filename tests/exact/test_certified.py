@@ -18,7 +18,7 @@ from imagine_bench.report import write_report
 from imagine_bench.report.data import collect
 from imagine_bench.running.bench import bench
 from imagine_bench.running.task_types import load_bench
-from imagine_bench.store.archive import archive_files, load_archive
+from imagine_bench.store.loading import archive_files, load_so_far
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_it_is_read_back_and_drawn(result, tmp_path, monkeypatch):
     assert "The world" in page and 'id="certificate"' in page and "12 of them starts" not in page
     for name, text in archive_files(result).items():
         (tmp_path / name).write_text(text)
-    assert load_archive(tmp_path).certificate == result.certificate
+    assert load_so_far(tmp_path).certificate == result.certificate
 
 
 def test_a_damaged_certificate_is_named(result, tmp_path):

@@ -69,7 +69,7 @@ def watched() -> Iterator[Executed]:
 def measure(options: Sequence[str]) -> Executed:
     """Run a bench in this process, its jobs one after the other, and report it."""
     from imagine_bench import cli
-    from imagine_bench.running.launchers import jobs, local
+    from imagine_bench.running.launchers import jobs
 
     def launch(_: object, todo: Sequence[jobs.Job], on_progress: object) -> tuple[jobs.Failure, ...]:
         screen = os.dup(1)  # a worker's output goes to its log
@@ -80,7 +80,7 @@ def measure(options: Sequence[str]) -> Executed:
             os.dup2(screen, 2)
         return tuple(jobs.Failure(job=job, reason=reason) for job, reason in found if reason)
 
-    local.LocalPool.launch = launch
+    jobs.LocalPool.launch = launch
     with tempfile.TemporaryDirectory() as folder, watched() as executed:
         sys.argv = ["imagine-bench", "bench", *(options or SMOKE), "--out", folder]
         code = cli.main()

@@ -21,8 +21,7 @@ from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.control import resolved_settings
 from imagine_bench.running.task_types import read_protocol
 from imagine_bench.running.trained import load_trained
-from imagine_bench.store.archive import archive_files, load_archive
-from imagine_bench.store.merge import merge
+from imagine_bench.store.loading import archive_files, load_so_far, merge
 
 SLOW = "dqn:controller.discount=0.99"
 _FEW = {"budgets": (2,), "evaluation_episodes": 3, "execution": "kinematic", "recorded_episodes": 0}
@@ -78,7 +77,7 @@ def test_one_agent_with_two_settings_in_one_table(tmp_path: Path) -> None:
     assert summary_table(both).count("DQN (discount 0.99)") >= 1
     for name, content in archive_files(both).items():
         (tmp_path / name).write_text(content)
-    assert load_archive(tmp_path).of(SLOW)[0].checkpoints[0].successes == both.of(SLOW)[0].checkpoints[0].successes
+    assert load_so_far(tmp_path).of(SLOW)[0].checkpoints[0].successes == both.of(SLOW)[0].checkpoints[0].successes
     parts = [
         dataclasses.replace(both, protocol=dataclasses.replace(both.protocol, agents=(agent,)), runs=both.of(agent))
         for agent in both.protocol.agents

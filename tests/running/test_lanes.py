@@ -15,7 +15,7 @@ from small_runs import run_observed, same_but_for_time, small
 from imagine_bench.errors import DivergedError
 from imagine_bench.protocols.runs import Job, RunSpec
 from imagine_bench.running import lanes
-from imagine_bench.running.launchers import local
+from imagine_bench.running.launchers import jobs
 from imagine_bench.running.run_state import Run
 from imagine_bench.store.results import RunResult
 
@@ -117,10 +117,10 @@ def test_runs_share_the_cores_of_their_machine(monkeypatch: pytest.MonkeyPatch, 
         given.append(cores)
         raise InterruptedError
 
-    monkeypatch.setattr(local, "usable_cores", lambda: 8)
-    monkeypatch.setattr(local, "_Child", begun)
+    monkeypatch.setattr(jobs, "usable_cores", lambda: 8)
+    monkeypatch.setattr(jobs, "_Child", begun)
     job = Job(spec=RunSpec(protocol=small(), agent="table", seed=0), folder=tmp_path)
-    for workers, jobs in ((8, 1), (2, 5), (8, 8), (16, 20)):
+    for workers, count in ((8, 1), (2, 5), (8, 8), (16, 20)):
         with pytest.raises(InterruptedError):
-            local.LocalPool(workers).launch([job] * jobs, lambda progress: None)
+            jobs.LocalPool(workers).launch([job] * count, lambda progress: None)
     assert given == [8, 4, 1, 1]

@@ -22,7 +22,7 @@ from imagine_bench.rules import fewest_actions
 from imagine_bench.running import phases, run_state
 from imagine_bench.running.queries import LabelOracle, Teacher
 from imagine_bench.store import encoders
-from imagine_bench.store.codec import read_arrays
+from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import RunResult
 
 
@@ -113,8 +113,8 @@ def test_a_query_is_about_its_last_action_and_goes_through_ends() -> None:
 def test_no_more_queries_than_allowed_and_no_macrostate(tmp_path: Path) -> None:
     do(tmp_path / "run", queries=3, demonstrations=2)
     (pupil,) = Pupil.made
-    asked = read_arrays(tmp_path / "run" / "training.npz")["queries"].tolist()
-    assert asked == [0, 0, 3, 3, 3, 3], "who watches does not ask"
+    last = load_newest(tmp_path / "run" / "checkpoints")
+    assert last is not None and last.values["queries"] == [0, 0, 3, 3, 3, 3], "who watches does not ask"
     assert len(pupil.answers) == 12
     assert all(answer is not None for _, answer in pupil.answers), "this puzzle leaves nothing to chance"
     assert len({answer for _, answer in pupil.answers}) > 1
@@ -208,7 +208,7 @@ def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monke
 def test_who_can_carry_over_or_ask_is_known() -> None:
     for agent, carries, asks in (("factored:given", True, True), ("imagination", True, False), ("dqn", False, False)):
         kind = registry.agent_entry(agent).encoder_kind
-        encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=kind)
+        encoder = encoders.own(registry.task("arrow_puzzle"), "clean", kind=kind)
         spec = RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0, encoder=encoder)
         made = registry.make_agent(agent, spec.context())
         assert (isinstance(made, TransferLearner), isinstance(made, QueryingAgent)) == (carries, asks)
@@ -268,7 +268,7 @@ def test_a_killed_and_taught_learner_ends_in_the_same_bits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str, changes: dict[str, Any]
 ) -> None:
     kind = registry.agent_entry(agent).encoder_kind
-    encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean", kind=kind)
+    encoder = encoders.own(registry.task("arrow_puzzle"), "clean", kind=kind)
     overrides = (("imagination.start_episode", 3),) if agent == "imagination" else ()
     wanted = small(agents=(agent,), budgets=(4, 7), evaluation_episodes=2, overrides=overrides, **changes)
 

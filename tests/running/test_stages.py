@@ -15,7 +15,7 @@ from imagine_bench.protocols.control import protocol
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.running import bench as benches
 from imagine_bench.store import run_folder
-from imagine_bench.store.merge import load_so_far
+from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult
 
 

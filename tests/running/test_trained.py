@@ -35,7 +35,7 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
         ("model.dynamics_hidden", (16,)),
         ("model.updates_per_step", 1),
     )
-    encoder = encoders.resolve(TASK, "clean")
+    encoder = encoders.own(TASK, "clean")
     agent = "imagination_uncertainty"
     named = encoders.identity(encoder)
     wanted = small(agents=(agent,), budgets=(2,), evaluation_episodes=1, overrides=tiny, encoder=named)
@@ -53,7 +53,7 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
         load_trained(tmp_path)
     with pytest.raises(ArtefactError, match=r"saw through encoder arrow_puzzle-clean@.*give the right file"):
         load_trained(folder, encoder="arrow_puzzle-mild")
-    other = dataclasses.replace(spec, encoder=encoders.resolve(TASK, "mild"))
+    other = dataclasses.replace(spec, encoder=encoders.own(TASK, "mild"))
     with pytest.raises(ArtefactError, match=r"is encoder arrow_puzzle-mild@.*, and this bench is of .*-clean@"):
         run(other, tmp_path / "another node", lambda progress: None)
 
@@ -68,8 +68,8 @@ def test_training_in_the_model_comes_before_an_analysis(tmp_path: Path, monkeypa
 
 def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> None:
     own = tmp_path / "own.safetensors"
-    shutil.copy(encoders.resolve(TASK, "clean"), own)
-    codes = encoders.resolve(TASK, "clean", kind="codes")
+    shutil.copy(encoders.own(TASK, "clean"), own)
+    codes = encoders.own(TASK, "clean", kind="codes")
     names = {"encoder": encoders.identity(own), "codes": encoders.identity(codes)}
     wanted = protocol("arrow_puzzle", "smoke", agents=("dqn", "factored:given"), **names)
     config = {"format": run_folder.FORMAT, "protocol": wanted.as_dict(), "seed": 0, "settings": {}}

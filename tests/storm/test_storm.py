@@ -29,7 +29,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.task_types import load_bench
 from imagine_bench.store.encoders import bundled
-from imagine_bench.store.merge import load_so_far
+from imagine_bench.store.loading import load_so_far
 
 pytestmark = pytest.mark.slow
 _FEW: dict[str, Any] = {"budgets": (2, 4), "evaluation_episodes": 2}
@@ -128,7 +128,7 @@ def test_every_region_of_every_file_may_be_damaged(  # noqa: C901, PLR0912
     run = folder / "table" / "seed_0"
     if not finished:
         (run / "DONE").unlink()
-        for name in ("measured.npz", "training.npz", "imagined.npz", "recording.rrd"):
+        for name in ("imagined.npz", "recording.rrd"):
             (run / name).unlink()
     load = load_bench if finished else load_so_far
     before, counts, rng = facts(load(folder)), Counter[str](), np.random.default_rng(0)

@@ -17,7 +17,7 @@ from imagine_bench.report.figures import REFERENCE, color, image, small_multiple
 from imagine_bench.report.page import made, write_page
 from imagine_bench.report.regression import robot_ik, toy_regression
 from imagine_bench.report.tables import Page, Section, Table, mean_std, number, percent
-from imagine_bench.store.codec import table_text
+from imagine_bench.store.files import table_text
 
 SECTIONS: dict[str, Callable[[RegressionResult], list[Section]]] = {
     "toy_regression": toy_regression.sections,

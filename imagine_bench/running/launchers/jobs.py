@@ -1,17 +1,26 @@
-"""Where runs are carried out. A launcher is given jobs and says how they went; they know nothing of one another."""
+"""Where runs are carried out. A launcher is given jobs and says how they went; they know nothing of one another.
+
+The local pool is here: processes of this machine, none of which outlives this one.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
+import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from unittest import mock
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known
-from imagine_bench.protocols.runs import Job, Launcher, OnProgress
+from imagine_bench.protocols.runs import Failure, Job, Launcher, OnProgress, Progress
 from imagine_bench.registry.machine import usable_cores
 from imagine_bench.running.task_types import task_type
 from imagine_bench.store.files import make_folder, writing
@@ -21,6 +30,9 @@ ONE_THREAD = dict.fromkeys(
 )
 """Small networks are slower on two threads than on one, and bits repeat only at a fixed count."""
 
+_POLL_S = 0.5
+_PATIENCE_S = 5.0
+
 
 def require_workers(workers: int) -> None:
     """Raise InvalidValueError unless there is at least one worker."""
@@ -29,7 +41,7 @@ def require_workers(workers: int) -> None:
 
 
 LAUNCHERS = {
-    "local": "imagine_bench.running.launchers.local:LocalPool",
+    "local": f"{__name__}:LocalPool",
     "ray": "imagine_bench.running.launchers.ray:RayCluster",
     "slurm": "imagine_bench.running.launchers.slurm:SlurmCluster",
 }
@@ -98,3 +110,111 @@ def _log(job: Job, text: str) -> None:
     make_folder(job.folder)
     with writing(job.log), job.log.open("a") as log:
         print(time.strftime("%Y-%m-%d %H:%M:%S"), text, file=log)
+
+
+class LocalPool:
+    """``workers`` processes of this machine at a time, at least 1, sharing its cores; none outlives this process."""
+
+    def __init__(self, workers: int) -> None:
+        require_workers(workers)
+        self._workers = workers
+
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+        """Carry out every job, ``workers`` at a time, in order; see :class:`Launcher`."""
+        cores = max(usable_cores() // max(min(self._workers, len(jobs)), 1), 1)
+        waiting = list(jobs)[::-1]
+        running: list[_Child] = []
+        failures: list[Failure] = []
+        try:
+            while waiting or running:
+                while waiting and len(running) < self._workers:
+                    running.append(_Child(waiting.pop(), cores))
+                wait([source for child in running for source in child.sources], timeout=_POLL_S)
+                for child in running:
+                    child.forward(on_progress)
+                for child in [child for child in running if child.ended]:
+                    running.remove(child)
+                    if child.failure is not None:
+                        failures.append(child.failure)
+                        on_progress(child.failure.progress)
+        finally:
+            for child in running:  # all at once, so that a second interrupt meanwhile finds none at work
+                child.process.terminate()
+            for child in running:
+                child.stop()
+        return tuple(failures)
+
+
+class _Child:
+    """A job in a process of its own."""
+
+    def __init__(self, job: Job, cores: int) -> None:
+        self._job = job
+        given = replace(job, spec=replace(job.spec, cores=cores))
+        self._reason: str | None = None
+        context = multiprocessing.get_context("spawn")  # a fork would inherit GL contexts and threads
+        self._receiver, sender = context.Pipe(duplex=False)
+        name = f"{job.spec.agent}/{job.folder.name}"
+        self.process: BaseProcess = context.Process(target=_work, args=(given, sender), name=name, daemon=True)
+        with mock.patch.dict(os.environ, ONE_THREAD):
+            self.process.start()
+        sender.close()
+
+    @property
+    def sources(self) -> list[Connection | int]:
+        """What to wait for."""
+        return [self.process.sentinel] if self._receiver.closed else [self._receiver, self.process.sentinel]
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process is gone and everything it sent was read."""
+        return self._receiver.closed and not self.process.is_alive()
+
+    @property
+    def failure(self) -> Failure | None:
+        """Why the job of this ended process failed, if it did; one that said nothing died with the process."""
+        code = self.process.exitcode
+        death = f"its process ended early with exit code {code} (-9: it was killed, such as for lack of memory)"
+        reason = death if self._reason is None else self._reason
+        return Failure(job=self._job, reason=reason) if reason else None
+
+    def forward(self, on_progress: OnProgress) -> None:
+        """Read what the process has sent so far."""
+        while (message := self._next()) is not None:
+            if isinstance(message, Progress):
+                on_progress(message)
+            else:
+                self._reason = message
+
+    def _next(self) -> Progress | str | None:
+        """What it sent next, or None for now; after the last message the process is gone."""
+        try:
+            return self._receiver.recv() if not self._receiver.closed and self._receiver.poll() else None
+        except (EOFError, OSError):
+            self._receiver.close()
+            self.process.join(_PATIENCE_S)
+            return None
+
+    def stop(self) -> None:
+        """End the process: its newest checkpoint is whole at any moment."""
+        self.process.terminate()
+        self.process.join(_PATIENCE_S)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+        self._receiver.close()
+
+
+def _work(job: Job, sender: Connection) -> None:
+    """The life of a worker process: its run, and why it failed or an empty string, told to the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all: the parent ends its workers in order
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    sender.send(carry_out(job, sender.send))
+
+
+def _die_with_parent() -> None:
+    """End this process when its parent has ended, by whatever death."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

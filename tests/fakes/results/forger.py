@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from imagine_bench.arrays import Arrays
 from imagine_bench.protocols.data import digest
-from imagine_bench.store.codec import read_arrays, table_rows, table_text, write_arrays
+from imagine_bench.store.checkpoints import load_newest, pack, save_snapshot
 from imagine_bench.store.files import sealed, sha256
+from imagine_bench.store.results import Checkpoint, KeptEpisodes
+from imagine_bench.store.run_folder import load_run, write_metrics
 
 Forge = Callable[[Path, np.random.Generator], None]
 
@@ -21,7 +25,9 @@ def mend(run: Path) -> None:
     """Bring the digests of a run up to date."""
     done = json.loads((run / "DONE").read_text())
     done.pop("seal")
-    done["sha256"] = {name: sha256(run / name) for name in done["sha256"]}
+    names = [name for name in done["sha256"] if "/" not in name]
+    names += [path.relative_to(run).as_posix() for path in run.glob("checkpoints/*/state.json")]
+    done["sha256"] = {name: sha256(run / name) for name in names}
     (run / "DONE").write_text(json.dumps(sealed(done)))
 
 
@@ -29,25 +35,46 @@ def one_run(bench: Path, rng: np.random.Generator) -> Path:
     return rng.choice(sorted(path.parent for path in bench.glob("*/seed_*/DONE")))  # type: ignore[arg-type]
 
 
+def rewrite(run: Path, rows: Sequence[Checkpoint], **values: Any) -> None:
+    """Other rows, or other values, in a run's checkpoint, and metrics that say the same."""
+    snapshot = load_newest(run / "checkpoints")
+    assert snapshot is not None
+    plain, arrays = pack(rows, "rows")
+    kept = {name: array for name, array in snapshot.arrays.items() if not name.startswith("rows/")}
+    told = {**snapshot.values, "rows": plain, **values}
+    save_snapshot(run / "checkpoints", dataclasses.replace(snapshot, arrays=kept | arrays, values=told))
+    write_metrics(run, rows)
+    mend(run)
+
+
+def with_episodes(row: Checkpoint, arrays: Arrays) -> Checkpoint:
+    """A row with other test episodes, and figures that follow from them."""
+    return dataclasses.replace(
+        row,
+        kept=KeptEpisodes(**arrays),
+        successes=int(arrays["success"].sum()),
+        solved="".join("01"[int(each)] for each in arrays["success"]),
+        mean_return=float(arrays["returns"].mean()),
+        mean_length=float(arrays["lengths"].mean()),
+        faults=int(arrays["faults"].sum()),
+    )
+
+
 def in_episodes(name: str, change: Callable[[Arrays, np.random.Generator], None]) -> Forge:
     """Change an array of the kept episodes, and metrics that say the same."""
 
     def forge(bench: Path, rng: np.random.Generator) -> None:
-        run = one_run(bench, rng)
-        arrays = read_arrays(run / "episodes.npz")
-        before = arrays[name].copy()
-        while np.array_equal(before, arrays[name]):
+        changed = False
+        while not changed:
+            run = one_run(bench, rng)
+            rows = list(load_run(run).checkpoints)
+            index = int(rng.integers(len(rows)))
+            before = vars(rows[index].kept)
+            arrays = {each: array.copy() for each, array in before.items()}
             change(arrays, rng)
-        write_arrays(run / "episodes.npz", arrays)
-        if name in ("success", "returns", "faults"):
-            rows = table_rows((run / "metrics.csv").read_text(), texts=("solved",))
-            for index, row in enumerate(rows):
-                solved = arrays["success"][:, index]
-                row |= {"successes": int(solved.sum()), "solved": "".join("01"[int(each)] for each in solved)}
-                row |= {"mean_return": float(arrays["returns"][:, index].mean())}
-                row |= {"faults": int(arrays["faults"][:, index].sum())}
-            (run / "metrics.csv").write_text(table_text(rows))
-        mend(run)
+            changed = not np.array_equal(before[name], arrays[name])
+        rows[index] = with_episodes(rows[index], arrays)
+        rewrite(run, rows)
 
     return forge
 
@@ -80,15 +107,19 @@ def shift_length(arrays: Arrays, rng: np.random.Generator) -> None:
         lengths.flat[other] += 1
 
 
-def metric(name: str) -> Forge:
-    """One more of a figure of a test."""
+def metric(name: str, everywhere: bool = True) -> Forge:
+    """One more of a figure of a test, in the table alone or in the checkpoint too."""
 
     def forge(bench: Path, rng: np.random.Generator) -> None:
         run = one_run(bench, rng)
-        rows = table_rows((run / "metrics.csv").read_text(), texts=("solved",))
-        rows[rng.integers(len(rows))][name] += 1
-        (run / "metrics.csv").write_text(table_text(rows))
-        mend(run)
+        rows = list(load_run(run).checkpoints)
+        index = int(rng.integers(len(rows)))
+        rows[index] = dataclasses.replace(rows[index], **{name: getattr(rows[index], name) + 1})
+        if everywhere:
+            rewrite(run, rows)
+        else:
+            write_metrics(run, rows)
+            mend(run)
 
     return forge
 
@@ -98,26 +129,23 @@ def surplus(lengthen: bool) -> Forge:
 
     def forge(bench: Path, rng: np.random.Generator) -> None:
         run = one_run(bench, rng)
-        arrays = read_arrays(run / "episodes.npz")
+        *rows, last = load_run(run).checkpoints
+        arrays = {name: array.copy() for name, array in vars(last.kept).items()}
         arrays["actions"] = np.append(arrays["actions"], arrays["actions"][-1:])
-        if lengthen:
-            arrays["lengths"][-1, -1] += 1
-            rows = table_rows((run / "metrics.csv").read_text(), texts=("solved",))
-            rows[-1]["mean_length"] = float(arrays["lengths"][:, -1].sum() / len(arrays["lengths"]))
-            (run / "metrics.csv").write_text(table_text(rows))
-        write_arrays(run / "episodes.npz", arrays)
-        mend(run)
+        arrays["lengths"][-1] += int(lengthen)
+        rewrite(run, [*rows, with_episodes(last, arrays)])
 
     return forge
 
 
 def training_start(bench: Path, rng: np.random.Generator) -> None:
     run = one_run(bench, rng)
-    arrays = read_arrays(run / "training.npz")
-    if len(arrays["starts"]):
-        arrays["starts"][rng.integers(len(arrays["starts"])), 0] += 1
-        write_arrays(run / "training.npz", arrays)
-        mend(run)
+    result = load_run(run)
+    assert result.training_starts is not None
+    starts = result.training_starts.tolist()
+    if starts:
+        starts[rng.integers(len(starts))][0] += 1
+        rewrite(run, result.checkpoints, starts=starts)
     else:
         metric("successes")(bench, rng)
 
@@ -157,7 +185,9 @@ def table(bench: Path, rng: np.random.Generator) -> None:
 def damage(bench: Path, rng: np.random.Generator) -> None:
     """Any byte of any file with a digest, which is left as it was."""
     run = one_run(bench, rng)
-    path = run / str(rng.choice(list(json.loads((run / "DONE").read_text())["sha256"])))
+    names = list(json.loads((run / "DONE").read_text())["sha256"])
+    names += [path.relative_to(run).as_posix() for path in run.glob("checkpoints/*/runner.safetensors")]
+    path = run / str(rng.choice(names))
     content = bytearray(path.read_bytes())
     content[rng.integers(len(content))] ^= int(rng.integers(1, 256))
     path.write_bytes(content)
@@ -171,4 +201,5 @@ FORGERIES: dict[str, Forge] = {
     "damage": damage, "surplus": surplus(lengthen=False),
     "after the end": surplus(lengthen=True), "budget": metric("episodes"), "successes": metric("successes"),
     "mean return": metric("mean_return"), "mean length": metric("mean_length"), "sum of faults": metric("faults"),
+    "table of a run": metric("mean_length", everywhere=False),
 }  # fmt: skip

@@ -17,8 +17,7 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.runs import Job, Progress, RunSpec
-from imagine_bench.running.launchers.jobs import LAUNCHERS, absolute, launcher
-from imagine_bench.running.launchers.local import LocalPool
+from imagine_bench.running.launchers.jobs import LAUNCHERS, LocalPool, absolute, launcher
 from imagine_bench.running.launchers.ray import RayCluster
 from imagine_bench.running.launchers.slurm import SlurmCluster
 from imagine_bench.store import encoders
@@ -31,7 +30,7 @@ needs_ray = pytest.mark.skipif(
 
 def jobs(root: Path, seeds: tuple[int, ...], episodes: int) -> list[Job]:
     """Small real learners that take a few seconds each and checkpoint often."""
-    encoder = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    encoder = encoders.own(registry.task("arrow_puzzle"), "clean")
     wanted = protocol(
         "arrow_puzzle", "smoke", agents=("dqn",), seeds=seeds, budgets=(episodes // 2, episodes),
         evaluation_episodes=5, execution="kinematic", open_loop_starts=0, recorded_episodes=0,
@@ -132,7 +131,7 @@ def test_a_node_and_a_worker_killed_in_the_middle_cost_no_result(
             killed["node"] = [progress.episode]
             cluster.remove_node(doomed, allow_graceful=False)
         elif killed["node"] and not killed["worker"] and progress.episode > killed["node"][0] + 40:
-            holder = (tmp_path / "ray" / f"seed_{progress.seed}" / ".lock").read_text()  # "process N on HOST"
+            holder = (tmp_path / "ray" / f"seed_{progress.seed}" / ".lock.holder").read_text()  # "process N on HOST"
             os.kill(int(holder.split()[1]), signal.SIGKILL)
             killed["worker"] = [progress.episode]
 

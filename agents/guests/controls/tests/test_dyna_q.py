@@ -179,7 +179,7 @@ def test_planning_is_ahead_on_the_arrow_puzzle(tmp_path: Path) -> None:
     solved = {}
     for name in ("q_learning", "dyna_q"):
         protocol = small(agents=(name,), budgets=(150,), evaluation_episodes=40, hyperparameters="fast")
-        encoder = encoders.resolve(task, "clean", kind="codes")
+        encoder = encoders.own(task, "clean", kind="codes")
         spec = RunSpec(protocol=protocol, agent=name, seed=1000, encoder=encoder)
         solved[name] = run_observed(spec, tmp_path / name, lambda progress: None).checkpoints[-1].success_rate
     chance = rules.facts(task.rules, task.horizon).chance_level

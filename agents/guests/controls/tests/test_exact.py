@@ -165,7 +165,7 @@ def test_exact_imagination_is_ahead_on_the_arrow_puzzle(tmp_path: Path) -> None:
     for name in ("imagination", "imagination_exact"):
         own = (("imagination.start_episode", 0),)
         protocol = small(agents=(name,), budgets=(150,), evaluation_episodes=40, hyperparameters="fast", overrides=own)
-        spec = RunSpec(protocol=protocol, agent=name, seed=1000, encoder=encoders.resolve(task, "clean"))
+        spec = RunSpec(protocol=protocol, agent=name, seed=1000, encoder=encoders.own(task, "clean"))
         solved[name] = run_observed(spec, tmp_path / name, lambda progress: None).checkpoints[-1].success_rate
     chance = rules.facts(task.rules, task.horizon).chance_level
     assert solved["imagination_exact"] > max(4 * chance, solved["imagination"])

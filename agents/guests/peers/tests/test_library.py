@@ -37,7 +37,7 @@ IMAGINING = ("sb3_dqn_imagined", "sb3_ppo_imagined")
 def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> RunResult:
     own = tuple(sorted(registry.own_settings(agent, FEW).items()))
     few = {"agents": (agent,), "budgets": (4, 8), "evaluation_episodes": 2, "overrides": own}
-    path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    path = encoders.own(registry.task("arrow_puzzle"), "clean")
     spec = RunSpec(protocol=small(**{**few, **changes}), agent=agent, seed=seed, encoder=path)
     result = run_observed(spec, folder, lambda progress: None)
     assert result is not None
@@ -143,7 +143,7 @@ def test_latents_are_those_of_our_own_agents() -> None:
     wrapped = LatentObservation(env, "arrow_puzzle-clean")
     latents, _ = wrapped.reset(seed=5)
     frame, _ = env.reset(seed=5)
-    path = encoders.resolve(registry.task("arrow_puzzle"), "clean")
+    path = encoders.own(registry.task("arrow_puzzle"), "clean")
     assert np.array_equal(latents, Encoder.load(path).encode(frame[None])[0][0].numpy())
     assert latents.shape == wrapped.observation_space.shape and latents.dtype == np.float32
     assert wrapped.observation_space.contains(wrapped.step(0)[0])
@@ -201,5 +201,5 @@ def test_bad_settings_are_refused(overrides: dict[str, Any], error: type[Excepti
 
 
 def spec(agent: str) -> RunSpec:
-    path = encoders.resolve(registry.task("arrow_puzzle"), "clean") if registry.agents()[agent].needs_encoder else None
+    path = encoders.own(registry.task("arrow_puzzle"), "clean") if registry.agents()[agent].needs_encoder else None
     return RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0, encoder=path)

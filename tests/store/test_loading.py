@@ -1,4 +1,4 @@
-"""Benches of different agents, or of different seeds of the same agents, shown as one."""
+"""Benches as tables: unfinished ones, kept ones, and several as one."""
 
 from __future__ import annotations
 
@@ -21,14 +21,12 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import summary_table, write_report
 from imagine_bench.running.bench import bench
 from imagine_bench.running.task_types import load_bench
-from imagine_bench.store.archive import load_archive
-from imagine_bench.store.bench_folder import is_archive
-from imagine_bench.store.merge import cut, load_so_far, merge
+from imagine_bench.store.loading import cut, load_so_far, merge
 from imagine_bench.store.results import BenchResult
 
 
 def load_merged(folders: list[Path], root: Path) -> BenchResult:
-    return merge([load_archive(each) if is_archive(each) else load_so_far(each) for each in folders], root)
+    return merge([load_so_far(each) for each in folders], root)
 
 
 _MADE = tempfile.TemporaryDirectory()
@@ -60,67 +58,49 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     first = do(tmp_path, "oracle", seeds=(0, 1), budgets=(4, 9))
     second = do(tmp_path, "random", seeds=(1, 2), budgets=(2, 4, 9))
     joined = load_merged([first, second], tmp_path)
-    assert (joined.protocol.agents, joined.protocol.seeds, joined.protocol.budgets) == (
-        ("oracle", "random"),
-        (1,),
-        (4, 9),
-    )
+    shown = joined.protocol
+    assert (shown.agents, shown.seeds, shown.budgets) == (("oracle", "random"), (1,), (4, 9))
     own = load_bench(second)
     assert np.array_equal(joined.success_rates("random")[0], own.success_rates("random")[0, 1:])
     assert joined.environment["bench 2"]["command"] == own.environment["command"]
-    assert joined.folder not in (first, second) and joined.folder.name.startswith("merged-")
-    assert dataclasses.asdict(joined.protocol)["evaluation_episodes"] == 3
+    assert joined.folder.name.startswith("merged-") and joined.missing == ()
 
 
-def test_diagnostics_of_a_test_not_shown_count_for_the_next(tmp_path: Path) -> None:
-    """Interval means, over 10, 20 and 70 steps, of which the first two end in one test that is shown."""
+def test_a_test_that_is_not_shown_changes_no_other(tmp_path: Path) -> None:
     whole = Protocol(task="arrow_puzzle", preset="quick", budgets=(10, 30, 100))
     run = bench_result(tmp_path, protocol=whole).of("imagination")[0]
-    rows = tuple(
-        dataclasses.replace(
-            row, env_steps=row.episodes, diagnostics={"time/model_s": time_s, "loss/x": 1.0, "epsilon": e}
-        )
-        for row, time_s, e in zip(run.checkpoints, (0.1, 0.4, 0.2), (0.9, 0.5, 0.1), strict=True)
-    )
-    cut_run = cut(dataclasses.replace(run, checkpoints=rows), dataclasses.replace(whole, budgets=(30, 100)))
-    first, second = cut_run.checkpoints
-    assert first.diagnostics == {"time/model_s": pytest.approx((10 * 0.1 + 20 * 0.4) / 30), "epsilon": 0.5}
-    assert second == rows[2]
+    assert cut(run, dataclasses.replace(whole, budgets=(30, 100))).checkpoints == run.checkpoints[1:]
 
 
 @pytest.mark.parametrize(
-    ("agents", "changes", "words"),
+    ("agents", "changes", "error", "words"),
     [
-        (("oracle",), {}, "a seed in common"),
-        (("oracle", "random"), {}, "an agent in common"),
-        (("random",), {"appearance": "mild"}, "has appearance 'mild' where .* has 'clean'"),
-        (("random",), {"seeds": (5,)}, "have no seeds in common"),
-        (("random",), {"budgets": (3,)}, "have no budgets in common"),
+        (("oracle",), {}, InvalidValueError, "have the same seed of the same agent"),
+        (("oracle", "random"), {}, InvalidValueError, "have the same seed of the same agent"),
+        (("random",), {"appearance": "mild"}, InvalidValueError, "has appearance 'mild' where .* has 'clean'"),
+        (("random",), {"encoder": "x@0123456789ab"}, InvalidValueError, "has encoder 'x@.*' where .* has 'a@"),
+        (("random",), {"seeds": (5,)}, ArtefactError, "No seed of this bench"),
+        (("random",), {"budgets": (3,)}, InvalidValueError, "budgets"),
+        (("oracle",), {"seeds": (5,), "settings_digest": "one"}, InvalidValueError, "has settings_digest 'one'"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(
-    tmp_path: Path, agents: tuple[str, ...], changes: dict[str, Any], words: str
+    tmp_path: Path, agents: tuple[str, ...], changes: dict[str, Any], error: type[Exception], words: str
 ) -> None:
-    first = do(tmp_path, "oracle")
+    first = do(tmp_path, "oracle", encoder="a@0123456789ab")
     other = do(tmp_path / "other", *agents, **changes)
-    with pytest.raises(InvalidValueError, match=words):
+    with pytest.raises(error, match=words):
         load_merged([first, other], tmp_path)
 
 
-def test_seeds_of_two_benches_are_those_of_one(tmp_path: Path) -> None:
+def test_seeds_of_two_benches_are_those_of_one_in_any_order(tmp_path: Path) -> None:
     whole = load_bench(do(tmp_path / "whole", "oracle", "random", seeds=(0, 1, 2)))
-    late = do(tmp_path / "there", "oracle", "random", seeds=(2,))
+    late = do(tmp_path / "there", "random", "oracle", seeds=(2,))
     early = do(tmp_path / "here", "oracle", "random", seeds=(0, 1))
-    joined = load_merged([late, early], tmp_path)
+    joined = load_merged([early, late], tmp_path)
     assert joined.protocol == whole.protocol
     for agent in ("oracle", "random"):
         assert np.array_equal(joined.success_rates(agent), whole.success_rates(agent))
-
-
-def test_the_order_of_agents_is_nothing(tmp_path: Path) -> None:
-    here, there = do(tmp_path, "oracle", "random", seeds=(0,)), do(tmp_path, "random", "oracle", seeds=(1,))
-    joined = load_merged([here, there], tmp_path)
-    assert (joined.protocol.agents, joined.protocol.seeds) == (("oracle", "random"), (0, 1))
 
 
 def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
@@ -130,7 +110,6 @@ def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
     assert joined.protocol.seeds == (0, 2)
     assert joined.missing == ("oracle seed 1: 0 of 9 real episodes",)
     assert "One of these benches is not finished: shown are 2 seeds up to 9 real" in summary_table(joined)
-    assert "Missing are oracle seed 1" in write_report(joined).read_text()
 
 
 def test_seeds_whose_machines_chose_other_settings_are_refused(tmp_path: Path) -> None:
@@ -143,14 +122,6 @@ def test_seeds_whose_machines_chose_other_settings_are_refused(tmp_path: Path) -
     with pytest.raises(ArtefactError, match=r"ran with model\.precision 'bfloat16' and .*seed_1 with 'float32'"):
         dataclasses.replace(result, runs=tuple(runs))
     assert dataclasses.replace(result, runs=(runs[0], dataclasses.replace(runs[1], settings={}))), "kept ones have none"
-
-
-@pytest.mark.parametrize("digest", ["another", ""])
-def test_seeds_of_other_settings_are_refused(tmp_path: Path, digest: str) -> None:
-    here = do(tmp_path, "random", seeds=(0,), settings_digest="one")
-    there = do(tmp_path, "random", seeds=(1,), settings_digest=digest)
-    with pytest.raises(InvalidValueError, match=rf"of different settings \(.*{digest or 'unknown'}"):
-        load_merged([here, there], tmp_path)
 
 
 def test_the_command_writes_one_report_of_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -173,18 +144,12 @@ def test_kept_results_say_what_their_run_folders_said(tmp_path: Path) -> None:
     assert write_report(without).is_file()
 
 
-def test_kept_results_have_a_report_of_their_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", str(kept_from(do(tmp_path, "oracle", "random"), tmp_path / "kept"))]) == 0
-    assert "oracle" in capsys.readouterr().out
-    assert (tmp_path / "kept/report/index.html").is_file()
-
-
 def test_an_unfinished_bench_keeps_its_largest_table(tmp_path: Path) -> None:
     folder = do(tmp_path, "oracle", "random", seeds=(0, 1), budgets=(4, 9))
     kept = kept_from(folder, tmp_path / "kept")
     rows = (kept / "results.csv").read_text().splitlines(keepends=True)
     (kept / "results.csv").write_text("".join(row for row in rows if not row.startswith("random,1,9,")))
-    part = load_archive(kept)
+    part = load_so_far(kept)
     assert (part.protocol.seeds, part.protocol.budgets) == ((0,), (4, 9))
     assert part.whole == load_bench(folder).protocol
     assert part.missing == ("random seed 1: 4 of 9 real episodes",)
@@ -193,7 +158,7 @@ def test_an_unfinished_bench_keeps_its_largest_table(tmp_path: Path) -> None:
 def test_kept_regression_results_have_no_report_and_say_so(capsys: pytest.CaptureFixture[str]) -> None:
     kept = Path(__file__).parents[2] / "docs/results/toy_regression-thesis"
     assert main(["report", str(kept)]) == 2
-    assert "keeps a bench of toy_regression, whose tables are its .csv files" in capsys.readouterr().err
+    assert "of the regression task toy_regression, in which no agent acts" in capsys.readouterr().err
 
 
 def test_a_damaged_table_is_named(tmp_path: Path) -> None:
@@ -204,16 +169,14 @@ def test_a_damaged_table_is_named(tmp_path: Path) -> None:
         load_merged([first, kept], tmp_path)
 
 
-def test_kept_results_are_read_back_and_keep_their_hash(tmp_path: Path) -> None:
+def test_kept_results_keep_the_hash_that_they_were_made_with(tmp_path: Path) -> None:
     folder = do(tmp_path, "oracle", "random", seeds=(0, 1))
-    kept, whole = load_archive(kept_from(folder, tmp_path / "kept")), load_bench(folder)
-    assert (kept.protocol, kept.protocol_hash) == (whole.protocol, whole.protocol_hash)
-    for agent in whole.protocol.agents:
-        assert kept.success_rates(agent).tolist() == whole.success_rates(agent).tolist()
-    facts = json.loads((tmp_path / "kept" / "bench.json").read_text())
-    facts["protocol_hash"] = "0123456789ab"
-    (tmp_path / "kept" / "bench.json").write_text(json.dumps(facts))
-    assert load_archive(tmp_path / "kept").protocol_hash == "0123456789ab"
+    kept = kept_from(folder, tmp_path / "kept")
+    whole = load_bench(folder)
+    assert (load_so_far(kept).protocol, load_so_far(kept).protocol_hash) == (whole.protocol, whole.protocol_hash)
+    facts = json.loads((kept / "bench.json").read_text())
+    (kept / "bench.json").write_text(json.dumps({**facts, "protocol_hash": "0123456789ab"}))
+    assert load_so_far(kept).protocol_hash == "0123456789ab"
 
 
 def test_a_table_cut_short_leaves_later_imagination_out(tmp_path: Path) -> None:
