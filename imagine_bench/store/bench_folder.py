@@ -168,12 +168,12 @@ def require_either(given: Path | None, task: str | None) -> None:
 
 
 def newest_bench(root: Path, *tasks: str | None) -> Path:
-    """Return the bench folder below ``root`` that was worked on last, of any task or of those that are given, or ArtefactError."""
+    """Return the bench folder below ``root`` that was worked on last, of some tasks or of any, or ArtefactError."""
     return _newest(root, f"*/{_SESSIONS}", "bench", [task for task in tasks if task]).parent
 
 
 def newest_recording(root: Path, *tasks: str | None) -> Path:
-    """Return the recording below ``root`` that was written last, of any task or of those that are given, or ArtefactError."""
+    """Return the recording below ``root`` that was written last, of some tasks or of any, or ArtefactError."""
     return _newest(root, "**/recording.rrd", "recording", [task for task in tasks if task])
 
 
