@@ -14,9 +14,10 @@ import numpy as np
 
 from imagine_bench import appearance, reference, registry, statistics
 from imagine_bench.exact.certificate import certificate
+from imagine_bench.judge.causes import CAUSES
 from imagine_bench.registry.old_names import label_today
 from imagine_bench.report import figures
-from imagine_bench.report.data import collect
+from imagine_bench.report.data import agent_title, collect, frames_before
 from imagine_bench.store.loading import load_so_far
 
 mpl.use("agg")
@@ -76,25 +77,34 @@ SETTINGS = {"replay_ratio": " tuned", "discount": " defaults"}
 
 def peers() -> None:
     """Area under the success curve to 500 episodes of our agents and of libraries', and its price."""
-    rows = [(data, agent) for kept in PEERS for data in [collect(load_so_far(RESULTS / kept))] for agent in data.areas]
-    rows.sort(key=lambda row: row[0].areas[row[1]][500].value)
+    rows = []
+    for kept in PEERS:
+        data = collect(load_so_far(RESULTS / kept))
+        rows += [(data, record) for record in data.records if record["episodes"] == 500 and "area" in record]
+    rows.sort(key=lambda row: row[1]["area"])
     figure, axes = plt.subplots(figsize=(9, 0.9 + 0.28 * len(rows)), layout="constrained")
     columns = {1.14: "frames\nbefore", 1.28: "updates", 1.40: "CPU s"}
-    for height, (data, agent) in enumerate(rows):
-        color, area, price = figures.color(agent), data.areas[agent][500], data.prices(agent)[500]
-        shares = statistics.running_means(data.budgets, data.result.success_rates(agent), data.facts.chance_level)
-        seeds = 100 * shares[:, data.budgets.index(500)]
-        axes.plot([100 * area.low, 100 * area.high], [height] * 2, color=color, linewidth=6, alpha=0.3)
+    for height, (data, record) in enumerate(rows):
+        agent = record["agent"]
+        color = figures.color(agent)
+        shares = statistics.running_means(data.result.protocol.budgets, data.result.success_rates(agent),
+                                          data.facts.chance_level)  # fmt: skip
+        seeds = 100 * shares[:, data.result.protocol.budgets.index(500)]
+        axes.plot([100 * record["area_low_95"], 100 * record["area_high_95"]], [height] * 2, color=color, linewidth=6,
+                  alpha=0.3)  # fmt: skip
         axes.plot(seeds, [height] * len(seeds), "o", color=color, markersize=3.5)
-        axes.plot([100 * area.value], [height], "|", color=color, markersize=13, markeredgewidth=2.5)
-        for place, value in zip(columns, (data.frames_before[agent], price.updates, price.train_cpu_s), strict=True):
-            said = "?" if value is None or np.isnan(value) else f"{value:,.0f}"
+        axes.plot([100 * record["area"]], [height], "|", color=color, markersize=13, markeredgewidth=2.5)
+        prices = (frames_before(data, agent), record["gradient_updates"], record["train_cpu_s"])
+        for place, value in zip(columns, prices, strict=True):
+            said = "?" if np.isnan(value) else f"{value:,.0f}"
             axes.text(place, height, said, transform=axes.get_yaxis_transform(), ha="right", va="center")
     for place, name in columns.items():
         axes.text(place, 1.0, name, transform=axes.transAxes, ha="right", va="bottom")
     axes.axvline(100 * rows[0][0].facts.chance_level, color="#777777", linestyle=":", linewidth=1)
-    settings = ("".join(said for name, said in SETTINGS.items() if name in agent) for _, agent in rows)
-    names = [agent.partition(":")[0] + said for (_, agent), said in zip(rows, settings, strict=True)]
+    names = []
+    for _, record in rows:
+        settings = "".join(said for name, said in SETTINGS.items() if name in record["agent"])
+        names.append(record["agent"].partition(":")[0] + settings)
     axes.set_yticks(range(len(rows)), names)
     axes.set(xlim=(0, 100), ylim=(-0.6, len(rows) - 0.4))
     axes.set_xlabel("mean success over the first 500 real episodes (%); dotted: chance")
@@ -124,11 +134,28 @@ def ladder() -> None:
         by_seed = np.stack(list(table.values()), axis=1)
         reached[agent] = [statistics.first_lasting(list(table), seed, 0.95) for seed in by_seed]
     floor = certificate(registry.task("arrow_puzzle")).floor
-    last = max(max(table) for table in tested.values())
-    figure = figures.image(
-        "ladder", lambda: figures.ladder_figure(reached, last, floor and floor.episodes), "", dpi=110
-    )
-    (HERE / "ladder.png").write_bytes(figure.draw()[0])
+    beyond = 1.6 * max(max(table) for table in tested.values())
+    found = {agent: [beyond if each is None else each for each in seeds] for agent, seeds in reached.items()}
+    order = sorted(found, key=lambda agent: (np.median(found[agent]), np.mean(found[agent])))
+    figure, axes = plt.subplots(figsize=(9, 1.2 + 0.34 * len(order)), layout="constrained")
+    for place, agent in enumerate(order):
+        color = figures.color(agent)
+        axes.plot([min(found[order[0]]), np.median(found[agent])], [place] * 2, color=color, linewidth=2, alpha=0.4)
+        axes.plot([np.median(found[agent])], [place], "|", color=color, markersize=13, markeredgewidth=2.5)
+        for point, shift in zip(found[agent], np.linspace(-0.12, 0.12, len(found[agent])), strict=True):
+            axes.plot([point], [place + shift], ">" if point == beyond else "o", color=color, markersize=4.5)
+    if floor:
+        axes.axvline(floor.episodes, **figures.REFERENCE)
+        axes.set_title(f"dashed: cost of a cautious learner, {floor.episodes:.0f} episodes", fontsize=9, loc="left")
+    axes.set_yticks(range(len(order)), [agent_title(agent) for agent in order])
+    axes.set_xscale("log")
+    ticks = [50, 100, 200, 500]
+    axes.set_xticks([*ticks, beyond], [*(f"{tick:,}" for tick in ticks), "never"], rotation=45)
+    axes.minorticks_off()
+    axes.set_xlabel("real training episodes (logarithmic)")
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(HERE / "ladder.png", dpi=110)
 
 
 def thesis_settings() -> None:
@@ -211,17 +238,35 @@ def margins() -> None:
     figure.savefig(HERE / "margins.png", dpi=110)
 
 
+CAUSE_COLORS = ("#0072b2", "#56b4e9", "#e69f00", "#cc79a7", "#882255", "#8c8c8c", "#2b2b2f")
+
+
 def why() -> None:
-    """Failures by cause, as the report draws them."""
+    """Failures by cause: a panel an agent, a stacked bar a budget."""
     kept = RESULTS / "arrow_puzzle-mild-why"
     tests = json.loads((kept / "bench.json").read_text())["protocol"]["evaluation_episodes"]
-    found: figures.Failures = {}
+    found: dict[str, dict[str, Counter[str]]] = {}
+    seeds: Counter[str] = Counter()
     for run in json.loads((kept / "why.json").read_text())["runs"]:
+        agent = label_today(run["agent"])
+        seeds[agent] += 1
         for budget, counts in run["failures"].items():
-            before, causes = found.setdefault(label_today(run["agent"]), {}).get(int(budget), (0, Counter()))
-            found[label_today(run["agent"])][int(budget)] = (before + tests, causes + Counter(counts))
-    shown = {agent: by_budget for agent, by_budget in found.items() if agent != "factored:given"}
-    figure = figures.causes_figure(shown)
+            found.setdefault(agent, {}).setdefault(budget, Counter()).update(counts)
+    shown = [agent for agent in found if agent != "factored:given"]
+    figure, both = plt.subplots(1, len(shown), figsize=(3.4 * len(shown), 3.4), sharey=True, layout="constrained")
+    for axes, agent in zip(both, shown, strict=True):
+        bottom = np.zeros(len(found[agent]))
+        for cause, color in zip(CAUSES, CAUSE_COLORS, strict=True):
+            shares = np.array([100 * counts[cause] / (tests * seeds[agent]) for counts in found[agent].values()])
+            if any(counts[cause] for each in shown for counts in found[each].values()):
+                axes.bar(list(found[agent]), shares, bottom=bottom, color=color, label=cause)
+            bottom += shares
+        axes.set_title(agent_title(agent), fontsize=9.5)
+        axes.set_ylim(0, 100)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_xlabel("real training episodes")
+    both[0].set_ylabel("test episodes that failed (%)")
+    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
 
 

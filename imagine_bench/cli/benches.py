@@ -258,7 +258,7 @@ class Plan(OfBench):
     def __call__(self) -> None:
         """Find, plan, report."""
         from imagine_bench.recording.plans import record_plans  # noqa: PLC0415 - Rerun, fonts and pillow load slowly
-        from imagine_bench.report.plans import plan_report  # noqa: PLC0415 - as below
+        from imagine_bench.report.audits import plan_report  # noqa: PLC0415 - as below
 
         run, task = self.meant()
         print(
@@ -339,17 +339,17 @@ class Verify(OfBench):
 
     def __call__(self) -> None:
         """Play and compare."""
-        from imagine_bench.report import page, verify, why  # noqa: PLC0415 - matplotlib loads slowly
+        from imagine_bench.report import audits  # noqa: PLC0415 - matplotlib loads slowly
 
         given, task = self.meant()
         if self.causes:
-            print(why.why_report(given, root=self.out, task=task, encoder=self.encoder))
+            print(audits.why_report(given, root=self.out, task=task, encoder=self.encoder))
             return
         if self.encoder is not None:
             raise InvalidValueError("--encoder goes with --causes; replaying episodes needs none.")
-        folder = page.chosen(given, self.out, task)
+        folder = audits.chosen(given, self.out, task)
         begun_s = time.process_time()
-        verdicts = verify.verify(folder)
+        verdicts = audits.verify(folder)
         print(*verdicts, cost(verdicts, time.process_time() - begun_s), sep="\n")
         if any(verdict.complaint for verdict in verdicts):
             sys.exit(1)

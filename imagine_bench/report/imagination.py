@@ -4,133 +4,112 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.recording.filmstrips import filmstrip, first_cut, png, sampled_filmstrips
+from imagine_bench.recording.filmstrips import filmstrip, png, sampled_filmstrips
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
-from imagine_bench.report.data import ReportData, agent_title, known_agent
-from imagine_bench.report.tables import DASH, Image, Section, Table, percent
+from imagine_bench.report.data import ReportData, agent_title, by_budget, known_agent
+from imagine_bench.report.page import flat
+from imagine_bench.report.tables import Image, Section, Table, percent, printed
 from imagine_bench.store import encoders
-from imagine_bench.store.files import read_json, reading
-from imagine_bench.store.results import ComparedRollout, OpenLoop
+from imagine_bench.store.files import reading
 
 SHOWN_ROLLOUTS = 3  # rollouts shown of each imagining agent: the first ones of its first seed
 _MEASURES = (
-    ("count", "transitions compared", "{:.0f}"),
+    ("count", "transitions compared", ".0f"),
     ("correct", "macrostate right (%)", "%"),
     ("correct_accepted", "right among those kept (%)", "%"),
     ("accepted", "kept by the filter (%)", "%"),
     ("termination_error", "wrong about the end (%)", "%"),
-    ("auroc_epistemic", "wrong ones found by epistemic (AUROC)", "{:.2f}"),
-    ("auroc_aleatoric", "by aleatoric", "{:.2f}"),
-    ("auroc_modal", "by modal", "{:.2f}"),
-    ("reward_mae", "reward error", "{:.3g}"),
-    ("epistemic", "epistemic", "{:.3g}"),
-    ("aleatoric", "aleatoric", "{:.3g}"),
-    ("modal", "modal", "{:.3g}"),
+    ("auroc_epistemic", "wrong ones found by epistemic (AUROC)", ".2f"),
+    ("auroc_aleatoric", "by aleatoric", ".2f"),
+    ("auroc_modal", "by modal", ".2f"),
+    ("reward_mae", "reward error", ".3g"),
+    ("epistemic", "epistemic", ".3g"),
+    ("aleatoric", "aleatoric", ".3g"),
+    ("modal", "modal", ".3g"),
 )
 _KINDS = ("epistemic", "aleatoric", "modal")
-_CARD_NAMES = {
-    "code_sizes": "values of each factor",
-    "cpu_s": "CPU seconds",
-    "kl_nats": "KL from the prior (nats a frame)",
-    "reconstruction": "reconstruction error",
-    "latent_size": "latent size",
-    "macrostate_names": "macrostate",
-    "probe": "probe accuracy",
-}
-_CARD_HIDDEN = {"format", "cardinalities"}
 
 
 def open_loop(data: ReportData) -> Section | None:
     """Imagination against the rules by depth."""
     if not data.open_loop:
         return None
-    deep = any(len(loop.correct) > 1 for loop in data.open_loop.values())
     words = (
-        f"Imagination against the rules after {data.budgets[-1]:,} real episodes: from real images, the model predicts "
-        "ahead without looking again, and a probe that the agents never use reads the macrostate (the discrete state "
-        "of the task) from what it imagines. Only chains of macro-actions that end no episode whatever chance may "
-        "bring are compared. Mean over seeds.",
+        "Imagination against the rules at the last budget: from real images, the model predicts ahead without looking "
+        "again, and a probe that the agents never use reads the macrostate (the discrete state of the task) from what "
+        "it imagines. Only chains of macro-actions that end no episode whatever chance may bring are compared. Means "
+        "over seeds.",
         "AUROC: among transitions that began in the right macrostate, the probability that one that goes wrong has the "
         "higher uncertainty of two; 0.5 is chance, 1 is perfect.",
     )
-    image = figures.plot("open_loop", lambda: open_loop_figure(data), "By imagined depth; means over seeds.")
-    tables = [_depth_table(agent, loop, folded=deep) for agent, loop in data.open_loop.items()]
-    return Section("Open-loop error by depth", words, [image] if deep else [], tables)
-
-
-def _depth_table(agent: str, loop: OpenLoop, *, folded: bool) -> Table:
-    """A row a measure, a column an imagined depth."""
-    title = agent_title(agent)
-    header = [f"{title}: depth", *(str(step + 1) for step in range(len(loop.count)))]
-    rows = [[words, *(_value(value, form) for value in getattr(loop, name))] for name, words, form in _MEASURES]
-    why = "the filter keeps none, or none or all are wrong"
-    unfold = f"In numbers: {title}" if folded else ""
-    return Table(f"openloop_{file_name(agent)}", header, rows, why_dash=why, folded=unfold)
-
-
-def _value(value: float, form: str) -> str:
-    if np.isnan(value):
-        return DASH
-    return percent(value) if form == "%" else form.format(value)
+    image = figures.image("open_loop", lambda: open_loop_figure(data), "By imagined depth; means over seeds.")
+    tables = []
+    for agent, loop in data.open_loop.items():
+        depths = (str(depth) for depth in range(1, 1 + len(loop["count"])))
+        rows = []
+        for name, title, form in _MEASURES:
+            rows.append([title, *(percent(value) if form == "%" else printed(value, form) for value in loop[name])])
+        why = "the filter keeps none, or none or all are wrong"
+        header = [f"{agent_title(agent)}: depth", *depths]
+        tables.append(Table(f"openloop_{file_name(agent)}", header, rows, why_dash=why))
+    return Section("Open-loop error by depth", words, [image], tables)
 
 
 def open_loop_figure(data: ReportData) -> Figure:
     """The measures of the tables by imagined depth, a panel each; an agent that knows no such uncertainty says 0."""
-    panels: dict[str, dict[str, dict[int, float]]] = {words: {} for _, words, _ in _MEASURES[1:]}
-    for agent, loop in data.open_loop.items():
-        for name, words, form in _MEASURES[1:]:
-            values = (100.0 if form == "%" else 1.0) * getattr(loop, name)
-            if name not in _KINDS or values.any():
-                panels[words][agent_title(agent)] = dict(enumerate(values, 1))
-    return figures.lines(panels, figures.colors(data.agents), "imagined depth (macro-actions)")
+    panels: dict[str, dict[str, dict[int, float]]] = {}
+    for name, title, form in _MEASURES[1:]:
+        scale = 100.0 if form == "%" else 1.0
+        panels[title] = {
+            agent_title(agent): dict(enumerate(scale * loop[name], 1))
+            for agent, loop in data.open_loop.items()
+            if name not in _KINDS or loop[name].any()
+        }
+    return figures.lines(panels, figures.colors(data.open_loop), "imagined depth (macro-actions)")
 
 
-def sampled_rollouts(data: ReportData) -> Section | None:
-    """One sheet an agent: several rollouts sampled from one start, of its first seed."""
+def rollouts(data: ReportData) -> Section | None:
+    """Imagined rollouts beside the real ones, and several sampled from one start, of each agent's first seed."""
     images = []
-    for agent in data.agents if data.installed else ():
+    for agent in data.result.protocol.agents if data.installed else ():
         run = data.result.of(agent)[0]
-        if run.sampled_rollouts:
-            caption = f"{agent_title(agent)}, seed {run.seed}: the same start {len(run.sampled_rollouts)} times."
-            sheet = png(sampled_filmstrips(run.sampled_rollouts, data.spec))
-            images.append(Image.of(f"sampled_rollouts_{file_name(agent)}", sheet, caption))
-    words = (
-        "What happens next is partly chance. Each row is one rollout, sampled from the same real image (the first one; "
-        "everything else is imagined and decoded), the agent choosing. Below each image stands what has changed: in "
-        "blue where the rules make it possible, in orange where not."
-    )
-    return Section("One start, several futures", [words], images) if images else None
-
-
-def filmstrips(data: ReportData) -> Section | None:
-    """Imagined rollouts beside the real ones."""
-    images = []
-    for agent in data.agents if data.installed else ():
-        run = data.result.of(agent)[0]
-        for number, compared in enumerate(run.imagined[:SHOWN_ROLLOUTS], 1):
-            caption = f"{agent_title(agent)}, seed {run.seed}, start {number}: {_rollout_words(compared)}."
+        whose = f"{agent_title(agent)}, seed {run.seed}"
+        for start, compared in enumerate(run.imagined[:SHOWN_ROLLOUTS], 1):
             strip = png(filmstrip(compared, data.spec.action_names))
-            images.append(Image.of(f"rollout_{file_name(agent)}_{number}", strip, caption))
+            images.append(Image(f"rollout_{file_name(agent)}_{start}", strip, f"{whose}, start {start}."))
+        if run.sampled_rollouts:
+            sheet = png(sampled_filmstrips(run.sampled_rollouts, data.spec))
+            caption = f"{whose}: the same start {len(run.sampled_rollouts)} times."
+            images.append(Image(f"sampled_rollouts_{file_name(agent)}", sheet, caption))
     words = (
         "Imagined rollouts of the trained agents, by their own greedy choice of macro-actions, decoded back into "
         "images. Top row: what the real environment shows for the same macro-actions. Bottom row: what the agent "
         "imagined; a blue frame where it is what the rules say, an orange one where not. The first of a few starts are "
-        "shown, which are the same for every agent; not the best."
+        "shown, which are the same for every agent; not the best.",
+        "Where what happens next is partly chance, several rollouts are sampled from one real image, a row each. Below "
+        "each image stands what has changed: in blue where the rules make it possible, in orange where not.",
     )
-    return Section("What the agents imagine", [words], images) if images else None
+    return Section("What the agents imagine", words, images) if images else None
 
 
-def _rollout_words(compared: ComparedRollout) -> str:
-    alive = np.concatenate([[True], ~compared.real_terminated[:-1]])  # imagined after the real end: nothing to match
-    matches = (compared.rollout.macrostates == compared.real_macrostates).all(axis=1) & alive
-    cut = first_cut(compared)
-    kept = "nothing is cut" if cut is None else f"the filter cuts before macro-action {cut + 1}"
-    return f"{matches.sum()} of {alive.sum()} imagined macrostates are what the rules say; {kept}"
+def acceptance(data: ReportData) -> Section | None:
+    """Imagined transitions that the filter kept while training to each budget from the one before."""
+    words = (
+        "An imagined rollout is a chain of transitions that the agent's world model predicts, starting from a real "
+        "image; depth counts its macro-actions. The uncertainty filter cuts a rollout at the first transition whose "
+        "epistemic uncertainty (what the model does not know for want of data) is too high. Two other kinds are shown "
+        "beside it: aleatoric (noise) and modal (several outcomes are possible)."
+    )
+    caption = "Share of the transitions imagined while training that were kept to be learned from. Means over seeds."
+    first = "imagined transitions kept (%) up to"
+    table = by_budget(
+        data, "acceptance", first, "acceptance", lambda record: percent(record.get("acceptance", math.nan)), caption
+    )
+    return Section("Imagined transitions kept", [words], tables=[table]) if table.rows else None
 
 
 def encoders_used(data: ReportData) -> Section | None:
@@ -139,27 +118,23 @@ def encoders_used(data: ReportData) -> Section | None:
     Raises:
         ArtefactError: A card is damaged.
     """
-    images, tables = [], []
+    images = []
+    tables = []
     for identity, agents in encoder_readers(data.result.protocol).items():
         name = identity.partition("@")[0]
         heading = f"{identity}, for {', '.join(map(agent_title, agents))}"
         path = encoders.find(identity)
-        card: dict[str, object] = {}
-        if path is not None and path.with_suffix(".json").is_file():
-            card = read_json(path.with_suffix(".json"), "an encoder's card")
         if path is not None and path.with_suffix(".png").is_file():
             with reading(path.with_suffix(".png"), "an encoder's image"):
                 content = path.with_suffix(".png").read_bytes()
             caption = f"{heading}: real frames the encoder never saw in training, and what it makes of them."
-            images.append(Image.of(f"encoder-{name}", content, caption))
-        shown = {key: value for key, value in card.items() if key not in _CARD_HIDDEN}
-        rows = [[_CARD_NAMES.get(key, key), _card_text(key, value)] for key, value in shown.items()]
-        missing = "" if rows else "It is not here, so its card is beside its file."
-        tables.append(Table(f"card-{name}", [heading, "its card"], rows, missing, prose=True))
+            images.append(Image(f"encoder-{name}", content, caption))
+        card = flat("", encoders.card(identity) or {"card": "not here"})
+        tables.append(Table(f"card-{name}", [heading, "its card"], list(map(list, card)), prose=True))
     words = (
         "Before any learning of the task, an encoder was trained once, on images without any rewards. It turns each "
         "image into a few numbers: a variational autoencoder into latents, one that finds factors into a code for each "
-        "factor. Probe accuracy is the share of held-out images whose whole macrostate can be read from them."
+        "factor. The probe's accuracy is the share of held-out images whose whole macrostate can be read from them."
     )
     return Section("What the agents see", [words], images, tables) if tables else None
 
@@ -173,15 +148,3 @@ def encoder_readers(protocol: Protocol) -> dict[str, list[str]]:
         if entry.needs_encoder and identity is not None:
             readers.setdefault(identity, []).append(agent)
     return readers
-
-
-def _card_text(key: str, value: object) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{inner} {_card_text(key, item)}" for inner, item in value.items())
-    if isinstance(value, list):
-        return ", ".join(map(str, value))
-    if not isinstance(value, float):
-        return str(value)
-    if math.isnan(value):
-        return DASH
-    return f"{100.0 * value:.2f} %" if key == "probe" else f"{value:.4g}"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import base64
+import functools
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from html import escape
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from imagine_bench import statistics
 from imagine_bench.store.files import csv_text
 
-V = TypeVar("V")
 DASH = "–"  # printed where there is no number; the table's caption says why
 
 
@@ -46,6 +44,12 @@ class Table:
     folded: str = ""  # words to unfold it by; empty for a table that is always shown
     prose: bool = False  # whether its cells hold sentences, which are aligned to the left
 
+    @classmethod
+    def of(cls, name: str, rows: Sequence[Mapping[str, str | Cell]], caption: str = "", why_dash: str = "") -> Table:
+        """A table of rows by column, each with the same ones."""
+        header = list(rows[0]) if rows else []
+        return cls(name, header, [list(row.values()) for row in rows], caption, why_dash)
+
     @property
     def cells(self) -> list[list[Cell]]:
         """The rows, every cell in full."""
@@ -61,11 +65,11 @@ class Table:
     def text(self) -> str:
         """The table for a terminal."""
         rows = [list(map(str, row)) for row in (self.header, *self.rows)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
         lines = []
-        for first, *others in rows:
-            cells = [f"{cell:>{width}}" for cell, width in zip(others, widths[1:], strict=True)]
-            lines.append("  ".join([first.ljust(widths[0]), *cells]).rstrip())
+        for name, *others in rows:
+            cells = map(str.rjust, others, widths)
+            lines.append("  ".join([name.ljust(first), *cells]).rstrip())
         return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
 
     @property
@@ -76,18 +80,8 @@ class Table:
     @property
     def markdown(self) -> str:
         """The table as Markdown."""
-        first, *others = (f"| {' | '.join(map(str, row))} |" for row in (self.header, *self.rows))
+        first, *others = (f"| {' | '.join(map(markdown_text, row))} |" for row in (self.header, *self.rows))
         return "\n".join([first, f"|{'---|' * len(self.header)}", *others])
-
-
-def by_budget(
-    name: str, first: str, values: Mapping[str, Mapping[int, V]], words: Callable[[V], str | Cell], caption: str = "",
-    why_dash: str = "",
-) -> Table:  # fmt: skip
-    """A table of a row a learner, by title, and a column a budget, each value put into words."""
-    budgets = next(iter(values.values()), {})
-    rows = [[title, *map(words, row.values())] for title, row in values.items()]
-    return Table(name, [first, *(f"{budget:,}" for budget in budgets)], rows, caption, why_dash)
 
 
 @dataclass(frozen=True)
@@ -95,30 +89,13 @@ class Image:
     """An image or figure, drawn when it is first asked for: a table on a terminal needs none."""
 
     name: str  # file name without ending
-    draw: Callable[[], tuple[bytes, str]]  # draws ``png`` and ``svg``
+    content: bytes | Callable[[], bytes]  # the PNG, or what draws it
     caption: str  # the text below it
 
-    @classmethod
-    def of(cls, name: str, png: bytes, caption: str) -> Image:
-        """Wrap a finished image."""
-        return cls(name, lambda: (png, ""), caption)
-
     @cached_property
-    def drawn(self) -> tuple[bytes, str]:
-        """The image on white, and the same as inline SVG whose text takes the page's color, or an empty text."""
-        return self.draw()
-
-    @property
     def png(self) -> bytes:
         """The image, on white."""
-        return self.drawn[0]
-
-    @property
-    def html(self) -> str:
-        """The element that shows it in a page, and needs no other file."""
-        png, svg = self.drawn
-        data = base64.b64encode(png).decode()
-        return svg or f'<img alt="{escape(self.caption)}" src="data:image/png;base64,{data}">'
+        return self.content if isinstance(self.content, bytes) else self.content()
 
 
 @dataclass(frozen=True)
@@ -146,23 +123,32 @@ class Page:
     settings: Mapping[str, Sequence[tuple[str, str]]] = field(default_factory=dict)  # each learner's, by title
     protocol: Sequence[tuple[str, str]] = ()  # the complete protocol: name and value
     recordings: Sequence[str] = ()  # paths of the recordings, below the bench
-    colors: Mapping[str, str] = field(default_factory=dict)  # colors of the learners, by title
     summary: str = ""  # the report on a terminal
 
 
-def seconds(value: float) -> str:
-    """``1,234.5``; not a number as a dash."""
-    return DASH if math.isnan(value) else f"{value:,.1f}"
+def markdown_text(value: object) -> str:
+    """A text as Markdown shows it unchanged: in a line, its special characters escaped."""
+    return re.sub(r"([\\`*_<>|&~]|^#|(?<=\])(?=\())", r"\\\1", " ".join(str(value).split()))
 
 
-def count(value: float) -> str:
-    """``1,234``; not a number as a dash."""
-    return DASH if math.isnan(value) else f"{value:,.0f}"
+def printed(value: float, form: str) -> str:
+    """A number in a format of Python's, with the minus a true one; not a number as a dash."""
+    return DASH if math.isnan(value) else format(value, form).replace("-", "\u2212")
 
 
-def decimals(value: float) -> str:
-    """``2.36``; not a number as a dash."""
-    return DASH if math.isnan(value) else f"{value:.2f}"
+seconds = functools.partial(printed, form=",.1f")  # 1,234.5
+count = functools.partial(printed, form=",.0f")  # 1,234
+decimals = functools.partial(printed, form=".2f")  # 2.36
+
+
+def percent(share: float) -> str:
+    """A share as a percentage with one decimal: ``0.6125`` as ``61.3``."""
+    return printed(100.0 * share, ".1f")
+
+
+def signed_percent(share: float) -> str:
+    """Like :func:`percent` with a sign."""
+    return printed(100.0 * share, "+.1f")
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -170,25 +156,13 @@ def number(value: float, digits: int = 3) -> str:
 
     In powers of ten from 100,000 on, and where those decimals would show nothing.
     """
-    if math.isnan(value):
-        return DASH
     if math.isinf(value):
         return "∞" if value > 0 else "\u2212∞"
     if value and (abs(value) >= 10**5 or abs(value) < 10.0**-digits):
-        return f"{value:.{digits - 1}e}".replace("-", "\u2212")
+        return printed(value, f".{digits - 1}e")
     rounded = float(f"{abs(value):.{digits - 1}e}")  # 9.999 is printed as 10.0
     whole = len(str(int(rounded))) if rounded >= 1 else 0
-    return f"{value:.{max(0, digits - whole)}f}".replace("-", "\u2212")
-
-
-def percent(share: float) -> str:
-    """A share as a percentage with one decimal: ``0.6125`` as ``61.3``; not a number as a dash."""
-    return DASH if math.isnan(share) else f"{100.0 * share:.1f}"
-
-
-def signed_percent(share: float) -> str:
-    """Like :func:`percent` with a sign, the minus a true one."""
-    return DASH if math.isnan(share) else f"{100.0 * share:+.1f}".replace("-", "\u2212")
+    return printed(value, f".{max(0, digits - whole)}f")
 
 
 def p_value(p: float) -> str:
@@ -202,17 +176,16 @@ def estimate(found: statistics.Estimate, words: Callable[[float], str] = percent
     return Cell(words(found.value), interval, note)
 
 
-def mean_text(values: Sequence[float], words: Callable[[float], str] = percent) -> str:
-    """Mean of a few runs with its 95 % interval; of one run the value alone, and a dash where one has none (NaN)."""
-    if any(math.isnan(value) for value in values):
-        return DASH
-    low, high = statistics.interval(values, trim=0.0, share=words is percent)
-    return str(estimate(statistics.Estimate(float(np.mean(values)), low, high), words))
+def over_seeds(values: Sequence[float], words: Callable[[float], str] = percent, *, share: bool = False) -> Cell:
+    """Interquartile mean over seeds with its 95 % interval, of a ``share`` in [0, 1]; a dash for no number."""
+    known = [value for value in values if not math.isnan(value)]
+    if not known:
+        return Cell(DASH)
+    low, high = statistics.interval(known, share=share)
+    return estimate(statistics.Estimate(statistics.iqm(known), math.nan if low == high else low, high), words)
 
 
 def mean_std(values: Sequence[float] | NDArray[np.float64]) -> str:
-    """``2.36 (0.45)``: mean and standard deviation, as the thesis prints them."""
-    mean = float(np.mean(values))
-    if math.isnan(mean):
-        return DASH
-    return f"{mean:.2f}" if len(values) < 2 else f"{mean:.2f} ({np.std(values, ddof=1):.2f})"
+    """``2.36 (0.45)``: mean and standard deviation, as the thesis prints them; the mean alone of one value."""
+    mean = decimals(float(np.mean(values)))
+    return mean if mean == DASH or len(values) < 2 else f"{mean} ({np.std(values, ddof=1):.2f})"

@@ -20,8 +20,8 @@ from imagine_bench.errors import ArtefactError
 from imagine_bench.judge.verify import Replays, _verify_test, verdicts
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report import bench_page
+from imagine_bench.report.audits import verify, with_report
 from imagine_bench.report.page import texts
-from imagine_bench.report.verify import verify, with_report
 from imagine_bench.running.bench import bench
 from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode, replay
 from imagine_bench.running.run_state import environments

@@ -14,32 +14,32 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
-from imagine_bench.report import bench_page, why
-from imagine_bench.report.exact import causes_table, read_failures
+from imagine_bench.report import audits
+from imagine_bench.report.audits import verify, why_report
+from imagine_bench.report.exact import read_causes
 from imagine_bench.report.page import texts
-from imagine_bench.report.verify import verify
+from imagine_bench.report.tables import Page
 from imagine_bench.rules import states_of
 from imagine_bench.running.bench import bench
 from imagine_bench.running.task_types import load_bench
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import make_folder, write_bytes
-from imagine_bench.store.results import BenchResult
 
 SPEC = registry.task("arrow_puzzle")
 
 
-def write_texts(result: BenchResult) -> None:
+def write_texts(folder: Path, page: Page) -> None:
     """A report without images, which are slow to draw."""
-    for name, text in texts(without_images(bench_page(result))).items():
-        write_bytes(make_folder(result.folder / "report") / name, text.encode())
+    for name, text in texts(without_images(page)).items():
+        write_bytes(make_folder(folder) / name, text.encode())
 
 
 def test_the_shares_of_a_bench_sum_to_all_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(why, "write_report", write_texts)
+    monkeypatch.setattr(audits, "write_page", write_texts)
     wanted = small(agents=("table", "random"), seeds=(0, 1), evaluation_episodes=12)
     folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
-    said = why.why_report(folder, root=tmp_path, task=None, encoder=None)
+    said = why_report(folder, root=tmp_path, task=None, encoder=None)
     with (folder / "why" / "causes.csv").open() as file:
         rows = list(csv.DictReader(file))
     result = load_bench(folder)
@@ -49,13 +49,13 @@ def test_the_shares_of_a_bench_sum_to_all_failures(tmp_path: Path, monkeypatch: 
             failed = [test for test, each in enumerate(row.solved) if each == "0"]
             assert [int(r["test"]) for r in mine] == failed and {r["cause"] for r in mine} <= set(CAUSES)
     assert {row["agent"] for row in rows} == {"table"}, "one that does not learn has nothing to explain"
-    for line in causes_table(read_failures(folder)).rows:
+    for line in read_causes(folder).rows:
         shares = [float(str(cell)) for cell in line[3:]]
         assert abs(sum(shares) - 100.0) < 0.2
         mine = [row["cause"] for row in rows if row["episodes"] == line[1] and row["cause"]]
         assert line[2] == f"{len(mine)} of {2 * 12}"
         assert shares == [round(100 * mine.count(name) / len(mine), 1) for name in CAUSES]
-    assert "| table |" in said and 'id="causes"' in (folder / "report" / "index.html").read_text()
+    assert "\ntable " in said and 'id="causes"' in (folder / "report" / "index.html").read_text()
     assert not any(each.complaint for each in verify(folder)), "the report with its causes follows from the runs"
 
 
@@ -63,11 +63,11 @@ def test_a_run_that_keeps_no_episodes_is_one_sentence(tmp_path: Path) -> None:
     folder = bench(small(), {}, root=tmp_path, launcher=Inline()).folder
     (folder / "table" / "seed_0" / "DONE").unlink()
     with pytest.raises(ArtefactError, match="is not finished; give the bench command again"):
-        why.why_report(folder, root=tmp_path, task=None, encoder=None)
+        why_report(folder, root=tmp_path, task=None, encoder=None)
     (folder / "why").mkdir(exist_ok=True)
     (folder / "why" / "causes.csv").write_text("agent,cause\n")
     with pytest.raises(ImagineBenchError, match="not a table of causes"):
-        read_failures(folder)
+        read_causes(folder)
 
 
 def learner(name: str, spec: TaskSpec) -> Agent:

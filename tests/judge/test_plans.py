@@ -22,7 +22,7 @@ from imagine_bench.judge.plans import PlanResult, carry_out, make_env, make_plan
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.runs import RunSpec
 from imagine_bench.recording.plans import record_plans
-from imagine_bench.report.plans import plan_table, summarise, write_plans
+from imagine_bench.report.audits import plan_table, summarise, write_plans
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running.trained import Trained
 
@@ -117,7 +117,7 @@ def test_optimal_plans_are_solved_without_a_second_look(right: list[PlanResult])
 
 
 def test_a_wrong_plan_stops_where_the_episode_does(wrong: list[PlanResult]) -> None:
-    assert summarise(wrong).solved < 6
+    assert summarise(wrong)["solved"] < 6
     failed = next(plan for plan in wrong if not plan.solved)
     assert failed.done < failed.length and failed.compared.real_terminated[-1]
     assert failed.outcome == f"failed at macro-action {failed.done}"
@@ -150,7 +150,7 @@ def test_a_detour_is_solved_but_not_optimal() -> None:
 def test_an_uncertain_plan_is_refused_and_says_so(dreams: dict[str, Any], bound: float | None, words: str) -> None:
     plan = next(plan for plan in carried_out(optimal(**dreams), 8, max_epistemic=bound) if plan.length > 1)
     assert words in plan.refused and bool(words) == bool(plan.refused) != plan.solved
-    assert plan.done == (0 if words else plan.length) and summarise([plan]).refused == bool(words)
+    assert plan.done == (0 if words else plan.length) and summarise([plan])["refused"] == bool(words)
     assert plan.outcome.startswith("refused: " if words else "solved")
 
 
@@ -177,22 +177,26 @@ def test_no_agent_without_imagination_and_no_empty_series() -> None:
 
 
 def test_what_is_written_holds_every_plan(wrong: list[PlanResult], right: list[PlanResult], tmp_path: Path) -> None:
-    summary = write_plans(tmp_path, wrong, TASK, {"commit": "abc"}, filmstrips=3)
+    said = write_plans(tmp_path, wrong, TASK, {"commit": "abc"})
+    summary = summarise(wrong)
     rows = (tmp_path / "plans.csv").read_text().splitlines()
     assert len(rows) == 13 and rows[0].startswith("plan,start,shortest,planned,done,solved,optimal,refused")
     kept = json.loads((tmp_path / "summary.json").read_text())
-    assert kept["commit"] == "abc" and kept["solved"] == summary.solved == sum(row.split(",")[5] == "1" for row in rows)
-    table = plan_table(summary, TASK)
+    assert kept["commit"] == "abc" and kept["solved"] == summary["solved"] == sum(
+        row.split(",")[5] == "1" for row in rows
+    )
+    table = plan_table(wrong, TASK)
+    assert table.text in said and all(f"plan {plan.number} from" in said for plan in wrong if not plan.solved)
     assert table.rows[0] == ["plans", "12", "20"] and table.rows[1][2] == "17"
     assert (tmp_path / "plans.png").stat().st_size > 5_000
-    assert len(list(tmp_path.glob("failed_*.png"))) == summary.attempted - summary.solved > 0
+    assert len(list(tmp_path.glob("failed_*.png"))) == min(6, len(wrong) - summary["solved"]) > 0
     (tmp_path / "recording.rrd").write_text("old")
-    write_plans(tmp_path, right[:1], TASK, {}, filmstrips=3)
+    write_plans(tmp_path, right[:1], TASK, {})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plans.csv", "plans.md", "plans.png", "summary.json"]
 
 
 def test_what_is_written_is_json_where_no_plan_was_solved(wrong: list[PlanResult], tmp_path: Path) -> None:
-    write_plans(tmp_path, [plan for plan in wrong if not plan.solved][:1], TASK, {}, filmstrips=1)
+    write_plans(tmp_path, [plan for plan in wrong if not plan.solved][:1], TASK, {})
     text = (tmp_path / "summary.json").read_text()
     assert json.loads(text, parse_constant=pytest.fail)["mean_length"] is None
 

@@ -19,7 +19,7 @@ from imagine_bench.judge.values import Terminations, optimal_length, termination
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.data import collect
 from imagine_bench.report.exact import policies
-from imagine_bench.report.tables import Table
+from imagine_bench.report.tables import Cell, Table
 from imagine_bench.rules import fewest_actions, greedy, states_of
 from imagine_bench.running import bench as benches
 from imagine_bench.store.files import lock
@@ -167,16 +167,10 @@ def test_a_report_follows_what_was_held_from_every_start(tmp_path: Path) -> None
         wrong = (run.agent, run.seed) == ("imagination", 1)
         return PolicyTable(action=astray if wrong else right, model=None)
 
-    whole, by_length, missed = page_of(one_astray)
+    (whole,) = page_of(one_astray)
     bad = ends_of(HARD, other_way)
-    assert "from all 66 starts" in whole.caption and whole.header[-1] == "macro-actions (optimal: 3.27)"
-    assert whole.rows[0] == ["DQN", "100.0 [100.0, 100.0]", *["0.0 [0.0, 0.0]"] * 4, "3.27 [3.27, 3.27]"]
+    assert whole.rows[0] == ["DQN", *map(Cell, ["100.0", *["0.0"] * 4, "3.27"])]
     assert str(whole.rows[1][1]).startswith(f"{50 + 50 * bad.success.mean():.1f} [")
-    near = bad.success[optimal_length(HARD, STARTS) == 2].mean()
-    assert by_length.rows[1] == ["2", "12", "100.0", f"{50 + 50 * near:.1f}"]
-    assert f"{(bad.success < 1).sum()} starts are not always solved" in missed.caption and len(missed.rows) == 12
-    assert all(row[2:] == ["100.0", "50.0"] for row in missed.rows)
-    assert len(page_of(lambda run: PolicyTable(action=right, model=None))) == 2, "none is missed"
     assert page_of(lambda run: None) == ()
 
 

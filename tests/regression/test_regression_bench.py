@@ -25,10 +25,10 @@ from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.results import PairResult, RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.regression.scores import log_score
+from imagine_bench.report.audits import why_report
 from imagine_bench.report.page import flat
 from imagine_bench.report.regression import robot_ik, toy_regression, write_report
 from imagine_bench.report.tables import number
-from imagine_bench.report.why import why_report
 from imagine_bench.running.bench import plan
 from imagine_bench.running.task_types import task_types
 from imagine_bench.running.trained import load_trained

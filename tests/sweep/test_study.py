@@ -85,14 +85,7 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
     origins = json.loads((tmp_path / "out" / "runs.json").read_text())
     assert [origin["variant"] for origin in origins] == ["table", "mild", "imaginer"]
     assert all(origin["versions"] and origin["machine"] for origin in origins)
-    assert (tmp_path / "out" / "study.png").stat().st_size > 5_000
     assert "| appearance | mild | table |" in (tmp_path / "out" / "report.md").read_text()
-
-
-def test_a_study_that_compares_nothing_has_no_picture(tmp_path: Path) -> None:
-    alone = dataclasses.replace(STUDY, variants=STUDY.variants[:1])
-    page = study_page(alone, run_study(alone, "arrow_puzzle", root=tmp_path, launcher=Here()))
-    assert not [image for section in page.sections for image in section.images]
 
 
 @pytest.mark.parametrize(
@@ -233,10 +226,10 @@ def test_the_table_says_what_helps(tmp_path: Path) -> None:
         ),
     ]  # fmt: skip
     page = study_page(STUDY, lines)
-    without, with_model = page.sections[0].tables[0].cells
+    without, _, first, last = page.sections[0].tables[0].cells  # a row a variant and budget
     assert [cell.text for cell in without[-2:]] == ["–", "1"]
-    assert list(map(str, with_model[1:7])) == ["mild", "table", "50.0", "90.0", "table", "+25.0 [+10.0, +40.0]"]
-    assert [cell.text for cell in with_model[-2:]] == ["30.0", "2"], "right at the last budget, mean of seeds"
+    assert list(map(str, first[1:7])) == ["mild", "table", "3", "50.0", "table", "+25.0 [+10.0, +40.0]"]
+    assert [cell.text for cell in last[-2:]] == ["30.0", "2"], "right at the last budget, mean of seeds"
     rows = csv.DictReader(page.files["seeds.csv"].splitlines())
     assert [row["imagined_right"] for row in rows] == [""] * 4 + ["0.1000", "0.2000", "0.3000", "0.4000"]
 

@@ -63,7 +63,7 @@ ROOMS: dict[str, dict[str, Sequence[str]]] = {
     },
     "report": {
         "imagine_bench/report/data.py": (
-            "tests/report/test_report_data.py", "tests/report/test_report_rollouts.py", "tests/report/test_report.py",
+            "tests/report/test_report_data.py", "tests/report/test_filmstrips.py", "tests/report/test_report.py",
         ),
     },
     "own agent": {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,8 @@ LEVELS = {
     "imagination_only": (0.1, 0.8),
 }
 DEPTH = 10
+WIDE = Protocol(task="arrow_puzzle", preset="thesis", budgets=(250, 2000, 6000), seeds=(0, 1, 7))
+"""A protocol of which the thesis has some budgets, and others that this has not."""
 
 
 def bench_result(folder: Path, *, protocol: Protocol | None = None) -> BenchResult:
@@ -32,6 +36,15 @@ def bench_result(folder: Path, *, protocol: Protocol | None = None) -> BenchResu
         "machine": {"cpu": "a <processor> & more", "cores": 2},
     }
     return BenchResult(protocol=protocol, runs=tuple(runs), environment=environment, folder=folder, wall_s=812.5)
+
+
+def rewritten(result: BenchResult, change: Callable[[RunResult, Checkpoint], Checkpoint]) -> BenchResult:
+    """The result with every checkpoint changed."""
+    runs = []
+    for run in result.runs:
+        rows = tuple(change(run, row) for row in run.checkpoints)
+        runs.append(dataclasses.replace(run, checkpoints=rows))
+    return dataclasses.replace(result, runs=tuple(runs))
 
 
 def run_result(protocol: Protocol, agent: str, seed: int, folder: Path) -> RunResult:

@@ -1,0 +1,287 @@
+"""Questions to a bench's trained agents, each with its table and files: plans, causes of failures, verification."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from itertools import zip_longest
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench import reference, registry, statistics
+from imagine_bench.errors import InvalidValueError, brief
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.judge.causes import WhyAnalysis
+from imagine_bench.judge.plans import PlanResult, make_plans, require_threshold
+from imagine_bench.judge.verify import Verdict, verify_runs
+from imagine_bench.recording.filmstrips import filmstrip, png
+from imagine_bench.registry.machine import describe_environment
+from imagine_bench.report.bench import bench_page
+from imagine_bench.report.exact import HEAD, causes_table
+from imagine_bench.report.page import texts, write_page
+from imagine_bench.report.tables import DASH, Table, percent
+from imagine_bench.running.progress import counted
+from imagine_bench.running.task_types import load_bench, task_type
+from imagine_bench.running.trained import (
+    best_run,
+    learners,
+    load_trained,
+    protocol_of_agents,
+    require_control,
+)
+from imagine_bench.seeding import evaluation_split
+from imagine_bench.store.bench_folder import newest_bench, require_either
+from imagine_bench.store.files import (
+    csv_text,
+    lock,
+    make_folder,
+    table_text,
+    with_null,
+    write_bytes,
+    write_json,
+    writing,
+)
+from imagine_bench.store.loading import load_so_far
+
+RECORDING = "recording.rrd"
+_SHOWN = 6  # the first plans, and the first that failed, as filmstrips
+_CELLS = {"report.md": r"^\|.*$", "index.html": r"<t[dh][^>]*>(.*?)</t[dh]>"}
+"""What is compared of a report's pages: the cells of their tables; of other files it is every line."""
+Record = Callable[..., Path]  # records plans: :func:`imagine_bench.recording.plans.record_plans`
+
+
+def chosen(given: Path | None, root: Path, task: str | None) -> Path:
+    """What was given, or else the newest bench of a task in which agents act, or of all such tasks.
+
+    Raises:
+        ImagineBenchError: Both are given, or there is no such bench.
+    """
+    require_either(given, task)
+    if task is not None:
+        task_type(task)  # knows every name
+        require_control(task, f"Task {task!r}")
+    return given or newest_bench(root, *(registry.tasks() if task is None else (task,)))
+
+
+def provenance(protocol_hash: str) -> dict[str, object]:
+    """Protocol, commit and command of a figure."""
+    environment = describe_environment()
+    return {"protocol_hash": protocol_hash, "commit": environment.get("commit"), "command": environment.get("command")}
+
+
+# Plans -------------------------------------------------------------------------------------------------------------
+
+
+def plan_report(
+    run: Path | None, *, root: Path, task: str | None, count: int, execution: str | None, max_epistemic: float | None,
+    encoder: str | None, recorded: int = 0, record: Record | None = None,
+) -> str:  # fmt: skip
+    """Plan, carry out, and leave a table, filmstrips and a recording in the run's folder, below ``plans``.
+
+    ``run`` is a run's folder, or a bench's, whose best imagining run is taken; None is the newest bench of ``task``,
+    or of any. ``max_epistemic`` is as in :func:`imagine_bench.judge.plans.make_plans`, ``encoder`` as in
+    :func:`imagine_bench.running.trained.load_trained`. The first ``recorded`` plans go to ``record``.
+    Returns the text to print.
+
+    Raises:
+        ImagineBenchError: Nothing to plan with, or a value out of range; nothing was written.
+        BusyError: Another process makes the same plans.
+    """
+    if recorded < 0 or count < 1:
+        raise InvalidValueError(f"Asked for {count} plans, {recorded} of them recorded; give at least 1 and 0.")
+    require_threshold(max_epistemic)
+    run = chosen(run, root, task)
+    if (run / "protocol.json").exists():  # a bench's folder
+        protocol_of_agents(run)
+        run = best_run(load_bench(run)).folder
+    trained = load_trained(run, encoder=encoder)
+    execution = trained.task.execution(execution)
+    name = f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"
+    folder = make_folder(run / "plans" / name)
+    spec = trained.spec
+    whose = {"agent": spec.agent, "seed": spec.seed, "episodes": trained.episodes}
+    how = {"appearance": spec.protocol.appearance, "execution": execution, "max_epistemic": max_epistemic}
+    with lock(folder / ".lock", f"The folder {folder}"):
+        made = make_plans(trained, count=count, execution=execution, max_epistemic=max_epistemic)
+        plans = list(counted(made, "plans", total=count))
+        text = write_plans(folder, plans, trained.task, {**provenance(spec.protocol.hash), **whose, **how})
+        if record is not None and recorded:
+            path = folder / RECORDING
+            record(trained, count=min(recorded, count), execution=execution, max_epistemic=max_epistemic, path=path)
+            text += f"\nRecording:  {path} (imagine-bench view opens it)"
+    return text
+
+
+def summarise(plans: Sequence[PlanResult]) -> dict[str, float]:
+    """Counts over plans, and macro-actions of the solved ones (0 and NaN where none was).
+
+    ``steps`` are macro-actions carried out, ``steps_as_imagined`` those that led where they were imagined to, and
+    ``faults`` those whose physics disagreed with the rules.
+    """
+    lengths = [plan.done for plan in plans if plan.solved]
+    return {
+        "attempted": len(plans),
+        "refused": sum(bool(plan.refused) for plan in plans),
+        "solved": len(lengths),
+        "optimal": sum(plan.optimal for plan in plans),
+        "shortest": min(lengths, default=0),
+        "longest": max(lengths, default=0),
+        "mean_length": float(np.mean(lengths)) if lengths else math.nan,
+        "steps": sum(plan.done for plan in plans),
+        "steps_as_imagined": sum(int(plan.as_imagined.sum()) for plan in plans),
+        "faults": sum(plan.faults for plan in plans),
+    }
+
+
+def plan_table(plans: Sequence[PlanResult], task: TaskSpec) -> Table:
+    """The counts, the thesis' beside them where it has any."""
+    found = summarise(plans)
+    thesis = {} if task.reference is None else reference.load(task.reference).get("plans", {})
+    low, high = statistics.wilson(int(found["solved"]), len(plans))
+    share = f"{percent(found['solved'] / len(plans))} % [{percent(low)}, {percent(high)}]"
+    lengths = f"{found['shortest']} to {found['longest']}, mean {found['mean_length']:.2f}" if found["solved"] else DASH
+    rows = [
+        ["plans", f"{len(plans)}", f"{thesis.get('attempted', DASH)}"],
+        ["solved", f"{found['solved']} = {share}", f"{thesis.get('solved', DASH)}"],
+        ["of these optimal", f"{found['optimal']}", f"{thesis.get('optimal_among_solved', DASH)}"],
+        ["refused as too uncertain", f"{found['refused']}", DASH],
+        ["macro-actions of a solved plan", lengths, f"{thesis['shortest']} to {thesis['longest']}" if thesis else DASH],
+        ["macro-actions that led where imagined", f"{found['steps_as_imagined']} of {found['steps']}", DASH],
+        ["faults of the physics", f"{found['faults']}", DASH],
+    ]
+    return Table("plans", ["open-loop plans, carried out blindly", "here", "thesis"], rows)
+
+
+def write_plans(folder: Path, plans: Sequence[PlanResult], task: TaskSpec, origin: Mapping[str, object]) -> str:
+    """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and filmstrips of the first plans that failed.
+
+    The files of an earlier call, its recording included, go. ``plans.png`` shows the first plans;
+    ``summary.json`` holds the ``origin`` too. Returns the text to print.
+
+    Raises:
+        SetupError: The folder cannot be written.
+    """
+    make_folder(folder)
+    with writing(folder):
+        for earlier in (*folder.glob("failed_*.png"), folder / RECORDING):
+            earlier.unlink(missing_ok=True)
+    table = plan_table(plans, task)
+    failures = [plan for plan in plans if not plan.solved]
+    words = "\n".join(f"- plan {plan.number} from {plan.start}: {plan.outcome}" for plan in failures)
+    write_bytes(folder / "plans.csv", table_text([_row(plan) for plan in plans]).encode())
+    write_json(folder / "summary.json", {**origin, **with_null(summarise(plans))})
+    heading = f"# {task.title}: plans imagined from one frame"
+    picture = "![Plans: real images above, imagined ones below](plans.png)"
+    write_bytes(folder / "plans.md", f"{heading}\n\n{table.markdown}\n\n{picture}\n\n{words}\n".encode())
+    write_bytes(folder / "plans.png", png(_stack(plans[:_SHOWN], task)))
+    for plan in failures[:_SHOWN]:
+        write_bytes(folder / f"failed_{plan.number:03d}.png", png(_stack([plan], task)))
+    facts = ", ".join(f"{name} {value}" for name, value in origin.items())
+    return f"{task.title}: {facts}\n\n{table.text}\n\n{words}\nFilmstrips: {folder / 'plans.png'}"
+
+
+def _row(plan: PlanResult) -> dict[str, float | str]:
+    """A row of plans.csv."""
+    rollout = plan.compared.rollout
+    return {
+        "plan": plan.number,
+        "start": " ".join(map(str, plan.start)),
+        "shortest": plan.shortest,
+        "planned": plan.length,
+        "done": plan.done,
+        "solved": int(plan.solved),
+        "optimal": int(plan.optimal),
+        "refused": plan.refused,
+        "as_imagined": int(plan.as_imagined.sum()),
+        "faults": plan.faults,
+        "max_epistemic": f"{float(rollout.epistemic.max()):.6g}",
+        "actions": " ".join(map(str, rollout.actions.tolist())),
+    }
+
+
+def _stack(plans: Sequence[PlanResult], task: TaskSpec) -> NDArray[np.uint8]:
+    """The filmstrips of plans below one another. Shape (height, width, 3)."""
+    columns = max(plan.length for plan in plans)
+    return np.concatenate([filmstrip(plan.compared, task.action_names, columns=columns) for plan in plans])
+
+
+# Causes of failures ------------------------------------------------------------------------------------------------
+
+
+def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: str | None) -> str:
+    """Find the one cause of every failed test of a bench's learners, keep them, and write its report anew.
+
+    The bench is as in :func:`chosen`, ``encoder`` as in :func:`imagine_bench.running.trained.load_trained`.
+    Returns what to print.
+
+    Raises:
+        ImagineBenchError: No bench, or none with an agent that can be taken up again.
+        BusyError: Another process is at the same.
+        SetupError: The bench's folder cannot be written.
+    """
+    bench = chosen(folder, root, task)
+    where = bench / "why"
+    protocol = protocol_of_agents(bench)
+    spec = registry.task(protocol.task)
+    appearance = protocol.appearance_in_tests
+    folders = learners(bench)
+    with lock(bench / ".why.lock", f"The folder {where}"):
+        analysis = WhyAnalysis(spec, appearance=appearance, purpose=evaluation_split(protocol.seeds[0]))
+        rows: list[Sequence[object]] = []
+        runs = []
+        for run in counted(folders, "runs", total=len(folders)):
+            trained = load_trained(run, encoder=encoder)
+            found = analysis.measure(trained)
+            head = {"agent": trained.spec.agent, "seed": trained.spec.seed}
+            by_budget = {str(each.episodes): Counter(each.causes.values()) for each in found}
+            runs.append({**head, "episodes": trained.episodes, "failures": by_budget})
+            for each in found:  # a row a failure; and one a test without any, whose cause is empty
+                for failure in each.causes.items() or [("", "")]:
+                    rows.append((*head.values(), each.episodes, each.tests, *failure))
+        table = causes_table(rows)
+        made = {**provenance(protocol.hash), "appearance": appearance, "frames": "kinematic", "runs": runs}
+        make_folder(where)
+        write_bytes(where / "causes.csv", csv_text([HEAD, *rows]).encode())
+        write_json(where / "summary.json", made)
+        text = f"# {spec.title}: why agents failed\n\n{table.markdown}\n\n{table.remark}\n"
+        write_bytes(where / "why.md", text.encode())
+    write_page(bench / "report", bench_page(load_so_far(bench)))
+    return f"{spec.title}, {appearance}\n\n{table.text}\n\n{table.remark}\n\nAll rows:   {where / 'causes.csv'}"
+
+
+# Verification ------------------------------------------------------------------------------------------------------
+
+
+def verify(folder: Path) -> list[Verdict]:
+    """Play a bench's runs again: one verdict a run and, where all runs hold, one on the tables of its report.
+
+    Raises:
+        ArtefactError: It is no bench of agents with folders of their own, or its protocol is damaged.
+    """
+    return with_report(folder, verify_runs(folder))
+
+
+def with_report(folder: Path, runs: list[Verdict]) -> list[Verdict]:
+    """The verdicts on the runs of a bench and, where all hold, one on its report."""
+    if any(each.complaint for each in runs) or not (folder / "report").is_dir():
+        return runs
+    return [*runs, Verdict(what="report", complaint=_report_complaint(folder))]
+
+
+def _report_complaint(folder: Path) -> str:
+    """The first line of the report's tables that does not follow from the runs; empty if all do."""
+    page = bench_page(load_so_far(folder))
+    bare = dataclasses.replace(page, sections=[dataclasses.replace(each, images=()) for each in page.sections])
+    for name, text in texts(bare).items():
+        path = folder / "report" / name
+        pattern = re.compile(_CELLS.get(name, "^.*$"), re.MULTILINE)
+        there = pattern.findall(path.read_text()) if path.is_file() else []
+        for has, wanted in zip_longest(there, pattern.findall(text), fillvalue="nothing"):
+            if has != wanted:
+                return f"{name} has {brief(has)} where the runs give {brief(wanted)}."
+    return ""

@@ -1,0 +1,103 @@
+"""Filmstrips show real frames as they are, mark what the rules forbid and where the filter cuts, and clip no words."""
+
+from __future__ import annotations
+
+import dataclasses
+import textwrap
+from pathlib import Path
+
+import numpy as np
+from fake_results import bench_result, compared_rollout
+
+from imagine_bench import registry
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.recording import filmstrips
+from imagine_bench.recording.filmstrips import CELL_PX, LABELS_PX, RIGHT, TITLE_PX, WRONG, changes, sampled_filmstrips
+from imagine_bench.report import bench_page
+from imagine_bench.store.results import ComparedRollout
+
+PICK_PLACE = registry.task("pick_place")
+START, ASKS_RIGHT, IMPOSSIBLE = np.array([[0, 0, 0, 0], [1, 0, 0, 2], [1, 1, 0, 2]])
+
+
+def rollout(*states: np.ndarray) -> ComparedRollout:
+    """Two steps from a start, by the first macro-action."""
+    compared = compared_rollout(np.random.default_rng(0), depth=2)
+    imagined = dataclasses.replace(
+        compared.rollout, macrostates=np.array(states[1:]), actions=np.zeros(2, dtype=np.int64)
+    )
+    return dataclasses.replace(compared, start_macrostate=states[0], rollout=imagined)
+
+
+def colored(sheet: np.ndarray) -> list[bool]:
+    """Whether something is marked as right, and as wrong."""
+    return [bool((sheet == color).all(axis=2).any()) for color in (RIGHT, WRONG)]
+
+
+def test_only_agents_that_sampled_rollouts_show_some(tmp_path: Path) -> None:
+    protocol = Protocol(task="pick_place", preset="quick", agents=("dqn", "imagination_only"), seeds=(0,), budgets=(5,))
+    plain = bench_result(tmp_path, protocol=protocol)
+    one = rollout(START, ASKS_RIGHT, START)
+    for sampled in ((), (one,) * 3):
+        runs = [dataclasses.replace(run, imagined=(one,) * 4, sampled_rollouts=sampled) for run in plain.runs]
+        page = bench_page(dataclasses.replace(plain, runs=tuple(runs)))
+        names = [image.name for section in page.sections for image in section.images]
+        assert [name for name in names if name.startswith("sampled")] == [
+            f"sampled_rollouts_{agent}" for agent in protocol.agents if sampled
+        ]
+        assert "rollout_dqn_3" in names and "rollout_dqn_4" not in names
+
+
+def test_the_values_of_rollouts_are_not_clipped() -> None:
+    """Each value that changes is written in full: where all change, the image gets more lines."""
+    other = np.array([len(values) - 1 for values in PICK_PLACE.macrostate_values])
+    assert len(textwrap.wrap(changes(START, other, PICK_PLACE), width=18)) > 4
+    few = sampled_filmstrips((rollout(START, ASKS_RIGHT, ASKS_RIGHT),), PICK_PLACE)
+    many = sampled_filmstrips((rollout(START, other, START),), PICK_PLACE)
+    assert many.shape[0] > few.shape[0] and many.shape[1] == few.shape[1]
+    ends = [int(np.flatnonzero((sheet != 255).any(axis=(1, 2)))[-1]) for sheet in (few, many)]
+    assert ends[0] + 30 < ends[1] < many.shape[0] - 4, "more lines, and nothing at the edge"
+
+
+def test_a_strip_marks_cut_error_and_end() -> None:
+    names = tuple(f"turn cube {index}" for index in range(6))
+    cut, whole = (filmstrips.filmstrip(compared_rollout(np.random.default_rng(0), cut=cut), names) for cut in (3, None))
+    assert cut.shape == whole.shape
+    assert (cut == filmstrips.CUT).all(axis=2).sum() > 500  # the line
+    assert not (whole == filmstrips.CUT).all(axis=2).any()
+    assert all((whole == color).all(axis=2).sum() > 500 for color in (RIGHT, WRONG)), "borders in both colors"
+    narrow = filmstrips.filmstrip(compared_rollout(np.random.default_rng(0)), names, columns=2)
+    assert narrow.shape[1] < whole.shape[1] and narrow.shape[0] == whole.shape[0]
+
+
+def test_real_frames_are_shown_unaltered_and_upright() -> None:
+    compared = compared_rollout(np.random.default_rng(0), cut=None)
+    strip = filmstrips.filmstrip(compared, tuple("abcdef"))
+    shown = strip[TITLE_PX : TITLE_PX + CELL_PX : 2, LABELS_PX : LABELS_PX + CELL_PX : 2]
+    np.testing.assert_array_equal(shown, compared.start_frame)
+
+
+def test_transitions_are_marked_by_row_gray_ones_too() -> None:
+    images = list(np.random.default_rng(0).integers(0, 255, (2, 32, 32), dtype=np.uint8))
+    sheet = filmstrips.transition_sheet(["one", "two"], [("real", images, None), ("imagined", images, [True, True])])
+    assert colored(sheet) == [True, False]
+    assert colored(filmstrips.transition_sheet(["one", "two"], [("real", images, None)])) == [False, False]
+
+
+def test_changes_are_named_and_judged_by_the_rules() -> None:
+    assert changes(START, ASKS_RIGHT, PICK_PLACE) == "left object picked, gesture right"
+    assert changes(ASKS_RIGHT, ASKS_RIGHT, PICK_PLACE) == "nothing changes"
+    assert filmstrips.is_possible(PICK_PLACE.rules, START, 0, ASKS_RIGHT)
+    assert not filmstrips.is_possible(PICK_PLACE.rules, START, 0, IMPOSSIBLE)
+    assert not filmstrips.is_possible(PICK_PLACE.rules, START, 1, ASKS_RIGHT), "another macro-action leads elsewhere"
+    assert not filmstrips.is_possible(PICK_PLACE.rules, IMPOSSIBLE, 0, ASKS_RIGHT), "nothing follows the impossible"
+
+
+def test_impossible_steps_are_marked_unless_frames_hide_something() -> None:
+    hidden: TaskSpec = dataclasses.replace(PICK_PLACE, sight=registry.task("pick_place:gesture=first").sight)
+    right = rollout(START, ASKS_RIGHT, IMPOSSIBLE)  # right at first, then a step that is impossible
+    wrong = rollout(START, IMPOSSIBLE, ASKS_RIGHT)
+    assert colored(sampled_filmstrips((right,), PICK_PLACE)) == [True, True]
+    assert colored(sampled_filmstrips((wrong,), PICK_PLACE)) == [False, True]
+    assert colored(sampled_filmstrips((right, wrong), hidden)) == [False, False]
