@@ -215,7 +215,7 @@ def test_agents_that_do_not_learn_are_not_compared(tmp_path: Path) -> None:
 
 def test_missing_and_doubled_runs_are_refused(result: BenchResult) -> None:
     for runs in (result.runs[:-1], (*result.runs, result.runs[0])):
-        with pytest.raises(ArtefactError, match="should hold the runs .* and holds .*'imagination_uncertainty', 1"):
+        with pytest.raises(ArtefactError, match=r"should hold the runs .* and holds .*'imagination_uncertainty', 1"):
             dataclasses.replace(result, runs=runs)
 
 
