@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
-import itertools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -14,17 +13,14 @@ from numpy.typing import NDArray
 
 from imagine_bench.arrays import Info, Observed
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
-from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, State, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, Floats, Frame, Outcome, PhysicsSettings, State, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.values import Json
 
-from .frames import frames_of
 from .motion.executor import MacroResult
 from .observations import Observer
-from .parameters.gesture import hides
-from .parameters.lag import Lag
-from .rendering.cameras import FRAME_PX, agent_camera, human_camera_view
-from .rendering.renderer import Renderer, image_size
+from .parameters.observation import delivered, hides
+from .rendering.cameras import FRAME_PX, human_camera_view
 from .rendering.window import HAS_PYGAME, Window
 from .scene_reader import FilmedScene
 from .scenes.appearance import Appearance
@@ -43,10 +39,10 @@ class EnvState:
     kind: tuple[str, str, str, PhysicsSettings]  #: task, execution, appearance and physics: where it may be set
     world: WorldState
     generator: Mapping[str, Json]  #: state of the generator that everything random is drawn from
-    macrostate: tuple[int, ...]
+    macrostate: State
     begun: bool
     latest: MacroResult | None = field(repr=False)
-    people: tuple[NDArray[np.float64], NDArray[np.float64]] = field(repr=False)
+    people: tuple[Floats, Floats] = field(repr=False)
     steps: int = 0
     #: what lag keeps back: observations, and what they show
     under_way: tuple[tuple[Observed, ...], tuple[State, ...]] = field(default=((), ()), repr=False)
@@ -127,32 +123,31 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
     ) -> None:
         modes = ("rgb_array", "human")
         self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
-        self._execution = require_known("execution", execution, EXECUTIONS)
+        self.execution = require_known("execution", execution, EXECUTIONS)
         self._id = spec.id
         self._rules = spec.rules
         self.preprocessing = spec.preprocessing
         self._starts = spec.rules.start_states
         self.horizon = spec.horizon
         self._sight = spec.sight
+        self._lag = spec.sight.lag if spec.sight else 0
         self._steps = 0
-        lag = spec.sight.lag if spec.sight else 0
-        self._lag = Lag[Observed](lag)
-        self._shown_lag = Lag[State](lag)
-        self._known = frozenset(states_of(spec.rules))
+        self._observations: tuple[Observed, ...] = ()
+        self._known = {state: state for state in states_of(spec.rules)}
         settings = PhysicsSettings.of(physics)
         level = appearance_level(appearance)
         self._window = Window(spec.title) if self.render_mode == "human" else None
         FilmedScene.__init__(self, make_world(level), motion_hz or (_WINDOW_HZ if self._window else 0.0))
         self.world.set_physics(settings)
-        self._make_world = make_world
-        self._begun = False
-        self._kind = (spec.id, self._execution, level.name, settings)
+        self.begun = False
+        self._kind = (spec.id, self.execution, level.name, settings)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
-        self._all_actions = np.ones(spec.n_actions, dtype=np.bool_)
-        self._observer = Observer(observation, size, self.world, spec.macrostate_values, self._observing_camera)
+        self._n_actions = spec.n_actions
+        self._observer = Observer(observation, size, self.world, spec.macrostate_values, self.camera)
         self.observation_space = self._observer.space
-        self._render_camera = Renderer(self.world.model, human_camera_view(camera, *image_size(width, height)))
-        self._macrostate = self._shown = self._starts[0]
+        self._rendered = self.camera(human_camera_view(camera, width, height))
+        self._macrostate = self._starts[0]
+        self._observed: tuple[State, ...] = ()
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
@@ -175,11 +170,11 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         """As :meth:`reset`, without an observation."""
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
-        self._begun = True
+        self.begun = True
         self._latest = None
         self._steps = 0
-        self._lag.kept = ()
-        self._shown_lag.kept = ()
+        self._observations = ()
+        self._observed = ()
         self.world.place(start, self.np_random)
         self._vary()
         reading = self.world.read()
@@ -203,27 +198,28 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         Returns:
             Reward, whether the episode has terminated, and info.
         """
-        if not self._begun:
+        if not self.begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
         chosen = self.checked(action)
         self._steps += 1
-        self._begun = False  # until the scene is a macrostate again: a simulation that blows up ends the episode
+        self.begun = False  # until the scene is a macrostate again: a simulation that blows up ends the episode
         start = self._macrostate
         outcome = intended = self._intended(start, chosen)
         self.world.sensing.draw(self.np_random)
         if self._sight is not None:
-            self.world.aim(self.np_random)
+            self.world.draw_placement_noise(self.np_random)
         fault = None
-        if self._execution == "physics":
+        if self.execution == "physics":
             self._people = self._mocap()
-            self._latest = self.world.execute(chosen, intended.macrostate, self.capture_motion_hz)
+            self.world.executor.capture_motion_hz = self.capture_motion_hz
+            self._latest = self.world.execute(chosen, intended.macrostate)
             fault = self._latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
-        self._vary(move_objects=self._execution == "kinematic")
+        self._vary(move_objects=self.execution == "kinematic")
         reading = self.world.read()
         self._reach(reading.macrostate)
-        self._begun = True
+        self.begun = True
         fault = fault or reading.problem
         if reading.macrostate != intended.macrostate:
             outcome = self._rules.judge(start, chosen, reading.macrostate)
@@ -231,20 +227,14 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         info = self._info(success=outcome.success, legal=outcome.success or not outcome.terminated, fault=fault)
         return float(outcome.reward), outcome.terminated, info
 
-    @property
-    def execution(self) -> str:
-        """``"physics"`` or ``"kinematic"``."""
-        return self._execution
-
-    @property
-    def begun(self) -> bool:
-        """Whether there is an episode to go on with."""
-        return self._begun
-
     def observe(self, envs: Sequence[MacroEnv]) -> list[Observed]:
         """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
-        now = self._observer.observe([(env._observer, env.world.shown(env._macrostate)) for env in envs])
-        return [env._lag.deliver(observation) for env, observation in zip(envs, now, strict=True)]
+        now = self._observer.observe([(env._observer, env.world.observed(env._macrostate)) for env in envs])
+        due = []
+        for env, observation in zip(envs, now, strict=True):
+            env._observations = delivered(env._observations, observation, env._lag)
+            due.append(copy.deepcopy(env._observations[0]) if env._lag else observation)
+        return due
 
     def diverged(self, error: DivergedError) -> Info:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
@@ -257,18 +247,18 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
 
     def rendered(self, envs: Sequence[MacroEnv]) -> list[Frame]:
         """What :meth:`render` returns of environments like this, drawn by its camera."""
-        return self._render_camera.frames([(env.model, env.data) for env in envs])
+        return self._rendered.frames([(env.model, env.data) for env in envs])
 
     def close(self) -> None:
         """Free the OpenGL contexts and close the window; may be called again."""
-        renderers = self._agent_camera, self._render_camera, self._human_camera
-        for each in (self._window, self._observer, *renderers):
-            if each is not None:
-                each.close()
+        for camera in self._cameras.values():
+            camera.close()
+        if self._window is not None:
+            self._window.close()
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
-        return self._all_actions.copy()
+        return np.ones(self._n_actions, dtype=np.bool_)
 
     def get_state(self) -> EnvState:
         """All that decides how the episode goes on, copied; of a wrapper, such as a time limit, it knows nothing."""
@@ -277,11 +267,11 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             world=self.world.get_state(),
             generator=copy.deepcopy(self.np_random.bit_generator.state),
             macrostate=self._macrostate,
-            begun=self._begun,
+            begun=self.begun,
             latest=self._latest,
             people=self._people,
             steps=self._steps,
-            under_way=(self._lag.kept, self._shown_lag.kept),
+            under_way=(self._observations, self._observed),
         )
 
     def set_state(self, state: EnvState) -> None:
@@ -297,23 +287,11 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
         self._macrostate = state.macrostate
-        self._begun = state.begun
+        self.begun = state.begun
         self._latest = state.latest
         self._people = state.people
         self._steps = state.steps
-        self._lag.kept, self._shown_lag.kept = state.under_way
-
-    def frame_of(self, macrostate: Sequence[int], rng: np.random.Generator | None = None) -> Frame:
-        """The frame (64, 64, 3) that a macrostate would show, without going there: nothing changes here.
-
-        ``rng`` draws how it lies and is lit, as the appearance says; without one every call draws the same.
-
-        Raises:
-            InvalidValueError: Not a macrostate of this task.
-        """
-        there = np.array([self._start({"macrostate": macrostate})], dtype=np.int64)
-        rng = np.random.default_rng(0) if rng is None else rng
-        return frames_of(self._make_world, self._rules, there, self._kind[2], rng)[0]
+        self._observations, self._observed = state.under_way
 
     # --- details -------------------------------------------------------------------------------------------------
 
@@ -322,14 +300,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         if self._window is None:
             return
         for _ in self.replay():
-            self._window.show(self._render_camera.frame(self.world.data), self._capture_motion_hz or _WINDOW_HZ)
-        self._window.show(self._render_camera.frame(self.world.data), _WINDOW_HZ)
-
-    def _observing_camera(self, part: str, size: int) -> Renderer:
-        """The camera of an image that is observed; the agent's own where that is the same."""
-        if part == "human":
-            return Renderer(self.world.model, human_camera_view(HUMAN_CAMERA, size, size))
-        return self._agent_camera if size == FRAME_PX else agent_camera(self.world.model, size)
+            self._window.show(self._rendered.frame(self.data), self.capture_motion_hz or _WINDOW_HZ)
+        self._window.show(self._rendered.frame(self.data), _WINDOW_HZ)
 
     def _vary(self, *, move_objects: bool = True) -> None:
         """Draw how this moment looks, and where that is hidden by chance, whether the gesture is seen."""
@@ -337,12 +309,12 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             self.world.hide_gesture(hides(self._sight, self.world.read().macrostate, self._steps, self.np_random))
         self.world.vary(self.np_random, move_objects=move_objects)
 
-    def _reach(self, macrostate: tuple[int, ...]) -> None:
+    def _reach(self, macrostate: State) -> None:
         """Be in a macrostate, once a moment, of which the frame that is due may show less, or another."""
         self._macrostate = macrostate
-        self._shown = self._shown_lag.deliver(self.world.shown(macrostate))
+        self._observed = delivered(self._observed, self.world.observed(macrostate), self._lag)
 
-    def _start(self, options: Info) -> tuple[int, ...]:
+    def _start(self, options: Info) -> State:
         if not isinstance(options, Mapping):
             raise InvalidValueError(
                 f"Reset options {brief(options)} are no mapping; give {{'macrostate': ...}} or nothing."
@@ -352,38 +324,27 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         if "macrostate" not in options:
             return self._starts[int(self.np_random.integers(len(self._starts)))]
         given = options["macrostate"]
-        try:
-            values = list(itertools.islice(given, len(self._starts[0]) + 1))  # what never ends is none
-            start = tuple(int(value) for value in values)
-            known = start in self._known and all(bool(a == b) for a, b in zip(start, values, strict=True))
-        except Exception:  # what is no number can fail in any way
-            known = False
-        if not known:
-            raise InvalidValueError(f"No macrostate {brief(given)}; give {self._allowed()}, such as {self._starts[0]}.")
+        start: State | None = None
+        with contextlib.suppress(Exception):  # what holds no numbers can fail in any way
+            start = self._known.get(tuple(np.asarray(given)))
+        if start is None:
+            listed = f"one of the {len(self._known)} of imagine_bench.registry.task({self._id!r}).rules.states"
+            raise InvalidValueError(f"No macrostate {brief(given)}; give {listed}, such as {self._starts[0]}.")
         return start
-
-    def _allowed(self) -> str:
-        top = tuple(max(state[index] for state in self._known) for index in range(len(self._starts[0])))
-        if len(self._known) == math.prod(value + 1 for value in top):
-            return f"{len(top)} integers from 0 to at most {top}"
-        return f"one of the {len(self._known)} of imagine_bench.registry.task({self._id!r}).rules.states"
 
     def checked(self, action: np.int64 | int) -> int:
         """A macro-action as a number. Raises InvalidValueError: no such action."""
-        n_actions = len(self._all_actions)
-        if isinstance(action, (int, np.integer)) and 0 <= action < n_actions:
+        if isinstance(action, (int, np.integer)) and 0 <= action < self._n_actions:
             return int(action)
-        try:
-            chosen = int(action) if np.ndim(action) == 0 and int(action) == action else -1
-        except Exception:  # as of a macrostate
-            chosen = -1
-        if not 0 <= chosen < n_actions:
-            raise InvalidValueError(
-                f"Action {brief(action)} does not exist; give an integer from 0 to {n_actions - 1}."
-            )
-        return chosen
+        with contextlib.suppress(Exception):  # as of a macrostate
+            chosen = np.asarray(action).item()
+            if chosen in range(self._n_actions):
+                return int(chosen)
+        raise InvalidValueError(
+            f"Action {brief(action)} does not exist; give an integer from 0 to {self._n_actions - 1}."
+        )
 
-    def _intended(self, start: tuple[int, ...], action: int) -> Outcome:
+    def _intended(self, start: State, action: int) -> Outcome:
         """The rules' outcome, drawn where they leave a choice."""
         outcomes = self._rules.outcomes(start, action)
         if len(outcomes) == 1:
@@ -395,7 +356,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         latest = self._latest
         return {
             "macrostate": np.array(self._macrostate, dtype=np.int64),
-            "shown": np.array(self._shown, dtype=np.int64),
+            "shown": np.array(self._observed[0], dtype=np.int64),
             "is_success": np.bool_(success),
             "success": np.bool_(success),
             "legal": np.bool_(legal),

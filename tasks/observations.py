@@ -1,8 +1,13 @@
-"""What an environment shows of one moment: the agent's frame, the human's view, the macrostate, the arm's own sense."""
+"""What an environment shows of one moment: the agent's frame, the human's view, the macrostate, the arm's own sense.
+
+Frames of macrostates that nobody acted for come from one scene and one renderer a thread, world and appearance level.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,18 +17,22 @@ from numpy.typing import NDArray
 
 from imagine_bench.arrays import Observed
 from imagine_bench.errors import InvalidValueError, brief, require_known
-from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Frame
+from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Frame, Rules, State
+from imagine_bench.rules import require_macrostates, states_of
 
-from .rendering.renderer import Renderer
-from .scene_reader import arm_columns, tcp_in_world
-from .scenes.arm import TCP_SITE
+from .parameters.observation import HIDDEN
+from .rendering.cameras import FRAME_PX, agent_camera_view, human_camera_view
+from .rendering.renderer import Renderer, View
+from .scenes.appearance import Appearance
+from .scenes.appearance import appearance as appearance_level
+from .scenes.arm import TCP_SITE, arm_columns, tcp_in_world
+from .scenes.constants import HUMAN_CAMERA
 from .world import World
 
 Part = NDArray[np.uint8] | NDArray[np.float32]
 """An image, or a vector."""
 _Space = gymnasium.Space[Any]  # of one part, or of several
-_Camera = Callable[[str, int], Renderer]
-_Moment = tuple["Observer", tuple[int, ...]]
+_Moment = tuple["Observer", State]
 _LOW = np.array([*[-2 * math.pi] * 7, -0.1, -0.1, *[-2.0] * 3, *[-1.0] * 4], dtype=np.float32)
 """Of ``proprio``: joints (rad), fingers (m), and the tool's position (m) and quaternion. The arm reaches 1.3 m."""
 
@@ -41,16 +50,19 @@ class Observer:
         size: Edge of images in pixels.
         world: What is observed.
         values: Names of the values of each coordinate of a macrostate.
-        camera: The renderer of an image, by its name and size.
+        camera: The renderer of a view.
 
     Raises:
         UnknownNameError: Another part.
         InvalidValueError: A part twice, or another size.
     """
 
-    def __init__(self, choice: str, size: int, world: World, values: Sequence[Sequence[str]], camera: _Camera) -> None:
+    def __init__(
+        self, choice: str, size: int, world: World, values: Sequence[Sequence[str]], camera: Callable[[View], Renderer]
+    ) -> None:
         names = choice.split(",") if isinstance(choice, str) else [choice]
-        self._names = tuple(require_known("observation", name, OBSERVATIONS) for name in names)
+        for name in names:
+            require_known("observation", name, OBSERVATIONS)
         if len(set(names)) < len(names):
             raise InvalidValueError(
                 f"Observation {choice!r} names a part twice; give each of {', '.join(OBSERVATIONS)} once."
@@ -59,43 +71,38 @@ class Observer:
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not low <= size <= high:
             raise InvalidValueError(f"Observation size {brief(size)} must be an integer from {low} to {high} pixels.")
         self._world = world
-        self._arm_qpos, _, _ = arm_columns(world.model)
+        self._arm_qpos = arm_columns(world.model).qpos
         self._tcp = world.model.site(TCP_SITE).id
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
-        self._cameras: dict[str, Renderer] = {}
-        for name in ("frame", "human"):
-            if name in names:
-                self._cameras[name] = camera(name, int(size))
+        views = {"frame": agent_camera_view(int(size)), "human": human_camera_view(HUMAN_CAMERA, size, size)}
+        self._cameras = {name: camera(view) for name, view in views.items() if name in names}
         image = gymnasium.spaces.Box(0, 255, (int(size), int(size), 3), np.uint8)
         one_hot = gymnasium.spaces.Box(0.0, 1.0, (int(self._offsets[-1]),), np.float32)
         arm = gymnasium.spaces.Box(_LOW, -_LOW)
         spaces: dict[str, _Space] = {"frame": image, "human": image, "state": one_hot, "proprio": arm}
-        chosen = {name: spaces[name] for name in self._names}
-        self.space: _Space = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[self._names[0]]
+        chosen = {name: spaces[name] for name in names}
+        self.space: _Space = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[names[0]]
+        self._names = tuple(names)
 
     def observe(self, moments: Sequence[_Moment]) -> Sequence[Observed]:
         """Worlds as they stand, each read as a macrostate, by observers like this one and drawn with its cameras."""
         scenes = [(observer._world.model, observer._world.data) for observer, _ in moments]
-        images = {name: camera.frames(scenes) for name, camera in self._cameras.items()}
-        columns = {name: self._column(name, moments, images.get(name)) for name in self._names}
+        columns: dict[str, Sequence[Part]] = {}
+        for name in self._names:
+            if name == "state":
+                columns[name] = [self._one_hot(macrostate) for _, macrostate in moments]
+            elif name == "proprio":
+                columns[name] = [observer._proprio() for observer, _ in moments]
+            else:
+                images = self._cameras[name].frames(scenes)
+                worlds = [observer._world for observer, _ in moments]
+                seen = [world.composite(image) for world, image in zip(worlds, images, strict=True)]
+                columns[name] = seen if name == "frame" else images
         if len(columns) == 1:
             return columns[self._names[0]]
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
-    def close(self) -> None:
-        """Free the OpenGL contexts; may be called again."""
-        for camera in self._cameras.values():
-            camera.close()
-
-    def _column(self, name: str, moments: Sequence[_Moment], images: list[Frame] | None) -> Sequence[Part]:
-        """One part of each moment."""
-        if images is None:
-            return [each._one_hot(state) if name == "state" else each._proprio() for each, state in moments]
-        if name == "human":
-            return images
-        return [each._world.develop(image) for (each, _), image in zip(moments, images, strict=True)]
-
-    def _one_hot(self, macrostate: tuple[int, ...]) -> NDArray[np.float32]:
+    def _one_hot(self, macrostate: State) -> NDArray[np.float32]:
         one_hot = np.zeros(self._offsets[-1], dtype=np.float32)
         one_hot[[first + value for first, value in zip(self._offsets, macrostate, strict=False) if value >= 0]] = 1.0
         return one_hot
@@ -103,3 +110,39 @@ class Observer:
     def _proprio(self) -> NDArray[np.float32]:
         data = self._world.data
         return np.concatenate([data.qpos[self._arm_qpos], tcp_in_world(data, self._tcp)], dtype=np.float32)
+
+
+MakeWorld = Callable[[Appearance], World]
+
+
+@functools.lru_cache(maxsize=8)
+def _frame_renderer(make_world: MakeWorld, level: Appearance, thread: int) -> tuple[World, Renderer]:
+    world = make_world(level)
+    return world, Renderer(world.model, agent_camera_view())
+
+
+def frames_of(
+    make_world: MakeWorld, rules: Rules, macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator
+) -> Frame:
+    """Frames (N, 64, 64, 3), uint8, of macrostates (N, M) in the kinematic mode, each placed and varied anew.
+
+    A gesture of -1 is hidden.
+
+    Raises:
+        UnknownNameError: No such appearance.
+        InvalidValueError: Macrostates of another shape or type, or none of the rules'.
+    """
+    macrostates = np.asarray(macrostates)
+    hidden = macrostates[..., -1] == HIDDEN
+    if hidden.any():  # the hand is somewhere
+        like = {state[:-1]: state for state in states_of(rules)}
+        macrostates = np.array([like.get(tuple(row[:-1]), row) if row[-1] == HIDDEN else row for row in macrostates])
+    macrostates = require_macrostates(rules, macrostates)
+    world, camera = _frame_renderer(make_world, appearance_level(appearance), threading.get_ident())
+    frames = np.empty((len(macrostates), FRAME_PX, FRAME_PX, 3), dtype=np.uint8)
+    for row, macrostate in enumerate(macrostates.tolist()):
+        world.place(tuple(macrostate), rng)
+        world.hide_gesture(bool(hidden[row]))
+        world.vary(rng)
+        frames[row] = world.composite(camera.frame(world.data))
+    return frames

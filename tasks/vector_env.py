@@ -10,8 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
@@ -22,16 +21,15 @@ from numpy.typing import NDArray
 
 from imagine_bench.arrays import Info, Observed
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
-from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces import Floats, Frame
 
 from .macro_env import MacroEnv
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
-Batch = tuple[Observed, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]
+Batch = tuple[Observed, Floats, NDArray[np.bool_], NDArray[np.bool_], Info]
 
 
-@dataclass(frozen=True)
-class _Step:
+class _Step(NamedTuple):
     """What became of a lane's macro-action."""
 
     reward: float
@@ -40,8 +38,7 @@ class _Step:
     diverged: bool = False
 
 
-@dataclass(frozen=True)
-class _Acting:
+class _Acting(NamedTuple):
     """A lane in the middle of a macro-action, or of the reset that takes its place."""
 
     begun_s: float  #: when it began, on the clock that all lanes share
@@ -49,9 +46,7 @@ class _Acting:
 
     def due_s(self) -> float:
         """When it ends on that clock; waits until it has been simulated."""
-        if self.step is None:
-            return self.begun_s
-        return self.begun_s + float(self.step.result().info["sim_time_s"])
+        return self.begun_s if self.step is None else self.begun_s + float(self.step.result().info["sim_time_s"])
 
 
 def _act(env: MacroEnv, action: int) -> _Step:
@@ -92,9 +87,8 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         name = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         self.autoreset_mode = _MODES[require_known("autoreset mode", name, _MODES)]
         threads = _cores() if threads is None else threads
-        for what, value in (("num_envs", len(lanes)), ("threads", threads)):
-            if not isinstance(value, int) or value < 1:
-                raise InvalidValueError(f"{what} is {brief(value)}; give an integer from 1 on.")
+        _require_count("num_envs", len(lanes))
+        _require_count("threads", threads)
         self.envs = tuple(lanes)
         self.num_envs = len(lanes)
         self._horizon = max_episode_steps
@@ -135,8 +129,8 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
             acting = self._acting.pop(lane, None)
             if acting is not None and acting.step is not None:
                 acting.step.result()  # its data is in use until then
-        infos = self._restart(chosen, seeds, options)
-        return self._stacked(range(self.num_envs)), _columns(infos, self.num_envs)
+        infos = self._restart(chosen, seeds, options, {})
+        return self._stacked(range(self.num_envs)), infos
 
     def step(self, actions: NDArray[np.int64]) -> Batch:
         """One macro-action in every lane.
@@ -199,7 +193,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
             raise InvalidValueError(f"{brief(n)} lanes cannot be received: {len(self._acting)} are acting.")
         due_s = {lane: acting.due_s() for lane, acting in self._acting.items()}
         first = sorted(due_s, key=due_s.__getitem__)[:n]
-        self._clock_s = max(due_s[lane] for lane in first)
+        self._clock_s = due_s[first[-1]]
         batch = self._received(first)
         infos = _rows(batch[-1], first)
         infos["env_id"] = np.array(first)
@@ -208,54 +202,47 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
     # --- details -------------------------------------------------------------------------------------------------
 
     def _received(self, lanes: list[int]) -> Batch:
-        """Observeds, rewards and ends of these lanes in this order; infos of all, masked."""
+        """Observations, rewards and ends of these lanes in this order; infos of all, masked."""
         rewards = np.zeros(len(lanes))
         terminated = np.zeros(len(lanes), dtype=np.bool_)
         truncated = np.zeros(len(lanes), dtype=np.bool_)
-        infos: dict[int, Info] = {}
+        acted: dict[int, Info] = {}
         for row, lane in enumerate(lanes):
-            acting = self._acting.pop(lane)
-            if acting.step is not None:
-                step = acting.step.result()
+            pending = self._acting.pop(lane).step
+            if pending is not None:
+                rewards[row], terminated[row], acted[lane], diverged = pending.result()
                 self._elapsed[lane] += 1
-                rewards[row] = step.reward
-                terminated[row] = step.terminated
-                out_of_time = self._horizon is not None and self._elapsed[lane] >= self._horizon
-                truncated[row] = step.diverged or out_of_time
-                infos[lane] = step.info
+                truncated[row] = diverged or (self._horizon is not None and self._elapsed[lane] >= self._horizon)
         self._over[lanes] = terminated | truncated
-        acted = [lane for lane in infos if self.envs[lane].begun]  # not those that diverged
-        collected: Info = {}
-        again = [lane for lane in lanes if lane not in infos]
+        self._look([lane for lane in acted if self.envs[lane].begun])  # not those that diverged
+        infos = Info()
+        again = [lane for lane in lanes if lane not in acted]
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             again = [lane for lane in lanes if self._over[lane]]
-            self._look([lane for lane in acted if lane in again])
-            final = {lane: {"final_obs": self._seen[lane], "final_info": infos[lane]} for lane in again}
-            collected = _columns(final, self.num_envs)
-        acted = [lane for lane in acted if lane not in again]
-        infos.update(self._restart(again, [None] * self.num_envs, {}, also=acted))
-        collected.update(_columns(infos, self.num_envs))
-        return self._stacked(lanes), rewards, terminated, truncated, collected
+            for lane in again:
+                final = {"final_obs": self._seen[lane], "final_info": acted.pop(lane)}
+                infos = self._add_info(infos, final, lane)
+        for lane, info in acted.items():
+            infos = self._add_info(infos, info, lane)
+        infos = self._restart(again, [None] * self.num_envs, {}, infos)
+        return self._stacked(lanes), rewards, terminated, truncated, infos
 
     def _begin(self, env: MacroEnv, action: int) -> Future[_Step]:
         """Begin a macro-action on another thread; a kinematic one is done here and now."""
         if self._simulates:
-            env.world.prepare()  # compiles, which only one thread may do at a time
+            env.world.executor.capture_motion_hz = env.capture_motion_hz  # made here: one thread at a time may compile
             return self._threads.submit(_act, env, action)
         done = Future[_Step]()
         done.set_result(_act(env, action))
         return done
 
-    def _restart(
-        self, lanes: Sequence[int], seeds: Sequence[int | None], options: Info, also: Sequence[int] = ()
-    ) -> dict[int, Info]:
-        """Their infos; they and the lanes ``also`` are observed together, so that both processes draw until the end."""
-        infos = {}
+    def _restart(self, lanes: list[int], seeds: Sequence[int | None], options: Info, infos: Info) -> Info:
+        """Begin an episode in each of these lanes, and observe it; their infos beside the given ones."""
         for lane in lanes:
-            infos[lane] = self.envs[lane].restart(seed=seeds[lane], options=options)
-        self._elapsed[list(lanes)] = 0
-        self._over[list(lanes)] = False
-        self._look([*also, *lanes])
+            infos = self._add_info(infos, self.envs[lane].restart(seed=seeds[lane], options=options), lane)
+        self._elapsed[lanes] = 0
+        self._over[lanes] = False
+        self._look(lanes)
         return infos
 
     def _look(self, lanes: Sequence[int]) -> None:
@@ -300,30 +287,14 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         return list(seed)
 
 
-def _columns(infos: dict[int, Info], n: int) -> Info:
-    """Infos of some lanes, alike, as arrays over all ``n`` with masks: as Gymnasium's ``_add_info``."""
-    lanes = np.array(list(infos), dtype=np.int64)
-    columns = Info()
-    mask = np.zeros(n, dtype=np.bool_)
-    mask[lanes] = True
-    for key, example in next(iter(infos.values()), {}).items():
-        values = [info[key] for info in infos.values()]
-        if isinstance(example, dict):
-            columns[key] = _columns(dict(zip(infos, values, strict=True)), n)
-        elif isinstance(example, (np.ndarray, np.number)) and key != "final_obs":
-            columns[key] = np.zeros((n, *example.shape), dtype=example.dtype)
-            columns[key][lanes] = values
-        else:
-            columns[key] = column = np.full(n, None, dtype=object)
-            for lane, value in zip(infos, values, strict=True):
-                column[lane] = value
-        columns[f"_{key}"] = mask.copy()
-    return columns
-
-
 def _rows(infos: Info, lanes: list[int]) -> Info:
     """Those lanes of arrays over all lanes."""
     return {key: _rows(value, lanes) if isinstance(value, dict) else value[lanes] for key, value in infos.items()}
+
+
+def _require_count(name: str, value: object) -> None:
+    if not isinstance(value, (int, np.integer)) or value < 1:
+        raise InvalidValueError(f"{name} is {brief(value)}; give an integer from 1 on.")
 
 
 def _cores() -> int:
@@ -353,8 +324,7 @@ def make(
     Raises:
         InvalidValueError: A number out of range, or a constructor of something else.
     """
-    if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
-        raise InvalidValueError(f"num_envs is {brief(num_envs)}; give an integer from 1 on.")
+    _require_count("num_envs", num_envs)
     creator = load_env_creator(env)
     lanes: list[Any] = [creator(**options) for _ in range(int(num_envs))]
     if isinstance(lanes[0], TimeLimit):  # one that limits itself

@@ -9,19 +9,18 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame, PhysicsSettings
+from imagine_bench.interfaces import Floats, Frame, PhysicsSettings, State
 
 from .motion import orientation
 from .motion.executor import MacroExecutor, MacroResult, at_rest
-from .motion.sensing import Sensing
+from .motion.orientation import Sensing
 from .parameters.distractors import Distraction
-from .parameters.gesture import HIDDEN
+from .parameters.observation import HIDDEN
 from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA
-from .scenes.fragments import Photographer, Shot
+from .scenes.fragments import Composite, draw_composite
 
 MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)
@@ -33,7 +32,7 @@ MAX_OTHER_SHIFT_M = 0.005
 class Reading:
     """What a world shows."""
 
-    macrostate: tuple[int, ...]  #: the nearest macrostate
+    macrostate: State  #: the nearest macrostate
     problem: str | None  #: what keeps the scene from being a proper macrostate, in words, or None
 
 
@@ -44,9 +43,9 @@ _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 class WorldState:
     """A scene's dynamic state, MuJoCo's with what starts its solvers, its looks, and the planner's latest error."""
 
-    physics: NDArray[np.float64]
-    looks: tuple[NDArray[np.float64], ...]
-    shot: Shot | None  #: where frames are photographs, the latest
+    physics: Floats
+    looks: tuple[Floats, ...]
+    composite: Composite | None  #: where frames are patched, of what the latest is
     sensing: Sensing
 
 
@@ -80,14 +79,14 @@ class World(abc.ABC):
         self._names = tuple(objects.values())
         self._varies = level.varies_every_frame
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
-        self._photographer = None if level.pool is None else Photographer(level)
+        self._composite: Composite | None = None
         self._distraction = Distraction(model, distractors) if distractors else None
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
         self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
         self._people = [model.material(name).id for name in ("skin", "cloth")]
-        self._aims = [[0.0, 0.0, 0.0] for _ in starts]
+        self._placement_noise = [[0.0, 0.0, 0.0] for _ in starts]
         self._read_at: tuple[bytes, bytes] | None = None
-        self._latest_objects: tuple[tuple[int, ...], str | None] = ((), None)
+        self._latest_objects: tuple[State, str | None] = ((), None)
         self._rest_qpos, self._rest_ctrl = at_rest(model)
         self.data.qpos[:] = self._rest_qpos
         self.update()
@@ -97,9 +96,8 @@ class World(abc.ABC):
         self.sensing.settings = settings
         model = self.model
         built = PhysicsSettings()
-        if settings.pad_friction != built.pad_friction:
-            tips = [index for index in range(model.ngeom) if TIP_IN_NAME in model.geom(index).name]
-            model.geom_friction[tips, :2] *= settings.pad_friction / built.pad_friction
+        tips = [index for index in range(model.ngeom) if TIP_IN_NAME in model.geom(index).name]
+        model.geom_friction[tips, :2] *= settings.pad_friction / built.pad_friction
         for name in FINGER_JOINTS:
             force_range = (-settings.finger_force_n, settings.finger_force_n)
             model.actuator_forcerange[model.actuator(name.replace("_slide", "_servo")).id] = force_range
@@ -113,21 +111,19 @@ class World(abc.ABC):
         physics = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, physics, _STATE)
         looks = tuple(np.array(each) for each in looks_of(self.model))
-        shot = None if self._photographer is None else self._photographer.shot
-        return WorldState(physics=physics, looks=looks, shot=shot, sensing=replace(self.sensing))
+        return WorldState(physics=physics, looks=looks, composite=self._composite, sensing=replace(self.sensing))
 
     def set_state(self, state: WorldState) -> None:
         """Put the scene as it was, to the bit."""
         mujoco.mj_setState(self.model, self.data, state.physics, _STATE)
         for mine, then in zip(looks_of(self.model), state.looks, strict=True):
             mine[:] = then
-        if self._photographer is not None and state.shot is not None:
-            self._photographer.shot = state.shot
-        for name in ("aside_m", "turned_rad"):
-            setattr(self.sensing, name, getattr(state.sensing, name))
+        self._composite = state.composite
+        self.sensing.aside_m = state.sensing.aside_m
+        self.sensing.turned_rad = state.sensing.turned_rad
         self.update()
 
-    def place(self, macrostate: tuple[int, ...], rng: np.random.Generator) -> None:
+    def place(self, macrostate: State, rng: np.random.Generator) -> None:
         """Start anew, every object a little off its place as the appearance says; nothing from before remains."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = self._rest_qpos
@@ -140,18 +136,18 @@ class World(abc.ABC):
             self._distraction.place(self.data, rng)
         self.update()
 
-    def aim(self, rng: np.random.Generator) -> None:
+    def draw_placement_noise(self, rng: np.random.Generator) -> None:
         """Draw where the next macro-action puts objects down: as far off their places as at a start.
 
         Then no frame tells what was moved before. Without it, objects come down exactly on their places.
         """
-        self._aims = rng.uniform(-1.0, 1.0, (len(self._aims), 3)).tolist()
+        self._placement_noise = rng.uniform(-1.0, 1.0, (len(self._placement_noise), 3)).tolist()
 
     def hide_gesture(self, hidden: bool) -> None:
         """Let no camera see people's hands and arms, or let all; where they are stays as it is."""
         self.model.mat_rgba[self._people, 3] = 0.0 if hidden else 1.0
 
-    def shown(self, macrostate: tuple[int, ...]) -> tuple[int, ...]:
+    def observed(self, macrostate: State) -> State:
         """What cameras see of a macrostate: its gesture is -1 where it is hidden."""
         return (*macrostate[:-1], HIDDEN) if self.model.mat_rgba[self._people[0], 3] == 0.0 else macrostate
 
@@ -161,39 +157,42 @@ class World(abc.ABC):
         Where frames are patched of fragments, a fragment's pose holds too unless objects must not move: what lies
         where physics left it lies there.
         """
-        if self._photographer is not None:
-            self._patch(self._photographer, rng, move_objects=move_objects)
+        if self._level.pool is not None:
+            self._patch(rng, move_objects=move_objects)
         elif self._varies:
             self._appearance.vary(rng)
-            *wobble, turn = rng.uniform(-1.0, 1.0, 4).tolist()
-            if self._hands_vary():
-                offset_m = [self._level.hand_offset_m * each for each in wobble]
-                self._gesture(self._read_gesture(), offset_m, self._level.hand_yaw_rad * turn)
+            self._vary_hands(self._read_gesture(), rng.uniform(-1.0, 1.0, 4).tolist())
         elif self._distraction is None:
             return
         if self._distraction is not None:
             self._distraction.vary(self.data, rng)
         self.update()
 
-    def _patch(self, photographer: Photographer, rng: np.random.Generator, *, move_objects: bool) -> None:
+    def _patch(self, rng: np.random.Generator, *, move_objects: bool) -> None:
         objects, _ = self._objects()
         gesture = self._read_gesture()
-        shot = photographer.draw(objects, self.shown((*objects, gesture))[-1], rng)  # light would tell what is hidden
-        for index, (value, fragment) in enumerate(zip(objects, shot.objects, strict=True)):
+        hidden = self.observed((*objects, gesture))[-1]  # light would tell what is hidden
+        self._composite = draw_composite(self._level, objects, hidden, rng)
+        for index, (value, fragment) in enumerate(zip(objects, self._composite.objects, strict=True)):
             if move_objects:
                 x, y, _, yaw = fragment.offset
                 self._put(index, value, (x, y, yaw))
-        if self._hands_vary():
-            *offset, yaw = shot.hand.offset
-            offset_m = [self._level.hand_offset_m * each for each in offset]
-            self._gesture(gesture, offset_m, self._level.hand_yaw_rad * yaw)
+        self._vary_hands(gesture, self._composite.hand.offset)
 
-    def develop(self, frame: Frame) -> Frame:
+    def _vary_hands(self, gesture: int, offset: Sequence[float]) -> None:
+        """Put hands off their places by shares of what the appearance allows in x, y, z and yaw, if they may vary."""
+        if self._hands_vary():
+            *shift, turn = offset
+            self._gesture(
+                gesture, [self._level.hand_offset_m * each for each in shift], self._level.hand_yaw_rad * turn
+            )
+
+    def composite(self, frame: Frame) -> Frame:
         """What the agent's camera makes of a rendered frame (H, W, 3): itself but where frames are photographs."""
-        return frame if self._photographer is None else self._photographer.develop(frame)
+        return frame if self._composite is None else self._composite.of(frame)
 
     @abc.abstractmethod
-    def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
+    def set_outcome(self, action: int, intended: State) -> None:
         """Kinematic execution: put the scene where a perfect ``action`` leads."""
 
     @property
@@ -201,12 +200,8 @@ class World(abc.ABC):
     def executor(self) -> MacroExecutor:
         """What carries macro-actions out in contact physics, made when it is first needed."""
 
-    def prepare(self) -> None:
-        """Make the executor, which otherwise the first execution makes."""
-        _ = self.executor
-
     @abc.abstractmethod
-    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
+    def execute(self, action: int, intended: State) -> MacroResult:
         """Physical execution: plan, simulate, and let people react.
 
         ``intended`` says what people in the scene do, never what the robot achieves.
@@ -243,7 +238,7 @@ class World(abc.ABC):
 
     # --- what they all do ----------------------------------------------------------------------------------------
 
-    def _off(self, offset: Sequence[float]) -> tuple[float, float, float]:
+    def _scaled(self, offset: Sequence[float]) -> tuple[float, float, float]:
         """Shares of what the appearance allows, in x, y and yaw, as metres and radians."""
         x, y, yaw = offset
         return self._level.object_offset_m * x, self._level.object_offset_m * y, self._level.object_yaw_rad * yaw
@@ -260,11 +255,11 @@ class World(abc.ABC):
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
-    def object_poses(self) -> NDArray[np.float64]:
+    def object_poses(self) -> Floats:
         """Positions and quaternions of the objects, copied. Shape (N, 7)."""
         return np.asarray(self.data.qpos[self.object_qpos])
 
-    def _objects(self) -> tuple[tuple[int, ...], str | None]:
+    def _objects(self) -> tuple[State, str | None]:
         """The value of each object, and what is wrong with the first that is not as it should be."""
         place = self.data.qpos.tobytes(), self.data.mocap_pos.tobytes()
         if place != self._read_at:  # asked several times of one moment
@@ -280,7 +275,7 @@ class World(abc.ABC):
             return None
         return f"{self._names[index]} is tipped by {math.degrees(tilt_rad):.0f} degrees"
 
-    def _pushed(self, moving: Collection[int], before: NDArray[np.float64], how: str) -> str | None:
+    def _pushed(self, moving: Collection[int], before: Floats, how: str) -> str | None:
         """Which object but the moving ones is elsewhere than in the poses before (N, 7)."""
         shift_m = np.linalg.norm(self.object_poses()[:, :3] - before[:, :3], axis=1)
         for index, name in enumerate(self._names):

@@ -56,6 +56,8 @@ class Arrows(WorldParameters):
     horizon: int | None = None  #: macro-actions before truncation, 1 to 1000; None: by the longest shortest plan
 
     FAMILY: ClassVar[str] = "arrows"
+    SCENE: ClassVar[str] = "imagine_bench.tasks.arrows.world:ArrowWorld"
+    IN_VIEW: ClassVar[tuple[str, ...]] = ("cubes", "distractors")
     RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
         "cubes": (1, MAX_CUBES),
         "shuffle": (0, 2**32 - 1),

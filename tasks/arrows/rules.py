@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Outcome
-from imagine_bench.rules import optimal_policy, tabulate
+from imagine_bench.interfaces import Outcome, State
 
-from ..parameters.goal_change import changing_goal
-from ..parameters.slip import slipping
+from ..parameters.rules import WorldRules
 from .description import N_DIRECTIONS, Arrows
 
 TOWARD_HUMAN, RIGHT, TOWARD_AGENT, LEFT = range(N_DIRECTIONS)
@@ -36,8 +34,8 @@ class Goal:
     """A condition on legal macrostates."""
 
     pointed: int | None = None  #: direction of the arrow of the cube that the human points at, or None for any
-    absent: tuple[int, ...] = ()  #: directions that no arrow may have
-    pattern: tuple[int, ...] = ()  #: direction of every arrow, or empty for any
+    absent: State = ()  #: directions that no arrow may have
+    pattern: State = ()  #: direction of every arrow, or empty for any
 
     @classmethod
     def of(cls, world: Arrows) -> Goal:
@@ -46,7 +44,7 @@ class Goal:
         goal = _GOALS[world.goal] if world.goal in _GOALS else cls(pattern=tuple(map(int, pattern)))
         return replace(goal, absent=(*goal.absent, TOWARD_AGENT)) if "agent" in world.forbidden else goal
 
-    def holds(self, macrostate: tuple[int, ...]) -> bool:
+    def holds(self, macrostate: State) -> bool:
         """Whether a legal macrostate is a goal."""
         *directions, pointed = macrostate
         return (
@@ -64,7 +62,7 @@ _GOALS = {
 
 
 @dataclass(frozen=True)
-class ArrowRules:
+class ArrowRules(WorldRules):
     """The macrostate machine of a world.
 
     Args:
@@ -84,13 +82,13 @@ class ArrowRules:
         return len(self.world.turns)
 
     @cached_property
-    def states(self) -> tuple[tuple[int, ...], ...]:
+    def states(self) -> tuple[State, ...]:
         """All macrostates: 192 of three cubes, 24,576 of six."""
         cubes = self.world.cubes
         return tuple(product(*[range(N_DIRECTIONS)] * cubes, range(cubes)))
 
     @cached_property
-    def start_states(self) -> tuple[tuple[int, ...], ...]:
+    def start_states(self) -> tuple[State, ...]:
         """The macrostates that are no end and from which turns lead to a goal, whatever slips or changes.
 
         Raises:
@@ -132,7 +130,7 @@ class ArrowRules:
         longest = int(self.plan_lengths.max())
         return self.world.horizon or max(SHORTEST_HORIZON, PLANS_IN_HORIZON * longest)
 
-    def is_legal(self, macrostate: tuple[int, ...]) -> bool:
+    def is_legal(self, macrostate: State) -> bool:
         """Whether no two arrows are alike that may not be."""
         directions = macrostate[:-1]
         forbidden = self.world.forbidden
@@ -140,28 +138,27 @@ class ArrowRules:
             return False
         return "neighbours" not in forbidden or all(left != right for left, right in pairwise(directions))
 
-    def is_goal(self, macrostate: tuple[int, ...]) -> bool:
+    def is_goal(self, macrostate: State) -> bool:
         """Whether the macrostate is legal and a goal."""
         return self.is_legal(macrostate) and self.goal.holds(macrostate)
 
-    def is_terminal(self, macrostate: tuple[int, ...]) -> bool:
+    def is_terminal(self, macrostate: State) -> bool:
         """Whether the macrostate is a goal or illegal."""
         return self.is_goal(macrostate) or not self.is_legal(macrostate)
 
-    def turned(self, macrostate: tuple[int, ...], action: int) -> tuple[int, ...]:
+    def turned(self, macrostate: State, action: int) -> State:
         """The macrostate after a macro-action that does not slip, also out of a terminal one.
 
         Raises:
             InvalidValueError: No such action.
         """
-        if not 0 <= action < self.n_actions:
-            raise InvalidValueError(f"Action {action} does not exist; give an integer from 0 to {self.n_actions - 1}.")
+        self.require_action(action)
         turned = list(macrostate)
         for turn in self.world.turns[action]:
             turned[turn.cube] = (turned[turn.cube] + (1 if turn.clockwise else -1)) % N_DIRECTIONS
         return tuple(turned)
 
-    def judge(self, macrostate: tuple[int, ...], action: int, reached: tuple[int, ...]) -> Outcome:
+    def judge(self, macrostate: State, action: int, reached: State) -> Outcome:
         """Reward and end of an episode depend on the macrostate reached alone."""
         del macrostate, action
         if not self.is_legal(reached):
@@ -170,24 +167,12 @@ class ArrowRules:
             return Outcome(1.0, reached, GOAL_REWARD, terminated=True, success=True)
         return Outcome(1.0, reached, STEP_REWARD, terminated=False, success=False)
 
-    def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
         """The result of a turn, which is certain but for the world's parameters."""
-        found: tuple[Outcome, ...] = (self.judge(macrostate, action, self.turned(macrostate, action)),)
-        if self.world.slip:
-            found = slipping(found, self.judge(macrostate, action, macrostate), self.world.slip)
-        return (
-            changing_goal(found, self._pointed_elsewhere, self.world.goal_change) if self.world.goal_change else found
-        )
+        return self.varied(macrostate, (self.judge(macrostate, action, self.turned(macrostate, action)),))
 
-    def _pointed_elsewhere(self, outcome: Outcome) -> list[Outcome]:
+    def asked_otherwise(self, outcome: Outcome) -> list[Outcome]:
+        """The outcomes where the human points at another cube."""
         *directions, pointed = outcome.macrostate
         others = [(*directions, cube) for cube in range(self.world.cubes) if cube != pointed]
         return [self.judge(outcome.macrostate, 0, other) for other in others]
-
-    @cached_property
-    def _policy(self) -> dict[tuple[int, ...], int]:
-        return dict(zip(self.states, optimal_policy(tabulate(self)).tolist(), strict=True))
-
-    def optimal_action(self, macrostate: tuple[int, ...]) -> int:
-        """The first action of a shortest plan (the lowest index among equals)."""
-        return self._policy[tuple(int(value) for value in macrostate)]

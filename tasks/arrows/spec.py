@@ -9,27 +9,24 @@ Importing this module is cheap: MuJoCo loads when an environment or a frame is m
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.wrappers import TimeLimit
-from numpy.typing import NDArray
 
 from imagine_bench.arrays import Observed
-from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
+from imagine_bench.interfaces import PerformanceTargets, TaskSpec
 from imagine_bench.preprocessing import gray_name
 from imagine_bench.rules import facts
 from imagine_bench.values import Setting
 
+from .. import specs
 from .description import Arrows
 from .rules import ArrowRules, Goal
 
 if TYPE_CHECKING:
     from ..macro_env import MacroEnv
-    from ..scenes.appearance import Appearance
-    from .world import ArrowWorld
 
 _DIRECTIONS = ("toward the human", "right", "toward the agent", "left")
 _CUBES = {1: ("only",), 2: ("left", "right"), 3: ("left", "middle", "right")}
@@ -41,6 +38,7 @@ _FORBIDDEN = {
     "neighbours": ", and no two neighbouring arrows may ever point the same way",
 }
 _NAMED = {
+    Arrows(): ("arrows", "Arrows", "Arrows"),
     Arrows(horizon=10): ("arrow_puzzle", "Arrow puzzle", "ArrowPuzzle"),
     Arrows(forbid="equal+agent", horizon=10): ("arrow_puzzle_hard", "Arrow puzzle, hard", "ArrowPuzzleHard"),
     Arrows(goal="toward_agent", horizon=10): (
@@ -81,22 +79,6 @@ def _described(world: Arrows, goal: Goal) -> str:
     )
 
 
-@functools.cache
-def _maker(world: Arrows) -> Callable[[Appearance], ArrowWorld]:
-    """The same one for the same world, so that what draws it is shared."""
-    from .world import ArrowWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
-
-    return functools.partial(ArrowWorld, arrows=world)
-
-
-def _rendered(rules: ArrowRules, macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
-    """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
-    from ..frames import frames_of  # noqa: PLC0415
-
-    scene = Arrows(cubes=rules.world.cubes, distractors=rules.world.distractors)
-    return frames_of(_maker(scene), rules, macrostates, appearance, rng)
-
-
 def spec_of(**world: Setting) -> TaskSpec:
     """A world of the family, by the fields of :class:`.description.Arrows`.
 
@@ -110,8 +92,7 @@ def spec_of(**world: Setting) -> TaskSpec:
 @functools.cache
 def _spec(world: Arrows) -> TaskSpec:
     rules = ArrowRules(world)
-    said = str(world).partition(":")[2].replace(",", ", ")
-    unnamed = (str(world), f"Arrows ({said})" if said else "Arrows", f"Arrows-{world.hash}" if said else "Arrows")
+    unnamed = (str(world), f"Arrows ({world.words})", f"Arrows-{world.hash}")
     name, title, gymnasium_name = _NAMED.get(world, unnamed)
     cubes = _CUBES.get(world.cubes, _ORDINALS[: world.cubes])
     return TaskSpec(
@@ -131,7 +112,7 @@ def _spec(world: Arrows) -> TaskSpec:
         rules=rules,
         sight=world.observation_model(),
         facts=functools.partial(facts, rules, rules.horizon),
-        render_macrostates=functools.partial(_rendered, rules),
+        render_macrostates=functools.partial(specs.render_macrostates, rules),
         reference=name if name in _IN_THESIS else None,
         targets=_targets(world, name),
     )
@@ -141,7 +122,7 @@ def _targets(world: Arrows, name: str) -> PerformanceTargets | None:
     if name == "arrow_puzzle":
         return _TARGETS
     objects = tuple(f"cube_{cube}" for cube in range(world.cubes))
-    return None if world in _NAMED or name == "arrows" else replace(_TARGETS, objects=objects, encoders={})
+    return None if world in _NAMED else replace(_TARGETS, objects=objects, encoders={})
 
 
 def make_env(**options: Any) -> MacroEnv:
@@ -153,10 +134,7 @@ def make_env(**options: Any) -> MacroEnv:
     Raises:
         InvalidValueError, UnknownNameError: As :func:`spec_of`.
     """
-    from ..macro_env import MacroEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
-
-    world = Arrows.taken_from(options, MacroEnv.KEYWORDS)
-    return MacroEnv(_spec(world), _maker(world), **options)
+    return specs.make_env(Arrows, _spec, options)
 
 
 def make_limited_env(**options: Any) -> TimeLimit[Observed, np.int64]:

@@ -8,14 +8,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from imagine_bench.interfaces import State
+
 from ..motion import orientation
 from ..motion.executor import MacroResult
 from ..scenes import constants as c
 from ..scenes.appearance import Appearance
-from ..scenes.layout import layout
 from ..world import MAX_SKEW_RAD, World
 from .description import Arrows
-from .scene import compile_arrow_scene
+from .scene import compile_arrow_scene, layout
 
 if TYPE_CHECKING:
     from ..motion.turn import TurnExecutor
@@ -29,13 +30,13 @@ MAX_OFF_SLOT_M = 0.015
 class ArrowWorld(World):
     """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
 
-    def __init__(self, level: Appearance, arrows: Arrows = _THESIS) -> None:
-        self._turns = arrows.turns
-        self._layout = layout(arrows.cubes)
-        objects = {f"cube_{cube}": f"cube {cube}" for cube in range(arrows.cubes)}
+    def __init__(self, level: Appearance, parameters: Arrows = _THESIS) -> None:
+        self._turns = parameters.turns
+        self._layout = layout(parameters.cubes)
+        objects = {f"cube_{cube}": f"cube {cube}" for cube in range(parameters.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
-        model = compile_arrow_scene(arrows.cubes, arrows.distractors)
-        super().__init__(model, level, objects=objects, materials=materials, distractors=arrows.distractors)
+        model = compile_arrow_scene(parameters.cubes, parameters.distractors)
+        super().__init__(model, level, objects=objects, materials=materials, distractors=parameters.distractors)
         self._hand = int(self.model.body("hand").mocapid[0])
 
     @functools.cached_property
@@ -45,30 +46,29 @@ class ArrowWorld(World):
 
         return TurnExecutor(self.model, self._layout.slots_xy_m, self.sensing)
 
-    def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
+    def set_outcome(self, action: int, intended: State) -> None:
         """Kinematic execution: a turned cube stands where a good turn leaves it."""
         for turn in self._turns[action]:
-            if not self._stays(turn.cube, intended):
-                self._put(turn.cube, intended[turn.cube], self._aims[turn.cube])
+            if not self._slipped(turn.cube, intended):
+                self._put(turn.cube, intended[turn.cube], self._placement_noise[turn.cube])
         self._gesture(intended[-1])
         self.update()
 
-    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
+    def execute(self, action: int, intended: State) -> MacroResult:
         """Physical execution: the arm turns cubes in contact physics, one after another, then everything is at rest.
 
         A cube that is due and shall stay as it is slips out of the fingers.
         """
         turns = self._turns[action]
         before = self.object_poses()
-        slipping = [turn.cube for turn in turns if self._stays(turn.cube, intended)]
+        slipping = [turn.cube for turn in turns if self._slipped(turn.cube, intended)]
         results = [
             self.executor.turn(
                 self.data,
                 cube=turn.cube,
                 clockwise=turn.clockwise,
                 slips=turn.cube in slipping,
-                off=self._off(self._aims[turn.cube]),
-                capture_motion_hz=capture_motion_hz,
+                noise=self._scaled(self._placement_noise[turn.cube]),
             )
             for turn in turns
         ]
@@ -80,13 +80,13 @@ class ArrowWorld(World):
         pushed = self._pushed(turned, before, f"while cube {turns[0].cube} was turned")
         return replace(result, fault=result.fault or pushed)
 
-    def _stays(self, cube: int, intended: tuple[int, ...]) -> bool:
+    def _slipped(self, cube: int, intended: State) -> bool:
         """Whether a cube whose turn is due has slipped: its direction is to be the one that it has."""
         return self._objects()[0][cube] == intended[cube]
 
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         x_m, y_m = self._layout.slots_xy_m[index]
-        right_m, up_m, turned_rad = self._off(offset)
+        right_m, up_m, turned_rad = self._scaled(offset)
         self.data.qpos[self.object_qpos[index]] = (
             x_m + right_m,
             y_m + up_m,

@@ -6,6 +6,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import mujoco.rollout
@@ -14,10 +15,10 @@ import numpy as np
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import Floats
 
-from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS
+from ..scenes.arm import ARM_JOINTS, arm_columns
 from ..scenes.constants import OBSERVATION_QPOS_RAD
-from .arm_model import ArmModel
-from .sensing import Sensing
+from .ik import ArmModel
+from .orientation import Sensing
 from .trajectory import Trajectory, Waypoint, plan
 
 REST_OPENING_M = 0.0365
@@ -30,7 +31,9 @@ _ARM_AT_REST_RAD = 0.02
 _RUNAWAY_RAD_S = 200.0
 """Nothing in the scene moves so fast (rad/s or m/s) unless the simulation has exploded."""
 _STATE = mujoco.mjtState
-_INPUTS = sum(each.value for each in (_STATE.mjSTATE_CTRL, _STATE.mjSTATE_MOCAP_POS, _STATE.mjSTATE_MOCAP_QUAT))
+_MOCAP = _STATE.mjSTATE_MOCAP_POS.value | _STATE.mjSTATE_MOCAP_QUAT.value
+_KEPT = _STATE.mjSTATE_QPOS.value | _MOCAP
+_INPUTS = _STATE.mjSTATE_CTRL.value | _MOCAP
 """What a rollout is told at every step, controls first; mocap bodies left out would fall back to their defaults."""
 _BAD_STATE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
@@ -48,35 +51,39 @@ def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
     """Positions (nq,) and controls (nu,) of a whole scene, its arm at the observation pose with open fingers."""
     qpos = model.qpos0.copy()
     ctrl = np.zeros(model.nu)
-    targets = [*zip(ARM_JOINTS, OBSERVATION_QPOS_RAD, strict=True), *((name, REST_OPENING_M) for name in FINGER_JOINTS)]
-    for name, value in targets:
-        qpos[model.joint(name).qposadr[0]] = value
-        ctrl[model.actuator(name.replace("_slide", "") + "_servo").id] = value
+    columns = arm_columns(model)
+    targets = (*OBSERVATION_QPOS_RAD, REST_OPENING_M, REST_OPENING_M)
+    qpos[columns.qpos] = targets
+    ctrl[columns.ctrl] = targets
     return qpos, ctrl
+
+
+class Samples(NamedTuple):
+    """A motion of a whole scene, for a recording."""
+
+    time_s: Floats  #: when the samples were taken, from 0. Shape (K,), K = 0 without capture.
+    qpos: Floats  #: positions. Shape (K, nq).
+    qvel: Floats  #: velocities. Shape (K, nv).
+    ctrl: Floats  #: commands to the servos from then on, at the end the last ones. Shape (K, nu).
 
 
 @dataclass(frozen=True, kw_only=True)
 class MacroResult:
     """What became of one macro-action."""
 
-    sim_time_s: float  #: simulated seconds
-    ik_error_m: float  #: largest distance between a solved waypoint and its target
+    sim_time_s: float = 0.0  #: simulated seconds
+    ik_error_m: float = 0.0  #: largest distance between a solved waypoint and its target
     fault: str | None  #: why the action failed physically, in words, or None
-    time_s: Floats  #: when the samples of the motion were taken, from 0. Shape (K,), K = 0 without capture.
-    qpos: Floats  #: the samples, whole scene. Shape (K, nq).
-    qvel: Floats  #: velocities at the same times. Shape (K, nv).
-    ctrl: Floats  #: commands to the servos from then on, at the end the last ones. Shape (K, nu).
+    motion: Samples
 
     def then(self, later: MacroResult) -> MacroResult:
         """Both as one macro-action; what went wrong first is its fault."""
+        shifted = later.motion._replace(time_s=later.motion.time_s + self.sim_time_s)
         return MacroResult(
             sim_time_s=self.sim_time_s + later.sim_time_s,
             ik_error_m=max(self.ik_error_m, later.ik_error_m),
             fault=self.fault or later.fault,
-            time_s=np.concatenate([self.time_s, later.time_s + self.sim_time_s]),
-            qpos=np.concatenate([self.qpos, later.qpos]),
-            qvel=np.concatenate([self.qvel, later.qvel]),
-            ctrl=np.concatenate([self.ctrl, later.ctrl]),
+            motion=Samples(*map(np.concatenate, zip(self.motion, shifted, strict=True))),
         )
 
 
@@ -84,17 +91,18 @@ class MacroExecutor:
     """Executes trajectories on a compiled scene that holds the arm: the base of what plans macro-actions.
 
     Before and after each macro-action the arm is set onto its observation pose; one that ended further off it than
-    0.02 rad is a fault. What plans for it measures true poses of objects, unless :class:`.sensing.Sensing` says else.
+    0.02 rad is a fault. What plans for it measures true poses of objects, unless
+    :class:`.orientation.Sensing` says else.
     """
 
     def __init__(self, model: mujoco.MjModel, sensing: Sensing | None = None) -> None:
         self.model = model
         self.arm = ArmModel()
         self.sensing = sensing or Sensing()
-        self._arm_qpos = np.array([int(model.joint(name).qposadr[0]) for name in ARM_JOINTS])
-        self._finger_qpos = np.array([int(model.joint(name).qposadr[0]) for name in FINGER_JOINTS])
-        self._arm_ctrl = np.array([model.actuator(f"{name}_servo").id for name in ARM_JOINTS])
-        self._finger_ctrl = np.array([model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS])
+        self.capture_motion_hz = 0.0  # samples of a motion a second for a recording; 0 takes none
+        columns = arm_columns(model)
+        self._arm_qpos, self._finger_qpos = np.split(columns.qpos, [len(ARM_JOINTS)])
+        self._arm_ctrl, self._finger_ctrl = np.split(columns.ctrl, [len(ARM_JOINTS)])
         self._qpos_column = mujoco.mj_stateSize(model, _STATE.mjSTATE_TIME.value)
         # Kept between runs: fresh pages cost time.
         self._states = np.empty((0, mujoco.mj_stateSize(model, _STATE.mjSTATE_FULLPHYSICS.value)))
@@ -108,13 +116,10 @@ class MacroExecutor:
         positions and on ``squeeze_m`` alone: the command to each finger that keeps an object held, or None, which opens
         the fingers to where they rest. Derived quantities are not updated.
         """
-        qpos = data.qpos.copy()
-        mocap_pos = data.mocap_pos.copy()
-        mocap_quat = data.mocap_quat.copy()
+        kept = np.empty(mujoco.mj_stateSize(self.model, _KEPT))
+        mujoco.mj_getState(self.model, data, kept, _KEPT)
         mujoco.mj_resetData(self.model, data)
-        data.qpos[:] = qpos
-        data.mocap_pos[:] = mocap_pos
-        data.mocap_quat[:] = mocap_quat
+        mujoco.mj_setState(self.model, data, kept, _KEPT)
         data.qpos[self._arm_qpos] = OBSERVATION_QPOS_RAD
         if squeeze_m is None:
             data.qpos[self._finger_qpos] = REST_OPENING_M
@@ -128,41 +133,36 @@ class MacroExecutor:
         *,
         ik_error_m: float,
         squeeze_m: float | None = None,
-        capture_motion_hz: float = 0.0,
     ) -> tuple[MacroResult, Floats, Trajectory]:
         """Plan a motion through ``waypoints``, the last of which is the observation pose, and execute it.
 
-        ``squeeze_m`` is as in :meth:`rest`, ``capture_motion_hz`` as in :meth:`capture`.
+        ``squeeze_m`` is as in :meth:`rest`.
 
         Returns:
             The result, whose fault says whether the arm came back; the positions as :meth:`run`; and the plan.
         """
         timestep_s = self.model.opt.timestep
-        start_rad = np.array(OBSERVATION_QPOS_RAD)
-        start_m = REST_OPENING_M if squeeze_m is None else squeeze_m
         trajectory = plan(
-            self.arm, start_qpos_rad=start_rad, start_opening_m=start_m, waypoints=waypoints, timestep_s=timestep_s
+            self.arm,
+            start_qpos_rad=np.array(OBSERVATION_QPOS_RAD),
+            start_opening_m=REST_OPENING_M if squeeze_m is None else squeeze_m,
+            waypoints=waypoints,
+            timestep_s=timestep_s,
         )
         qpos = self.run(data, trajectory, squeeze_m=squeeze_m)
-        time_s, samples, qvel, ctrl = self.capture(len(qpos) - 1, capture_motion_hz)
-        off_rad = float(np.abs(self.arm_qpos_rad(qpos[-1]) - OBSERVATION_QPOS_RAD).max())
-        astray = f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None
-        sim_time_s = (len(qpos) - 1) * timestep_s
+        steps = len(qpos) - 1
+        off_rad = float(np.abs(qpos[-1, self._arm_qpos] - OBSERVATION_QPOS_RAD).max())
         result = MacroResult(
-            sim_time_s=sim_time_s,
+            sim_time_s=steps * timestep_s,
             ik_error_m=ik_error_m,
-            fault=astray,
-            time_s=time_s,
-            qpos=samples,
-            qvel=qvel,
-            ctrl=ctrl,
+            fault=f"the arm ended {off_rad:.3f} rad off its observation pose" if off_rad > _ARM_AT_REST_RAD else None,
+            motion=self._capture(steps),
         )
         return result, qpos, trajectory
 
     def refused(self, reason: str) -> MacroResult:
         """The result of a macro-action for which the arm does not move."""
-        time_s, qpos, qvel, ctrl = self.capture(0, 0.0)
-        return MacroResult(sim_time_s=0.0, ik_error_m=0.0, fault=reason, time_s=time_s, qpos=qpos, qvel=qvel, ctrl=ctrl)
+        return MacroResult(fault=reason, motion=self._no_samples())
 
     def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
         """Execute ``trajectory``, planned at the model's timestep, from the canonical start.
@@ -203,40 +203,37 @@ class MacroExecutor:
             f"its start state and controls were saved in {path}."
         )
 
-    def arm_qpos_rad(self, qpos: Floats) -> Floats:
-        """The arm's joints in positions of the scene: (..., nq) to (..., 7)."""
-        return qpos[..., self._arm_qpos]
-
     def opening_m(self, qpos: Floats) -> Floats:
         """Each finger's distance from the grip's middle in positions of the scene: (..., nq) to (..., 2)."""
         return qpos[..., self._finger_qpos]
 
-    def capture(self, steps: int, motion_hz: float) -> tuple[Floats, Floats, Floats, Floats]:
-        """Samples of the latest run, of so many steps, for a recording: so many a second; 0 takes none.
+    def _no_samples(self) -> Samples:
+        model = self.model
+        return Samples(np.empty(0), np.empty((0, model.nq)), np.empty((0, model.nv)), np.empty((0, model.nu)))
+
+    def _capture(self, steps: int) -> Samples:
+        """Samples of the latest run, of so many steps: ``capture_motion_hz`` a second.
 
         Up to one a timestep they are steps of the simulation. Above, what lies between two steps is interpolated
         linearly, as the integrator moves positions; commands are held.
 
         Returns:
-            Times in s (K,), positions (K, nq), velocities (K, nv) and commands (K, nu), with the first and the last
-            step whenever ``motion_hz > 0``.
+            The samples, with the first and the last step whenever any are taken.
         """
+        if self.capture_motion_hz <= 0:
+            return self._no_samples()
         timestep_s = self.model.opt.timestep
         nq = self.model.nq
-        nv = self.model.nv
-        nu = self.model.nu
-        if motion_hz <= 0:
-            return np.empty(0), np.empty((0, nq)), np.empty((0, nv)), np.empty((0, nu))
-        stride = 1.0 / (motion_hz * timestep_s)
+        stride = 1.0 / (self.capture_motion_hz * timestep_s)
         at = np.append(np.arange(0, steps - 1e-9, stride), steps)  # in timesteps [K]
         at = np.unique(np.round(at)) if stride >= 1.0 else at
         before = np.minimum(at.astype(np.int64), steps - 1)
         share = (at - before)[:, None]
-        moving = self._states[:, self._qpos_column : self._qpos_column + nq + nv]
+        moving = self._states[:, self._qpos_column : self._qpos_column + nq + self.model.nv]
         samples = (1.0 - share) * moving[before] + share * moving[before + 1]
         for row in np.flatnonzero(share % 1.0):
             mujoco.mj_normalizeQuat(self.model, samples[row, :nq])
-        return at * timestep_s, samples[:, :nq], samples[:, nq:], self._control[before, :nu]
+        return Samples(at * timestep_s, samples[:, :nq], samples[:, nq:], self._control[before, : self.model.nu])
 
 
 def _diverged(data: mujoco.MjData, state: Floats) -> bool:

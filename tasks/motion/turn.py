@@ -9,14 +9,12 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 
 from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M
 from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
-from .orientation import ObjectPose
-from .sensing import Sensing
+from .orientation import ObjectPose, Sensing
 from .trajectory import Waypoint
 
 _QUARTER_RAD = math.pi / 2
@@ -65,34 +63,28 @@ class TurnExecutor(MacroExecutor):
         cube: int,
         clockwise: bool,
         slips: bool = False,
-        off: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        capture_motion_hz: float = 0.0,
+        noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> MacroResult:
         """Turn a cube by a quarter, as seen from above and in the frame, to a right angle on its nominal slot.
 
-        ``off`` has it come down so far off both: metres in x and y, and radians. One that ``slips`` stays: the fingers
-        grip it, open too early, and turn above it. The outcome is a pure function of the loose objects' positions and
-        the arguments, bit for bit.
-
-        Raises:
-            InvalidValueError: No such cube.
+        ``noise`` has it come down so far off both: metres in x and y, and radians. One that ``slips`` stays: the
+        fingers grip it, open too early, and turn above it. The outcome is a pure function of the loose objects'
+        positions and the arguments, bit for bit.
         """
-        if not 0 <= cube < len(self._slots):
-            raise InvalidValueError(f"No cube {cube}; there are 0 to {len(self._slots) - 1}.")
         poses = [
             self.sensing.pose(data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
             for start, place_m in zip(self._cube_qpos, self._slots_xy_m, strict=True)
         ]
         true = poses[cube]
         slot = self._slots[cube]
-        right_m, up_m, turned_rad = off
+        right_m, up_m, turned_rad = noise
         pose = self.sensing.erring(true)
         if pose.tilt_rad > _MAX_TILT_RAD:
             return self._refuse(data, f"cube {cube} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
         place_m = np.add(self._slots_xy_m[cube], (right_m, up_m))
         try:
             grip = self._reach(pose.position_m[:2], slot)
-            if any(off):
+            if any(noise):
                 slot = self._reach(place_m, slot)
         except UnreachableTargetError as error:
             return self._refuse(data, f"cube {cube} is out of reach: {error}")
@@ -102,7 +94,7 @@ class TurnExecutor(MacroExecutor):
         begins_along_x = skewed or along_x_m > along_y_m or (clockwise and along_x_m == along_y_m)
         opening_m = max(along_x_m if begins_along_x else along_y_m, _LEAST_OPENING_M)
         leaves_m = REST_OPENING_M
-        if any(off):
+        if any(noise):
             there = replace(pose, position_m=np.array([*place_m, CUBE_REST_Z_M]))
             beyond_m = _FINGER_HALF_WIDTH_M * abs(math.sin(turned_rad))  # a finger that is turned reaches further
             leaves_m = max(_rooms_m(others, there)[int(begins_along_x)] - beyond_m, _LEAST_OPENING_M)
@@ -110,9 +102,7 @@ class TurnExecutor(MacroExecutor):
         openings_m = (opening_m, leaves_m)
         waypoints = _waypoints(grip, slot, skews_rad, clockwise, begins_along_x != clockwise, slips, openings_m)
         error_m = max(grip.error_m, slot.error_m)
-        result, qpos, trajectory = self.perform(
-            data, waypoints, ik_error_m=error_m, capture_motion_hz=capture_motion_hz
-        )
+        result, qpos, trajectory = self.perform(data, waypoints, ik_error_m=error_m)
         holding = qpos[trajectory.last_step["close" if slips else "turn"] + 1]
         if self.opening_m(holding).mean() < _SQUEEZED_M + _MISSED_M:
             return replace(result, fault=f"the fingers closed past cube {cube}")

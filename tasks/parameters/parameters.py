@@ -11,7 +11,7 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError, brief
 from imagine_bench.interfaces import State
 from imagine_bench.values import Setting
 
-from .gesture import GestureObservation
+from .observation import GestureObservation
 
 GESTURES = ("always", "first")
 
@@ -31,6 +31,10 @@ class WorldParameters:
     distractors: int = 0  #: of no consequence, in view, 0 to 4: a screen of noise, the others balls that roll about
 
     FAMILY: ClassVar[str]
+    SCENE: ClassVar[str]
+    """Where the class of its scene lies, as ``module:name``."""
+    IN_VIEW: ClassVar[tuple[str, ...]] = ("distractors",)
+    """Parameters that a scene is made of."""
     RANGES: ClassVar[Mapping[str, tuple[float, float]]] = {
         "slip": (0.0, 0.99),
         "goal_change": (0.0, 1.0),
@@ -71,6 +75,16 @@ class WorldParameters:
         unusual = [name for name in own_first if getattr(self, name) != self._usual(name)]
         values = [f"{self.NAMED.get(name, name)}={getattr(self, name)}" for name in unusual]
         return f"{self.FAMILY}:{','.join(values)}" if values else self.FAMILY
+
+    @property
+    def words(self) -> str:
+        """The part of the canonical name that tells values, as a list in a sentence."""
+        return str(self).partition(":")[2].replace(",", ", ")
+
+    @property
+    def plainest(self) -> Self:
+        """The world with the fewest parameters that looks the same."""
+        return type(self)(**{name: getattr(self, name) for name in self.IN_VIEW})
 
     @property
     def hash(self) -> str:

@@ -11,13 +11,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
-from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Outcome
-from imagine_bench.rules import optimal_policy, tabulate
+from imagine_bench.interfaces import Outcome, State
 
-from ..parameters.goal_change import changing_goal
 from ..parameters.parameters import WorldParameters
-from ..parameters.slip import slipping
+from ..parameters.rules import WorldRules
 
 N_OBJECTS = 3
 PLACED, PICKED, HANDED_OVER = range(3)
@@ -36,12 +33,12 @@ WRONG_REWARD = -5.0
 _ALL_PLACED = (PLACED,) * N_OBJECTS
 
 
-def held_object(macrostate: tuple[int, ...]) -> int | None:
+def held_object(macrostate: State) -> int | None:
     """Which object the gripper holds."""
     return macrostate.index(PICKED) if PICKED in macrostate[:N_OBJECTS] else None
 
 
-def _with(objects: tuple[int, ...], index: int, value: int) -> tuple[int, ...]:
+def _with(objects: State, index: int, value: int) -> State:
     return (*objects[:index], value, *objects[index + 1 :])
 
 
@@ -50,10 +47,11 @@ class PickPlace(WorldParameters):
     """A world: the parameters of all tasks, and no others."""
 
     FAMILY: ClassVar[str] = "pick_place"
+    SCENE: ClassVar[str] = "imagine_bench.tasks.pick_place.world:PickWorld"
 
 
 @dataclass(frozen=True)
-class PickPlaceRules:
+class PickPlaceRules(WorldRules):
     """The macrostate machine: action i picks object i, or places it if it is held; action 3 hands over.
 
     The human's next gesture is drawn: after a pick that was asked for, the two other objects and the open palm are
@@ -68,7 +66,7 @@ class PickPlaceRules:
         return N_OBJECTS + 1
 
     @cached_property
-    def states(self) -> tuple[tuple[int, ...], ...]:
+    def states(self) -> tuple[State, ...]:
         """The 12 macrostates of play in the order of table 3.1, then the 7 ends."""
         held = [_with(_ALL_PLACED, each, PICKED) for each in range(N_OBJECTS)]
         play = [(*_ALL_PLACED, gesture) for gesture in POINTING]
@@ -77,24 +75,24 @@ class PickPlaceRules:
         return (*play, *given, *((*objects, WITHDRAWN) for objects in (_ALL_PLACED, *held)))
 
     @cached_property
-    def start_states(self) -> tuple[tuple[int, ...], ...]:
+    def start_states(self) -> tuple[State, ...]:
         """Everything on the table, the human points at one of the three."""
         return tuple((*_ALL_PLACED, gesture) for gesture in POINTING)
 
     @staticmethod
-    def _wishes(held: int) -> tuple[int, ...]:
+    def _wishes(held: int) -> State:
         """What the human may say next when ``held`` has been picked as asked."""
         return (*(each for each in POINTING if each != held), OPEN_PALM)
 
-    def is_legal(self, macrostate: tuple[int, ...]) -> bool:
+    def is_legal(self, macrostate: State) -> bool:
         """Whether the human's hands are still there: they are withdrawn at the first wrong action."""
         return macrostate[N_OBJECTS] != WITHDRAWN
 
-    def is_terminal(self, macrostate: tuple[int, ...]) -> bool:
+    def is_terminal(self, macrostate: State) -> bool:
         """Whether an object was handed over or the human has withdrawn."""
         return HANDED_OVER in macrostate[:N_OBJECTS] or not self.is_legal(macrostate)
 
-    def is_asked_for(self, macrostate: tuple[int, ...], action: int) -> bool:
+    def is_asked_for(self, macrostate: State, action: int) -> bool:
         """Whether ``action`` is what the human wants now, or the step toward it."""
         if self.is_terminal(macrostate):
             return False
@@ -104,14 +102,13 @@ class PickPlaceRules:
             return action == gesture
         return action == (HAND_OVER if gesture == OPEN_PALM else held)
 
-    def objects_after(self, macrostate: tuple[int, ...], action: int) -> tuple[int, ...]:
+    def objects_after(self, macrostate: State, action: int) -> State:
         """Where the objects are after ``action``, asked for or not: the robot does it as far as that is possible.
 
         Raises:
             InvalidValueError: No such action.
         """
-        if not 0 <= action < self.n_actions:
-            raise InvalidValueError(f"Action {action} does not exist; give an integer from 0 to {self.n_actions - 1}.")
+        self.require_action(action)
         objects = macrostate[:N_OBJECTS]
         held = held_object(macrostate)
         if HANDED_OVER in objects:
@@ -123,24 +120,24 @@ class PickPlaceRules:
             return _with(objects, action, PICKED)
         return _with(objects, held, PLACED) if action == held else objects
 
-    def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
         """One outcome a possible next gesture, and of what slips, which is not punished."""
         found = self._outcomes(macrostate, action)
-        if self.is_terminal(macrostate):
-            return found
-        if self.world.slip:
-            unmoved = Outcome(1.0, macrostate, PLACE_REWARD, terminated=False, success=False)
-            found = slipping(found, unmoved, self.world.slip)
-        return changing_goal(found, self._asked_otherwise, self.world.goal_change) if self.world.goal_change else found
+        return found if self.is_terminal(macrostate) else self.varied(macrostate, found)
 
-    def _asked_otherwise(self, outcome: Outcome) -> list[Outcome]:
+    def slipped(self, macrostate: State) -> Outcome:
+        """The outcome of a macro-action that does nothing, which is not punished."""
+        return Outcome(1.0, macrostate, PLACE_REWARD, terminated=False, success=False)
+
+    def asked_otherwise(self, outcome: Outcome) -> list[Outcome]:
+        """The outcomes where the human makes another gesture."""
         objects = outcome.macrostate[:N_OBJECTS]
         gesture = outcome.macrostate[N_OBJECTS]
         held = held_object(outcome.macrostate)
         wishes = POINTING if held is None else self._wishes(held)
         return [replace(outcome, macrostate=(*objects, wish)) for wish in wishes if wish != gesture]
 
-    def _outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
+    def _outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
         objects = self.objects_after(macrostate, action)
         if not self.is_asked_for(macrostate, action):
             gesture = OPEN_PALM if HANDED_OVER in objects else WITHDRAWN
@@ -156,17 +153,9 @@ class PickPlaceRules:
             for wish in wishes
         )
 
-    def judge(self, macrostate: tuple[int, ...], action: int, reached: tuple[int, ...]) -> Outcome:
+    def judge(self, macrostate: State, action: int, reached: State) -> Outcome:
         """The outcome that was reached; whatever is none of them counts as a wrong action."""
         for outcome in self.outcomes(macrostate, action):
             if outcome.macrostate == reached:
                 return outcome
         return Outcome(1.0, reached, WRONG_REWARD, terminated=True, success=False)
-
-    @cached_property
-    def _policy(self) -> dict[tuple[int, ...], int]:
-        return dict(zip(self.states, optimal_policy(tabulate(self)).tolist(), strict=True))
-
-    def optimal_action(self, macrostate: tuple[int, ...]) -> int:
-        """The action with the largest expected return (the lowest index among equals)."""
-        return self._policy[tuple(int(value) for value in macrostate)]

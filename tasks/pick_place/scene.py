@@ -11,10 +11,9 @@ import mujoco
 from ..parameters.distractors import add_distractors
 from ..scenes import constants as c
 from ..scenes.arm import arm_spec, let_arm_touch
-from ..scenes.hand import add_pointing_hand
+from ..scenes.hand import add_open_hand, add_pointing_hand
 from ..scenes.objects import add_objects
 from ..scenes.tabletop import add_tabletop
-from .open_hand import add_open_hand
 
 TIMESTEP_S = 0.003
 """Objects are carried here: contacts are as stiff as two steps, and in softer ones what is held creeps as the arm

@@ -6,45 +6,23 @@ Importing this module is cheap: MuJoCo loads when an environment or a frame is m
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from imagine_bench.interfaces import Frame, PerformanceTargets, TaskSpec
+from imagine_bench.interfaces import PerformanceTargets, TaskSpec
 from imagine_bench.rules import facts
 from imagine_bench.values import Setting
 
+from .. import specs
 from .rules import HANDED_OVER, N_OBJECTS, PickPlace, PickPlaceRules
 
 if TYPE_CHECKING:
     from ..macro_env import MacroEnv
-    from ..scenes.appearance import Appearance
-    from .world import PickWorld
 
 HORIZON = 50
 """Of no weight: an optimal agent needs 6 actions on average and is cut off once in 25,000 episodes."""
 _OBJECTS = ("ball", "car", "cup")
 _PLACES = ("left", "middle", "right")
-
-
-@functools.cache
-def _maker(distractors: int) -> Callable[[Appearance], PickWorld]:
-    """The same one for the same scene, so that what draws it is shared."""
-    from .world import PickWorld  # noqa: PLC0415  (MuJoCo loads on the first frame)
-
-    return functools.partial(PickWorld, distractors=distractors)
-
-
-def _rendered(
-    rules: PickPlaceRules, macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator
-) -> Frame:
-    """Frames of macrostates in the kinematic mode; see :func:`.frames.frames_of`."""
-    from ..frames import frames_of  # noqa: PLC0415
-
-    return frames_of(_maker(rules.world.distractors), rules, macrostates, appearance, rng)
 
 
 _CHAPTER_3 = ("dqn", "imagination_only")
@@ -83,7 +61,7 @@ SPEC = TaskSpec(
     encoder="pick_place",
     rules=_RULES,
     facts=functools.partial(facts, _RULES, HORIZON),
-    render_macrostates=functools.partial(_rendered, _RULES),
+    render_macrostates=functools.partial(specs.render_macrostates, _RULES),
     reference="pick_place",
     config_group="chapter_3",
     targets=PerformanceTargets(
@@ -110,17 +88,16 @@ def _spec(world: PickPlace) -> TaskSpec:
     if world == PickPlace():
         return SPEC
     rules = PickPlaceRules(world)
-    parameters = str(world).partition(":")[2].replace(",", ", ")
     return replace(
         SPEC,
         id=str(world),
-        title=f"{SPEC.title} ({parameters})",
+        title=f"{SPEC.title} ({world.words})",
         env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
         encoder=SPEC.encoder + world.encoder_suffix,
         sight=world.observation_model(lambda state: HANDED_OVER in state[:N_OBJECTS]),  # a palm that carries is seen
         rules=rules,
         facts=functools.partial(facts, rules, HORIZON),
-        render_macrostates=functools.partial(_rendered, rules),
+        render_macrostates=functools.partial(specs.render_macrostates, rules),
         reference=None,
     )
 
@@ -134,7 +111,4 @@ def make_env(**options: Any) -> MacroEnv:
 
     How the rules are read where the thesis is silent stands in ``docs/reference/environments.md``.
     """
-    from ..macro_env import MacroEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
-
-    world = PickPlace.taken_from(options, MacroEnv.KEYWORDS)
-    return MacroEnv(_spec(world), _maker(world.distractors), **options)
+    return specs.make_env(PickPlace, _spec, options)

@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imagine_bench.interfaces import State
+
 from ..motion import orientation
 from ..motion.executor import REST_OPENING_M, MacroResult
 from ..scenes.appearance import Appearance
 from ..scenes.arm import FINGER_JOINTS, TCP_SITE
 from ..scenes.constants import TABLE_HEIGHT_M
-from ..scenes.hand import fingertip_m
+from ..scenes.hand import PALM_REACH_M, fingertip_m
 from ..scenes.objects import MATERIALS, OBJECTS, SLOTS_XY_M, standing_m
 from ..world import MAX_SKEW_RAD, World
-from .open_hand import PALM_REACH_M
-from .rules import HAND_OVER, HANDED_OVER, N_OBJECTS, OPEN_PALM, PICKED, PLACED, WITHDRAWN, held_object
+from .rules import HAND_OVER, HANDED_OVER, N_OBJECTS, OPEN_PALM, PICKED, PLACED, WITHDRAWN, PickPlace, held_object
 from .scene import IDLE_FINGERTIP_M, IDLE_PALM_M, PALM_M, compile_pick_scene
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ _HANDS_FORWARD_X_M = 0.90
 """Fingertip or palm nearer to the robot than this say something."""
 _VAIN_M = 0.09
 """The gripper stops so far above what it reaches out for in vain, and its lift."""
+_PLAIN = PickPlace()
 _GRIP_SHARE = 0.5
 """Share of the objects' pose variation that remains in the grip, which centres them."""
 
@@ -43,11 +45,11 @@ _GRIP_SHARE = 0.5
 class PickWorld(World):
     """One scene of pick-and-place, its appearance varied as ``level`` says."""
 
-    def __init__(self, level: Appearance, distractors: int = 0) -> None:
+    def __init__(self, level: Appearance, parameters: PickPlace = _PLAIN) -> None:
         objects = {spec.name: f"the {spec.name}" for spec in OBJECTS}
-        model = compile_pick_scene(distractors)
+        model = compile_pick_scene(parameters.distractors)
         materials = ("table_top", "skin", *MATERIALS)
-        super().__init__(model, level, objects=objects, materials=materials, distractors=distractors)
+        super().__init__(model, level, objects=objects, materials=materials, distractors=parameters.distractors)
         self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in FINGER_JOINTS]
         self._finger_ctrl = [self.model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS]
         self._tcp = self.model.site(TCP_SITE).id
@@ -68,7 +70,7 @@ class PickWorld(World):
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Put an object on its place, into the gripper or into the palm."""
         spec = OBJECTS[index]
-        right_m, up_m, turned_rad = self._off(offset)
+        right_m, up_m, turned_rad = self._scaled(offset)
         if value == PLACED:
             base_m = standing_m(index)
             share_x = 1.0
@@ -107,18 +109,18 @@ class PickWorld(World):
 
     # --- acting --------------------------------------------------------------------------------------------------
 
-    def set_outcome(self, action: int, intended: tuple[int, ...]) -> None:
+    def set_outcome(self, action: int, intended: State) -> None:
         """Kinematic execution: what moved is where a good macro-action leaves it."""
         del action
         for index, (now, then) in enumerate(zip(self._objects()[0], intended, strict=False)):
             if now != then:
-                self._put(index, then, self._aims[index])
+                self._put(index, then, self._placement_noise[index])
                 if now == PICKED:
                     self._fingers(REST_OPENING_M, REST_OPENING_M)
         self._gesture(intended[N_OBJECTS])
         self.update()
 
-    def execute(self, action: int, intended: tuple[int, ...], capture_motion_hz: float) -> MacroResult:
+    def execute(self, action: int, intended: State) -> MacroResult:
         """Physical execution: the arm acts in contact, everything comes to rest, and then the human answers.
 
         The human answers as ``intended`` says if the objects are where that says, and stand as they should; whatever
@@ -127,7 +129,7 @@ class PickWorld(World):
         before = self._objects()[0]
         poses = self.object_poses()
         stays = before == intended[:N_OBJECTS]
-        result = self._act(action, before, stays, capture_motion_hz)
+        result = self._act(action, before, stays)
         self.update()
         self.executor.rest_holding(self.data, held_object(self._objects()[0]))
         self.update()
@@ -139,24 +141,24 @@ class PickWorld(World):
         moving = [index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])]
         return replace(result, fault=result.fault or self._pushed(moving, poses, "by the way"))
 
-    def _act(self, action: int, objects: tuple[int, ...], stays: bool, capture_motion_hz: float) -> MacroResult:
+    def _act(self, action: int, objects: State, stays: bool) -> MacroResult:
         """What the robot does, possible or not: what it cannot do, or slips, it reaches out for in vain."""
         held = held_object(objects)
         executor = self.executor
         if action == HAND_OVER:
             palm_m = self.data.mocap_pos[self._palm].copy()
             if held is not None and self._read_gesture() == OPEN_PALM and not stays:
-                return executor.hand_over(self.data, index=held, palm_m=palm_m, capture_motion_hz=capture_motion_hz)
+                return executor.hand_over(self.data, index=held, palm_m=palm_m)
             place_m = np.array([*PALM_M[:2], PALM_M[2] + _VAIN_M])
         elif HANDED_OVER not in objects and held == action and not stays:
-            off = self._off(self._aims[action])
-            return executor.place(self.data, index=action, off=off, capture_motion_hz=capture_motion_hz)
+            noise = self._scaled(self._placement_noise[action])
+            return executor.place(self.data, index=action, noise=noise)
         elif HANDED_OVER not in objects and held is None and not stays:
-            return executor.pick(self.data, index=action, capture_motion_hz=capture_motion_hz)
+            return executor.pick(self.data, index=action)
         else:
             x_m, y_m, z_m = standing_m(action)
             place_m = np.array([x_m, y_m, z_m + _VAIN_M])
-        return executor.visit(self.data, place_m=place_m, held=held, capture_motion_hz=capture_motion_hz)
+        return executor.visit(self.data, place_m=place_m, held=held)
 
     # --- reading -------------------------------------------------------------------------------------------------
 

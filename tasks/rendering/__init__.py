@@ -1,5 +1,5 @@
 """Drawing: images of a scene from its cameras, and windows that show images."""
 
-from .renderer import Renderer, View, close_idle_contexts, gl_renderer
+from .renderer import Renderer, View, close_contexts, gl_renderer
 
-__all__ = ["Renderer", "View", "close_idle_contexts", "gl_renderer"]
+__all__ = ["Renderer", "View", "close_contexts", "gl_renderer"]

@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
-import mujoco
+import numpy as np
+
+from imagine_bench.errors import InvalidValueError, brief
 
 from ..scenes.constants import AGENT_CAMERA, ARM_GROUP, SCENE_GROUP, SETTING_GROUP
-from .renderer import Renderer, View
+from .renderer import View
 
 FRAME_PX = 64
+MAX_IMAGE_PX = 4096
 DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
 
 
-def agent_camera(model: mujoco.MjModel, size_px: int = FRAME_PX) -> Renderer:
-    """The agent's view of a model: no arm, hard edges, no shadows."""
-    return Renderer(model, View(camera=AGENT_CAMERA, width=size_px, height=size_px, groups=(SCENE_GROUP,)))
+def agent_camera_view(size_px: int = FRAME_PX) -> View:
+    """What agents see: no arm, hard edges, no shadows."""
+    return View(camera=AGENT_CAMERA, width=size_px, height=size_px, groups=(SCENE_GROUP,))
 
 
 def human_camera_view(camera: str, width: int, height: int) -> View:
-    """A view for people: everything in it, soft edges, shadows and sky."""
-    quality = {"shadow_px": 2048, "samples": 4, "slices": 28}
-    return View(camera=camera, width=width, height=height, groups=DRAWN_GROUPS, sky=True, **quality)
+    """A view for people: everything in it, soft edges, shadows and sky.
+
+    Raises:
+        InvalidValueError: A width or height out of range.
+    """
+    for name, value in (("width", width), ("height", height)):
+        if not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_IMAGE_PX:
+            raise InvalidValueError(f"Image {name} {brief(value)} must be an integer from 1 to {MAX_IMAGE_PX} pixels.")
+    return View(
+        camera=camera,
+        width=int(width),
+        height=int(height),
+        groups=DRAWN_GROUPS,
+        shadow_px=2048,
+        samples=4,
+        slices=28,
+        sky=True,
+    )

@@ -1,12 +1,12 @@
 """The only owner of OpenGL: images of a MuJoCo scene, from contexts that are made late and closed with care.
 
-- A context is made at the first image, in the process that draws it; one inherited through a fork is dropped.
+- A context is made at the first image, in the process that draws it; one inherited through a fork is left alone.
 - Every call makes its own context current first, closing included: MuJoCo frees whatever context is current.
-- Any thread may draw, one at a time. A context stays current in the thread that made it. Another thread makes a
-  context of its own; where the work changes threads again, contexts are released after each frame.
+- Renderers that draw the same scene from the same view share one context, which costs as much as 700 frames to make.
+  The few that were used last are kept for the next renderer.
+- Any thread may draw, one at a time. The contexts of the main thread stay current there. Other threads share contexts
+  that are released after each image; without EGL, which alone can release one, each thread has its own.
 - What is still open when the interpreter exits is closed before MuJoCo closes the display.
-- Renderers of the main thread share the context of one scene and one view, which costs as much as 700 frames to make.
-  The last of a few contexts that nobody uses any more are kept for the next renderer.
 """
 
 from __future__ import annotations
@@ -20,9 +20,7 @@ import hashlib
 import os
 import sys
 import threading
-import weakref
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,12 +28,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known
+from imagine_bench.errors import SetupError, require_known
+from imagine_bench.interfaces import State
 
-MAX_IMAGE_PX = 4096
 _OFFSCREEN = mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value
 _ALL_OBJECTS = mujoco.mjtCatBit.mjCAT_ALL.value
 _EXTRA_GEOMS = 32
+_MESHES = ("mesh_vert", "mesh_normal", "mesh_texcoord", "mesh_face", "mesh_graph", "hfield_data", "skin_vert")
+_IN_CONTEXT = (*_MESHES, "tex_data", "tex_height", "tex_width", "tex_type")
 _MISSING_GL = (
     "No OpenGL for headless rendering ({reason}): on Debian or Ubuntu install it with "
     "'apt-get install libegl1 libgl1-mesa-dri', elsewhere set MUJOCO_GL to a platform that works.{chosen}"
@@ -51,25 +51,21 @@ class View:
     camera: str
     width: int = 64
     height: int = 64
-    groups: tuple[int, ...] = (0,)
+    groups: State = (0,)
     shadow_px: int = 0  # edge of the shadow map; 0 draws no shadows
     samples: int = 0  # multisampling; 0 draws hard edges
     slices: int = 12  # corners of a drawn cylinder
     sky: bool = False  # whether to draw the skybox
 
 
-def image_size(width: int, height: int) -> tuple[int, int]:
-    """Width and height of an image in pixels as numbers. Raises InvalidValueError: one out of range."""
-    for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_IMAGE_PX:
-            raise InvalidValueError(f"Image {name} {brief(value)} must be an integer from 1 to {MAX_IMAGE_PX} pixels.")
-    return int(width), int(height)
+def _is_egl() -> bool:
+    return sys.platform == "linux" and os.environ.get("MUJOCO_GL") == "egl"
 
 
 def _new_gl_context(width: int, height: int) -> Any:
     """A current OpenGL context of the platform that MUJOCO_GL names, or a headless one."""
     try:
-        if sys.platform == "linux" and os.environ.get("MUJOCO_GL") == "egl":
+        if _is_egl():
             from mujoco.egl import GLContext  # noqa: PLC0415  (also where MuJoCo was imported before we chose)
         else:
             from mujoco.gl_context import GLContext  # noqa: PLC0415
@@ -119,44 +115,30 @@ def _release() -> None:
     egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, nothing, nothing, egl.EGL.EGL_NO_CONTEXT)
 
 
-def _empty_scene(model: mujoco.MjModel, view: View) -> mujoco.MjvScene:
-    """An empty scene of a model, to be filled and drawn as a view says."""
+def _drawing(model: mujoco.MjModel, view: View) -> tuple[mujoco.MjvOption, mujoco.MjvCamera, mujoco.MjvScene]:
+    """What a view draws, from where, and an empty scene to be filled with it."""
+    option = mujoco.MjvOption()
+    option.geomgroup[:] = np.isin(np.arange(mujoco.mjNGROUP), view.groups)
+    option.sitegroup[:] = 0
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    camera.fixedcamid = model.camera(view.camera).id
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + _EXTRA_GEOMS)
     flags = mujoco.mjtRndFlag
     scene.flags[flags.mjRND_SHADOW.value] = view.shadow_px > 0
     scene.flags[flags.mjRND_SKYBOX.value] = view.sky
     scene.flags[flags.mjRND_REFLECTION.value] = False
     scene.flags[flags.mjRND_HAZE.value] = False
-    return scene
-
-
-def _drawn_groups(view: View) -> mujoco.MjvOption:
-    """The geom groups that a view draws."""
-    option = mujoco.MjvOption()
-    option.geomgroup[:] = np.isin(np.arange(mujoco.mjNGROUP), view.groups)
-    option.sitegroup[:] = 0
-    return option
-
-
-def _fixed_camera(model: mujoco.MjModel, view: View) -> mujoco.MjvCamera:
-    """The camera of the model that a view names."""
-    camera = mujoco.MjvCamera()
-    camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-    camera.fixedcamid = model.camera(view.camera).id
-    return camera
+    return option, camera, scene
 
 
 class _Canvas:
-    """An OpenGL context with one model's meshes and textures in it."""
+    """An OpenGL context with one model's meshes and textures in it, for one thread or, released, for any."""
 
-    def __init__(self, model: mujoco.MjModel, view: View) -> None:
-        self.users = 0  # renderers that share it
-        self.damaged = False  # whether other code was found to have freed a part of it
-        self.pid = os.getpid()
-        self.thread: int | None = threading.get_ident()  # in which it may be current; None once it is released
+    def __init__(self, model: mujoco.MjModel, view: View, thread: int | None) -> None:
+        self.thread = thread
         self.gl = _new_gl_context(view.width, view.height)
-        self._is_egl = type(self.gl).__module__.endswith("egl")
-        self._address = ctypes.cast(self.gl._context, ctypes.c_void_p).value if self._is_egl else None
+        self._address = ctypes.cast(self.gl._context, ctypes.c_void_p).value if _is_egl() else None
         try:
             with _quality(model, view):
                 self.mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -165,12 +147,11 @@ class _Canvas:
         mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
         self._model = model  # its scene below points into it
         self._rect = mujoco.MjrRect(0, 0, view.width, view.height)
-        self._probe = _empty_scene(model, view)
+        option, camera, self._probe = _drawing(model, view)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        option = _drawn_groups(view)
-        mujoco.mjv_updateScene(model, data, option, None, _fixed_camera(model, view), _ALL_OBJECTS, self._probe)
+        mujoco.mjv_updateScene(model, data, option, None, camera, _ALL_OBJECTS, self._probe)
         self._probe_image = self.draw(self._probe)
 
     def draw(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
@@ -191,94 +172,65 @@ class _Canvas:
 
     def make_current(self) -> None:
         """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything."""
-        if not self._is_egl or _current()() != self._address:
+        if self._address is None or _current()() != self._address:
             self.gl.make_current()
 
-    @property
-    def usable(self) -> bool:
-        """Whether this thread of this process may make it current."""
-        return self.pid == os.getpid() and self.thread in (None, threading.get_ident())
-
-    def release(self) -> None:
-        """Leave it to any thread; EGL alone can."""
-        if self._is_egl:
-            _release()
-            self.thread = None
-
     def close(self) -> None:
-        """Free everything; nothing if that was done before or belongs to a parent process or another thread."""
-        gl = self.gl
-        mjr = self.mjr
-        self.gl = None
-        self.mjr = None
-        if gl is None:
-            return
-        if not self.usable:
-            _inherited.append((gl, gl._context, mjr))
-            gl._context = None  # its destructor would free it from here, or after the display was closed
-            return
-        gl.make_current()
-        mjr.free()
-        gl.free()
+        """Free everything."""
+        self.make_current()
+        self.mjr.free()
+        self.gl.free()
 
 
 def _drawn_as(model: mujoco.MjModel) -> bytes:
     """A digest of all that a context keeps of a model: equal for models that one context may draw."""
     vis = model.vis
-    settings = [getattr(vis.map, name) for name in ("shadowclip", "shadowscale", "fogstart", "fogend")]
+    settings = [vis.map.shadowclip, vis.map.shadowscale, vis.map.fogstart, vis.map.fogend]
     numbers = [*settings, *vis.rgba.fog, vis.global_.linewidth, model.stat.extent]
-    arrays = [model.mesh_vert, model.mesh_normal, model.mesh_texcoord, model.mesh_face, model.mesh_graph]
-    arrays += [model.tex_data, model.tex_height, model.tex_width, model.tex_type, model.hfield_data, model.skin_vert]
     digest = hashlib.sha256(np.array(numbers).tobytes())
-    for array in arrays:
+    for name in _IN_CONTEXT:
+        array = getattr(model, name)
         digest.update(f"{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(array.tobytes())
     return digest.digest()
 
 
 class _Canvases:
-    """The shared contexts of the main thread of one process, by what they draw."""
+    """The contexts of this process, by scene, view and thread; the one used last comes last."""
 
     def __init__(self) -> None:
-        self._pid = os.getpid()
-        self._canvases: dict[tuple[bytes, View], _Canvas] = {}  # in the order of their last use
+        self.lock = threading.RLock()
+        self._canvases: dict[tuple[bytes, View, int | None], _Canvas] = {}
+        self._others: list[_Canvas] = []
 
-    def borrow(self, scene: bytes, model: mujoco.MjModel, view: View) -> _Canvas:
-        """The context of a scene and a view, made if there is none."""
-        if self._pid != os.getpid():
-            self.close()
-            self._pid = os.getpid()
-        canvas = self._canvases.pop((scene, view), None)
-        if canvas is not None and not canvas.is_whole():
-            canvas.damaged = True  # renderers that use it take a new one for their next frame
-            if not canvas.users:
-                canvas.close()
+    def find(self, scene: bytes, model: mujoco.MjModel, view: View, known: _Canvas | None) -> _Canvas:
+        """The context of a scene and a view, made if there is none, or if one that is not the known one is damaged."""
+        is_main = threading.current_thread() is threading.main_thread()
+        thread = None if _is_egl() and not is_main else threading.get_ident()
+        canvas = self._canvases.pop((scene, view, thread), None)
+        if canvas is not None and canvas is not known and not canvas.is_whole():
+            canvas.close()
             canvas = None
         if canvas is None:
-            canvas = _Canvas(model, view)
-        self._canvases[scene, view] = canvas
-        canvas.users += 1
+            self.close(_KEPT - 1)
+            canvas = _Canvas(model, view, thread)
+            _close_at_exit()
+        self._canvases[scene, view, thread] = canvas
         return canvas
 
-    def give_back(self, canvas: _Canvas) -> None:
-        """One renderer less uses it; of those without a user the few that were used last are kept."""
-        canvas.users -= 1
-        if not canvas.users and canvas not in self._canvases.values():  # another one took its place
-            canvas.close()
-        self.free_idle(_KEPT)
-
-    def free_idle(self, keep: int = 0) -> None:
-        """Free the contexts that nobody uses, but for the last ones."""
-        idle = [key for key, each in list(self._canvases.items()) if not each.users]
-        for key in idle[: max(0, len(idle) - keep)]:
+    def close(self, keep: int = 0) -> None:
+        """Free the contexts that this thread may free, but for those that were used last."""
+        usable = [key for key, each in self._canvases.items() if each.thread in (None, threading.get_ident())]
+        for key in usable[: max(0, len(usable) - keep)]:
             self._canvases.pop(key).close()
 
-    def close(self) -> None:
-        """Free every context."""
-        canvases = list(self._canvases.values())
+    def leave(self) -> None:
+        """Use no context any more, and free none, since they belong to a parent process or another thread."""
+        self.lock = threading.RLock()  # a thread of the parent's may have held it
+        self._others += self._canvases.values()
         self._canvases.clear()
-        for canvas in canvases:
-            canvas.close()
+        for canvas in self._others:
+            canvas.gl._context = None  # its destructor would free it from here
 
 
 @contextlib.contextmanager
@@ -301,30 +253,24 @@ def _quality(model: mujoco.MjModel, view: View) -> Iterator[None]:
         model.vis.global_ = size_before
 
 
-_KEPT = 4
-"""Contexts that are kept although nobody uses them."""
-_shared = _Canvases()
-_open: weakref.WeakSet[Renderer] = weakref.WeakSet()
-_inherited: list[Any] = []
-"""Contexts of a parent process or another thread: never used here and never freed, since they belong there."""
+_KEPT = 12
+"""Contexts that are kept at most, of each thread."""
+_canvases = _Canvases()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_canvases.leave)
 
 
-def close_idle_contexts() -> None:
-    """Free the OpenGL contexts that are kept for the next renderer."""
-    _shared.free_idle()
-
-
-def _close_all() -> None:
-    for renderer in list(_open):
-        renderer.close()
-    _shared.close()
+def close_contexts() -> None:
+    """Free the OpenGL contexts of this thread; a renderer that draws again makes a new one."""
+    with _canvases.lock:
+        _canvases.close()
 
 
 @functools.cache
-def _close_all_at_exit(pid: int) -> None:
-    """Register, once in each process, after MuJoCo registered its own clean-up, so that ours runs first."""
-    del pid
-    atexit.register(_close_all)
+def _close_at_exit() -> None:
+    """Register the end after MuJoCo registered its own, so that ours comes first."""
+    atexit.register(_canvases.leave)
+    atexit.register(close_contexts)
 
 
 class Renderer:
@@ -335,16 +281,11 @@ class Renderer:
     """
 
     def __init__(self, model: mujoco.MjModel, view: View) -> None:
-        self._canvas: _Canvas | None = None
-        self._takeovers = 0
-        self._lock = threading.RLock()
-        self._pid = os.getpid()
         require_known("camera", view.camera, [model.camera(index).name for index in range(model.ncam)])
         self.view = view
         self._model = model
-        self._scene = _empty_scene(model, view)
-        self._option = _drawn_groups(view)
-        self._camera = _fixed_camera(model, view)
+        self._canvas: _Canvas | None = None
+        self._option, self._camera, self._scene = _drawing(model, view)
 
     @functools.cached_property
     def _drawn_as(self) -> bytes:
@@ -367,51 +308,20 @@ class Renderer:
             SetupError: As :meth:`frame`.
         """
         drawn = []
-        with self._one_at_a_time():
-            canvas = self._ready_canvas()
+        with _canvases.lock:
+            canvas = _canvases.find(self._drawn_as, self._model, self.view, self._canvas)
+            self._canvas = canvas
             canvas.make_current()
             for scene in scenes:
                 mujoco.mjv_updateScene(*scene, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
                 drawn.append(canvas.draw(self._scene)[::-1].copy())
-            if self._takeovers > 1:
-                canvas.release()
+            if canvas.thread is None:
+                _release()
         return drawn
 
-    def _one_at_a_time(self) -> AbstractContextManager[bool]:
-        """The lock of this process: a thread of the parent's that held it when this was forked lives there alone."""
-        if self._pid != os.getpid():
-            self._lock = threading.RLock()
-            self._pid = os.getpid()
-        return self._lock
-
-    def _ready_canvas(self) -> _Canvas:
-        canvas = self._canvas
-        if canvas is not None and canvas.usable and not canvas.damaged:
-            return canvas
-        self._takeovers += canvas is not None and canvas.pid == os.getpid() and not canvas.damaged
-        self.close()
-        if threading.current_thread() is threading.main_thread() and not self._takeovers:
-            canvas = _shared.borrow(self._drawn_as, self._model, self.view)
-            give_back: Callable[[], None] = functools.partial(_shared.give_back, canvas)
-        else:
-            canvas = _Canvas(self._model, self.view)
-            give_back = canvas.close
-        self._canvas = canvas
-        # A renderer that is merely forgotten must free its context with it current, too.
-        self._finalizer = weakref.finalize(self, give_back)
-        self._finalizer.atexit = False
-        _open.add(self)
-        _close_all_at_exit(os.getpid())
-        return canvas
-
     def close(self) -> None:
-        """Free the OpenGL context, if this process has one. Safe to call again; a later frame makes a new one."""
-        with self._one_at_a_time():
-            canvas = self._canvas
-            self._canvas = None
-            _open.discard(self)
-            if canvas is not None:
-                self._finalizer()
+        """Leave the OpenGL context to the next renderer. Safe to call again; a later frame finds or makes one."""
+        self._canvas = None
 
     def __reduce__(self) -> tuple[type[Renderer], tuple[mujoco.MjModel, View]]:
         return type(self), (self._model, self.view)

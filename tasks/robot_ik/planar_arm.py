@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats, Motion, Shape3D
 
-from ..scene_reader import body_names, poses_of, shapes_of
+from ..scene_reader import body_poses, motion_of, shapes_of
 
 MOVE_S = 1.6
 """Simulated seconds of a movement; the servos have come to rest by then (a test says how near)."""
@@ -93,14 +93,15 @@ class PlanarArm:
         every = max(1, math.ceil(1.0 / (hz * self.model.opt.timestep) - 1e-9))
         mujoco.mj_resetData(self.model, data)
         data.ctrl[:] = joints_rad
-        positions = [data.qpos.copy()]
+        mujoco.mj_kinematics(self.model, data)
         times = [0.0]
+        poses = [body_poses(data)]
         for step in range(0, self._steps, every):
             mujoco.mj_step(self.model, data, min(every, self._steps - step))
-            positions.append(data.qpos.copy())
+            mujoco.mj_kinematics(self.model, data)
             times.append(float(data.time))
-        poses = poses_of(self.model, np.array(positions), data.mocap_pos, data.mocap_quat)
-        return Motion(body_names=body_names(self.model), time_s=np.array(times), poses_in_world=poses)
+            poses.append(body_poses(data))
+        return motion_of(self.model, times, poses)
 
     def shapes(self) -> tuple[Shape3D, ...]:
         """Every drawable part."""

@@ -9,10 +9,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench.appearance import POINTS, appearance_name, factors_of
-from imagine_bench.interfaces import HELD_OUT
+from imagine_bench.interfaces import HELD_OUT, Floats
 
 _CHANNELS = 3
 
@@ -112,7 +111,7 @@ def between(name: str, factors: Mapping[str, float]) -> Appearance:
     return Appearance(name=name, **widths)
 
 
-def looks_of(model: mujoco.MjModel) -> tuple[NDArray[np.float64], ...]:
+def looks_of(model: mujoco.MjModel) -> tuple[Floats, ...]:
     """What any appearance writes into a model: views of it."""
     headlight = model.vis.headlight
     return headlight.ambient, headlight.diffuse, model.light_diffuse, model.mat_rgba, model.cam_pos, model.cam_quat
@@ -133,34 +132,23 @@ class AppearanceSampler:
         self._level = level
         self._camera = model.camera(camera).id
         self._materials = np.array([model.material(name).id for name in materials])
-        headlight = model.vis.headlight
-        self._ambient = headlight.ambient.copy()
-        self._diffuse = headlight.diffuse.copy()
-        self._light_diffuse = model.light_diffuse.copy()
-        self._rgba = model.mat_rgba[self._materials].copy()
-        self._camera_pos = model.cam_pos[self._camera].copy()
-        self._camera_quat = model.cam_quat[self._camera].copy()
+        self._nominal = [each.copy() for each in looks_of(model)]
 
     def vary(self, rng: np.random.Generator) -> None:
         """Write one new sample; it replaces the one before, nothing adds up."""
         level = self._level
-        model = self._model
+        *lights, rgba, cam_pos, cam_quat = looks_of(self._model)
+        *nominal_lights, nominal_rgba, nominal_pos, nominal_quat = self._nominal
         if level.light_fraction:
             brightness = 1.0 + level.light_fraction * rng.uniform(-1.0, 1.0)
-            model.vis.headlight.ambient = self._ambient * brightness
-            model.vis.headlight.diffuse = self._diffuse * brightness
-            model.light_diffuse[:] = self._light_diffuse * brightness
+            for light, nominal in zip(lights, nominal_lights, strict=True):
+                light[:] = nominal * brightness
         if level.color_fraction:
             tint = 1.0 + level.color_fraction * rng.uniform(-1.0, 1.0, (len(self._materials), _CHANNELS))
-            model.mat_rgba[self._materials, :_CHANNELS] = np.minimum(self._rgba[:, :_CHANNELS] * tint, 1.0)
+            rgba[self._materials, :_CHANNELS] = np.minimum(nominal_rgba[self._materials, :_CHANNELS] * tint, 1.0)
         if level.camera_offset_m or level.camera_angle_rad:
             shift, turn = rng.uniform(-1.0, 1.0, (2, 3))
-            model.cam_pos[self._camera] = self._camera_pos + level.camera_offset_m * shift
-            model.cam_quat[self._camera] = _turned(self._camera_quat, level.camera_angle_rad * turn)
-
-
-def _turned(quat: NDArray[np.float64], rotation_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``quat`` (w, x, y, z) followed in its own frame by a rotation vector. Shape (4,)."""
-    turned = quat.copy()
-    mujoco.mju_quatIntegrate(turned, rotation_rad, 1.0)
-    return turned
+            cam_pos[self._camera] = nominal_pos[self._camera] + level.camera_offset_m * shift
+            quat = nominal_quat[self._camera].copy()
+            mujoco.mju_quatIntegrate(quat, level.camera_angle_rad * turn, 1.0)
+            cam_quat[self._camera] = quat

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from importlib import resources
+from typing import NamedTuple
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Floats
 
 ARM_JOINTS = tuple(f"right_j{index}" for index in range(7))
 """From the base to the wrist."""
@@ -45,3 +50,33 @@ def let_arm_touch(spec: mujoco.MjSpec) -> None:
 def arm_spec() -> mujoco.MjSpec:
     """A new specification of the arm, its base at the origin; add a scene to it or compile it alone."""
     return mujoco.MjSpec.from_string(resources.files("imagine_bench.assets").joinpath("sawyer.xml").read_text())
+
+
+class ArmColumns(NamedTuple):
+    """Where the seven joints, then the two fingers, are in the arrays of a scene. Shapes (9,)."""
+
+    qpos: NDArray[np.int64]
+    qvel: NDArray[np.int64]
+    ctrl: NDArray[np.int64]
+
+
+def arm_columns(model: mujoco.MjModel) -> ArmColumns:
+    """The columns of the arm in positions, velocities and controls."""
+    joints = [model.joint(name) for name in (*ARM_JOINTS, *FINGER_JOINTS)]
+    servos = [model.actuator(f"{joint.name.replace('_slide', '')}_servo") for joint in joints]
+    return ArmColumns(
+        qpos=np.array([joint.qposadr[0] for joint in joints]),
+        qvel=np.array([joint.dofadr[0] for joint in joints]),
+        ctrl=np.array([servo.id for servo in servos]),
+    )
+
+
+def tcp_in_world(data: mujoco.MjData, tcp: int) -> Floats:
+    """Position (m) and quaternion (w, x, y, z) of a site, the point between the fingers. Shape (7,).
+
+    Kinematics is up to date.
+    """
+    pose = np.empty(7)
+    pose[:3] = data.site_xpos[tcp]
+    mujoco.mju_mat2Quat(pose[3:], data.site_xmat[tcp])
+    return pose

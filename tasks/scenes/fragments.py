@@ -12,9 +12,8 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces import Floats, Frame, State
 from imagine_bench.seeding import SeedTree
 
 from .appearance import Appearance
@@ -32,7 +31,7 @@ class Fragment:
     """One photograph of one microstate."""
 
     offset: tuple[float, float, float, float]  #: shares in [-1, 1] of the level's offsets x, y, z and of its yaw
-    light: NDArray[np.float64]  #: brightness at the patch's corners, by row, column and channel. Shape (2, 2, 3).
+    light: Floats  #: brightness at the patch's corners, by row, column and channel. Shape (2, 2, 3).
 
 
 @functools.cache
@@ -49,52 +48,46 @@ def fragments(level: Appearance, subject: str, value: int) -> tuple[Fragment, ..
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shot:
-    """All that makes one photograph of a rendered frame."""
+class Composite:
+    """All that makes a photograph of a rendered frame."""
 
     hand: Fragment
     objects: tuple[Fragment, ...]
-    gamma: float = 1.0
-    noise_seed: int = 0
+    gamma: float
+    noise_std: float
+    noise_seed: int
 
-
-class Photographer:
-    """Draws the fragments of each frame, and makes a rendered frame a photograph of them: its latest ``shot``."""
-
-    def __init__(self, level: Appearance) -> None:
-        self._level = level
-        self.shot = Shot(hand=fragments(level, "hand", 0)[0], objects=(fragments(level, "object 0", 0)[0],))
-
-    def draw(self, objects: tuple[int, ...], gesture: int, rng: np.random.Generator) -> Shot:
-        """A new shot: fragments of the hand and of each object, uniformly from their pools, gamma and noise."""
-        hand = fragments(self._level, "hand", gesture)[int(rng.integers(HAND_FRAGMENTS))]
-        chosen = rng.integers(OBJECT_FRAGMENTS, size=len(objects)).tolist()
-        pools = [fragments(self._level, f"object {index}", value) for index, value in enumerate(objects)]
-        self.shot = Shot(
-            hand=hand,
-            objects=tuple(pool[which] for pool, which in zip(pools, chosen, strict=True)),
-            gamma=1.0 + self._level.gamma_half_width * rng.uniform(-1.0, 1.0),
-            noise_seed=int(rng.integers(1 << 63)),
-        )
-        return self.shot
-
-    def develop(self, frame: Frame) -> Frame:
-        """The photograph of a rendered frame (H, W, 3): the same one until the next draw."""
-        shot = self.shot
-        height, width, channels = frame.shape
-        light = np.empty((height, width, channels))
+    def of(self, frame: Frame) -> Frame:
+        """The photograph of a rendered frame (H, W, 3)."""
+        height, width, _ = frame.shape
+        light = np.empty(frame.shape)
         top = round(height * HAND_SHARE)
-        seams = np.linspace(0, width, len(shot.objects) + 1).round().astype(int)
-        light[:top] = _spread(shot.hand.light, top, width)
-        for left, right, fragment in zip(seams[:-1], seams[1:], shot.objects, strict=True):
+        seams = np.linspace(0, width, len(self.objects) + 1).round().astype(int)
+        light[:top] = _spread(self.hand.light, top, width)
+        for left, right, fragment in zip(seams[:-1], seams[1:], self.objects, strict=True):
             light[top:, left:right] = _spread(fragment.light, height - top, right - left)
-        generator = np.random.default_rng(shot.noise_seed)
-        noise = generator.standard_normal(frame.shape)
-        seen = np.clip(frame / _WHITE * light + self._level.noise_std * noise, 0.0, 1.0)
-        return np.rint(_WHITE * seen**shot.gamma).astype(np.uint8)
+        noise = np.random.default_rng(self.noise_seed).standard_normal(frame.shape)
+        lit = np.clip(frame / _WHITE * light + self.noise_std * noise, 0.0, 1.0)
+        return np.rint(_WHITE * lit**self.gamma).astype(np.uint8)
 
 
-def _spread(corners: NDArray[np.float64], height: int, width: int) -> NDArray[np.float64]:
+def draw_composite(level: Appearance, objects: State, gesture: int, rng: np.random.Generator) -> Composite:
+    """Fragments of the hand and of each object, uniformly from their pools, gamma and noise."""
+    hand = fragments(level, "hand", gesture)[int(rng.integers(HAND_FRAGMENTS))]
+    chosen = rng.integers(OBJECT_FRAGMENTS, size=len(objects)).tolist()
+    return Composite(
+        hand=hand,
+        objects=tuple(
+            fragments(level, f"object {index}", value)[which]
+            for index, (value, which) in enumerate(zip(objects, chosen, strict=True))
+        ),
+        gamma=1.0 + level.gamma_half_width * rng.uniform(-1.0, 1.0),
+        noise_std=level.noise_std,
+        noise_seed=int(rng.integers(1 << 63)),
+    )
+
+
+def _spread(corners: Floats, height: int, width: int) -> Floats:
     """Corners (2, 2, C) interpolated bilinearly over a patch. Shape (height, width, C)."""
     shares = (np.linspace(0.0, 1.0, pixels) for pixels in (height, width))
     down, across = (np.stack([1.0 - share, share], axis=1) for share in shares)

@@ -1,7 +1,9 @@
-"""A pointing human hand as a mocap body: its origin is the index fingertip, and it points along the body's -x.
+"""A person's hands as mocap bodies: a right one that points and a left one that opens its palm.
 
-It is a right hand, palm down, that comes from the far side of the table: the thumb is on the frame's right. Hand and
-sleeve are one mesh each, since every drawn geom costs more than its vertices do.
+The origin of the pointing hand is its index fingertip; it points along the body's -x, palm down, from the far side of
+the table, so that its thumb is on the frame's right. The origin of the open hand is the middle of its palm; its fingers
+point along -x. A plate and a rim of capsules carry what is laid into it; they are felt and not drawn. Hand and sleeve
+are one mesh each, since every drawn geom costs more than its vertices do.
 """
 
 from __future__ import annotations
@@ -12,19 +14,51 @@ from . import constants as c
 from .meshes import Mesh, ellipsoid, limb, merge
 
 Joint = tuple[float, float, float, float]
-"""x, y, z and radius of a joint, metres."""
+Limb = tuple[Joint, ...]
+"""x, y, z and radius of a joint, metres; joints from the root to the tip."""
 
-_INDEX: tuple[Joint, ...] = ((0.078, 0.003, 0.032, 0.0110), (0.030, 0.0, 0.010, 0.0088), (0.008, 0.0, 0.001, 0.0075))
-_CURLED: tuple[tuple[Joint, ...], ...] = (
+_INDEX: Limb = ((0.078, 0.003, 0.032, 0.0110), (0.030, 0.0, 0.010, 0.0088), (0.008, 0.0, 0.001, 0.0075))
+_CURLED: tuple[Limb, ...] = (
     ((0.076, 0.022, 0.031, 0.0105), (0.050, 0.021, 0.016, 0.0095), (0.066, 0.021, -0.002, 0.0085)),
     ((0.080, 0.040, 0.028, 0.0100), (0.057, 0.038, 0.013, 0.0090), (0.072, 0.038, -0.003, 0.0080)),
     ((0.087, 0.055, 0.024, 0.0090), (0.068, 0.053, 0.010, 0.0080), (0.080, 0.052, -0.002, 0.0072)),
 )
-_THUMB: tuple[Joint, ...] = ((0.135, 0, 0.030, 0.0130), (0.102, -0.019, 0.016, 0.0105), (0.074, -0.014, 0.006, 0.0085))
-_FOREARM: tuple[Joint, ...] = ((0.165, 0.030, 0.046, 0.024), (0.235, 0.034, 0.075, 0.029))
-_SLEEVE: tuple[Joint, ...] = ((0.235, 0.034, 0.075, 0.038), (0.440, 0.048, 0.165, 0.050), (0.640, 0.075, 0.270, 0.062))
+_THUMB: Limb = ((0.135, 0, 0.030, 0.0130), (0.102, -0.019, 0.016, 0.0105), (0.074, -0.014, 0.006, 0.0085))
+_FOREARM: Limb = ((0.165, 0.030, 0.046, 0.024), (0.235, 0.034, 0.075, 0.029))
+_SLEEVE: Limb = ((0.235, 0.034, 0.075, 0.038), (0.440, 0.048, 0.165, 0.050), (0.640, 0.075, 0.270, 0.062))
 _PALM_CENTER_M = (0.118, 0.028, 0.037)
 _PALM_RADII_M = (0.052, 0.040, 0.019)
+
+PALM_REACH_M = 0.036
+"""What lies in the palm has its middle within so far of the palm's."""
+
+_OPEN_FINGERS: tuple[Limb, ...] = tuple(
+    (
+        (-0.036, 0.8 * y, -0.012, 0.0105),
+        (-0.036 - 0.45 * reach, 0.95 * y, -0.012, 0.0095),
+        (-0.036 - 0.80 * reach, 1.1 * y, -0.004, 0.0088),
+        (-0.036 - reach, 1.15 * y, 0.006, 0.0078),
+    )
+    for y, reach in ((-0.034, 0.058), (-0.012, 0.068), (0.011, 0.064), (0.033, 0.048))
+)
+_OPEN_THUMB: Limb = (
+    (0.03, -0.034, -0.012, 0.014),
+    (0, -0.060, -0.004, 0.011),
+    (-0.026, -0.072, 0.004, 0.0088),
+)
+_HEEL: Limb = ((0.020, 0.0, -0.020, 0.022), (0.070, 0.004, -0.020, 0.024), (0.100, 0.006, -0.016, 0.023))
+_OPEN_FOREARM: Limb = ((0.090, 0.006, -0.016, 0.024), (0.160, 0.010, 0.004, 0.029))
+_OPEN_SLEEVE: Limb = (
+    (0.160, 0.010, 0.004, 0.038),
+    (0.365, 0.0, 0.094, 0.050),
+    (0.565, -0.02, 0.200, 0.062),
+)
+_OPEN_PALM_CENTER_M = (0.004, 0.0, -0.014)
+_OPEN_PALM_RADII_M = (0.056, 0.047, 0.015)
+
+_PLATE_HALF_M = (0.050, 0.042, 0.008)
+_RIM_M = (0.046, 0.040)
+_RIM_RADIUS_M = 0.007
 
 
 def hand_meshes() -> dict[str, Mesh]:
@@ -60,6 +94,33 @@ def add_limb(
     for (part, mesh), (material, group) in zip(meshes.items(), materials, strict=True):
         add_drawn_mesh(spec, body, part, mesh, material=material, group=group, geom=f"{part}_skin")
     return body
+
+
+def open_hand_meshes() -> dict[str, Mesh]:
+    """Palm, four fingers bent up a little and the thumb, which the agent's frame shows; the bare wrist; the sleeve."""
+    fingers = [limb(finger, sides=5) for finger in _OPEN_FINGERS]
+    palm = ellipsoid(_OPEN_PALM_CENTER_M, _OPEN_PALM_RADII_M, sides=11, rings=4)
+    hand = merge([palm, limb(_OPEN_THUMB, sides=5), *fingers, limb(_HEEL, sides=7)])
+    return {"palm": hand, "palm_wrist": limb(_OPEN_FOREARM, sides=10), "palm_sleeve": limb(_OPEN_SLEEVE, sides=12)}
+
+
+def add_open_hand(spec: mujoco.MjSpec, palm_m: tuple[float, float, float]) -> None:
+    """Add the mocap body ``palm`` with the middle of its palm at a place in the world."""
+    body = add_limb(spec, "palm", palm_m, open_hand_meshes())
+    touch = {"mass": 0.0, "group": c.COLLISION_GROUP, "friction": (0.9, 0.01, 0.002)}
+    body.add_geom(
+        name="palm_plate", type=mujoco.mjtGeom.mjGEOM_BOX, size=_PLATE_HALF_M, pos=(0, 0, -_PLATE_HALF_M[2]), **touch
+    )
+    x, y, z = *_RIM_M, 0.5 * _RIM_RADIUS_M
+    corners = ((-x, -y, z), (-x, y, z), (x, y, z), (x, -y, z))
+    for number, (start, end) in enumerate(zip(corners, corners[1:] + corners[:1], strict=True)):
+        body.add_geom(
+            name=f"palm_rim_{number}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=(_RIM_RADIUS_M, 0, 0),
+            fromto=(*start, *end),
+            **touch,
+        )
 
 
 def add_drawn_mesh(

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imagine_bench.interfaces import Floats
+
+Point = tuple[float, float, float]
 _CAP_RAD = np.pi / 4
 """Latitude of the ring that rounds a limb's tip."""
 
@@ -19,7 +22,7 @@ _CAP_RAD = np.pi / 4
 class Mesh:
     """A triangle mesh."""
 
-    vertices: NDArray[np.float64]  #: shape (V, 3), metres
+    vertices: Floats  #: shape (V, 3), metres
     faces: NDArray[np.int64]  #: vertex indices. Shape (F, 3).
 
 
@@ -32,7 +35,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _rings_to_mesh(rings: NDArray[np.float64], first: NDArray[np.float64], last: NDArray[np.float64]) -> Mesh:
+def _rings_to_mesh(rings: Floats, first: Floats, last: Floats) -> Mesh:
     """Stitch rings (R, N, 3), counter-clockwise about the way from ``first`` to ``last``, into a closed surface."""
     n_rings, n_sides = rings.shape[:2]
     vertices = np.concatenate([rings.reshape(-1, 3), first[None], last[None]])
@@ -49,7 +52,7 @@ def _rings_to_mesh(rings: NDArray[np.float64], first: NDArray[np.float64], last:
     return Mesh(vertices, np.concatenate(faces).astype(np.int64))
 
 
-def _frames_along(axes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _frames_along(axes: Floats) -> Floats:
     """Two unit vectors that complete each axis (R, 3) to a right-handed frame, all turned alike. Shape (R, 2, 3)."""
     helper = np.eye(3)[int(np.abs(axes).max(axis=0).argmin())]
     u = np.cross(axes, helper)
@@ -57,7 +60,7 @@ def _frames_along(axes: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([u, np.cross(axes, u)], axis=1)
 
 
-def limb(joints: Sequence[tuple[float, float, float, float]], *, sides: int = 8) -> Mesh:
+def limb(joints: Sequence[tuple[float, float, float, float]], *, sides: int) -> Mesh:
     """A bent, tapered tube through joints, rounded at its last one, such as a finger.
 
     Args:
@@ -80,83 +83,58 @@ def limb(joints: Sequence[tuple[float, float, float, float]], *, sides: int = 8)
     return _rings_to_mesh(rings, points[0] - 0.5 * radii[0] * bones[0], points[-1] + radii[-1] * tip)
 
 
-def ellipsoid(center: ArrayLike, radii: ArrayLike, *, sides: int = 10, rings: int = 5) -> Mesh:
+def ellipsoid(center: Point, radii: Point, *, sides: int, rings: int) -> Mesh:
     """An ellipsoid with its axes along x, y and z.
 
     Args:
-        center: Metres. Shape (3,).
-        radii: Metres. Shape (3,).
+        center: Metres.
+        radii: Metres.
         sides: Corners of a cross-section.
         rings: Cross-sections between the poles.
     """
-    center = np.asarray(center, dtype=np.float64)
-    radii = np.asarray(radii, dtype=np.float64)
     latitude = np.linspace(-np.pi / 2, np.pi / 2, rings + 2)[1:-1, None]
     angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)[None, :]
     unit = np.stack([np.cos(latitude) * np.cos(angle), np.cos(latitude) * np.sin(angle), np.sin(latitude + 0 * angle)])
     pole = np.array([0.0, 0.0, radii[2]])
-    return _rings_to_mesh(center + np.moveaxis(unit, 0, -1) * radii, center - pole, center + pole)
+    return _rings_to_mesh(np.array(center) + np.moveaxis(unit, 0, -1) * radii, center - pole, center + pole)
 
 
-def prism(outline: ArrayLike, bottom_m: float, top_m: float) -> Mesh:
-    """A flat plate: an outline that is star-shaped about its mean, pulled up along z.
-
-    Args:
-        outline: Corners in the x-y plane, counter-clockwise seen from above, metres. Shape (N, 2).
-        bottom_m: Height of the lower face.
-        top_m: Height of the upper face.
-    """
-    outline = np.asarray(outline, dtype=np.float64)
-    rings = np.stack([np.insert(outline, 2, height, axis=1) for height in (bottom_m, top_m)])
-    center = outline.mean(axis=0)
-    return _rings_to_mesh(rings, np.array([*center, bottom_m]), np.array([*center, top_m]))
-
-
-def box(low: ArrayLike, high: ArrayLike, *, taper: float = 1.0) -> Mesh:
-    """A box between two corners, its top shrunk about its middle by ``taper``.
+def stack(outlines: Sequence[ArrayLike], heights_m: Sequence[float], middle: ArrayLike = (0.0, 0.0)) -> Mesh:
+    """A solid between level outlines, each star-shaped about one middle, closed by its lowest and its highest.
 
     Args:
-        low: Metres. Shape (3,).
-        high: Metres. Shape (3,).
-        taper: Size of the top face relative to the bottom face, in (0, 1].
+        outlines: Corners in the x-y plane, counter-clockwise seen from above, metres. Shapes (N, 2).
+        heights_m: Of each outline, ascending.
+        middle: In the x-y plane, metres. Shape (2,).
     """
-    low = np.asarray(low, dtype=np.float64)
-    high = np.asarray(high, dtype=np.float64)
-    middle = (low + high) / 2
-    half = (high - low) / 2
+    rings = [np.insert(np.asarray(each), 2, z, axis=1) for each, z in zip(outlines, heights_m, strict=True)]
+    return _rings_to_mesh(np.array(rings), np.append(middle, heights_m[0]), np.append(middle, heights_m[-1]))
+
+
+def box(low: Point, high: Point, *, taper: float = 1.0) -> Mesh:
+    """A box between two corners, in metres, its top shrunk about its middle by ``taper``, in (0, 1]."""
+    middle = (np.array(low[:2]) + high[:2]) / 2
+    half = (np.array(high[:2]) - low[:2]) / 2
     corners = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-    rings = np.stack(
-        [
-            np.concatenate([middle[:2] + scale * half[:2] * corners, np.full((4, 1), z)], axis=1)
-            for scale, z in ((1.0, low[2]), (taper, high[2]))
-        ]
-    )
-    return _rings_to_mesh(rings, np.array([*middle[:2], low[2]]), np.array([*middle[:2], high[2]]))
+    outlines = [middle + scale * half * corners for scale in (1.0, taper)]
+    return stack(outlines, (low[2], high[2]), middle)
 
 
-def turned_profile(profile: Sequence[tuple[float, float]], *, sides: int = 12) -> Mesh:
-    """A solid of revolution about z, such as a cup.
-
-    Args:
-        profile: (radius, z) from the bottom to the top, metres; both ends are closed by discs.
-        sides: Corners of a cross-section.
-    """
+def turned_profile(profile: Sequence[tuple[float, float]], *, sides: int) -> Mesh:
+    """A solid of revolution about z, such as a cup: (radius, z) from the bottom to the top, metres."""
     angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rings = np.stack([np.insert(radius * circle, 2, z, axis=1) for radius, z in profile])
-    return _rings_to_mesh(rings, np.array([0.0, 0.0, profile[0][1]]), np.array([0.0, 0.0, profile[-1][1]]))
+    return stack([radius * circle for radius, _ in profile], [z for _, z in profile])
 
 
-def arch(center: ArrayLike, *, radius: float, thickness: float, corners: int = 6, sides: int = 5) -> Mesh:
+def arch(center: Point, *, radius: float, thickness: float) -> Mesh:
     """Half a ring in the x-z plane that bulges toward -x, such as a cup's handle.
 
     Args:
-        center: Middle of the ring's chord, metres. Shape (3,).
+        center: Middle of the ring's chord, metres.
         radius: Of the ring's centre line.
         thickness: Radius of the bent rod.
-        corners: Bones along the arch.
-        sides: Corners of a cross-section.
     """
-    x, y, z = np.asarray(center, dtype=np.float64)
-    angle = np.linspace(-np.pi / 2, np.pi / 2, corners + 1)
-    return limb([(x - radius * np.cos(a), y, z + radius * np.sin(a), thickness) for a in angle], sides=sides)
+    x, y, z = center
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 7)
+    return limb([(x - radius * np.cos(a), y, z + radius * np.sin(a), thickness) for a in angle], sides=5)

@@ -178,17 +178,6 @@ def test_starts_are_spread_over_the_start_states(task):
     assert chi_square < len(starts) + 5 * np.sqrt(2 * len(starts))
 
 
-def test_a_closed_environment_holds_no_opengl_context():
-    env = make(**KINEMATIC, render_mode="rgb_array").unwrapped
-    env.reset(seed=0)
-    env.render()
-    env.human_view(64, 48)
-    renderers = env._agent_camera, env._render_camera, env._human_camera
-    assert all(renderer._canvas is not None for renderer in renderers)
-    env.close()
-    assert all(renderer._canvas is None for renderer in renderers)
-
-
 def test_render_gives_the_asked_view_and_nothing_without_a_mode():
     env = make(render_mode="rgb_array", width=80, height=60, camera="wrist", **KINEMATIC)
     env.reset(seed=0)

@@ -316,19 +316,21 @@ def test_every_task_has_a_vector_id_and_keeps_its_default():
     usual.close()
 
 
-def test_lanes_are_drawn_in_one_context_which_is_freed():
-    before = len(rendering._open)
+def test_lanes_are_drawn_in_one_context_a_view(monkeypatch):
+    made = []
+    make_context = rendering._new_gl_context
+    monkeypatch.setattr(rendering, "_new_gl_context", lambda *size: made.append(size) or make_context(*size))
+    rendering.close_contexts()
     vector = make(n=4, **KINEMATIC, appearance="strong", render_mode="rgb_array", width=48, height=32)
     vector.reset(seed=0)
     vector.step(np.zeros(4, dtype=int))
-    assert len(rendering._open) == before + 1
+    assert made == [(64, 64)]
     images = vector.render()
     assert [image.shape for image in images] == [(32, 48, 3)] * 4
-    assert len(rendering._open) == before + 2
+    assert made == [(64, 64), (48, 32)]
     assert np.array_equal(images[1], vector.envs[1].render())
     assert not all(np.array_equal(images[0], image) for image in images)
     vector.close()
-    assert len(rendering._open) == before
     assert make(**KINEMATIC).render() is None
 
 

@@ -22,6 +22,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import plain_torch
+from imagine_bench.tasks.rendering.cameras import agent_camera_view
 from plain_torch import least_cpu_s
 
 from imagine_bench import registry
@@ -165,7 +166,7 @@ def drawing(spec: TaskSpec) -> Iterator[Figure]:
 
 def _mjr_alone(scene: gymnasium.Env) -> Callable[[], object]:
     """MuJoCo's drawing and reading of the pixels of the latest frame, with nothing of this suite around it."""
-    camera = scene._agent_camera
+    camera = scene.camera(agent_camera_view())
     pixels = np.empty((camera.view.height, camera.view.width, 3), dtype=np.uint8)
     rect = mujoco.MjrRect(0, 0, camera.view.width, camera.view.height)
 

@@ -8,7 +8,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.motion.arm_model import ArmModel
+from imagine_bench.tasks.motion.ik import ArmModel
 from imagine_bench.tasks.scenes.constants import TIMESTEP_S
 from worlds import draw_quickly
 
@@ -89,7 +89,7 @@ def test_rates_above_the_simulation_s_are_interpolated():
     )
     np.testing.assert_allclose(motion.joint_rad_s[42], steps.joint_rad_s[26] * 0.75 + steps.joint_rad_s[27] * 0.25)
     np.testing.assert_array_equal(motion.joint_command_rad[41], steps.joint_command_rad[25])
-    quats = env.unwrapped._latest.qpos[:, env.unwrapped.world.object_qpos[:, 3:]]
+    quats = env.unwrapped._latest.motion.qpos[:, env.unwrapped.world.object_qpos[:, 3:]]
     np.testing.assert_allclose(np.linalg.norm(quats, axis=-1), 1.0, atol=1e-12)
 
 
@@ -111,7 +111,7 @@ def test_recording_the_motion_changes_no_bit(task):
         np.testing.assert_equal(info, info_too)
     np.testing.assert_array_equal(state.world.physics, state_too.world.physics)
     assert state.generator == state_too.generator
-    assert len(state.latest.time_s) == 0 < len(state_too.latest.time_s)
+    assert len(state.latest.motion.time_s) == 0 < len(state_too.latest.motion.time_s)
 
 
 def test_both_cameras_film_the_motion():

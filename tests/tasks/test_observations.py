@@ -117,30 +117,3 @@ def test_a_pickled_environment_observes_the_same_parts():
 def test_what_cannot_be_observed_is_refused(options, error, message):
     with pytest.raises(error, match=message):
         make(**options)
-
-
-@pytest.mark.parametrize(("task", "execution"), list(zip(WORLDS, EXECUTIONS, strict=True)))
-def test_frame_of_shows_a_macrostate_and_changes_nothing(task, execution):
-    env, twin = (make(task, execution=execution, appearance="strong") for _ in range(2))
-    other = registry.task(task).rules.start_states[-1]
-    seen, _ = twin.reset(seed=7, options={"macrostate": other})
-    for each in (env, twin):
-        each.reset(seed=1)
-        each.step(1)
-    before = env.unwrapped.get_state()
-    frame = env.unwrapped.frame_of(other, np.random.default_rng(7))
-    np.testing.assert_array_equal(frame, seen)
-    np.testing.assert_array_equal(env.unwrapped.frame_of(other), env.unwrapped.frame_of(other))
-    after = env.unwrapped.get_state()
-    np.testing.assert_array_equal(before.world.physics, after.world.physics)
-    for look, look_too in zip(before.world.looks, after.world.looks, strict=True):
-        np.testing.assert_array_equal(look, look_too)
-    assert (before.generator, before.macrostate) == (after.generator, after.macrostate)
-    for action in (0, 1):
-        (image, *result), (image_too, *result_too) = env.step(action), twin.step(action)
-        np.testing.assert_array_equal(image, image_too)
-        np.testing.assert_equal(result, result_too)
-    with pytest.raises(InvalidValueError, match="No macrostate"):
-        env.unwrapped.frame_of((9, 9, 9, 9))
-    env.close()
-    twin.close()

@@ -7,8 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene
-from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.ik import ArmIK
+from imagine_bench.tasks.motion.ik import ArmIK, ArmModel
 from imagine_bench.tasks.pick_place.scene import compile_pick_scene
 from imagine_bench.tasks.scenes.constants import HOME_QPOS_RAD, TABLE_HEIGHT_M
 
@@ -149,7 +148,7 @@ def near_misses(task, actions):
         _, _, over, _, info = env.step(int(rng.integers(spec.n_actions)))
         assert not info["fault"], info["fault_reason"]
         data.mocap_pos[:] = people
-        for qpos in env._latest.qpos:
+        for qpos in env._latest.motion.qpos:
             found |= touching(model, data, qpos, names)
             samples += 1
     return found, samples
@@ -200,7 +199,7 @@ def test_a_finger_enters_the_pointing_hand_by_little():
         data.mocap_pos[:] = env.data.mocap_pos
         over = env.step(int(rng.integers(6)))[2]
         closest_m.append(1.0)
-        for qpos in env._latest.qpos:
+        for qpos in env._latest.motion.qpos:
             data.qpos[:] = qpos
             mujoco.mj_kinematics(model, data)
             gaps_m = [mujoco.mj_geomDistance(model, data, hand, finger, 1.0, None) for finger in fingers]

@@ -47,7 +47,8 @@ def test_the_gripper_passes_the_pointing_hand(name, state, action):
     world = world_of(name, FIXED)
     world.place(state, np.random.default_rng(0))
     people = world.data.mocap_pos.copy()
-    result = world.execute(action, registry.task(name).rules.outcomes(state, action)[0].macrostate, 20.0)
+    world.executor.capture_motion_hz = 20.0
+    result = world.execute(action, registry.task(name).rules.outcomes(state, action)[0].macrostate)
     assert result.fault is None
     model = world.model
     hand = model.geom("hand_skin").id
@@ -57,7 +58,7 @@ def test_the_gripper_passes_the_pointing_hand(name, state, action):
     data = mujoco.MjData(model)
     data.mocap_pos[:] = people
     closest_m = 1.0
-    for qpos in result.qpos:
+    for qpos in result.motion.qpos:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         closest_m = min(closest_m, *(mujoco.mj_geomDistance(model, data, hand, part, 1.0, None) for part in parts))

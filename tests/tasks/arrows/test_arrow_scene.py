@@ -7,13 +7,12 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.scene import compile_arrow_scene
+from imagine_bench.tasks.arrows.scene import compile_arrow_scene, layout
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.rendering import Renderer, View
-from imagine_bench.tasks.rendering.cameras import agent_camera
+from imagine_bench.tasks.rendering.cameras import agent_camera_view
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance
-from imagine_bench.tasks.scenes.layout import layout
 
 from imagine_bench.preprocessing import STRIP_WIDTH
 
@@ -28,7 +27,7 @@ def world():
 
 @pytest.fixture(scope="module")
 def camera(world):
-    renderer = agent_camera(world.model)
+    renderer = Renderer(world.model, agent_camera_view())
     yield renderer
     renderer.close()
 

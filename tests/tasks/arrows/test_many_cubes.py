@@ -4,9 +4,9 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.description import Arrows
+from imagine_bench.tasks.arrows.scene import layout
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.scenes.appearance import appearance
-from imagine_bench.tasks.scenes.layout import layout
 
 
 def _world(level="clean", **fields):
@@ -20,7 +20,7 @@ def test_a_turn_of_any_cube_moves_no_neighbour(cubes):
     for cube in range(cubes):
         state, before = world.read().macrostate, world.object_poses()
         wanted = (*state[:cube], 1, *state[cube + 1 :])
-        assert world.execute(2 * cube, wanted, 0.0).fault is None
+        assert world.execute(2 * cube, wanted).fault is None
         assert world.read().macrostate == wanted
         shift_m = np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1)
         assert np.delete(shift_m, cube).max(initial=0.0) < 1e-3
@@ -41,10 +41,11 @@ def test_fingers_open_no_wider_than_there_is_room(seed):
 def test_coupled_cubes_are_turned_in_one_macro_action():
     world = _world(cubes=4, coupling="neighbour")
     world.place((0, 0, 0, 0, 2), np.random.default_rng(0))
-    result = world.execute(2, (0, 1, 1, 0, 2), 20.0)
+    world.executor.capture_motion_hz = 20.0
+    result = world.execute(2, (0, 1, 1, 0, 2))
     assert result.fault is None
     assert world.read().macrostate == (0, 1, 1, 0, 2)
-    assert (np.diff(result.time_s) >= 0).all() and result.time_s[-1] == pytest.approx(result.sim_time_s)
+    assert (np.diff(result.motion.time_s) >= 0).all() and result.motion.time_s[-1] == pytest.approx(result.sim_time_s)
 
 
 @pytest.mark.parametrize("action", [0, 1, 2, 3])
@@ -53,11 +54,12 @@ def test_a_cube_that_slips_stays_though_it_was_gripped(action):
     state = (1, 3, 0)
     world.place(state, np.random.default_rng(0))
     before = world.object_poses()
-    result = world.execute(action, state, 50.0)
+    world.executor.capture_motion_hz = 50.0
+    result = world.execute(action, state)
     assert result.fault is None
     assert world.read().macrostate == state
     assert np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1).max() < 4e-3  # squared in the fingers
-    assert world.executor.opening_m(result.qpos).min() < 0.0275  # the fingers did close on it
+    assert world.executor.opening_m(result.motion.qpos).min() < 0.0275  # the fingers did close on it
 
 
 def test_columns_of_cubes_are_apart_so_a_finger_is_clear():

@@ -7,8 +7,8 @@ import mink
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.description import MAX_CUBES
-from imagine_bench.tasks.motion.arm_model import ArmModel
-from imagine_bench.tasks.motion.ik import ArmIK, UnreachableTargetError, pointing_down
+from imagine_bench.tasks.arrows.scene import layout
+from imagine_bench.tasks.motion.ik import ArmIK, ArmModel, UnreachableTargetError, pointing_down
 from imagine_bench.tasks.motion.trajectory import (
     EFFORT_SHARE,
     PEAK_ACCELERATION,
@@ -20,7 +20,6 @@ from imagine_bench.tasks.motion.trajectory import (
     shortest_duration_s,
 )
 from imagine_bench.tasks.scenes.constants import CUBE_EDGE_M, HOME_QPOS_RAD, TABLE_HEIGHT_M, TIMESTEP_S
-from imagine_bench.tasks.scenes.layout import layout
 
 from imagine_bench.errors import ImagineBenchError
 

@@ -176,4 +176,4 @@ def test_a_hidden_palm_still_takes_what_is_handed_over():
     env.reset(seed=0, options={"macrostate": (1, 0, 0, 3)})
     _, reward, terminated, _, info = env.step(3)
     assert terminated and info["is_success"] and not info["fault"] and reward == 5.0
-    assert tuple(info["macrostate"]) == (2, 0, 0, 3) and env.world.shown((2, 0, 0, 3)) == (2, 0, 0, 3)
+    assert tuple(info["macrostate"]) == (2, 0, 0, 3) and env.world.observed((2, 0, 0, 3)) == (2, 0, 0, 3)

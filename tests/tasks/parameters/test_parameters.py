@@ -5,34 +5,25 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.parameters.goal_change import changing_goal
-from imagine_bench.tasks.parameters.slip import slipping
 
 from imagine_bench import registry
-from imagine_bench.interfaces import Outcome
-
-STAY, WIN, MOVE = (
-    Outcome(1.0, (0,), -1.0, terminated=False, success=False),
-    Outcome(1.0, (1,), 5.0, terminated=True, success=True),
-    Outcome(1.0, (2,), -1.0, terminated=False, success=False),
-)
 
 
 def chances(outcomes):
     return {each.macrostate: each.probability for each in outcomes}
 
 
-def test_outcomes_of_parameters_by_hand():
-    assert chances(slipping((MOVE,), STAY, 0.25)) == {(2,): 0.75, (0,): 0.25}
-    turned = changing_goal((MOVE,), lambda outcome: [STAY, WIN], 0.5)
-    assert chances(turned) == {(2,): 0.5, (0,): 0.25, (1,): 0.25} and turned[2].success
-    assert changing_goal((WIN,), lambda outcome: [STAY], 0.5) == (WIN,)  # what is over is over
-    assert changing_goal((MOVE,), lambda outcome: [], 0.5) == (MOVE,)
-    assert chances(changing_goal((MOVE,), lambda outcome: [STAY], 1.0)) == {(0,): 1.0}
-    both = changing_goal(
-        slipping((MOVE,), STAY, 0.5), lambda outcome: [STAY if outcome.macrostate == (2,) else MOVE], 0.2
+def test_slips_and_changing_goals_of_arrows_by_hand():
+    rules = registry.task("arrows:cubes=2,forbid=none,goal=00,slip=0.25,fickle=0.5").rules
+    after, before = (3, 1), (2, 1)
+    assert chances(rules.outcomes((*before, 0), 0)) == pytest.approx(
+        {(*after, 0): 0.375, (*after, 1): 0.375, (*before, 0): 0.125, (*before, 1): 0.125}
     )
-    assert chances(both) == pytest.approx({(2,): 0.5, (0,): 0.5})
+    won = rules.outcomes((3, 0, 0), 0)
+    assert chances(won) == pytest.approx({(0, 0, 0): 0.75, (3, 0, 0): 0.125, (3, 0, 1): 0.125})  # what is over is over
+    assert [each.success for each in won] == [True, False, False]
+    always = registry.task("arrows:cubes=2,forbid=none,goal=00,fickle=1").rules
+    assert chances(always.outcomes((*before, 0), 0)) == {(*after, 1): 1.0}
 
 
 def test_parameters_of_pick_and_place_by_hand():

@@ -8,7 +8,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.motion.arm_model import ArmModel
+from imagine_bench.tasks.motion.ik import ArmModel
 from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, PICKED, WITHDRAWN
 from imagine_bench.tasks.pick_place.scene import PALM_M, TIMESTEP_S
 from imagine_bench.tasks.pick_place.spec import SPEC
@@ -125,13 +125,14 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert intended in [outcome.macrostate for outcome in RULES.outcomes(state, action)]
     world.place(state, rng())
     before = world.object_poses()
-    result = world.execute(action, intended, 1 / TIMESTEP_S)
+    world.executor.capture_motion_hz = 1 / TIMESTEP_S
+    result = world.execute(action, intended)
     assert result.fault is None
     assert (world.read().macrostate, world.read().problem) == (intended, None)
     joints = [int(world.model.joint(f"right_j{index}").qposadr[0]) for index in range(7)]
-    speed_rad_s = np.abs(np.diff(result.qpos[:, joints], axis=0)) / TIMESTEP_S
+    speed_rad_s = np.abs(np.diff(result.motion.qpos[:, joints], axis=0)) / TIMESTEP_S
     assert (speed_rad_s.max(axis=0) <= ArmModel().speed_limit_rad_s).all()
-    assert np.abs(result.qpos[-1, joints] - c.OBSERVATION_QPOS_RAD).max() < 2e-3
+    assert np.abs(result.motion.qpos[-1, joints] - c.OBSERVATION_QPOS_RAD).max() < 2e-3
     untouched = [index for index in range(3) if state[index] == intended[index] == 0]
     assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
@@ -155,7 +156,7 @@ def test_only_friction_lifts(spoil, index):
     world = PickWorld(FIXED)
     spoil(world.model)
     world.place((0, 0, 0, index), rng())
-    result = world.execute(index, RULES.outcomes((0, 0, 0, index), index)[0].macrostate, 0.0)
+    result = world.execute(index, RULES.outcomes((0, 0, 0, index), index)[0].macrostate)
     assert result.fault == f"the fingers closed and do not hold the {OBJECTS[index].name}"
     assert world.read().macrostate[index] == 0
     assert world.read().macrostate[3] == WITHDRAWN
@@ -178,7 +179,7 @@ def test_what_is_dropped_is_a_fault_and_ends_the_episode(macrostate, action):
 
 def test_pushing_another_object_is_a_fault(world, monkeypatch):
     world.place((0, 0, 0, 0), rng())
-    world.execute(0, (1, 0, 0, 1), 0.0)
+    world.execute(0, (1, 0, 0, 1))
     place = world.executor.place
 
     def clumsy(data, **arguments):
@@ -187,22 +188,23 @@ def test_pushing_another_object_is_a_fault(world, monkeypatch):
         return result
 
     monkeypatch.setattr(world.executor, "place", clumsy)
-    assert world.execute(0, (0, 0, 0, 1), 0.0).fault == "the cup was pushed 7 mm by the way"
+    assert world.execute(0, (0, 0, 0, 1)).fault == "the cup was pushed 7 mm by the way"
 
 
 def test_what_is_out_of_reach_is_a_fault(world):
     world.place((0, 0, 0, 0), rng())
     world.data.qpos[world.object_qpos[0][0]] = 1.4
     world.update()
-    result = world.execute(0, (1, 0, 0, 1), 10.0)
+    world.executor.capture_motion_hz = 10.0
+    result = world.execute(0, (1, 0, 0, 1))
     assert "the ball is out of reach: The gripper cannot reach" in result.fault
-    assert result.qpos.shape == (0, world.model.nq)
+    assert result.motion.qpos.shape == (0, world.model.nq)
 
 
 def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
     """However the arm ended, the object keeps its pose in the gripper, and the arm is at its observation pose."""
     world.place((0, 0, 0, 1), rng())
-    world.execute(1, (0, 1, 0, 0), 0.0)
+    world.execute(1, (0, 1, 0, 0))
     row, tcp = world.object_qpos[1], world.model.site("tcp").id
 
     def in_gripper():
@@ -232,15 +234,15 @@ def test_a_macro_action_is_a_function_of_positions_and_arguments(state, action, 
     one, other = PickWorld(FIXED), PickWorld(FIXED)
     one.place(state, rng())
     held = state.index(PICKED)
-    one.execute((held + 1) % 3, (*state[:3], state[3]), 0.0)  # reaches out in vain, with the object
+    one.execute((held + 1) % 3, (*state[:3], state[3]))  # reaches out in vain, with the object
     start = one.data.qpos.copy(), one.data.mocap_pos.copy(), one.data.mocap_quat.copy()
-    one.execute(action, intended, 0.0)
+    one.execute(action, intended)
     other.place((0, 0, 0, 2), rng())
-    other.execute(2, (0, 0, 1, 3), 0.0)
+    other.execute(2, (0, 0, 1, 3))
     other.data.qpos[:], other.data.mocap_pos[:], other.data.mocap_quat[:] = start
     other.data.qvel[:], other.data.qacc_warmstart[:] = 0.3, 7.0
     other.update()
-    other.execute(action, intended, 0.0)
+    other.execute(action, intended)
     np.testing.assert_array_equal(one.data.qpos, other.data.qpos)
     np.testing.assert_array_equal(one.data.ctrl, other.data.ctrl)
 
@@ -249,7 +251,7 @@ def test_the_handed_over_object_rests_in_the_palm(world):
     for index, spec in enumerate(OBJECTS):
         state = tuple(1 if each == index else 0 for each in range(3))
         world.place((*state, OPEN_PALM), rng())
-        world.execute(HAND_OVER, (*(2 if each == index else 0 for each in range(3)), OPEN_PALM), 0.0)
+        world.execute(HAND_OVER, (*(2 if each == index else 0 for each in range(3)), OPEN_PALM))
         before = world.object_poses()[index, :3]
         assert math.dist(before[:2], PALM_M[:2]) < 0.015
         assert before[2] - PALM_M[2] == pytest.approx(spec.grip_height_m, abs=2e-3)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.scenes.appearance import appearance
-from imagine_bench.tasks.scenes.fragments import Photographer, fragments
+from imagine_bench.tasks.scenes.fragments import draw_composite, fragments
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
@@ -51,10 +51,8 @@ def test_every_microstate_has_a_pool_of_its_own():
     assert len({look.offset for pool in looks for look in pool}) == 12 * 16 + 3 * 50
 
 
-def developed(level, photographer_seed, frame):
-    photographer = Photographer(level)
-    photographer.draw((0, 1, 2), 0, np.random.default_rng(photographer_seed))
-    return photographer.develop(frame)
+def composite(level, seed, frame):
+    return draw_composite(level, (0, 1, 2), 0, np.random.default_rng(seed)).of(frame)
 
 
 def test_gamma_covers_a_half_to_one_and_a_half():
@@ -64,7 +62,7 @@ def test_gamma_covers_a_half_to_one_and_a_half():
     )
     flat, gamma = np.full((64, 64, 3), 64, dtype=np.uint8), []
     for seed in range(300):
-        (level,) = np.unique(developed(plain, seed, flat))
+        (level,) = np.unique(composite(plain, seed, flat))
         gamma.append(np.log(level / 255) / np.log(64 / 255))
     assert 0.49 < min(gamma) < 0.52 and 1.48 < max(gamma) < 1.51
     assert abs(np.mean(gamma) - 1.0) < 0.05
@@ -72,7 +70,7 @@ def test_gamma_covers_a_half_to_one_and_a_half():
 
 def test_light_is_the_fragment_s_and_changes_at_the_seams_alone():
     quiet = PHOTO.__class__(name="quiet", object_offset_m=0.0, object_yaw_rad=0.0, pool=1, light_fraction=0.15)
-    image = developed(quiet, 3, np.full((64, 64, 3), 128, dtype=np.uint8)).astype(int)[..., 0]
+    image = composite(quiet, 3, np.full((64, 64, 3), 128, dtype=np.uint8)).astype(int)[..., 0]
     down, across = np.abs(np.diff(image, axis=0)).max(axis=1), np.abs(np.diff(image[TOP:], axis=1)).max(axis=0)
     assert np.flatnonzero(down > 3).tolist() == [TOP - 1]
     assert np.flatnonzero(across > 4).tolist() == [20, 42]
@@ -82,14 +80,9 @@ def test_light_is_the_fragment_s_and_changes_at_the_seams_alone():
 def test_noise_is_drawn_anew_and_stays_until_then():
     frame = np.full((64, 64, 3), 128, dtype=np.uint8)
     noisy = PHOTO.__class__(name="noisy", object_offset_m=0.0, object_yaw_rad=0.0, pool=1, noise_std=PHOTO.noise_std)
-    photographer, rng = Photographer(noisy), np.random.default_rng(0)
-    images = []
-    for _ in range(2):
-        photographer.draw((0, 1, 2), 0, rng)
-        images += [photographer.develop(frame), photographer.develop(frame)]
-    assert np.array_equal(images[0], images[1]) and np.array_equal(images[2], images[3])
-    assert not np.array_equal(images[0], images[2])
-    assert (images[0] / 255).std() == pytest.approx(PHOTO.noise_std, rel=0.05)
+    first, second = (composite(noisy, seed, frame) for seed in (0, 1))
+    assert np.array_equal(first, composite(noisy, 0, frame)) and not np.array_equal(first, second)
+    assert (first / 255).std() == pytest.approx(PHOTO.noise_std, rel=0.05)
 
 
 def test_frames_of_macrostates_and_of_environments_are_photographs():

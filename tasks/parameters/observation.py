@@ -1,15 +1,20 @@
-"""Gesture: what the human says is seen in every frame, in the first of an episode, or by chance."""
+"""Gesture and lag: frames may hide what the human says, and come some macro-actions late.
+
+The first observations of an episode repeat the start.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from imagine_bench.interfaces import Sight, State
 
 HIDDEN = -1
+_Seen = TypeVar("_Seen")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,3 +47,8 @@ def hides(sight: Sight, macrostate: State, step: int, rng: np.random.Generator) 
     seen = sight.seen(macrostate, step)
     which = 0 if len(seen) == 1 else int(rng.random() >= seen[0][0])
     return seen[which][1][-1] == HIDDEN
+
+
+def delivered(under_way: tuple[_Seen, ...], newest: _Seen, lag: int) -> tuple[_Seen, ...]:
+    """What is under way once the newest observation is taken in; the first of it is due now."""
+    return (*under_way, newest)[-1 - lag :]
