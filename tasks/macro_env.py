@@ -25,7 +25,7 @@ from .rendering.window import HAS_PYGAME, Window
 from .scene_reader import FilmedScene
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
-from .scenes.constants import HUMAN_CAMERA
+from .scenes.constants import AGENT_CAMERA, HUMAN_CAMERA
 from .world import World, WorldState
 
 _BUILT = PhysicsSettings()
@@ -145,6 +145,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         self._n_actions = spec.n_actions
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self.camera)
         self.observation_space = self._observer.space
+        require_known("camera", camera, (HUMAN_CAMERA, AGENT_CAMERA))
         self._rendered = self.camera(human_camera_view(camera, width, height))
         self._macrostate = self._starts[0]
         self._observed: tuple[State, ...] = ()
@@ -251,7 +252,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
 
     def close(self) -> None:
         """Free the OpenGL contexts and close the window; may be called again."""
-        for camera in self._cameras.values():
+        for camera in self._cameras:
             camera.close()
         if self._window is not None:
             self._window.close()

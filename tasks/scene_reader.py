@@ -88,7 +88,7 @@ class FilmedScene:
     def __init__(self, world: World, motion_hz: float) -> None:
         self.world = world
         self.capture_motion_hz = motion_hz
-        self._cameras: dict[View, Renderer] = {}
+        self._cameras: list[Renderer] = []
         self._latest: MacroResult | None = None
         self._people = self._mocap()
 
@@ -156,9 +156,11 @@ class FilmedScene:
 
     def camera(self, view: View) -> Renderer:
         """The renderer of a view, made when it is first asked for. Raises UnknownNameError: no such camera."""
-        if view not in self._cameras:
-            self._cameras[view] = Renderer(self.model, view)
-        return self._cameras[view]
+        for camera in self._cameras:
+            if camera.view == view:
+                return camera
+        self._cameras.append(Renderer(self.model, view))
+        return self._cameras[-1]
 
     def agent_view(self) -> Frame:
         """The frame that agents see, drawn now. Shape (64, 64, 3)."""

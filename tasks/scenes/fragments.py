@@ -66,7 +66,8 @@ class Composite:
         light[:top] = _spread(self.hand.light, top, width)
         for left, right, fragment in zip(seams[:-1], seams[1:], self.objects, strict=True):
             light[top:, left:right] = _spread(fragment.light, height - top, right - left)
-        noise = np.random.default_rng(self.noise_seed).standard_normal(frame.shape)
+        generator = np.random.default_rng(self.noise_seed)
+        noise = generator.standard_normal(frame.shape)
         lit = np.clip(frame / _WHITE * light + self.noise_std * noise, 0.0, 1.0)
         return np.rint(_WHITE * lit**self.gamma).astype(np.uint8)
 

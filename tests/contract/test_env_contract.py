@@ -290,7 +290,9 @@ def kinematic():
     ],
 )
 def test_a_wrong_macrostate_is_refused(kinematic, given):
-    with pytest.raises(InvalidValueError, match=r"No macrostate .*; give 4 integers from 0 to at most \(3, 3, 3, 2\)"):
+    with pytest.raises(
+        InvalidValueError, match=r"No macrostate .*; give one of the 192 of imagine_bench.*, such as \(0"
+    ):
         kinematic.reset(options={"macrostate": given})
 
 
