@@ -147,17 +147,19 @@ def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: Task
 
 
 def transition_sheet(titles: Sequence[str], rows: Sequence[TileRow]) -> NDArray[np.uint8]:
-    """Draw single transitions side by side (thesis' figure 5.9): a title each, below it an image of each named row.
+    """Draw single transitions side by side (thesis' figure 5.9): a title each, above the first row of
+    as many images, and an image of each named row.
 
     Images are square, RGB or gray bytes. A row that is judged has a border around each image, blue where it is right
     and orange where not, and says it below. The image has shape (height, width, 3), uint8.
     """
     drawn: list[tuple[str, list[Tile]]] = []
+    titled = [len(images) for _, images, _ in rows].index(len(titles))
     for name, images, judged in rows:
         tiles = []
         for place, image in enumerate(images):
             right = None if judged is None else judged[place]
-            tiles.append(Tile(image, "" if drawn else titles[place], _verdict(right), right))
+            tiles.append(Tile(image, titles[place] if len(drawn) == titled else "", _verdict(right), right))
         drawn.append((name, tiles))
     return sheet(drawn)
 

@@ -248,8 +248,6 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
         make_folder(where)
         write_bytes(where / "causes.csv", csv_text([HEAD, *rows]).encode())
         write_json(where / "summary.json", made)
-        text = f"# {spec.title}: why agents failed\n\n{table.markdown}\n\n{table.remark}\n"
-        write_bytes(where / "why.md", text.encode())
     write_page(bench / "report", bench_page(load_so_far(bench)))
     return f"{spec.title}, {appearance}\n\n{table.text}\n\n{table.remark}\n\nAll rows:   {where / 'causes.csv'}"
 

@@ -122,16 +122,11 @@ def _unfinished(result: BenchResult) -> list[str]:
     if not result.missing:
         return []
     part = result.protocol
-    seeds = str(len(part.seeds))
-    episodes = f"{part.budgets[-1]:,}"
-    if result.whole:
-        seeds += f" of {len(result.whole.seeds)}"
-        episodes += f" of {result.whole.budgets[-1]:,}"
-    which = "This bench" if result.whole else "One of these benches"
-    named = "; ".join(result.missing[:_NAMED])
+    whole = result.whole or part
+    named = "; ".join(result.missing[:_NAMED]) + ("; …" if len(result.missing) > _NAMED else "")
     return [
-        f"{which} is not finished: shown are {seeds} seeds up to {episodes} real episodes. "
-        f"Missing are {named}{'; …' if len(result.missing) > _NAMED else ''}. The same bench command goes on."
+        f"This bench is not finished: shown are {len(part.seeds)} of {len(whole.seeds)} seeds up to "
+        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {named}. The same bench command goes on."
     ]
 
 
@@ -262,31 +257,29 @@ def _alone(record: Record) -> Cell:
 
 def cost(data: ReportData) -> Section:
     """What each agent had had at the last budget, CPU seconds and faults."""
-    header = ["one run, mean over seeds", "real macro-actions", "frames its encoder saw before", "gradient updates"]
-    header += ["training (CPU s)", "of which learning", "the rest: environment, seeing, acting"]
-    header += ["all tests (CPU s)", "faults in all tests"]
+    rows = []
+    for agent in data.result.protocol.agents:
+        runs = data.result.of(agent)
+        last = data.of(agent)[-1]
+        tested = None if known_agent(agent).learns else 1  # the one test of others stands at every budget
+        tests = [row for run in runs for row in run.checkpoints[:tested]]
+        played = round(sum(row.mean_length * row.test_episodes for row in tests))
+        rows.append({
+            "one run, mean over seeds": agent_title(agent),
+            "real macro-actions": count(last["env_steps"]),
+            "frames its encoder saw before": count(frames_before(data, agent)),
+            "gradient updates": count(last["gradient_updates"]),
+            "training (CPU s)": seconds(last["train_cpu_s"]),
+            "of which learning": seconds(float(np.mean([learner_cpu_s(run) for run in runs]))),
+            "all tests (CPU s)": seconds(sum(row.eval_cpu_s for row in tests) / len(runs)),
+            "faults in all tests": f"{sum(row.faults for row in tests)} of {played:,}",
+        })  # fmt: skip
     caption = (
         "Frames before training are drawn from all macrostates alike. A fault is a macro-action whose physical outcome "
         f"was not what the rules say. The whole bench took {data.result.wall_s:,.0f} s of wall time."
     )
-    rows = [_cost_row(data, agent) for agent in data.result.protocol.agents]
-    why = "not counted by the agent, or an encoder that is not bundled"
-    return Section("What it cost, and what went wrong", tables=[Table("cost", header, rows, caption, why)])
-
-
-def _cost_row(data: ReportData, agent: str) -> list[str]:
-    """The one test of an agent that does not learn stands at every budget, and counts once."""
-    runs = data.result.of(agent)
-    last = data.of(agent)[-1]
-    tested = None if known_agent(agent).learns else 1
-    tests = [row for run in runs for row in run.checkpoints[:tested]]
-    training = last["train_cpu_s"]
-    learning = float(np.mean([learner_cpu_s(run) for run in runs]))
-    testing = sum(row.eval_cpu_s for row in tests) / len(runs)
-    played = round(sum(row.mean_length * row.test_episodes for row in tests))
-    counts = map(count, (last["env_steps"], frames_before(data, agent), last["gradient_updates"]))
-    times = map(seconds, (training, learning, training - learning, testing))
-    return [agent_title(agent), *counts, *times, f"{sum(row.faults for row in tests)} of {played:,}"]
+    table = Table.of("cost", rows, caption, "not counted by the agent, or an encoder that is not bundled")
+    return Section("What it cost, and what went wrong", tables=[table])
 
 
 def success_figure(data: ReportData) -> Figure:

@@ -6,13 +6,14 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays
@@ -149,7 +150,7 @@ def judgement_page(found: Judged) -> Page:
         files={"scores.csv": _csv(found)},
         facts=flat("", read_json(found.folder / "judgement.json", "a judgement")),
         protocol=flat("", dataclasses.asdict(judgement)),
-        summary=_scores(found, "short", SHORT, judgement.sizes).text,
+        summary=sections[0].tables[0].text,
     )
 
 
@@ -182,45 +183,39 @@ def _title(model: str) -> str:
 
 
 def _by_model(
-    found: Judged, name: str, columns: Mapping[str, Callable[[Scores], float]], caption: str,
-    sizes: Sequence[int] | None = None, folded: str = "",
-) -> Table:  # fmt: skip
+    found: Judged, name: str, columns: Mapping[str, Callable[[Scores], float]], caption: str, folded: str = ""
+) -> Table:
     """A row a model and number of transitions, a column a number over seeds; NaN where a model has none."""
     rows: list[list[str | Cell]] = []
     for (model, size), cells in found.cells.items():
-        if size in (sizes or found.judgement.sizes):
-            transitions = DASH if runs_of(model) else f"{size:,}"  # those of a trained agent are its bench's to say
-            rows.append([_title(model), transitions])
-            for column, value in columns.items():
-                rows[-1].append(over_seeds(list(map(value, cells)), _number, share=column in _SHARES))
+        transitions = DASH if runs_of(model) else f"{size:,}"  # those of a trained agent are its bench's to say
+        rows.append([_title(model), transitions])
+        for column, value in columns.items():
+            rows[-1].append(over_seeds(list(map(value, cells)), _number, share=column in _SHARES))
     return Table(name, ["world model", "transitions", *columns], rows, caption, _WHY_DASH, folded)
 
 
-def _scores(
-    found: Judged, name: str, names: Sequence[str], sizes: Sequence[int] | None = None, folded: str = ""
-) -> Table:
+def _scores(found: Judged, name: str, names: Iterable[str], folded: str = "") -> Table:
     columns = {COLUMNS[each]: functools.partial(score, name=each) for each in names}
     caption = "Interquartile means over seeds or runs, with 95 % intervals. 0 is best in every error; value loss is in "
-    return _by_model(found, name, columns, f"{caption}units of reward.", sizes, folded)
+    return _by_model(found, name, columns, f"{caption}units of reward.", folded)
 
 
 def in_short(found: Judged) -> Section:
-    """The main scores at the most transitions, and the reader's own errors."""
+    """The main scores, and the reader's own errors."""
     errors = {name: f"{share:.2%}" for name, share in read_json(found.folder / "reader.json", "errors").items()}
-    reader = Table("reader", list(errors), [list(errors.values())], "What the reader of images gets wrong itself.")
     words = (
         "A reader that was trained apart turns imagined images into macrostates. Of real frames, it misreads some or "
         "refuses to read them; fog, noise and blends of two frames should not be read."
     )
-    tables = [_scores(found, "short", SHORT, found.judgement.sizes[-1:]), reader]
-    return Section("In short", [words], tables=tables)
+    reader = Table.of("reader", [errors], "What the reader of images gets wrong itself.")
+    return Section("In short", [words], tables=[_scores(found, "short", SHORT), reader])
 
 
 def question(found: Judged, title: str) -> Section:
     """The scores that answer one question, after every number of transitions."""
     name = title.lower().strip("?").replace(" ", "_").replace(",", "")
-    table = _scores(found, name, list(QUESTIONS[title]), None, "After every number of transitions")
-    return Section(title, [_WORDS[title]], tables=[table])
+    return Section(title, [_WORDS[title]], tables=[_scores(found, name, QUESTIONS[title])])
 
 
 def risk(found: Judged) -> Section:
@@ -273,64 +268,56 @@ def compared(found: Judged) -> Section:
     return Section("Against each other", tables=[table], answers=answers)
 
 
-# Images ------------------------------------------------------------------------------------------------------------
-
-
-def futures(found: Judged) -> Section | None:
-    """One rollout, real and as each model imagines it."""
-    if not found.images:
-        return None
-    names = found.spec.action_names
-    (one, *_) = found.images.values()
-    start = one["futures_before"][0]
-    titles = ["start", *(f"{step}. {names[action]}" for step, action in enumerate(one["futures_actions"][0], 1))]
-    rows: list[TileRow] = [("real", [start, *one["futures_real"][0]], None)]
-    for model, arrays in found.images.items():
-        right = [True, *arrays["futures_right"][0].tolist()]
-        rows.append((_title(model), [start, *arrays["futures_imagined"][0]], right))
-    caption = "One real start and the same macro-actions, real and as each model imagines them."
-    return Section("One future", images=[Image("futures", png(transition_sheet(titles, rows)), caption)])
-
-
 def where(found: Judged) -> Section:
-    """Total variation by what may make it hard, the worst ten transitions of each model, and those after the end."""
+    """Total variation by what may make it hard."""
     groups: dict[tuple[str, str], dict[str, list[float]]] = {}
     for model, cells in found.last.items():
         for cell in cells:
             for kind, each in cell["where"].items():
                 for name, value in each.items():
                     groups.setdefault((kind, name), {}).setdefault(model, []).append(value)
-    rows: list[list[str | Cell]] = []
-    for group, values in groups.items():
-        rows.append([*group, *(over_seeds(values.get(model, []), _number, share=True) for model in found.last)])
-    header = ["by", "which", *map(_title, found.last)]
+    rows: list[dict[str, str | Cell]] = []
+    for (kind, name), values in groups.items():
+        rows.append({"by": kind, "which": name})
+        for model in found.last:
+            rows[-1][_title(model)] = over_seeds(values.get(model, []), _number, share=True)
     caption = f"Total variation of one step{found.after}; of a coordinate, that of it alone."
-    table = Table("where", header, rows, caption, "no such transition")
-    images = []
+    return Section("Where it fails", tables=[Table.of("where", rows, caption, "no such transition")])
+
+
+def images(found: Judged) -> Section | None:
+    """One rollout, transitions after the end of an episode and the worst ten of each model, real and as imagined."""
+    shown = [_sheet(found, "futures", "The same macro-actions from one real start.", "futures", found.images)]
     for model, arrays in found.images.items():
         if not arrays["worst_right"].all():
             caption = f"The ten worst transitions of {_title(model)}."
-            images.append(_transitions(found, f"worst_{file_name(model)}", caption, "worst", {"imagined": arrays}))
-    ended = {_title(model): arrays for model, arrays in found.images.items() if "after_before" in arrays}
-    if ended:  # the thesis' figure 5.9
-        caption = "Macro-actions after the end of an episode, which no data contains."
-        images.append(_transitions(found, "after_the_end", caption, "after", ended))
-    return Section("Where it fails", tables=[table], images=images)
+            shown.append(_sheet(found, f"worst_{file_name(model)}", caption, "worst", {model: arrays}))
+    ended = {model: arrays for model, arrays in found.images.items() if "after_before" in arrays}
+    caption = "Macro-actions after the end of an episode, which no data contains."  # the thesis' figure 5.9
+    shown.append(_sheet(found, "after_the_end", caption, "after", ended))
+    return Section("Real, and as each model imagines it", images=[each for each in shown if each])
 
 
-def _transitions(found: Judged, name: str, caption: str, kind: str, models: Mapping[str, Arrays]) -> Image:
-    """Transitions of a kind before and after, real and imagined."""
+def _sheet(found: Judged, name: str, caption: str, kind: str, models: Mapping[str, Arrays]) -> Image | None:
+    """Transitions, or a rollout's steps, before and after, real and imagined; None where no model has any."""
+    if not models:
+        return None
     (one, *_) = models.values()
-    titles = [found.spec.action_names[action] for action in one[f"{kind}_actions"][:, 0]]
-    rows: list[TileRow] = [("before", one[f"{kind}_before"], None), ("real", one[f"{kind}_real"][:, 0], None)]
-    for title, arrays in models.items():
-        rows.append((title, arrays[f"{kind}_imagined"][:, 0], arrays[f"{kind}_right"][:, 0].tolist()))
+    titles = [found.spec.action_names[action] for action in one[f"{kind}_actions"].flat]
+    rows: list[TileRow] = [("before", one[f"{kind}_before"], None), ("real", _joined(one[f"{kind}_real"]), None)]
+    for model, arrays in models.items():
+        rows.append((_title(model), _joined(arrays[f"{kind}_imagined"]), arrays[f"{kind}_right"].ravel().tolist()))
     return Image(name, png(transition_sheet(titles, rows)), caption)
+
+
+def _joined(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Images of all steps of all transitions, one behind the other."""
+    return images.reshape(-1, *images.shape[2:])
 
 
 SECTIONS: tuple[Callable[[Judged], Section | None], ...] = (
     in_short,
-    futures,
+    images,
     risk,
     *(functools.partial(question, title=title) for title in QUESTIONS),
     by_start,

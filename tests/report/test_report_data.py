@@ -53,7 +53,7 @@ def test_costs_are_means_over_seeds(result: BenchResult, agent: str) -> None:
         taken = np.diff([[0, *(row.env_steps for row in run.checkpoints)] for run in runs])
         learning = (a_step_s * taken).sum(axis=1).mean()
     training = records[-1]["train_cpu_s"]
-    times = (training, learning, training - learning, sum(row.eval_cpu_s for row in tests) / 3)
+    times = (training, learning, sum(row.eval_cpu_s for row in tests) / 3)
     shown = {row[0]: row[1:] for row in cost(data).tables[0].rows}[agent_title(agent)]
     faults = f"{sum(row.faults for row in tests)} of {steps:,}"
     counts = map(count, (records[-1]["env_steps"], frames_before(data, agent), records[-1]["gradient_updates"]))

@@ -109,7 +109,7 @@ def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
     joined = load_merged([here, there], tmp_path)
     assert joined.protocol.seeds == (0, 2)
     assert joined.missing == ("oracle seed 1: 0 of 9 real episodes",)
-    assert "One of these benches is not finished: shown are 2 seeds up to 9 real" in summary_table(joined)
+    assert "This bench is not finished: shown are 2 of 2 seeds up to 9 of 9 real" in summary_table(joined)
 
 
 def test_seeds_whose_machines_chose_other_settings_are_refused(tmp_path: Path) -> None:
