@@ -126,7 +126,8 @@ def _unfinished(result: BenchResult) -> list[str]:
     named = "; ".join(result.missing[:_NAMED]) + ("; …" if len(result.missing) > _NAMED else "")
     return [
         f"This bench is not finished: shown are {len(part.seeds)} of {len(whole.seeds)} seeds up to "
-        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {named}. The same bench command goes on."
+        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {named}. "
+        "The same bench command goes on."
     ]
 
 
