@@ -1,11 +1,13 @@
-"""Paths that the documentation of November 27 named, in ``frozen/documented.txt``: each can be imported today.
+"""What was documented on November 27 still works: paths can be imported, commands and make targets name the line.
 
-A line is a module, ``module:name`` or ``module:Class.member``. An old one warns once.
+A line of ``frozen/documented.txt`` is a module, ``module:name`` or ``module:Class.member``. An old one warns once.
 """
 
 from __future__ import annotations
 
 import importlib
+import re
+import subprocess
 import sys
 import warnings
 from collections.abc import Mapping
@@ -14,6 +16,8 @@ from pathlib import Path
 import pytest
 
 from imagine_bench import MOVED, MOVED_NAMES
+from imagine_bench.cli import parsed
+from imagine_bench.errors import InvalidValueError
 
 LINES = (Path(__file__).parent / "frozen" / "documented.txt").read_text().split()
 NAMES: Mapping[str, list[str]] = {
@@ -65,3 +69,79 @@ def test_an_old_documented_path_warns_once(old: str, monkeypatch: pytest.MonkeyP
             module = importlib.import_module(path)
             assert not name or getattr(module, name)
     assert len(seen) == 1
+
+
+COMMANDS = (
+    "bench",
+    "report",
+    "plan",
+    "judge",
+    "verify",
+    "why",
+    "study",
+    "suite",
+    "dataset",
+    "view",
+    "encoder",
+    "film",
+    "play",
+    "speed",
+    "margins",
+    "coverage",
+    "check",
+    "describe",
+    "new",
+    "doctor",
+    "list",
+)
+TARGETS = (
+    "help",
+    "ready",
+    "setup",
+    "bench",
+    "peers",
+    "plan",
+    "judge",
+    "verify",
+    "why",
+    "study",
+    "suite",
+    "view",
+    "report",
+    "data",
+    "encoder",
+    "film",
+    "doctor",
+    "test",
+    "test-slow",
+    "storm",
+    "mutants",
+    "lint",
+    "docs",
+    "build",
+    "lock",
+    "speed",
+    "clean",
+)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_former_command_is_parsed_or_names_the_line(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        with pytest.raises(SystemExit) as ended:
+            parsed([command, "--help"])
+    except InvalidValueError as refusal:
+        assert re.search(r"In a checkout type: (make|python) \S+", str(refusal))
+    else:
+        assert ended.value.code == 0 and "usage: imagine-bench" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_former_make_target_types_a_command_that_there_is(target: str) -> None:
+    root = Path(__file__).parents[2]
+    said = subprocess.run(["make", "-n", target], cwd=root, capture_output=True, text=True, check=False)
+    assert said.returncode == 0 and said.stdout.strip(), said.stderr
+    for command in re.findall(r"bin/imagine-bench ([a-z]+)", said.stdout):
+        with pytest.raises(SystemExit) as ended:
+            parsed([command, "--help"])
+        assert ended.value.code == 0, command

@@ -52,22 +52,13 @@ def env(request):
 
 @pytest.mark.parametrize("execution", EXECUTIONS)
 @pytest.mark.parametrize("task", WORLDS)
-def test_gymnasium_s_checker_is_content(task, execution):
+def test_checkers_of_gymnasium_and_stable_baselines_are_content(task, execution):
     env = make(task, execution=execution, render_mode="rgb_array", width=64, height=48)
     with warnings.catch_warnings(record=True) as complaints:
         warnings.simplefilter("always")
         check_env(env.unwrapped, skip_render_check=execution == "physics")
-    env.close()
-    assert not complaints, [str(each.message) for each in complaints]
-
-
-@pytest.mark.parametrize("task", WORLDS)
-def test_stable_baselines_checker_is_content(task):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    env = make(task, **KINEMATIC)
-    with warnings.catch_warnings(record=True) as complaints:
-        warnings.simplefilter("always")
-        checker.check_env(env, warn=True)
+        if execution == "kinematic":
+            pytest.importorskip("stable_baselines3.common.env_checker").check_env(env, warn=True)
     env.close()
     assert not complaints, [str(each.message) for each in complaints]
 
@@ -178,29 +169,24 @@ def test_starts_are_spread_over_the_start_states(task):
     assert chi_square < len(starts) + 5 * np.sqrt(2 * len(starts))
 
 
-def test_render_gives_the_asked_view_and_nothing_without_a_mode():
-    env = make(render_mode="rgb_array", width=80, height=60, camera="wrist", **KINEMATIC)
+def test_views_are_of_the_asked_size_and_draw_no_random_number():
+    env = make(appearance="strong", render_mode="rgb_array", width=80, height=60, camera="wrist", **KINEMATIC).unwrapped
     env.reset(seed=0)
-    first = env.render()
-    assert first.shape == (60, 80, 3)
-    assert np.array_equal(first, env.render())
-    assert not np.shares_memory(first, env.render())
+    before = env.np_random.bit_generator.state
+    first, again = env.render(), env.render()
+    assert first.shape == (60, 80, 3) and np.array_equal(first, again) and not np.shares_memory(first, again)
+    env.shapes()
+    env.motion()
+    human = env.human_view(64, 48)
+    assert human.shape == (48, 64, 3) and human.std() > 20, "the whole scene"
+    assert env.np_random.bit_generator.state == before
+    with pytest.raises(InvalidValueError, match="Image width -1"):
+        env.human_view(-1, 48)
     env.close()
     silent = make(**KINEMATIC).unwrapped
     silent.reset(seed=0)
     assert silent.render() is None
     silent.close()
-
-
-def test_rendering_draws_no_random_number():
-    env = make(appearance="strong", render_mode="rgb_array", width=32, height=32, camera="wrist", **KINEMATIC).unwrapped
-    env.reset(seed=0)
-    before = env.np_random.bit_generator.state
-    env.render()
-    env.shapes()
-    env.motion()
-    assert env.np_random.bit_generator.state == before
-    env.close()
 
 
 # --- faults ------------------------------------------------------------------------------------------------------
@@ -275,15 +261,10 @@ def kinematic():
     "given",
     [
         (0, 1, 2),
-        (0, 1, 2, 3),
         (0, 1, 4, 0),
-        (-1, 1, 2, 0),
         (0.5, 1, 2, 0),
-        (float("inf"), 1, 2, 0),
         "0120",
-        7,
         None,
-        np.ma.masked,
         (np.ma.masked,) * 4,
         np.array([["x"]]),
         (0,) * 10**6,
@@ -324,13 +305,6 @@ def test_wrong_reset_options_name_what_is_allowed(kinematic, options, message):
         kinematic.reset(options=options)
 
 
-def test_the_error_names_the_list_of_possible_macrostates():
-    env = gymnasium.make("imagine_bench/PickPlace-v0", **KINEMATIC)
-    with pytest.raises(InvalidValueError, match=r"one of the 19 of .*task\('pick_place'\)\.rules\.states, such as"):
-        env.reset(options={"macrostate": (0, 1, 2, 0)})
-    env.close()
-
-
 def test_a_step_before_the_first_reset_is_refused():
     env = make(**KINEMATIC).unwrapped
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
@@ -353,7 +327,7 @@ def test_an_episode_whose_simulation_blew_up_is_over(monkeypatch, tmp_path):
     env.close()
 
 
-@pytest.mark.parametrize("action", [6, -1, 1.5, "left", None, float("inf"), np.array([1, 2]), np.array([])])
+@pytest.mark.parametrize("action", [6, -1, 1.5, "left", None, np.array([1, 2])])
 def test_a_wrong_action_is_refused(kinematic, action):
     with pytest.raises(InvalidValueError, match="does not exist; give an integer from 0 to 5"):
         kinematic.step(action)
@@ -408,17 +382,6 @@ def test_shapes_and_motion_describe_the_scene():
     assert by_name["right_hand"] > 0.1
     assert by_name["cube_0"] < 1e-3
     assert by_name["hand"] == by_name["world"] == 0.0
-
-
-def test_the_human_view_shows_the_whole_scene_at_the_asked_size():
-    env = make(**KINEMATIC).unwrapped
-    env.reset(seed=0)
-    small = env.human_view(64, 48)
-    assert small.shape == (48, 64, 3)
-    assert small.std() > 20
-    with pytest.raises(InvalidValueError, match="Image width -1"):
-        env.human_view(-1, 48)
-    env.close()
 
 
 def test_appearances_are_those_of_the_interfaces():

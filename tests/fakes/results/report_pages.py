@@ -4,40 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from html.parser import HTMLParser
+from html import unescape
 
 from imagine_bench.report.tables import Page
 
 PAGE_PX = 1200 - 2 * 24  # the page's own margin
 CHARACTER_PX, PADDING_PX = 8.0, 19.2
-
-
-class Tables(HTMLParser):
-    """The cells of every table: rows of texts, headers included."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.tables: list[list[list[str]]] = []
-        self._text: str | None = None
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag == "table":
-            self.tables.append([])
-        elif tag == "tr":
-            self.tables[-1].append([])
-        elif tag in {"td", "th"}:
-            self._text = ""
-        elif tag == "br" and self._text is not None:
-            self._text += " "
-
-    def handle_data(self, data: str) -> None:
-        if self._text is not None:
-            self._text += data
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag in {"td", "th"}:
-            self.tables[-1][-1].append(str(self._text))
-            self._text = None
 
 
 def without_images(page: Page) -> Page:
@@ -65,16 +37,14 @@ def check_texts(written: dict[str, str]) -> None:
     check_markdown(written["report.md"])
 
 
-def addresses(page: str) -> list[str]:
-    """Every address that a page would load."""
-    return re.findall(r'\b(?:src|href|data)="([^"]*)"', page)
-
-
 def read_tables(page: str) -> list[list[list[str]]]:
-    """All tables of a page."""
-    parser = Tables()
-    parser.feed(page)
-    return parser.tables
+    """The cells of all tables of a page: rows of texts, headers included."""
+    tables = []
+    for table in re.findall(r"<table.*?</table>", page, flags=re.DOTALL):
+        rows = re.findall(r"<tr>.*?</tr>", table, flags=re.DOTALL)
+        cells = [re.findall(r"<t[dh]>(.*?)</t[dh]>", row, flags=re.DOTALL) for row in rows]
+        tables.append([[unescape(re.sub(r"<[^>]+>", " ", cell)) for cell in row] for row in cells])
+    return tables
 
 
 def narrowest_px(table: list[list[str]]) -> float:
