@@ -70,6 +70,12 @@ class _Ring:
         """Forget all rows."""
         self.added = 0
 
+    def _put(self, **row: Tensor | float) -> None:
+        """Store one row by column, in place of the oldest."""
+        for name, value in row.items():
+            self._columns[name][self.added % self.capacity] = value
+        self.added += 1
+
     def _draw(self, count: int, generator: torch.Generator, weights: Tensor | None = None) -> dict[str, Tensor]:
         if self.added == 0:
             raise InvalidValueError("The memory is empty; store a transition before sampling from it.")
@@ -104,16 +110,12 @@ class RealMemory(_Ring):
         self, posterior: Posterior, action: int, reward: float, next_posterior: Posterior, terminated: bool
     ) -> None:
         """Store one transition between posteriors (mu, sigma), each of shape (Z,)."""
-        row = self.added % self.capacity
-        columns = self._columns
-        columns["mu"][row], columns["sigma"][row] = posterior
-        columns["next_mu"][row], columns["next_sigma"][row] = next_posterior
-        columns["action"][row] = action
-        columns["reward"][row] = reward
-        columns["terminated"][row] = float(terminated)
-        if "error" in columns:  # what was never replayed comes first
-            columns["error"][row] = columns["error"][: len(self)].max() if len(self) else 1.0
-        self.added += 1
+        mu, sigma = posterior
+        next_mu, next_sigma = next_posterior
+        row = {"mu": mu, "sigma": sigma, "next_mu": next_mu, "next_sigma": next_sigma}
+        if "error" in self._columns:  # what was never replayed comes first
+            row["error"] = self._columns["error"][: len(self)].max() if len(self) else torch.ones(())
+        self._put(**row, action=action, reward=reward, terminated=float(terminated))
 
     def sample(self, count: int, generator: torch.Generator, *, spread: float = 1.0, balance: float = 0.0) -> Batch:
         """Draw transitions with replacement, and latents with ``spread`` times their posteriors' standard deviation.
@@ -165,9 +167,8 @@ class StartMemory(_Ring):
 
     def add(self, posterior: Posterior) -> None:
         """Store the posterior (mu, sigma) of one start, each of shape (Z,)."""
-        row = self.added % self.capacity
-        self._columns["mu"][row], self._columns["sigma"][row] = posterior
-        self.added += 1
+        mu, sigma = posterior
+        self._put(mu=mu, sigma=sigma)
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """Draw starts with replacement, and latents from their posteriors. Shape (count, Z)."""

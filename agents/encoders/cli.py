@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench.appearance import appearance_name
+from imagine_bench.arrays import Arrays
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import TaskSpec, appearance_of_tests, bundled_name
+from imagine_bench.interfaces import Frame, TaskSpec, appearance_of_tests, bundled_name
+from imagine_bench.preprocessing import preprocess
 from imagine_bench.seeding import SeedTree
 
-from .encoder import Encoder, EncoderCard, bundled_encoder, refuse_existing
-from .figure import COLUMNS, sample_sheet
+from .encoder import Encoder, EncoderCard, bundled_encoder, refuse_existing, view
+from .probe import Latents
 from .recipes import Recipe, recipe_named
 from .training import draw_frames, train_encoder
+
+COLUMNS = 8
+"""Frames in the figure."""
 
 
 def retrain(
@@ -30,17 +36,15 @@ def retrain(
     appearance: str,
     seed: int,
     out: Path,
-    steps: int | None = None,
-    batch: int | None = None,
-    latents: int | None = None,
     device: str = "cpu",
+    **numbers: int | None,
 ) -> str:
     """Make an encoder, leave artefact, card and figure in ``out``, and say how it compares to the bundled one.
 
     The files are ``<encoder>-<appearance>.safetensors`` (``-codes`` after it where the recipe gives codes), ``.json``
-    and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own; ``steps``, ``batch`` and
-    ``latents`` replace its numbers of gradient steps, of images a step and of latents; the steps are made on
-    ``device``. A training that was killed goes on from ``.<name>.unfinished.pt`` in ``out``.
+    and ``.png``. A recipe is a name among the task's ``RECIPES``, or settings of one's own; the numbers ``steps``,
+    ``batch`` and ``latents`` replace its gradient steps, images a step and latents; the steps are made on ``device``.
+    A training that was killed goes on from ``.<name>.unfinished.pt`` in ``out``.
 
     Raises:
         UnknownNameError: An unknown recipe, appearance or device.
@@ -51,11 +55,10 @@ def retrain(
             few or such like frames.
     """
     recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
-    numbers = {"steps": steps, "batch": batch, "latents": latents}
     given: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
-    elsewhere = {} if device == "cpu" else {"device": device}
-    if recipe.kind == "codes" and given | elsewhere:
-        options = " ".join(f"--{name} {value}" for name, value in (given | elsewhere).items())
+    choices = given if device == "cpu" else {**given, "device": device}
+    if recipe.kind == "codes" and choices:
+        options = " ".join(f"--{name} {value}" for name, value in choices.items())
         raise InvalidValueError(f"Recipe {recipe.name} finds its codes without gradient steps; leave out {options}.")
     recipe = replace(recipe, **given)
     appearance = appearance_name(appearance)
@@ -64,7 +67,12 @@ def retrain(
     refuse_existing(path)
     unfinished = path.with_name(f".{name}.unfinished.pt")
     with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}", disable=None) as bar:
-        show = partial(_show, bar)
+
+        def show(stage: str, done: float) -> None:
+            bar.desc = stage
+            bar.n = done
+            bar.refresh()
+
         encoder = train_encoder(
             spec,
             recipe=recipe,
@@ -77,9 +85,8 @@ def retrain(
     seeds = SeedTree(seed).child("encoder_probe", spec.id, appearance, "picture")
     frames, macrostates = draw_frames(spec, appearance_of_tests(appearance), COLUMNS, seeds.generator())
     noise = torch.Generator().manual_seed(seeds.child("torch").integer())
-    sheet = sample_sheet(encoder, spec, frames, macrostates, noise)
     picture = io.BytesIO()
-    sheet.save(picture, format="png")
+    sample_sheet(encoder, spec, frames, macrostates, noise).savefig(picture, format="png")
     encoder.save(path, picture.getvalue())
     unfinished.unlink(missing_ok=True)
     bundled = bundled_encoder(name)
@@ -88,31 +95,46 @@ def retrain(
 
 
 def compare(new: EncoderCard, bundled: EncoderCard | None) -> str:
-    """A small table of two cards, or of one where nothing is bundled."""
-    columns = {"new": new} if bundled is None else {"new": new, "bundled": bundled}
-    lines = [f"{'':34}" + "".join(f"{name:>12}" for name in columns)]
-    for label, text in _ROWS.items():
-        lines.append(f"{label:34}" + "".join(f"{text(card):>12}" for card in columns.values()))
-    return "\n".join(lines)
+    """A line each of two cards, or of one where nothing is bundled."""
+    text = f"new:     {summary(new)}"
+    return text if bundled is None else f"{text}\nbundled: {summary(bundled)}"
 
 
-_ROWS: dict[str, Callable[[EncoderCard], str]] = {
-    "recipe": lambda card: card.recipe.name,
-    "seed": lambda card: str(card.seed),
-    "latents": lambda card: str(card.latent_size),
-    "macrostate read right": lambda card: f"{card.probe['mlp']:.2%}",
-    "  from sampled latents": lambda card: f"{card.probe['mlp_sampled']:.2%}",
-    "  by a linear reader": lambda card: f"{card.probe['linear']:.2%}",
-    "held-out frames": lambda card: str(card.recipe.held_out_frames),
-    "KL from the prior, nats": lambda card: f"{card.kl_nats:.1f}",
-    "CPU s, frames included": lambda card: f"{card.cpu_s['total']:.0f}",
-}
+def summary(card: EncoderCard) -> str:
+    """What an encoder reads of held-out frames, by the stored probe, from sampled latents and by a linear reader."""
+    read = ", ".join(f"{name} {share:.2%}" for name, share in card.probe.items())
+    cost = f"{card.kl_nats:.1f} nats from the prior, {card.cpu_s['total']:.0f} CPU s"
+    return (
+        f"recipe {card.recipe.name}, seed {card.seed}, {card.latent_size} latents; of {card.recipe.held_out_frames} "
+        f"held-out frames read right: {read}; {cost}."
+    )
 
 
-def _show(bar: tqdm, stage: str, done: float) -> None:
-    if bar.disable:
-        return
-    if bar.desc != f"{stage}: ":
-        bar.set_description(stage, refresh=False)
-        bar.reset()
-    bar.update(done - bar.n)
+def sample_sheet(
+    encoder: Encoder, spec: TaskSpec, frames: Frame, macrostates: NDArray[np.int64], generator: torch.Generator
+) -> Figure:
+    """A figure of what an encoder keeps, one column a frame: camera, network input, decoded mean and decoded sample.
+
+    Below each column of ``frames`` (N, 64, 64, 3) stands what the probe reads, red where it is not ``macrostates``
+    (N, M).
+    """
+    latents = Latents(*encoder.encode(frames))
+    preprocessing = encoder.card.preprocessing
+    rows: Arrays = {
+        "camera": frames,
+        "encoder's view": view(preprocess(preprocessing)(frames), preprocessing),
+        "decoded mean": encoder.decode(latents.mu),
+        "decoded sample": encoder.decode(latents.sample(generator)),
+    }
+    figure = Figure(figsize=(2.0 * len(frames), 2.5 * len(rows)), layout="constrained")
+    figure.suptitle(f"{encoder.card.task}, appearance {encoder.card.appearance}, recipe {encoder.card.recipe.name}")
+    axes = figure.subplots(len(rows), len(frames), squeeze=False)
+    for line, (label, images) in zip(axes, rows.items(), strict=True):
+        line[0].set_ylabel(label)
+        for place, image in zip(line, images, strict=True):
+            place.imshow(image, cmap="gray", vmin=0.0, vmax=1.0)
+            place.set(xticks=(), yticks=())
+    for place, right, read in zip(axes[-1], macrostates, encoder.read_macrostate(latents.mu), strict=True):
+        words = "\n".join(spec.value_names(read))
+        place.set_xlabel(words, color="black" if (right == read).all() else "red")
+    return figure

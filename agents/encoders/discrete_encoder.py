@@ -13,7 +13,6 @@ connected components of a mutual nearest-neighbour graph (Brito et al. 1997; the
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
 
 import numpy as np
 import scipy  # its parts load, slowly, when first used: an agent that only sees with an encoder needs none
@@ -24,7 +23,7 @@ from torch.nn import functional
 
 from imagine_bench.errors import InvalidValueError
 
-from .network import EncoderNetwork
+from .network import CERTAIN, EncoderNetwork
 
 POOL = 2
 """Pixels a side that are averaged: factors are larger, and jitter matters less."""
@@ -41,7 +40,6 @@ _LONELY = 0.05  # share of the images in the sparsest surroundings, which link n
 _LEAST_GAP = 0.13  # of the root mean square of a factor's gaps; clouds with a narrower one between them are merged
 _IMAGES = 2000  # a channel, of three or more; more find no other factors
 _DEPENDENCE_IMAGES = 3000
-_CERTAIN = -20.0  # log variance of a latent that is known
 _DARK = 0.01  # of full scale; the median brightness is not taken for less
 
 
@@ -61,16 +59,16 @@ class DiscreteEncoder(EncoderNetwork):
         self.latent_size = sum(code_sizes)
         factors = len(code_sizes)
         pixels = channels * -(-height // POOL) * -(-width // POOL)
-        self.register_buffer("background", torch.zeros(channels, height, width))
-        self.register_buffer("appearance", torch.zeros(self.latent_size, channels, height, width))
-        self.register_buffer("basis", torch.zeros(factors, FEATURES, pixels))
-        self.register_buffer("centre", torch.zeros(factors, FEATURES))
-        self.register_buffer("exemplars", torch.zeros(factors, EXEMPLARS, FEATURES))
-        self.register_buffer("values", torch.zeros(factors, EXEMPLARS))
-
-    def target(self, images: Tensor) -> Tensor:
-        """Images as they are."""
-        return images
+        shapes = {
+            "background": (channels, height, width),
+            "appearance": (self.latent_size, channels, height, width),
+            "basis": (factors, FEATURES, pixels),
+            "centre": (factors, FEATURES),
+            "exemplars": (factors, EXEMPLARS, FEATURES),
+            "values": (factors, EXEMPLARS),
+        }
+        for name, shape in shapes.items():
+            self.register_buffer(name, torch.zeros(shape))
 
     def codes(self, images: Tensor) -> Tensor:
         """The value of each factor of ``images`` (N, C, H, W). Shape (N, P), int64."""
@@ -83,7 +81,7 @@ class DiscreteEncoder(EncoderNetwork):
         codes = self.codes(images)
         hot = [functional.one_hot(codes[:, factor], size) for factor, size in enumerate(self.code_sizes)]
         mu = torch.cat(hot, dim=1).to(self.background.dtype)
-        return mu, torch.full_like(mu, _CERTAIN)
+        return mu, torch.full_like(mu, CERTAIN)
 
     def mean(self, latents: Tensor) -> Tensor:
         """The mean appearance of every factor's value, before the background."""
@@ -95,7 +93,7 @@ class DiscreteEncoder(EncoderNetwork):
 
     def information(self, mu: Tensor, log_variance: Tensor) -> Tensor:
         """That of certain codes from uniform ones: sum of log of the number of values."""
-        return mu.new_full((len(mu),), float(np.log(self.code_sizes).sum()))
+        return torch.tensor(self.code_sizes).log().sum()
 
 
 def smoothed(images: Tensor) -> Tensor:
@@ -119,29 +117,25 @@ def discover(images: Tensor, generator: torch.Generator) -> DiscreteEncoder:
     """
     chosen = images[torch.randperm(len(images), generator=generator)[: _IMAGES * max(images.shape[1], 3)]]
     pixels = torch.cat([smoothed(chunk) for chunk in chosen.split(500)]).double().numpy()  # [N, X]
-    factors = [_factor(pixels, group) for group in pixel_groups(pixels)]
-    found = [factor for factor in factors if factor is not None]
+    found = []
+    for group in pixel_groups(pixels):
+        basis = _directions(pixels, group)
+        centre = basis @ pixels.mean(axis=0)
+        features = pixels @ basis.T - centre
+        value = clouds(features)
+        if value.max() > 0:
+            found.append((group, basis, centre, features, value))
     if not found:
         raise InvalidValueError("No factor with two values or more was found; the images hardly differ.")
-    network = DiscreteEncoder(tuple(int(factor.value.max()) + 1 for factor in found), *images.shape[1:])
-    for index, factor in enumerate(found):
-        rows = _balanced(factor.value, generator)
-        network.basis[index] = torch.from_numpy(factor.basis)
-        network.centre[index] = torch.from_numpy(factor.centre)
-        network.exemplars[index] = torch.from_numpy(factor.features[rows])
-        network.values[index] = torch.from_numpy(factor.value[rows].astype(np.float64))
-    _fit_appearance(network, chosen, [factor.group for factor in found])
+    network = DiscreteEncoder(tuple(int(value.max()) + 1 for *_, value in found), *images.shape[1:])
+    for index, (_, basis, centre, features, value) in enumerate(found):
+        rows = _balanced(value, generator)
+        network.basis[index] = torch.from_numpy(basis)
+        network.centre[index] = torch.from_numpy(centre)
+        network.exemplars[index] = torch.from_numpy(features[rows])
+        network.values[index] = torch.from_numpy(value[rows].astype(np.float64))
+    _fit_appearance(network, chosen, [group for group, *_ in found])
     return network
-
-
-class _Factor(NamedTuple):
-    """A factor: its pixels (X,), basis (F, X) and centre (F,) of its features (N, F), and values (N,), -1 for none."""
-
-    group: NDArray[np.bool_]
-    basis: NDArray[np.float64]
-    centre: NDArray[np.float64]
-    features: NDArray[np.float64]
-    value: NDArray[np.int64]
 
 
 def pixel_groups(pixels: NDArray[np.float64]) -> list[NDArray[np.bool_]]:
@@ -172,10 +166,9 @@ def dependence(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     square = linear**2 - 1.0
     square /= np.maximum(square.std(axis=0), 1e-6)
     both = np.concatenate([linear, square], axis=1)
-    correlation = np.abs(both.T @ both) / len(both)
     size = pixels.shape[1]
-    blocks = [correlation[a : a + size, b : b + size] for a in (0, size) for b in (0, size)]
-    largest = np.clip(np.maximum.reduce(blocks), 0.0, 1.0)
+    correlation = np.abs(both.T @ both).reshape(2, size, 2, size).max(axis=(0, 2)) / len(both)
+    largest = np.clip(correlation, 0.0, 1.0)
     np.fill_diagonal(largest, 1.0)
     return np.maximum(largest, largest.T)
 
@@ -198,11 +191,15 @@ def clouds(points: NDArray[np.float64]) -> NDArray[np.int64]:
     _, first, twin = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
     same = scipy.sparse.csr_matrix((np.ones(count), (np.arange(count), first[twin.ravel()])), shape=(count, count))
     label = scipy.sparse.csgraph.connected_components(mutual + same, directed=False)[1]
-    sizes = np.bincount(label)
-    order = [index for index in np.argsort(-sizes, kind="stable") if sizes[index] > _LEAST_SHARE * count]
-    number = np.full(len(sizes), -1)
-    number[order] = np.arange(len(order))
-    return _merge_close(shifted, number[label])
+    return _merge_close(shifted, _by_size(label, _LEAST_SHARE * count))
+
+
+def _by_size(label: NDArray[np.int64], least: float = 0.0) -> NDArray[np.int64]:
+    """Labels (N,), -1 for none, numbered by size from 0; those of at most ``least`` points become -1."""
+    sizes = np.bincount(label[label >= 0])
+    number = np.append(np.argsort(-sizes, kind="stable").argsort(), -1)
+    number[:-1][sizes <= least] = -1
+    return number[label]
 
 
 def _merge_close(points: NDArray[np.float64], label: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -214,34 +211,24 @@ def _merge_close(points: NDArray[np.float64], label: NDArray[np.int64]) -> NDArr
     count = int(label.max()) + 1
     if count < 3:
         return label
-    apart = _gaps([points[label == index] for index in range(count)])
-    typical = np.sqrt((apart[np.triu_indices(count, 1)] ** 2).mean())
-    whole = scipy.sparse.csgraph.connected_components(apart < _LEAST_GAP * typical, directed=False)[1]
-    order = np.argsort(-np.bincount(whole[label[label >= 0]]), kind="stable")
-    return np.append(order.argsort()[whole], -1)[label]
+    apart = np.zeros((count, count))
+    for a, b in itertools.combinations(range(count), 2):
+        apart[a, b] = scipy.spatial.cKDTree(points[label == a]).query(points[label == b])[0].min()
+    pairs = np.triu_indices(count, 1)
+    near = np.zeros_like(apart)
+    near[pairs] = apart[pairs] < _LEAST_GAP * np.sqrt((apart[pairs] ** 2).mean())
+    whole = scipy.sparse.csgraph.connected_components(near, directed=False)[1]
+    return _by_size(np.append(whole, -1)[label])
 
 
-def _gaps(clouds: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Distances between the nearest points of clouds (N, F) each. Shape (K, K)."""
-    gaps = np.zeros((len(clouds), len(clouds)))
-    for a, b in itertools.combinations(range(len(clouds)), 2):
-        gap = scipy.spatial.cKDTree(clouds[a]).query(clouds[b])[0].min()
-        gaps[a, b] = gap
-        gaps[b, a] = gap
-    return gaps
-
-
-def _factor(pixels: NDArray[np.float64], group: NDArray[np.bool_]) -> _Factor | None:
-    """The factor of a group of pixels (X,), or None where it has one value only."""
+def _directions(pixels: NDArray[np.float64], group: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The principal directions of a group of pixels (X,), among all pixels (N, X). Shape (F, X)."""
     own = pixels[:, group]
     centred = own - own.mean(axis=0)
     directions = np.linalg.eigh(centred.T @ centred)[1][:, ::-1][:, :FEATURES]  # [X', F]
     basis = np.zeros((FEATURES, pixels.shape[1]))
     basis[: directions.shape[1], group] = directions.T
-    centre = basis @ pixels.mean(axis=0)
-    features = pixels @ basis.T - centre
-    value = clouds(features)
-    return _Factor(group, basis, centre, features, value) if value.max() > 0 else None
+    return basis
 
 
 def _balanced(value: NDArray[np.int64], generator: torch.Generator) -> NDArray[np.int64]:

@@ -18,19 +18,16 @@ from torch import Tensor, nn
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame
-from imagine_bench.preprocessing import PREPROCESSING, join_cells, preprocess
+from imagine_bench.preprocessing import join_cells, preprocess
 
 from .discrete_encoder import DiscreteEncoder
-from .network import EncoderNetwork
+from .network import EncoderNetwork, OfferedNetwork, image_shape, read_whole
 from .probe import Probe
 from .recipes import Recipe
-from .vae import Vae, build_vae
+from .vae import build_vae
 
 FORMAT = "imagine_bench.encoder/1"
-PROBE_HIDDEN = 256
-"""Units of each hidden layer of the stored probe."""
 _CHUNK = 512  # frames encoded at once, to bound memory
-_FRAME_SHAPE = (64, 64, 3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +45,7 @@ class EncoderCard:
     command: str  #: makes it again
     data: str  #: what the frames were, in words
     versions: dict[str, str]
-    cpu_s: dict[str, float]  #: CPU seconds spent on ``frames``, ``training``, ``probe`` and in ``total``
+    cpu_s: dict[str, float]  #: CPU seconds spent in ``total``
     kl_nats: float  #: KL from the prior on held-out frames, mean a frame
     reconstruction: float  #: squared error of the decoded held-out frames, mean a pixel, in the network's own units
     #: Fraction of held-out frames whose whole macrostate is read right from the mean latents by a ``linear`` reader and
@@ -64,21 +61,14 @@ class EncoderCard:
 
     @classmethod
     def from_json(cls, text: str) -> EncoderCard:
-        """Undo :meth:`to_json`; InvalidValueError where it is not an encoder's card of this format."""
-        try:
-            values: dict[str, Any] = json.loads(text)
-            if values.pop("format") != FORMAT:
-                raise InvalidValueError("its format is another one")
-            recipe = values.pop("recipe")
-            recipe = Recipe(**{**recipe, "widths": tuple(recipe["widths"])})
-            names = ("macrostate_names", "cardinalities", "code_sizes")
-            tuples: dict[str, Any] = {key: tuple(values.pop(key)) for key in names if key in values}
-            card = cls(recipe=recipe, **tuples, **values)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise InvalidValueError(f"Not an {FORMAT} card: {error}.") from error
-        if card.preprocessing not in PREPROCESSING:
-            raise InvalidValueError(f"Its preprocessing {card.preprocessing!r} is unknown.")
-        return card
+        """Undo :meth:`to_json`; an error of any kind where it is not an encoder's card of this format."""
+        values: dict[str, Any] = json.loads(text)
+        if values.pop("format") != FORMAT:
+            raise InvalidValueError(f"its format is not {FORMAT}")
+        recipe = values.pop("recipe")
+        recipe = Recipe(**{**recipe, "widths": tuple(recipe["widths"])})
+        lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
+        return cls(recipe=recipe, **{**values, **lists})
 
 
 class Encoder:
@@ -90,7 +80,7 @@ class Encoder:
         self.device = torch.device(device)
         self.network = network.to(self.device).requires_grad_(False).eval()
         self.probe = probe.to(self.device).requires_grad_(False).eval()
-        self._preprocess = preprocess(card.preprocessing)
+        self._preprocess = read_whole if card.offer else preprocess(card.preprocessing)
 
     @torch.no_grad()
     def encode(self, frames: Frame) -> tuple[Tensor, Tensor]:
@@ -102,19 +92,17 @@ class Encoder:
         Raises:
             InvalidValueError: Frames of another shape or type.
         """
-        if frames.dtype != np.uint8 or frames.shape[1:] != _FRAME_SHAPE:
+        if frames.dtype != np.uint8 or frames.shape[1:] != (64, 64, 3):
             got = f"frames of type {frames.dtype} and shape {frames.shape}"
             raise InvalidValueError(f"The encoder got {got}; give uint8 of shape (N, 64, 64, 3).")
-        chunks = [self._encode_chunk(frames[i : i + _CHUNK]) for i in range(0, len(frames), _CHUNK)]
-        if len(chunks) == 1:
-            return chunks[0]
         empty = torch.empty((0, self.latent_size), device=self.device)
-        mu, sigma = zip((empty, empty), *chunks, strict=True)
-        return torch.cat(mu), torch.cat(sigma)
-
-    def _encode_chunk(self, frames: Frame) -> tuple[Tensor, Tensor]:
-        mu, log_variance = self.network.posterior(torch.from_numpy(self._preprocess(frames)).to(self.device))
-        return mu, (0.5 * log_variance).exp()
+        chunks = [(empty, empty)]
+        for start in range(0, len(frames), _CHUNK):
+            images = torch.from_numpy(self._preprocess(frames[start : start + _CHUNK])).to(self.device)
+            mu, log_variance = self.network.posterior(images)
+            chunks.append((mu, (0.5 * log_variance).exp()))
+        means, deviations = zip(*chunks, strict=True)
+        return torch.cat(means), torch.cat(deviations)
 
     def latents(self, frame: Frame) -> NDArray[np.float32]:
         """Posterior means (Z,) of one frame (64, 64, 3)."""
@@ -122,9 +110,15 @@ class Encoder:
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> NDArray[np.float32]:
-        """One image of the whole view for every row of ``latents`` (N, Z), as :func:`view` shapes it, in [0, 1]."""
+        """One image of the whole view for every row of ``latents`` (N, Z), as :func:`view` shapes it, in [0, 1].
+
+        Those of another package's encoder are as it draws them, or gray (N, 64, 64).
+        """
+        latents = latents.to(self.device)
+        if self.card.offer:
+            return self.network.decode(latents, 64, 64).numpy()
         _, height, width = image_shape(self.card.preprocessing)
-        return view(self.network.decode(latents.to(self.device), height, width).cpu().numpy(), self.card.preprocessing)
+        return view(self.network.decode(latents, height, width).cpu().numpy(), self.card.preprocessing)
 
     def read_macrostate(self, latents: Tensor) -> NDArray[np.int64]:
         """What the evaluation-only probe reads from ``latents`` (N, Z); agents must not use it. Shape (N, M)."""
@@ -144,20 +138,14 @@ class Encoder:
             for name, module in (("vae", self.network), ("probe", self.probe))
             for key, value in module.state_dict().items()
         }
+        card = self.card.to_json()
+        contents = {".json": f"{card}\n".encode(), ".png": picture, path.suffix: save(tensors, metadata={"card": card})}
         path.parent.mkdir(parents=True, exist_ok=True)
-        artefact = save(tensors, metadata={"card": self.card.to_json()})
-        beside = {path.with_suffix(".json"): f"{self.card.to_json()}\n".encode()}
-        if picture:
-            beside[path.with_suffix(".png")] = picture
         begun = _begun(path)
         begun.touch()
-        for target, content in {**beside, path: artefact}.items():
-            unfinished = target.with_name(f".{target.name}.partial")
-            with unfinished.open("wb") as stream:
-                stream.write(content)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(unfinished, target)
+        for suffix, content in contents.items():
+            if content:
+                write_whole(path.with_suffix(suffix), content)
         begun.unlink()
 
     @classmethod
@@ -174,24 +162,28 @@ class Encoder:
                 card = EncoderCard.from_json((file.metadata() or {}).get("card", ""))
                 tensors = {key: file.get_tensor(key).float() for key in file.keys()}
             network = _empty_network(card)
-            if network.latent_size != card.latent_size:
-                raise InvalidValueError(f"its card says {card.latent_size} latents, its network {network.latent_size}")
-            probe = empty_probe(network.latent_size, card.cardinalities)
+            probe = Probe(card.latent_size, card.cardinalities)
             _fill(network, tensors, "vae.")
             _fill(probe, tensors, "probe.")
+            return cls(network, probe, card, device)
         except Exception as error:  # a file that is no encoder can be wrong in any way
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:300].rstrip(".")
             raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
-        if card.offer:
-            from .offered import OfferedEncoder  # noqa: PLC0415 - it is made of this
-
-            return OfferedEncoder(network, probe, card, device)
-        return cls(network, probe, card, device)
 
 
 def bundled_encoder(name: str) -> Path:
     """Where the encoder that comes with the package under ``name`` (``"arrow_puzzle-mild"``) is, if it is there."""
     return Path(str(resources.files("imagine_bench.assets"))) / "encoders" / f"{name}.safetensors"
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file so that it is whole or as before, whenever the process is killed."""
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    os.replace(partial, path)
 
 
 def refuse_existing(path: Path) -> None:
@@ -207,12 +199,6 @@ def _begun(path: Path) -> Path:
     return path.with_name(f".{path.name}.begun")
 
 
-def image_shape(preprocessing: str) -> tuple[int, int, int]:
-    """(C, H, W) of what a preprocessing gives."""
-    shape = preprocess(preprocessing)(np.zeros((1, *_FRAME_SHAPE), dtype=np.uint8)).shape
-    return shape[1], shape[2], shape[3]
-
-
 def view(images: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]:
     """One image of the whole view from preprocessed images: (N, C, H, W) to gray (N, H', W') or RGB (N, H, W, 3)."""
     if preprocessing.startswith("gray"):
@@ -222,25 +208,10 @@ def view(images: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]
 
 def _empty_network(card: EncoderCard) -> EncoderNetwork:
     if card.offer:
-        from .offered import OfferedNetwork  # noqa: PLC0415 - it is made of this
-
-        return OfferedNetwork(card.offer, card.latent_size)
+        return OfferedNetwork(card.offer)
     if card.recipe.kind == "latents":
-        return empty_vae(card.recipe, card.preprocessing)
-    with torch.device("meta"):
-        return DiscreteEncoder(card.code_sizes, *image_shape(card.preprocessing))
-
-
-def empty_vae(recipe: Recipe, preprocessing: str) -> Vae:
-    """The VAE of a recipe on the meta device: shapes without weights, and no random numbers drawn."""
-    with torch.device("meta"):
-        return build_vae(recipe, *image_shape(preprocessing))
-
-
-def empty_probe(latent_size: int, cardinalities: tuple[int, ...], hidden: int = PROBE_HIDDEN) -> Probe:
-    """A probe on the meta device."""
-    with torch.device("meta"):
-        return Probe(latent_size, cardinalities, hidden)
+        return build_vae(card.recipe, card.preprocessing)
+    return DiscreteEncoder(card.code_sizes, *image_shape(card.preprocessing))
 
 
 def _fill(network: nn.Module, tensors: dict[str, Tensor], prefix: str) -> None:

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..networks.weights import initialise
+from ..networks.mlp import initialise, relu_layers
 
+HIDDEN = 256
+"""Units of each hidden layer of the stored probe."""
 _BATCH = 256
 _LEARNING_RATE = 3e-3
 
@@ -36,22 +38,20 @@ class Probe(nn.Module):
         latent_size: Latents Z.
         cardinalities: Values of each of the M coordinates.
         hidden: Units of each of two hidden layers; 0 makes it linear.
+
+    Its weights are undefined before :func:`train_probe`, or before they are loaded.
     """
 
     centre: Tensor
     scale: Tensor
 
-    def __init__(self, latent_size: int, cardinalities: Sequence[int], hidden: int) -> None:
+    def __init__(self, latent_size: int, cardinalities: Sequence[int], hidden: int = HIDDEN) -> None:
         super().__init__()
         self.cardinalities = tuple(cardinalities)
         self.register_buffer("centre", torch.zeros(latent_size))
         self.register_buffer("scale", torch.ones(latent_size))
-        outputs = sum(cardinalities)
-        if hidden:
-            layers = [nn.Linear(latent_size, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()]
-            self.layers: nn.Module = nn.Sequential(*layers, nn.Linear(hidden, outputs))
-        else:
-            self.layers = nn.Linear(latent_size, outputs)
+        sizes = (latent_size, hidden, hidden, sum(cardinalities)) if hidden else (latent_size, sum(cardinalities))
+        self.layers = relu_layers(sizes)
 
     def logits(self, latents: Tensor) -> tuple[Tensor, ...]:
         """Unnormalised log probabilities of each coordinate's values. M tensors of shape (N, cardinality)."""

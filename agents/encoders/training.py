@@ -1,15 +1,16 @@
 """Make an encoder: render frames, train the VAE or discover the factors, fit the evaluation-only probe, measure.
 
-Every measurement is on fresh frames.
+Every measurement is on fresh frames. An encoder that another package offers is not trained; its scale is measured when
+it is first used, and it is kept with its probe in an ordinary encoder's file, which names the offer.
 """
 
 from __future__ import annotations
 
+import io
 import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,21 +21,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.appearance import appearance_name
-from imagine_bench.errors import DivergedError
+from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.interfaces import Frame, TaskSpec, appearance_of_tests
 from imagine_bench.preprocessing import preprocess
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 
-from ..networks.weights import initialise
-from .discrete_encoder import DiscreteEncoder, discover
-from .encoder import PROBE_HIDDEN, Encoder, EncoderCard, empty_probe, empty_vae, image_shape
-from .network import EncoderNetwork
+from ..networks.mlp import initialise
+from .discrete_encoder import discover
+from .encoder import Encoder, EncoderCard, write_whole
+from .network import EncoderNetwork, OfferedNetwork, image_shape, read_whole
 from .perception import prepare_torch
 from .probe import Latents, Probe, accuracy, train_probe
-from .recipes import RECIPES, Recipe, recipe_named
-from .unfinished import Kept, Unfinished
-from .vae import MlpVae, Vae
+from .recipes import RECIPES, Recipe
+from .vae import Vae, build_vae
 
 Progress = Callable[[str, float], None]
 """Told the stage (``"frames"``, ``"training"``, ``"probe"``) and the fraction of it that is done."""
@@ -44,6 +44,10 @@ _PART = 250  # images whose gradients are added up: 2000 at once leave the proce
 _CHECK_EVERY = 50  # steps between checks for NaN
 _RISE = 0.02  # fraction of the steps over which the learning rate rises
 _LIBRARIES = ("torch", "numpy", "mujoco")
+SAVE_EVERY_S = 60.0
+"""Seconds between two states of a training that are kept."""
+OFFERED = Recipe(name="offered", architecture="offered", frames=4000, held_out_frames=1000, probe_steps=2000)
+"""Frames that scale and probe of another package's encoder are made of, and the probe's steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,9 +83,16 @@ def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generato
     return spec.render_macrostates(macrostates, appearance, rng), macrostates % classes_of(spec)
 
 
-def frame_set(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator, progress: Progress) -> FrameSet:
-    """Render ``n`` labelled frames of uniformly drawn macrostates."""
-    prepare = preprocess(spec.preprocessing)
+def frame_set(
+    spec: TaskSpec,
+    appearance: str,
+    n: int,
+    rng: np.random.Generator,
+    progress: Progress,
+    prepare: Callable[[Frame], NDArray[np.float32]] | None = None,
+) -> FrameSet:
+    """Render ``n`` labelled frames of uniformly drawn macrostates, preprocessed as the task declares or else."""
+    prepare = prepare or preprocess(spec.preprocessing)
     images: list[Tensor] = []
     labels: list[NDArray[np.int64]] = []
     for start in range(0, n, _CHUNK):
@@ -106,6 +117,42 @@ def learning_rate_at(recipe: Recipe, step: int) -> float:
     return recipe.learning_rate * min(1.0, (done + 1e-3) / _RISE) * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
+class Unfinished:
+    """Keeps a training in a file, so that one that was killed goes on with the same bits.
+
+    The file is three times as large as the weights; ``what`` names the training uniquely.
+    """
+
+    def __init__(self, path: Path, what: str) -> None:
+        self._path = path
+        self._what = what
+        self._saved_s = time.monotonic()
+
+    def load(self) -> dict[str, Any] | None:
+        """Return the kept state, or None. Raises ArtefactError if the file is damaged or of another training."""
+        if not self._path.exists():
+            return None
+        try:
+            what, kept = torch.load(self._path, weights_only=True)
+        except Exception as error:  # a damaged file can be wrong in any way
+            raise ArtefactError(f"{self._path} is damaged; remove it to begin anew.") from error
+        if what != self._what:
+            raise ArtefactError(f"{self._path} is of another training; remove it or choose another folder.")
+        return kept
+
+    def due(self) -> bool:
+        """Whether the last state was kept more than a minute ago."""
+        return time.monotonic() - self._saved_s >= SAVE_EVERY_S
+
+    def save(self, kept: dict[str, Any]) -> None:
+        """Write numbers, tensors and states of optimisers atomically."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        content = io.BytesIO()
+        torch.save((self._what, kept), content)  # to a full disk torch itself would end in an error of its own
+        write_whole(self._path, content.getvalue())
+        self._saved_s = time.monotonic()
+
+
 def train_vae(
     vae: Vae,
     data: FrameSet,
@@ -114,7 +161,7 @@ def train_vae(
     progress: Progress,
     unfinished: Unfinished | None = None,
 ) -> float:
-    """Minimise the beta-VAE loss with Adam, in place, and return the CPU seconds of it, earlier processes' included.
+    """Minimise the beta-VAE loss with Adam, in place, and return the CPU seconds that earlier processes spent on it.
 
     The VAE stays on its device; what is drawn is drawn by ``generator``, on the CPU.
 
@@ -123,28 +170,21 @@ def train_vae(
         ArtefactError: What is unfinished is damaged or another training.
     """
     optimiser = torch.optim.Adam(vae.parameters(), lr=recipe.learning_rate, fused=True)
-    n = len(data.images)
-    first = 0
-    order = torch.empty(0, dtype=torch.int64)
-    begun_s = time.process_time()
-    device = next(vae.parameters()).device
-    data = replace(data, images=data.images.to(device))
-    at_once = _PART if device.type == "cpu" else recipe.batch
-    if unfinished is not None and (kept := unfinished.load()) is not None:
-        first = kept["step"]
-        order = kept["order"]
-        begun_s = begun_s - kept["cpu_s"]
+    kept: dict[str, Any] = {"step": 0, "order": torch.empty(0, dtype=torch.int64), "cpu_s": 0.0}
+    found = None if unfinished is None else unfinished.load()
+    if found is not None:
+        kept = found
         vae.load_state_dict(kept["vae"])
         optimiser.load_state_dict(kept["optimiser"])
         generator.set_state(kept["generator"])
-
-    def so_far(step: int, order: Tensor) -> Kept:
-        made = {"vae": vae.state_dict(), "optimiser": optimiser.state_dict(), "generator": generator.get_state()}
-        return {"step": step, "order": order, "cpu_s": time.process_time() - begun_s, **made}
-
-    for step in range(first, recipe.steps):
+    order = kept["order"]
+    begun_s = time.process_time() - kept["cpu_s"]
+    device = next(vae.parameters()).device
+    data = replace(data, images=data.images.to(device))
+    at_once = _PART if device.type == "cpu" else recipe.batch
+    for step in range(kept["step"], recipe.steps):
         while len(order) < recipe.batch:
-            order = torch.cat([order, torch.randperm(n, generator=generator)])
+            order = torch.cat([order, torch.randperm(len(data.images), generator=generator)])
         rows = order[: recipe.batch]
         order = order[recipe.batch :]
         noise = torch.randn((len(rows), vae.latent_size), generator=generator)
@@ -158,79 +198,94 @@ def train_vae(
         optimiser.step()
         if (step % _CHECK_EVERY == 0 or step == recipe.steps - 1) and not total.isfinite():
             raise DivergedError(f"The encoder's loss became {total.item()} at step {step} of {recipe.steps}.")
-        if unfinished is not None:
-            unfinished.save(partial(so_far, step + 1, order))
+        if unfinished is not None and unfinished.due():
+            learned = {"vae": vae.state_dict(), "optimiser": optimiser.state_dict(), "generator": generator.get_state()}
+            counted = {"step": step + 1, "order": order, "cpu_s": time.process_time() - begun_s}
+            unfinished.save({**learned, **counted})
         progress("training", (step + 1) / recipe.steps)
-    return time.process_time() - begun_s
+    return kept["cpu_s"]
 
 
 def train_encoder(
     spec: TaskSpec,
     *,
-    recipe: str | Recipe,
+    recipe: Recipe,
     appearance: str,
     seed: int,
-    progress: Progress | None = None,
+    progress: Progress = lambda stage, done: None,
     unfinished: Path | None = None,
     device: str = "cpu",
+    offer: str = "",
 ) -> Encoder:
     """Make an encoder from nothing: the same arguments give the same weights, bit for bit, on one machine.
 
-    A recipe is a name among the task's ``RECIPES``, or settings of one's own. ``seed`` is the root of the seed tree:
-    training frames come from its ``encoder_training`` branch and held-out ones from its ``encoder_probe`` branch, of
-    looks kept for tests where the appearance has such. ``unfinished`` is a file in which a VAE's training is kept once
-    a minute and from which one that was killed goes on; when all is done it is removed. ``device`` is where a VAE's
-    gradient steps are made; all else is the CPU's.
+    ``seed`` is the root of the seed tree: training frames come from its ``encoder_training`` branch and held-out ones
+    from its ``encoder_probe`` branch, of looks kept for tests where the appearance has such. ``unfinished`` is a file
+    in which a VAE's training is kept once a minute and from which one that was killed goes on; when all is done it is
+    removed. ``device`` is where a VAE's gradient steps are made; all else is the CPU's. ``offer`` is the
+    ``"module:attr"`` of what another package offers, in the recipe :data:`OFFERED`.
 
     Raises:
-        UnknownNameError: An unknown recipe, appearance or device.
+        UnknownNameError: An unknown appearance or device.
         SetupError: The machine has no such device.
         DivergedError: The loss became NaN or infinite.
-        InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames.
+        InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames, or what is
+            offered gives no latents.
         ArtefactError: The unfinished training is damaged or another one.
     """
-    recipe = recipe_named(recipe, spec.config_group) if isinstance(recipe, str) else recipe
     if recipe.kind == "codes":
         recipe = replace(recipe, frames=recipe.frames * max(image_shape(spec.preprocessing)[0], 3) // 3)
     appearance = appearance_name(appearance)
-    progress = progress or (lambda stage, done: None)
     prepare_torch(device)
     seeds = SeedTree(seed)
-    train_seeds, probe_seeds = (seeds.child(use, spec.id, appearance) for use in ("encoder_training", "encoder_probe"))
-    clock = {"": time.process_time()}
-    data = frame_set(spec, appearance, recipe.frames, train_seeds.generator(), progress)
+    train_seeds = seeds.child("encoder_training", spec.id, appearance)
+    probe_seeds = seeds.child("encoder_probe", spec.id, appearance)
+    prepare = read_whole if offer else None
+    begun_s = time.process_time()
+    data = frame_set(spec, appearance, recipe.frames, train_seeds.generator(), progress, prepare)
     unseen = appearance_of_tests(appearance)
-    held_out = frame_set(spec, unseen, recipe.held_out_frames, probe_seeds.generator(), progress)
-    clock["frames"] = time.process_time()
+    held_out = frame_set(spec, unseen, recipe.held_out_frames, probe_seeds.generator(), progress, prepare)
     generator = torch.Generator().manual_seed(train_seeds.child("torch").integer())
     network: EncoderNetwork
-    if recipe.kind == "codes":
+    if offer:
+        network = _fitted_offer(offer, data)
+    elif recipe.kind == "codes":
         network = discover(data.batch(torch.arange(recipe.frames)), generator)
     else:
         what = f"{spec.id} {appearance} {seed} {recipe} {device}"
         kept = None if unfinished is None else Unfinished(unfinished, what)
-        network, training_s = _trained_vae(recipe, spec.preprocessing, data, generator, progress, kept, device)
-        earlier_s = clock["frames"] + training_s - time.process_time()
-        clock |= {stage: at - earlier_s for stage, at in clock.items()}
-    _round_to_half(network)
-    clock["training"] = time.process_time()
-    cardinalities = classes_of(spec)
+        network = vae = build_vae(recipe, spec.preprocessing)
+        initialise(vae, generator)
+        vae.fit_appearance(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
+        begun_s -= train_vae(vae.to(device), data, recipe, generator, progress, kept)
+    _round_to_half(network.cpu())
     latents = latents_of(network, data)
-    probe, linear = (empty_probe(network.latent_size, cardinalities, hidden) for hidden in (PROBE_HIDDEN, 0))
-    for reader in (probe.to_empty(device="cpu"), linear.to_empty(device="cpu")):
+    probe = Probe(network.latent_size, classes_of(spec))
+    linear = Probe(network.latent_size, classes_of(spec), hidden=0)
+    for reader in (probe, linear):
         train_probe(reader, latents, data.macrostates, steps=recipe.probe_steps, generator=generator)
         _round_to_half(reader)
-    clock["probe"] = time.process_time()
     progress("probe", 1.0)
-    noise = torch.Generator().manual_seed(probe_seeds.child("torch").integer())
-    measured = _measure(network, probe, linear, held_out, noise)
-    sizes = network.code_sizes if isinstance(network, DiscreteEncoder) else ()
-    measured |= {"latent_size": network.latent_size, "code_sizes": sizes, "cpu_s": _laps(clock)}
-    return Encoder(network, probe, _card(spec, recipe, appearance, seed, device, **measured))
+    measured = _measured(network, probe, linear, held_out, probe_seeds.child("torch").integer())
+    measured["cpu_s"] = {"total": round(time.process_time() - begun_s, 1)}
+    return Encoder(network, probe, _card(spec, recipe, appearance, seed, device, offer=offer, **measured))
 
 
-def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, device: str, **measured: Any) -> EncoderCard:
+def _card(
+    spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, device: str, *, offer: str, **measured: Any
+) -> EncoderCard:
+    """The card of an encoder; its command names the options that changed a recipe's numbers."""
     gpu = {"gpu": torch.cuda.get_device_name()} if device == "cuda" else {}
+    command = f"imagine-bench encoder --task {spec.id} --appearance {appearance} --recipe {recipe.name} --seed {seed}"
+    named = RECIPES[spec.config_group].get(recipe.name, recipe)
+    for name in ("steps", "batch", "latents"):
+        if getattr(recipe, name) != getattr(named, name):
+            command += f" --{name} {getattr(recipe, name)}"
+    if gpu:
+        command += " --device cuda"
+    if offer:
+        command = f"imagine-bench bench --task {spec.id} --appearance {appearance} --encoder {recipe.name}"
+    training = f"what {offer} was trained on, {recipe.frames}" if offer else f"{recipe.frames} training"
     return EncoderCard(
         task=spec.id,
         appearance=appearance,
@@ -239,42 +294,12 @@ def _card(spec: TaskSpec, recipe: Recipe, appearance: str, seed: int, device: st
         macrostate_names=spec.macrostate_names,
         cardinalities=classes_of(spec),
         seed=seed,
-        command=f"imagine-bench encoder --task {spec.id} --appearance {appearance} "
-        f"--recipe {recipe.name} --seed {seed}{_changed(spec, recipe)}{' --device cuda' if gpu else ''}",
-        data=f"{recipe.frames} training and {recipe.held_out_frames} held-out frames, kinematic, macrostates uniform",
+        command=command,
+        data=f"{training} and {recipe.held_out_frames} held-out frames, kinematic, macrostates uniform",
         versions={name: version(name) for name in _LIBRARIES} | gpu,
+        offer=offer,
         **measured,
     )
-
-
-def _changed(spec: TaskSpec, recipe: Recipe) -> str:
-    """The options of the command that changed a recipe's numbers, where they did."""
-    named = RECIPES[spec.config_group].get(recipe.name, recipe)
-    pairs = ((name, getattr(recipe, name)) for name in ("steps", "batch", "latents"))
-    return "".join(f" --{name} {value}" for name, value in pairs if value != getattr(named, name))
-
-
-def _laps(clock: dict[str, float]) -> dict[str, float]:
-    """Seconds of each stage and in total, from the times at which stages ended."""
-    laps = {stage: end - start for start, (stage, end) in zip(clock.values(), list(clock.items())[1:], strict=False)}
-    return {stage: round(seconds, 1) for stage, seconds in {**laps, "total": sum(laps.values())}.items()}
-
-
-def _trained_vae(
-    recipe: Recipe,
-    preprocessing: str,
-    data: FrameSet,
-    generator: torch.Generator,
-    progress: Progress,
-    unfinished: Unfinished | None,
-    device: str,
-) -> tuple[Vae, float]:
-    vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
-    initialise(vae, generator)
-    if isinstance(vae, MlpVae):
-        vae.fit_appearance(data.batch(torch.arange(min(_CHUNK, recipe.frames))))
-    cpu_s = train_vae(vae.to(device), data, recipe, generator, progress, unfinished)
-    return vae.cpu(), cpu_s
 
 
 @torch.no_grad()
@@ -287,29 +312,51 @@ def _round_to_half(network: torch.nn.Module) -> None:
 @torch.no_grad()
 def latents_of(network: EncoderNetwork, data: FrameSet) -> Latents:
     """The latents of every frame."""
-    chunks = [network.posterior(data.batch(rows)) for rows in torch.split(torch.arange(len(data.images)), _CHUNK)]
+    chunks = [network.posterior(data.batch(rows)) for rows in torch.arange(len(data.images)).split(_CHUNK)]
     mu, log_variance = (torch.cat(column) for column in zip(*chunks, strict=True))
     return Latents(mu, (0.5 * log_variance).exp())
 
 
-def _measure(
-    network: EncoderNetwork, probe: Probe, linear: Probe, held_out: FrameSet, generator: torch.Generator
-) -> dict[str, Any]:
-    """Measure an encoder on frames that no training saw, for its card."""
-    latents = latents_of(network, held_out)
-    right = held_out.macrostates
-    kl = network.information(latents.mu, 2.0 * latents.sigma.log())
-    read = {"linear": accuracy(linear, latents.mu, right), "mlp": accuracy(probe, latents.mu, right)}
-    read["mlp_sampled"] = accuracy(probe, latents.sample(generator), right)
-    reconstruction = _squared_error(network, held_out, latents)
-    return {"kl_nats": round(kl.mean().item(), 3), "reconstruction": reconstruction, "probe": read}
-
-
 @torch.no_grad()
-def _squared_error(network: EncoderNetwork, data: FrameSet, latents: Latents) -> float:
-    """Squared error of the mean latents' images, mean a pixel."""
-    total = 0.0
-    for rows in torch.split(torch.arange(len(data.images)), _CHUNK):
-        images = data.batch(rows)
-        total += (network.mean(latents.mu[rows]) - network.target(images)).square().sum().item()
-    return total / network.target(data.batch(torch.arange(1))).numel() / len(data.images)
+def _measured(network: EncoderNetwork, probe: Probe, linear: Probe, held_out: FrameSet, seed: int) -> dict[str, Any]:
+    """What a card says of an encoder on frames that no training saw."""
+    latents = latents_of(network, held_out)
+    sampled = latents.sample(torch.Generator().manual_seed(seed))
+    right = held_out.macrostates
+    squared = 0.0
+    pixels = 0
+    for rows in torch.arange(len(right)).split(_CHUNK):
+        target = network.target(held_out.batch(rows))
+        squared += (network.mean(latents.mu[rows]) - target).square().sum().item()
+        pixels += target.numel()
+    return {
+        "latent_size": network.latent_size,
+        "code_sizes": network.code_sizes,
+        "kl_nats": round(network.information(latents.mu, 2.0 * latents.sigma.log()).item(), 3),
+        "reconstruction": squared / pixels,
+        "probe": {
+            "linear": accuracy(linear, latents.mu, right),
+            "mlp": accuracy(probe, latents.mu, right),
+            "mlp_sampled": accuracy(probe, sampled, right),
+        },
+    }
+
+
+def fit_offered(spec: TaskSpec, *, name: str, offer: str, appearance: str, path: Path) -> None:
+    """Measure the scale of what another package offers, train the probe and write the artefact.
+
+    Raises:
+        InvalidValueError: What is offered gives no latents.
+        ArtefactError: The file exists.
+    """
+    train_encoder(spec, recipe=replace(OFFERED, name=name), appearance=appearance, seed=0, offer=offer).save(path)
+
+
+def _fitted_offer(offer: str, data: FrameSet) -> OfferedNetwork:
+    """What another package offers; latents that are no codes are brought to mean 0 and standard deviation 1."""
+    network = OfferedNetwork(offer)
+    if not network.code_sizes:
+        mu = latents_of(network, data).mu
+        network.centre.copy_(mu.mean(dim=0))
+        network.scale.copy_(mu.std(dim=0).clamp_min(1e-3))
+    return network

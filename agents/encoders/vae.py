@@ -14,7 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from .network import EncoderNetwork
+from ..networks.mlp import relu_layers
+from .network import EncoderNetwork, image_shape
 from .recipes import Recipe
 
 _LEAST_CONTRAST = 0.005  # of full scale; inputs about as flat as this are amplified less
@@ -39,7 +40,7 @@ def kl_from_standard_normal(mu: Tensor, log_variance: Tensor) -> Tensor:
 
 
 class Vae(EncoderNetwork):
-    """The base class of both architectures."""
+    """The base class of both architectures; weights are undefined before they are drawn or loaded."""
 
     @abc.abstractmethod
     def generate(self, latents: Tensor) -> Tensor:
@@ -54,8 +55,11 @@ class Vae(EncoderNetwork):
         """-log p(target | latents) up to a constant, a SUM over pixels. Shape (N,)."""
 
     def information(self, mu: Tensor, log_variance: Tensor) -> Tensor:
-        """KL from the standard normal."""
-        return kl_from_standard_normal(mu, log_variance)
+        """KL from the standard normal, mean a frame. Shape ()."""
+        return kl_from_standard_normal(mu, log_variance).mean()
+
+    def fit_appearance(self, images: Tensor) -> None:
+        """Take what :meth:`decode` cannot know of latents from training images (N, C, H, W): here nothing."""
 
     def elbo(self, images: Tensor, noise: Tensor, beta: float) -> Elbo:
         """The beta-VAE loss (Higgins et al. 2017; thesis equation 5.1, corrected) of images (N, C, H, W) in [0, 1].
@@ -65,7 +69,7 @@ class Vae(EncoderNetwork):
         mu, log_variance = self.posterior(images)  # [N, Z]
         latents = mu + (0.5 * log_variance).exp() * noise  # [N, Z]
         reconstruction = self.log_loss(self.generate(latents), self.target(images)).mean()
-        kl = kl_from_standard_normal(mu, log_variance).mean()
+        kl = self.information(mu, log_variance)
         return Elbo(reconstruction + beta * kl, reconstruction, kl)
 
 
@@ -93,23 +97,20 @@ class MlpVae(Vae):
         self._image_shape = (channels, height, width)
         self._precision = recipe.pixel_std**-2
         sizes = (channels // groups * height * width, *recipe.widths)
-        self.encoder = _mlp(*sizes, 2 * recipe.latents)
-        self.decoder = _mlp(recipe.latents, *reversed(sizes))
+        self.encoder = relu_layers((*sizes, 2 * recipe.latents))
+        self.decoder = relu_layers((recipe.latents, *reversed(sizes)))
         # What a person expects to see: the mean brightness and contrast of the training images.
         self.register_buffer("brightness", torch.tensor(0.5))
         self.register_buffer("contrast", torch.tensor(0.2))
 
-    def _split(self, images: Tensor) -> Tensor:
-        """Standardised groups of channels, a row each. Shape (N * groups, pixels)."""
-        return standardise(images.reshape(len(images) * self._groups, -1))
-
     def target(self, images: Tensor) -> Tensor:
         """Images whose groups of channels are standardised."""
-        return self._split(images).reshape(images.shape)
+        return standardise(images.reshape(len(images) * self._groups, -1)).reshape(images.shape)
 
     def posterior(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Each group encoded on its own, their latents side by side. Two tensors of shape (N, Z)."""
-        mu, log_variance = self.encoder(self._split(images)).chunk(2, dim=1)  # [N * groups, L]
+        groups = self.target(images).reshape(len(images) * self._groups, -1)
+        mu, log_variance = self.encoder(groups).chunk(2, dim=1)  # [N * groups, L]
         return mu.reshape(len(images), self.latent_size), log_variance.reshape(len(images), self.latent_size)
 
     def generate(self, latents: Tensor) -> Tensor:
@@ -142,13 +143,16 @@ class HaSchmidhuberVae(Vae):
         super().__init__()
         self.latent_size = recipe.latents
         down: list[nn.Module] = []
-        for before, after in pairwise((channels, 32, 64, 128, 256)):
-            down += [nn.Conv2d(before, after, kernel_size=4, stride=2), nn.ReLU()]
-        self.encoder = nn.Sequential(*down, nn.Flatten(), nn.Linear(1024, 2 * recipe.latents))
-        up: list[nn.Module] = [nn.Linear(recipe.latents, 1024), nn.Unflatten(1, (1024, 1, 1))]
-        for (before, after), size in zip(pairwise((1024, 128, 64, 32, channels)), (5, 5, 6, 6), strict=True):
-            up += [nn.ConvTranspose2d(before, after, kernel_size=size, stride=2), nn.ReLU()]
-        self.decoder = nn.Sequential(*up[:-1])
+        up: list[nn.Module] = []
+        with torch.device("meta"):  # torch would draw weights from its global generator
+            for before, after in pairwise((channels, 32, 64, 128, 256)):
+                down += [nn.Conv2d(before, after, kernel_size=4, stride=2), nn.ReLU()]
+            down += [nn.Flatten(), nn.Linear(1024, 2 * recipe.latents)]
+            up += [nn.Linear(recipe.latents, 1024), nn.Unflatten(1, (1024, 1, 1))]
+            for (before, after), size in zip(pairwise((1024, 128, 64, 32, channels)), (5, 5, 6, 6), strict=True):
+                up += [nn.ConvTranspose2d(before, after, kernel_size=size, stride=2), nn.ReLU()]
+        self.encoder = nn.Sequential(*down).to_empty(device="cpu")
+        self.decoder = nn.Sequential(*up[:-1]).to_empty(device="cpu")
 
     def target(self, images: Tensor) -> Tensor:
         """Images resampled to 64 x 64."""
@@ -176,19 +180,12 @@ class HaSchmidhuberVae(Vae):
         return _resize(self.mean(latents), height, width)
 
 
-def build_vae(recipe: Recipe, channels: int, height: int, width: int) -> Vae:
-    """The VAE of a recipe for images of shape (C, H, W), with whatever weights torch initialises it to."""
+def build_vae(recipe: Recipe, preprocessing: str) -> Vae:
+    """The VAE of a recipe for preprocessed frames, its weights undefined."""
+    channels, height, width = image_shape(preprocessing)
     if recipe.architecture == "ha_schmidhuber":
         return HaSchmidhuberVae(recipe, channels)
     return MlpVae(recipe, channels, height, width, groups=channels if recipe.architecture == "strips" else 1)
-
-
-def _mlp(*sizes: int) -> nn.Sequential:
-    """Linear layers with ReLU between them."""
-    layers: list[nn.Module] = []
-    for before, after in pairwise(sizes):
-        layers += [nn.Linear(before, after), nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
 
 
 def _resize(images: Tensor, height: int, width: int) -> Tensor:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
-from itertools import accumulate, repeat
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout, planned_actions
+from imagine_bench.interfaces.model import UNCERTAINTIES
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -25,9 +25,8 @@ from ..networks.precision import settle
 from ..replay import Batch, Transitions
 from ..settings import Hyperparameters
 from .filter import weight_samples
-from .rollouts import TERMINAL, Imagination, ImaginedStep, Weights
+from .rollouts import Imagination, RolloutStep
 from .settings import HYPERPARAMETERS, Settings
-from .uncertainty import decompose
 
 _PREDICTIONS = 20_000  # mixtures predicted at once, over weight samples and rows, to bound memory
 _BRANCHES = 8  # imagined samples that an expected outcome is averaged over
@@ -81,7 +80,7 @@ class ImaginingAgent(DQN):
         with self.meters.cpu_time("time/model_s"):
             for batch in self.draw_model_batches(draws["replay"]):
                 losses = model.update(batch, draws["dropout"])
-                for name, value in asdict(losses).items():
+                for name, value in losses._asdict().items():
                     self.meters.add(f"loss/{name}", value)
                 self.updates += 1
         self.meters.count("time/model_s")
@@ -157,65 +156,59 @@ class ImaginingAgent(DQN):
         InvalidValueError if there is no depth to imagine, or actions are none.
         """
         planned = planned_actions(actions, depth, self.n_actions)
+        imagination = self.imagination
+        encoder = self.perception.encoder
         start = self.perceive(frame).unsqueeze(0)  # [1, Z]
-        return self._rollout(start, list(self._unroll(start, planned, depth, rng)))
+        generator = torch.Generator(start.device).manual_seed(int(rng.integers(2**63)))
+        values: list[Tensor] = []
+
+        def act(z: Tensor) -> Tensor:
+            values.append(self.tested.values(z))  # [1, A]
+            if planned is None:
+                return values[-1].argmax(dim=-1)
+            return torch.tensor([planned[len(values) - 1]], device=z.device)
+
+        steps: list[RolloutStep] = []
+        longest = depth if planned is None else len(planned)
+        for each in imagination.unroll(start, act, imagination.draw_weights(generator), generator, longest, cut=False):
+            steps.append(each)
+            if planned is None and each.step.terminated:
+                break
+        imagined = [each.step for each in steps]
+        latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
+        scores = [imagination.uncertainties(step) for step in imagined]
+        return ImaginedRollout(
+            actions=_joined([each.action for each in steps]),
+            frames=encoder.decode(latents),
+            start_frame=encoder.decode(start)[0],
+            rewards=_joined([step.reward for step in imagined]),
+            p_terminated=_joined([step.p_terminated for step in imagined]),
+            q_values=_joined(values),
+            accepted=np.logical_and.accumulate(_joined([each.kept for each in steps])),
+            macrostates=encoder.read_macrostate(latents),
+            **{name: _joined([score[name] for score in scores]) for name in UNCERTAINTIES},
+        )
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
         """Average over :data:`_BRANCHES` imagined samples; see :class:`.capabilities.OutcomePredictor`."""
+        imagination = self.imagination
         z = self.perception.encoder.encode(frames)[0]
         shape = (len(frames), self.n_actions, _BRANCHES)
         generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
-        action = np.tile(np.repeat(np.arange(self.n_actions), _BRANCHES), len(frames))
+        action = torch.arange(self.n_actions, device=z.device).repeat_interleave(_BRANCHES).repeat(len(frames))
         z = z.repeat_interleave(self.n_actions * _BRANCHES, dim=0)
-        weights = self.imagination.draw_weights(generator)
-        next_z, reward, p_terminated = _predict(self.imagination, z, action, weights, generator)
-        read = self.perception.encoder.read_macrostate(next_z)
+        weights = imagination.draw_weights(generator)
+        samples = imagination.model.members * (1 if weights.dynamics is None else imagination.settings.weight_samples)
+        size = max(1, _PREDICTIONS // samples)  # pieces fit the memory
+        parts = zip(z.split(size), action.split(size), strict=True)
+        steps = [imagination.step(*part, weights, generator) for part in parts]
+        read = self.perception.encoder.read_macrostate(torch.cat([step.next_z for step in steps]))
+        ended = _joined([step.terminated for step in steps])
+        reward = _joined([step.reward.double() for step in steps])
         return ExpectedOutcomes(
             macrostates=read.reshape(*shape, -1),
-            p_continues=(p_terminated <= TERMINAL).double().cpu().numpy().reshape(shape) / _BRANCHES,
-            reward=reward.double().cpu().numpy().reshape(shape).mean(axis=2),
-        )
-
-    def _unroll(
-        self, z: Tensor, planned: list[int] | None, depth: int, rng: np.random.Generator
-    ) -> Iterator[tuple[Tensor, Tensor, ImaginedStep]]:
-        """Yield the values before, the action and the result of each imagined step of one rollout."""
-        generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
-        weights = self.imagination.draw_weights(generator)
-        for index in range(depth if planned is None else len(planned)):
-            values = self.tested.values(z)  # [1, A]
-            action = values.argmax(dim=-1) if planned is None else torch.tensor([planned[index]], device=z.device)
-            step = self.imagination.step(z, action, weights, generator)
-            yield values, action, step
-            if planned is None and float(step.p_terminated) > TERMINAL:
-                return
-            z = step.next_z
-
-    def _rollout(self, start: Tensor, steps: list[tuple[Tensor, Tensor, ImaginedStep]]) -> ImaginedRollout:
-        values, actions, imagined = zip(*steps, strict=True)
-        encoder = self.perception.encoder
-        imagination = self.imagination
-        latents = torch.cat([step.next_z for step in imagined])  # [D, Z]
-        parts = [decompose(step.samples) for step in imagined]
-        nothing = torch.zeros_like(imagined[0].reward)  # on the device of what follows
-        before = accumulate(map(imagination.uncertainty, imagined), initial=nothing)
-        gathered = before if imagination.settings.accumulates else repeat(0.0)
-
-        def joined(values: Iterable[Tensor]) -> NDArray[np.float32]:
-            return torch.cat(list(values)).cpu().numpy()
-
-        return ImaginedRollout(
-            actions=torch.cat(actions).cpu().numpy(),
-            frames=encoder.decode(latents),
-            start_frame=encoder.decode(start)[0],
-            rewards=joined(step.reward for step in imagined),
-            p_terminated=joined(step.p_terminated for step in imagined),
-            q_values=joined(values),
-            epistemic=joined(imagination.filter.score(part.epistemic) for part in parts),
-            aleatoric=joined(imagination.filter.score(part.aleatoric) for part in parts),
-            modal=joined(imagination.filter.score(part.modal) for part in parts),
-            accepted=np.logical_and.accumulate(joined(map(imagination.keeps, imagined, gathered))),
-            macrostates=encoder.read_macrostate(latents),
+            p_continues=(~ended).astype(np.float64).reshape(shape) / _BRANCHES,
+            reward=reward.reshape(shape).mean(axis=2),
         )
 
 
@@ -241,15 +234,6 @@ make_uncertainty = partial(build, ImaginingAgent, filtered=True)
 """The ``imagination_uncertainty`` agent: algorithm 1 with the filter."""
 
 
-def _predict(
-    imagination: Imagination, z: Tensor, action: NDArray[np.int64], weights: Weights, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Next latents (N, Z), rewards (N,) and P(terminal) (N,), in pieces that fit the memory."""
-    model = imagination.model
-    settings = imagination.settings
-    samples = model.members * (1 if weights.dynamics is None else settings.weight_samples)
-    size = max(1, _PREDICTIONS // samples)
-    parts = zip(z.split(size), torch.from_numpy(action).to(z.device).split(size), strict=True)
-    steps = [imagination.step(*part, weights, generator) for part in parts]
-    next_z, rewards, ends = zip(*((step.next_z, step.reward, step.p_terminated) for step in steps), strict=True)
-    return torch.cat(next_z), torch.cat(rewards), torch.cat(ends)
+def _joined(parts: list[Tensor]) -> NDArray[Any]:
+    """One array of the rows of several tensors."""
+    return torch.cat(parts).cpu().numpy()

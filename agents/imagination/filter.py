@@ -14,7 +14,7 @@ from imagine_bench.errors import InvalidValueError
 
 from ..replay import RealMemory
 from .settings import Settings
-from .uncertainty import decompose, reduction
+from .uncertainty import REDUCTIONS, decompose
 from .world_model import EnvironmentModel
 
 _CALIBRATION = 64
@@ -36,30 +36,25 @@ class EpistemicFilter:
     """
 
     def __init__(self, settings: Settings, *, active: bool) -> None:
-        samples = weight_samples(settings)
-        weighed = settings.imagination.confidence_scale is not None
-        readers = {
-            "The filter": (active, "choose the agent without the filter"),
-            "imagination.curiosity": (settings.imagination.curiosity > 0.0, "set it to 0"),
-            "imagination.confidence_scale": (weighed, "set it to null"),
-        }
-        for who, (reads, without) in readers.items():
-            if reads and samples * settings.model.members == 1:
-                raise InvalidValueError(
-                    f"{who} compares what several networks say, and with model.members 1 and model.dropout 0, or "
-                    "imagination.weight_samples 1, there is one. Set model.dropout above 0 and "
-                    f"imagination.weight_samples above 1, or model.members above 1, or {without}."
-                )
         self.reads_reward = active and settings.imagination.reward_threshold is not None
-        if self.reads_reward and samples == 1:
-            raise InvalidValueError(
-                "imagination.reward_threshold compares dropout samples of the reward network, and with model.dropout 0 "
-                "or imagination.weight_samples 1 there is one. Set model.dropout above 0 and "
-                "imagination.weight_samples above 1, or imagination.reward_threshold to null."
-            )
+        samples = weight_samples(settings)
+        several = samples * settings.model.members > 1
+        readers = {
+            "The filter": (active, several),
+            "imagination.curiosity": (settings.imagination.curiosity > 0.0, several),
+            "imagination.confidence_scale": (settings.imagination.confidence_scale is not None, several),
+            "imagination.reward_threshold": (self.reads_reward, samples > 1),
+        }
+        for who, (reads, enough) in readers.items():
+            if reads and not enough:
+                raise InvalidValueError(
+                    f"{who} compares what several networks say, and here is one. Set model.dropout above 0 and "
+                    "imagination.weight_samples above 1, or do without it; of all but the reward, model.members above "
+                    "1 is enough."
+                )
         self.settings = settings.imagination
         self.active = active
-        self._reduce = reduction(self.settings.reduction)
+        self._reduce = REDUCTIONS[self.settings.reduction]
         self.threshold = self.settings.threshold
 
     def reset(self) -> None:

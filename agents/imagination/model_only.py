@@ -13,123 +13,26 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import AgentState, Transition
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
 from ..dqn import Controller, epsilon
 from ..encoders.perception import Perception
-from ..meters import Meters
-from ..replay import Batch, ImaginedMemory, RealMemory, StartMemory
+from ..replay import ImaginedMemory, StartMemory
 from .agent import ImaginingAgent, build
-from .rollouts import TERMINAL, Imagination
 from .settings import Settings
 
 _STARTS = 1_000
 """Starts of real episodes that are kept."""
 
 
-class ModelOnlyTraining:
-    """Trains a new controller in a world model, an imagined episode at a time; changes only a threshold that moves.
-
-    Every training draws from generators of its own, named by the real step that it begins at, so it is the same whether
-    earlier ones took place or not. ``seeds`` is this training's node of the seed tree.
-    """
-
-    def __init__(
-        self, imagination: Imagination, n_actions: int, settings: Settings, seeds: SeedTree, device: torch.device
-    ) -> None:
-        self.imagination = imagination
-        self._n_actions = n_actions
-        self.settings = settings
-        self._seeds = seeds
-        self._device = device
-        self.begin(0)
-
-    def begin(self, real_step: int) -> None:
-        """Start with a new controller and an empty memory; ``real_step`` names the world model's age."""
-        seeds = self._seeds.child(real_step)
-        device = self._device
-        size = self.imagination.model.latent_size
-        self.real_step = real_step
-        self.episodes = 0
-        self.steps = 0
-        self._generator = torch.Generator(device).manual_seed(seeds.child("episodes").integer())
-        weights = torch.Generator(device).manual_seed(seeds.child("controller").integer())
-        self.controller = Controller(size, self._n_actions, self.settings.controller, weights)
-        weighted = self.settings.imagination.confidence_scale is not None
-        self._memory = ImaginedMemory(self.settings.memory.imagined, size, device, weighted=weighted)
-
-    def episode(self, starts: StartMemory, real: RealMemory, meters: Meters) -> None:
-        """Imagine one episode from a replayed start, learning at every step of it.
-
-        The filter, where there is one, ends it before the first transition that it discards. ``real`` is read by a
-        moving threshold only. DivergedError if the controller's loss is no longer finite.
-        """
-        imagination = self.imagination
-        settings = self.settings.imagination
-        generator = self._generator
-        weights = imagination.draw_weights(generator)
-        imagination.filter.move_threshold(imagination.model, real, weights.dynamics, generator)
-        z = starts.sample(1, generator)
-        predicted = 0
-        kept = 0
-        gathered = torch.zeros(1, device=z.device)
-        while kept < settings.depth:
-            chance = max(epsilon(self.steps, self.settings.controller), settings.exploration)
-            action = imagination.act(self.controller, z, chance, generator)
-            step = imagination.step(z, action, weights, generator)
-            predicted += 1
-            if not bool(imagination.keeps(step, gathered)):
-                break
-            terminated = step.p_terminated > TERMINAL
-            weight = imagination.confidence(step, gathered)
-            self._memory.add(Batch(z, action, step.reward, step.next_z, terminated.float(), weight=weight))
-            gathered = imagination.gathered_with(step, gathered)
-            for _ in range(self.settings.controller.updates_per_step):
-                batch = self._memory.sample(self.settings.controller.batch_size, generator)
-                meters.add("loss/bellman_imagined", self.controller.update(batch))
-            self.steps += 1
-            kept = kept + 1
-            z = step.next_z
-            if bool(terminated):
-                break
-        meters.add("imagination/acceptance_rate", kept, predicted)
-        meters.add("imagination/mean_depth", kept)
-        self.episodes += 1
-
-    def values(self) -> dict[str, int]:
-        """Counters, JSON-serialisable."""
-        return {
-            "real_step": self.real_step,
-            "episodes": self.episodes,
-            "steps": self.steps,
-            "imagined": self._memory.added,
-        }
-
-    def arrays(self) -> Arrays:
-        """Copies of weights, moments, target network, memory and generator."""
-        return {
-            **snapshot.prefixed("controller", snapshot.training_arrays(self.controller, self.controller.optimiser)),
-            **snapshot.prefixed("memory", self._memory.arrays()),
-            "generator": snapshot.generator_array(self._generator),
-        }
-
-    def load(self, arrays: Arrays, values: dict[str, int]) -> None:
-        """Take up the results of :meth:`arrays` and :meth:`values`."""
-        self.begin(values["real_step"])
-        self.episodes = values["episodes"]
-        self.steps = values["steps"]
-        snapshot.load_training(self.controller, self.controller.optimiser, snapshot.below("controller", arrays))
-        self._memory.load(snapshot.below("memory", arrays), values["imagined"])
-        snapshot.load_generator(self._generator, arrays["generator"])
-
-
 class ModelOnlyAgent(ImaginingAgent):
-    """Explores with one controller, and is tested with another that was trained in the world model alone.
+    """Explores with one controller, and is tested with another that is trained in the world model alone.
 
-    ``filtered`` says whether imagined episodes end where the epistemic uncertainty is too large.
+    ``filtered`` says whether imagined episodes end where the epistemic uncertainty is too large. Every training draws
+    from generators of its own, named by the real step that it begins at, so it is the same whether earlier ones took
+    place or not; it changes nothing but itself and a threshold that moves.
     """
 
     def __init__(
@@ -143,19 +46,37 @@ class ModelOnlyAgent(ImaginingAgent):
         filtered: bool,
     ) -> None:
         super().__init__(perception, n_actions, settings, seeds, device, filtered=filtered)
-        self.training = ModelOnlyTraining(self.imagination, n_actions, settings, seeds.child("model_only"), device)
-        self._starts = StartMemory(_STARTS, perception.latent_size, device)
+        self._seeds = seeds.child("model_only")
+        self._device = device
+        self.starts = StartMemory(_STARTS, perception.latent_size, device)
         self._episode = -1
+        self.begin_training(0)
 
     @property
     def tested(self) -> Controller:
         """The controller that was trained in the model alone."""
-        return self.training.controller
+        return self.trained
+
+    def begin_training(self, real_step: int) -> None:
+        """Start with a new controller and an empty memory; ``real_step`` names the world model's age."""
+        seeds = self._seeds.child(real_step)
+        generators = {
+            name: torch.Generator(self._device).manual_seed(seeds.child(name).integer())
+            for name in ("episodes", "controller")
+        }
+        self.real_step = real_step
+        self.imagined_episodes = 0
+        self.imagined_steps = 0
+        self._draws = generators["episodes"]
+        self.trained = self.new_controller(generators["controller"])
+        weighted = self.settings.imagination.confidence_scale is not None
+        size = self.perception.latent_size
+        self.imagined = ImaginedMemory(self.settings.memory.imagined, size, self._device, weighted=weighted)
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Remember where episodes begin, and learn as the DQN and its world model do; DivergedError as there."""
         if episode != self._episode:
-            self._starts.add(self.perception.posterior(transition.observation.frame))
+            self.starts.add(self.perception.posterior(transition.observation.frame))
             self._episode = episode
         super().observe(transition, episode=episode)
 
@@ -167,9 +88,9 @@ class ModelOnlyAgent(ImaginingAgent):
     def reset_for_new_task(self) -> None:
         """Reset as every imagining agent does; the starts and the training in the model begin anew too."""
         super().reset_for_new_task()
-        self._starts.clear()
+        self.starts.clear()
         self._episode = -1
-        self.training.begin(0)
+        self.begin_training(0)
 
     def train_in_model(self) -> bool:
         """Imagine one episode, learn from it, and return whether one was left; real steps make training begin anew.
@@ -178,34 +99,81 @@ class ModelOnlyAgent(ImaginingAgent):
         """
         if self.steps == 0:
             return False  # nothing was learned and no start was seen
-        if self.training.real_step != self.steps:
-            self.training.begin(self.steps)
-        if self.training.episodes >= self.settings.imagination.model_only_episodes:
+        if self.real_step != self.steps:
+            self.begin_training(self.steps)
+        if self.imagined_episodes >= self.settings.imagination.model_only_episodes:
             return False
-        before = self.training.steps
         with self.meters.cpu_time("time/model_only_s"):
-            self.training.episode(self._starts, self.real, self.meters)
-        self.updates += (self.training.steps - before) * self.settings.controller.updates_per_step
+            self._imagine_episode()
         return True
+
+    def _imagine_episode(self) -> None:
+        """Imagine one episode from a replayed start, learning at every step of it.
+
+        The filter, where there is one, ends it before the first transition that it discards.
+        """
+        imagination = self.imagination
+        settings = self.settings.imagination
+        controller = self.settings.controller
+        draws = self._draws
+        weights = imagination.draw_weights(draws)
+        imagination.filter.move_threshold(imagination.model, self.real, weights.dynamics, draws)
+        predicted = 0
+        kept = 0
+
+        def act(z: Tensor) -> Tensor:
+            chance = max(epsilon(self.imagined_steps, controller), settings.exploration)
+            return imagination.act(self.trained, z, chance, draws)
+
+        for each in imagination.unroll(self.starts.sample(1, draws), act, weights, draws, settings.depth):
+            predicted += 1
+            if not each.kept:
+                break
+            kept += 1
+            self.imagined.add(imagination.learnable(each))
+            for _ in range(controller.updates_per_step):
+                batch = self.imagined.sample(controller.batch_size, draws)
+                self.meters.add("loss/bellman_imagined", self.trained.update(batch))
+                self.updates += 1
+            self.imagined_steps += 1
+        self.meters.add("imagination/acceptance_rate", kept, predicted)
+        self.meters.add("imagination/mean_depth", kept)
+        self.imagined_episodes += 1
 
     def diagnostics(self) -> dict[str, float]:
         """Return the diagnostics of an imagining agent, with the transitions of the training in the model."""
-        return {**super().diagnostics(), "imagined_transitions": float(self.training.steps)}
+        return {**super().diagnostics(), "imagined_transitions": float(self.imagined_steps)}
 
     def state(self) -> AgentState:
         """Return a snapshot that includes the training in the model and the starts of episodes."""
         state = super().state()
-        state.arrays.update(snapshot.prefixed("model_only", self.training.arrays()))
-        state.arrays.update(snapshot.prefixed("starts", self._starts.arrays()))
-        own = {"model_only": self.training.values(), "starts_added": self._starts.added, "episode": self._episode}
-        state.values.update(own)
+        trained = snapshot.training_arrays(self.trained, self.trained.optimiser)
+        state.arrays.update(snapshot.prefixed("model_only/controller", trained))
+        state.arrays.update(snapshot.prefixed("model_only/memory", self.imagined.arrays()))
+        state.arrays["model_only/generator"] = snapshot.generator_array(self._draws)
+        state.arrays.update(snapshot.prefixed("starts", self.starts.arrays()))
+        training = {
+            "real_step": self.real_step,
+            "episodes": self.imagined_episodes,
+            "steps": self.imagined_steps,
+            "imagined": self.imagined.added,
+        }
+        state.values.update(model_only=training, starts_added=self.starts.added, episode=self._episode)
         return state
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         super().restore(state)
-        self.training.load(snapshot.below("model_only", state.arrays), state.values["model_only"])
-        self._starts.load(snapshot.below("starts", state.arrays), state.values["starts_added"])
+        arrays = state.arrays
+        training = state.values["model_only"]
+        self.begin_training(training["real_step"])
+        self.imagined_episodes = training["episodes"]
+        self.imagined_steps = training["steps"]
+        trained = snapshot.below("model_only/controller", arrays)
+        snapshot.load_training(self.trained, self.trained.optimiser, trained)
+        self.imagined.load(snapshot.below("model_only/memory", arrays), training["imagined"])
+        snapshot.load_generator(self._draws, arrays["model_only/generator"])
+        self.starts.load(snapshot.below("starts", arrays), state.values["starts_added"])
         self._episode = state.values["episode"]
 
 

@@ -6,7 +6,9 @@ dynamics; every prediction averages over them, and their disagreement is the epi
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,6 +16,7 @@ from torch import Tensor
 
 from imagine_bench.arrays import Arrays
 from imagine_bench.errors import DivergedError, InvalidValueError
+from imagine_bench.interfaces.model import UNCERTAINTIES
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
@@ -35,8 +38,7 @@ LATENT_LIMIT = 1e6
 Adam keeps the square of a gradient, in which a latent occurs with its fourth power; a larger limit could overflow."""
 
 
-@dataclass(frozen=True, slots=True)
-class Weights:
+class Weights(NamedTuple):
     """Weight samples that all steps of a call share: masks of the dynamics (E, T, H), None where nothing is dropped.
 
     Those of the reward network are (1, T, H), None where the filter does not read it.
@@ -58,9 +60,23 @@ class ImaginedStep:
     #: does not read it. Shape (N,).
     reward_std: Tensor | None
 
+    @property
+    def terminated(self) -> Tensor:
+        """Which rollouts end here. Shape (N,), bool."""
+        return self.p_terminated > TERMINAL
 
-@dataclass(frozen=True, slots=True)
-class Counts:
+
+class RolloutStep(NamedTuple):
+    """One step of N rollouts that are unrolled together."""
+
+    z: Tensor  #: where it began. Shape (N, Z).
+    action: Tensor  #: shape (N,)
+    step: ImaginedStep
+    kept: Tensor  #: which are kept. Shape (N,), bool.
+    gathered: Tensor  #: uncertainty of each rollout before it, in squared units of z. Shape (N,).
+
+
+class Counts(NamedTuple):
     """How much one call imagined: rollouts begun, transitions predicted, transitions kept."""
 
     rollouts: int
@@ -164,6 +180,11 @@ class Imagination:
         """Epistemic variance of N imagined steps, reduced to one number each, in squared units of z. Shape (N,)."""
         return self.filter.score(decompose(step.samples).epistemic)
 
+    def uncertainties(self, step: ImaginedStep) -> dict[str, Tensor]:
+        """The variances of N imagined steps by cause, reduced alike. Each of shape (N,)."""
+        parts = decompose(step.samples)
+        return {name: self.filter.score(getattr(parts, name)) for name in UNCERTAINTIES}
+
     def keeps(self, step: ImaginedStep, gathered: Tensor | float = 0.0) -> Tensor:
         """Return whether the filter keeps each transition; without a filter only runaway ones are dropped. (N,), bool.
 
@@ -182,6 +203,13 @@ class Imagination:
             return None
         return 1.0 / (1.0 + (gathered + self.uncertainty(step)) / scale)
 
+    def learnable(self, each: RolloutStep) -> Batch:
+        """The transitions of a step that are kept, as a controller learns from them."""
+        step = each.step
+        weight = self.confidence(step, each.gathered)
+        ended = step.terminated.float()
+        return Batch(each.z, each.action, step.reward, step.next_z, ended, weight=weight).where(each.kept)
+
     def gathered_with(self, step: ImaginedStep, gathered: Tensor) -> Tensor:
         """The uncertainty of each rollout up to and with this step, where steps accumulate; else as before: (N,)."""
         return gathered + self.uncertainty(step) if self.settings.accumulates else gathered
@@ -198,10 +226,44 @@ class Imagination:
         del z, action
         return self.keeps(step, gathered)
 
+    def unroll(
+        self,
+        z: Tensor,
+        act: Callable[[Tensor], Tensor],
+        weights: Weights,
+        generator: torch.Generator,
+        depth: int,
+        *,
+        cut: bool = True,
+    ) -> Iterator[RolloutStep]:
+        """Imagine rollouts side by side, at most ``depth`` steps of them.
+
+        Args:
+            z: Where they begin. Shape (N, Z).
+            act: Chooses the actions (N,) of states (N, Z).
+            weights: Weight samples of all steps.
+            generator: Draws what happens.
+            depth: Most steps.
+            cut: Whether a rollout ends where the model says that the episode does, or with its first transition that
+                :meth:`admits` discards; else all go on to the end, and :meth:`keeps` says what is kept.
+        """
+        gathered = torch.zeros(len(z), device=z.device)
+        for _ in range(depth):
+            action = act(z)
+            step = self.step(z, action, weights, generator)
+            kept = self.admits(z, action, step, gathered) if cut else self.keeps(step, gathered)
+            yield RolloutStep(z, action, step, kept, gathered)
+            gathered = self.gathered_with(step, gathered)
+            z = step.next_z
+            if cut:
+                going_on = kept & ~step.terminated
+                z = z[going_on]
+                gathered = gathered[going_on]
+            if len(z) == 0:
+                return
+
     def rollouts(self, controller: Controller, current: Tensor, real: RealMemory, epsilon: float) -> Counts:
         """Imagine ``I_B`` rollouts and store what the filter keeps.
-
-        A rollout ends where the model says that the episode does, or with its first discarded transition.
 
         Args:
             controller: Chooses the actions, epsilon-greedily.
@@ -211,31 +273,20 @@ class Imagination:
         """
         settings = self.settings
         generator = self.generators["rollouts"]
-        scale = self.settings.confidence_scale
-        sampled = self.filter.active or scale is not None or settings.predicts_with != "network"
+        sampled = self.filter.active or settings.confidence_scale is not None or settings.predicts_with != "network"
         weights = self.draw_weights(self.generators["dropout"]) if sampled else Weights(None, None)
         self.filter.move_threshold(self.model, real, weights.dynamics, self.generators["replay"])
-        z = self._starts(current, real)
+        chance = max(epsilon, settings.exploration)
         predicted = 0
         accepted = 0
-        gathered = torch.zeros(len(z), device=z.device)
-        for _ in range(settings.depth):
-            action = self.act(controller, z, max(epsilon, settings.exploration), generator)
-            step = self.step(z, action, weights, generator)
-            terminated = step.p_terminated > TERMINAL
-            keep = self.admits(z, action, step, gathered)
-            predicted = predicted + len(z)
-            accepted = accepted + int(keep.sum())
-            if keep.any():
-                weight = self.confidence(step, gathered)
-                imagined = Batch(z, action, step.reward, step.next_z, terminated.float(), weight=weight)
-                self.memory.add(imagined.where(keep))
-            gathered = self.gathered_with(step, gathered)
-            going_on = keep & ~terminated
-            z = step.next_z[going_on]
-            gathered = gathered[going_on]
-            if len(z) == 0:
-                break
+
+        def act(z: Tensor) -> Tensor:
+            return self.act(controller, z, chance, generator)
+
+        for each in self.unroll(self._starts(current, real), act, weights, generator, settings.depth):
+            predicted += len(each.z)
+            accepted += int(each.kept.sum())
+            self.memory.add(self.learnable(each))
         return Counts(settings.breadth, predicted, accepted)
 
     def _starts(self, current: Tensor, real: RealMemory) -> Tensor:

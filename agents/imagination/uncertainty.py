@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from imagine_bench.errors import require_known
 
 from . import mixture as mdn
 from .mixture import Mixture
 
 
-@dataclass(frozen=True, slots=True)
-class Uncertainty:
+class Uncertainty(NamedTuple):
     """Predictive variance by cause, a dimension at a time; the three sum to the total (equation 4.24)."""
 
     epistemic: Tensor  #: spread of the mean over weight samples: too little data. Shape (..., Z).
@@ -72,8 +69,3 @@ REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "max": lambda values: values.amax(dim=-1),
 }
 """How a vector of variances (..., Z) becomes the one number that a threshold is compared with."""
-
-
-def reduction(name: str) -> Callable[[Tensor], Tensor]:
-    """The reduction over dimensions of that name; UnknownNameError if there is none."""
-    return REDUCTIONS[require_known("uncertainty reduction", name, REDUCTIONS)]

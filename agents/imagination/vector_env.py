@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from imagine_bench.arrays import Info, State
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats, Frame
+from imagine_bench.interfaces.model import UNCERTAINTIES
 
 from .agent import ImaginingAgent
-from .rollouts import LATENT_LIMIT, TERMINAL, Imagination, ImaginedStep
-from .uncertainty import decompose
+from .rollouts import LATENT_LIMIT, Imagination, ImaginedStep
 
 Latents = NDArray[np.float32]
 Switches = NDArray[np.bool_]
-VERDICT = ("accepted", "epistemic", "aleatoric", "modal")
+VERDICT = ("accepted", *UNCERTAINTIES)
 """What an info says of a transition."""
 
 
@@ -102,7 +102,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
         reached = np.where(accepted[:, None], step.next_z.cpu().numpy(), self._z)  # [N, Z]
         reward = np.where(accepted, step.reward.cpu().numpy(), 0.0).astype(np.float64)
         self._steps += 1
-        terminated = accepted & (step.p_terminated > TERMINAL).cpu().numpy()
+        terminated = accepted & step.terminated.cpu().numpy()
         truncated = ~terminated & (~accepted | (self._steps >= self.horizon))
         ended = terminated | truncated
         info = self._info(step, accepted, reached, ended)
@@ -113,10 +113,8 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
         return self._z.copy(), reward, terminated, truncated, info
 
     def _info(self, step: ImaginedStep, accepted: Switches, reached: Latents, ended: Switches) -> Info:
-        parts = decompose(step.samples)
-        values = {"accepted": accepted} | {
-            name: self.imagination.filter.score(getattr(parts, name)).cpu().numpy() for name in VERDICT[1:]
-        }
+        scores = self.imagination.uncertainties(step)
+        values = {"accepted": accepted, **{name: scores[name].cpu().numpy() for name in UNCERTAINTIES}}
         info: Info = {}
         for index, over in enumerate(ended):
             own = {name: column[index].item() for name, column in values.items()}

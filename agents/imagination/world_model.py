@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -27,8 +28,7 @@ from .mixture import Mixture
 from .settings import WorldModelSettings
 
 
-@dataclass(frozen=True, slots=True)
-class ModelLosses:
+class ModelLosses(NamedTuple):
     """Means over a batch: negative log-likelihood (nats, members summed), log-cosh (of reward units), cross-entropy."""
 
     dynamics: float
@@ -131,7 +131,7 @@ class EnvironmentModel(nn.Module):
         """
         terms = torch.stack(self.losses(batch, dropout))
         losses = ModelLosses(*terms.tolist())
-        if not all(map(math.isfinite, astuple(losses))):
+        if not all(map(math.isfinite, losses)):
             raise DivergedError(f"The world model's losses are no longer finite: {losses}. Lower model.learning_rate.")
         self.optimiser.zero_grad()
         terms.sum().backward()

@@ -42,33 +42,27 @@ class Adam:
     def step(self) -> None:
         """Update every weight that has a gradient."""
         for weights, decay in self.groups:
-            grads = {weight: weight.grad for weight in weights if weight.grad is not None}
-            if grads:
-                self._update(grads, decay)
-
-    def _update(self, grads: dict[nn.Parameter, Tensor], decay: float) -> None:
-        states = [self.state[weight] or self._begin(weight) for weight in grads]
-        steps = [state["step"] for state in states]
-        torch._foreach_add_(steps, 1)
-        first, second = ([state[name] for state in states] for name in MOMENTS)
-        torch._fused_adam_(
-            list(grads),
-            list(grads.values()),
-            first,
-            second,
-            [],
-            steps,
-            lr=self.learning_rate,
-            beta1=_BETAS[0],
-            beta2=_BETAS[1],
-            weight_decay=decay,
-            eps=_EPSILON,
-            amsgrad=False,
-            maximize=False,
-        )
-
-    def _begin(self, weight: nn.Parameter) -> dict[str, Tensor]:
-        state = {name: torch.zeros_like(weight) for name in MOMENTS}
-        state["step"] = torch.zeros((), device=weight.device)
-        self.state[weight] = state
-        return state
+            moved = {weight: weight.grad for weight in weights if weight.grad is not None}
+            for weight in moved:
+                if not self.state[weight]:
+                    self.state[weight] = {name: torch.zeros_like(weight) for name in MOMENTS}
+                    self.state[weight]["step"] = torch.zeros((), device=weight.device)
+            if not moved:
+                continue
+            first, second, steps = ([self.state[weight][name] for weight in moved] for name in (*MOMENTS, "step"))
+            torch._foreach_add_(steps, 1)
+            torch._fused_adam_(
+                list(moved),
+                list(moved.values()),
+                first,
+                second,
+                [],
+                steps,
+                lr=self.learning_rate,
+                beta1=_BETAS[0],
+                beta2=_BETAS[1],
+                weight_decay=decay,
+                eps=_EPSILON,
+                amsgrad=False,
+                maximize=False,
+            )

@@ -16,18 +16,42 @@ Masks = tuple[Tensor, ...]
 """One dropout mask a hidden layer, each (E, N, H): what a unit is multiplied by, 0 or 1 / (1 - dropout)."""
 
 
+def relu_layers(sizes: Sequence[int], device: torch.device | str = "cpu") -> nn.Sequential:
+    """Linear layers with ReLU between them; their weights are undefined, so that nothing is drawn.
+
+    ``sizes`` are units of input, hidden and output layers, at least 2.
+    """
+    layers: list[nn.Module] = []
+    for n_in, n_out in pairwise(sizes):
+        layers += [nn.utils.skip_init(nn.Linear, n_in, n_out, device=device), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+@torch.no_grad()
+def initialise(network: nn.Module, generator: torch.Generator) -> None:
+    """Draw every linear and convolutional weight and bias from U(-1/sqrt(fan_in), 1/sqrt(fan_in)), torch's default law.
+
+    torch's own constructors draw from the global generator. Other modules are left alone. The generator must be on the
+    network's device.
+    """
+    for module in network.modules():
+        if isinstance(module, nn.Linear | nn.Conv2d | nn.ConvTranspose2d):
+            bound = 1.0 / math.sqrt(module.weight[0].numel())
+            for weight in module.parameters():
+                weight.uniform_(-bound, bound, generator=generator)
+
+
 def mlp(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequential:
     """One network: ReLU hidden layers and a linear output; Glorot uniform weights, biases 0 (the defaults of Keras).
 
     ``sizes`` are units of input, hidden and output layers, at least 2; the generator's device is the network's.
     """
-    layers: list[nn.Module] = []
-    for n_in, n_out in pairwise(sizes):
-        linear = nn.utils.skip_init(nn.Linear, n_in, n_out, device=generator.device)
-        nn.init.xavier_uniform_(linear.weight, generator=generator)
-        nn.init.zeros_(linear.bias)
-        layers += [linear, nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    network = relu_layers(sizes, generator.device)
+    for layer in network:
+        if isinstance(layer, nn.Linear):
+            nn.init.xavier_uniform_(layer.weight, generator=generator)
+            nn.init.zeros_(layer.bias)
+    return network
 
 
 def dropout_mask(

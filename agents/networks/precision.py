@@ -14,7 +14,7 @@ def settle(precision: str, device: str) -> str:
 
 def hidden_dtype(precision: str, device: str) -> torch.dtype:
     """The format of hidden layers while a gradient is wanted."""
-    return {"float32": torch.float32, "bfloat16": torch.bfloat16}[settle(precision, device)]
+    return torch.bfloat16 if settle(precision, device) == "bfloat16" else torch.float32
 
 
 def _multiplies_bfloat16(device: str) -> bool:

@@ -17,7 +17,7 @@ from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined
 
 from ..encoders.perception import prepare_torch
-from ..networks.weights import initialise
+from ..networks.mlp import initialise
 
 _STEPS = 1_200
 _BATCH = 32
@@ -82,12 +82,10 @@ class Convolutional:
         del samples, rng
         asked = torch.from_numpy(actions[:, frames.shape[1] - 1 :])
         pieces = zip(torch.from_numpy(frames[:, -1]).split(_CHUNK), asked.split(_CHUNK), strict=True)
-        pictures, rewards, ended = (torch.cat(column) for column in zip(*(self._roll(*p) for p in pieces), strict=True))
-        return Imagined(
-            pictures=(pictures * 255.0).round().to(torch.uint8).numpy()[:, None],
-            probabilities=np.ones((len(frames), 1, asked.shape[1])),
-            rewards=rewards.numpy()[:, None], p_ended=ended.numpy()[:, None],
-        )  # fmt: skip
+        rolled = [self._roll(*piece) for piece in pieces]
+        pictures, rewards, ended = (torch.cat(column).numpy()[:, None] for column in zip(*rolled, strict=True))
+        certain = np.ones((len(frames), 1, asked.shape[1]))
+        return Imagined(pictures=pictures, probabilities=certain, rewards=rewards, p_ended=ended)
 
     def _roll(self, frames: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Pictures (N, D, 64, 64, 3), rewards and P(ended) (N, D) of one piece."""
@@ -98,7 +96,7 @@ class Convolutional:
         over = []
         for action in actions.unbind(dim=1):
             images, reward, logit = self.network(images, action)
-            drawn.append(images.permute(0, 2, 3, 1))
+            drawn.append((images.permute(0, 2, 3, 1) * 255.0).round().to(torch.uint8))
             earned.append(alive * reward * _REWARD)
             alive = alive * (1.0 - logit.sigmoid())
             over.append(1.0 - alive)

@@ -7,8 +7,9 @@ settings of ``quick``, or those printed in the thesis; how long they train is fi
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 from imagine_bench.arrays import Array, Arrays
 from imagine_bench.interfaces import AgentContext, Frame
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined
+from imagine_bench.interfaces.model import Imagined
 from imagine_bench.values import Setting
 
 from ..encoders.encoder import Encoder
@@ -26,13 +27,11 @@ from ..encoders.perception import load_perception, prepare_torch
 from ..imagination.filter import weight_samples
 from ..imagination.rollouts import Imagination
 from ..imagination.settings import HYPERPARAMETERS, Settings
-from ..imagination.uncertainty import decompose
 from ..replay import Batch, RealMemory
 
 UPDATES = 1_500
 _MOST = 0.5  # share of its futures that the filter keeps of a step that counts as kept
 _MC_DROPOUT = {"model.members": 1, "model.dropout": 0.25, "imagination.weight_samples": 20}
-_GAUSSIAN = {**_MC_DROPOUT, "model.components": 1}
 
 
 class LatentModel:
@@ -86,30 +85,25 @@ class LatentModel:
         """Futures in closed loop through latents; see :class:`.interfaces.model.WorldModel`."""
         generator = self._generator(rng)
         rows = len(frames)
+        asked = torch.from_numpy(actions[:, frames.shape[1] - 1 :]).repeat_interleave(samples, dim=0)
+        turns = iter(asked.unbind(dim=1))
         z = self.states(frames, actions).repeat_interleave(samples, dim=0)  # [N S, Z]
         weights = self.imagination.draw_weights(generator)
         alive = torch.ones(len(z))
         kept = torch.ones(len(z), dtype=torch.bool)
-        gathered = torch.zeros(len(z))
-        steps: dict[str, list[Array]] = {
-            name: [] for name in ("pictures", "rewards", "p_ended", "accepted", *UNCERTAINTIES)
-        }
-        for action in torch.from_numpy(actions[:, frames.shape[1] - 1 :]).unbind(dim=1):
-            step = self.imagination.step(z, action.repeat_interleave(samples), weights, generator)
-            z = step.next_z
-            spread = decompose(step.samples)
-            steps["pictures"].append(
-                (self.encoder.decode(z[:, : self.encoder.latent_size]) * 255.0).round().astype(np.uint8)
-            )
+        steps: defaultdict[str, list[Array]] = defaultdict(list)
+        depth = asked.shape[1]
+        for each in self.imagination.unroll(z, lambda _: next(turns), weights, generator, depth, cut=False):
+            step = each.step
+            images = self.encoder.decode(step.next_z[:, : self.encoder.latent_size])
+            steps["pictures"].append((images * 255.0).round().astype(np.uint8))
             steps["rewards"].append((alive * step.reward).numpy())
             alive = alive * (1.0 - step.p_terminated)
             steps["p_ended"].append((1.0 - alive).numpy())
-            kept = kept & self.imagination.keeps(step, gathered)  # what follows a discarded step is discarded
-            gathered = self.imagination.gathered_with(step, gathered)
+            kept = kept & each.kept  # what follows a discarded step is discarded
             steps["accepted"].append(kept.view(rows, samples).float().mean(dim=1).numpy() >= _MOST)
-            for name in UNCERTAINTIES:
-                reduced = self.imagination.filter.score(getattr(spread, name))
-                steps[name].append(reduced.view(rows, samples).mean(dim=1).numpy())
+            for name, values in self.imagination.uncertainties(step).items():
+                steps[name].append(values.view(rows, samples).mean(dim=1).numpy())
         found: Arrays = {name: np.stack(each, axis=1) for name, each in steps.items()}
         for name in ("pictures", "rewards", "p_ended"):
             found[name] = found[name].reshape(rows, samples, *found[name].shape[1:])
@@ -125,28 +119,20 @@ class LatentModel:
         return torch.Generator(self.encoder.device).manual_seed(int(rng.integers(2**63)))
 
 
-def _make(context: AgentContext, overrides: Mapping[str, Setting]) -> LatentModel:
+def _make(
+    context: AgentContext, *, overrides: Mapping[str, Setting], hyperparameters: str | None = None
+) -> LatentModel:
     given = {**overrides, **context.overrides}
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, given, context.config_group)
+    settings = HYPERPARAMETERS.resolve(hyperparameters or context.hyperparameters, given, context.config_group)
     prepare_torch(context.device)
     return LatentModel(load_perception(context).encoder, settings, context)
 
 
-def make_dropout(context: AgentContext) -> LatentModel:
-    """One network whose hidden units are dropped again and again."""
-    return _make(context, _MC_DROPOUT)
-
-
-def make_ensemble(context: AgentContext) -> LatentModel:
-    """Three networks without dropout."""
-    return _make(context, {"model.members": 3, "model.dropout": 0.0})
-
-
-def make_gaussian(context: AgentContext) -> LatentModel:
-    """One network with dropout and one Gaussian."""
-    return _make(context, _GAUSSIAN)
-
-
-def make_thesis(context: AgentContext) -> LatentModel:
-    """At the settings that the thesis prints; those of chapter 3 have one network, and so no epistemic uncertainty."""
-    return _make(replace(context, hyperparameters="published"), {})
+make_dropout = partial(_make, overrides=_MC_DROPOUT)
+"""One network whose hidden units are dropped again and again."""
+make_ensemble = partial(_make, overrides={"model.members": 3, "model.dropout": 0.0})
+"""Three networks without dropout."""
+make_gaussian = partial(_make, overrides={**_MC_DROPOUT, "model.components": 1})
+"""One network with dropout and one Gaussian."""
+make_thesis = partial(_make, overrides={}, hyperparameters="published")
+"""At the settings that the thesis prints; those of chapter 3 have one network, and so no epistemic uncertainty."""

@@ -27,6 +27,9 @@ class MacrostateRenderer(Protocol):
 class Copy:
     """Says that nothing ever changes, is rewarded or ends."""
 
+    def __init__(self, context: AgentContext) -> None:
+        del context
+
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Learn nothing."""
         del dataset, rng
@@ -86,14 +89,3 @@ class Exact:
     def parameters(self) -> int:
         """None."""
         return 0
-
-
-def make_copy(context: AgentContext) -> Copy:
-    """The model that says that nothing changes."""
-    del context
-    return Copy()
-
-
-def make_exact(spec: TaskSpec, renderer: MacrostateRenderer) -> Exact:
-    """The rules and the renderer."""
-    return Exact(spec, renderer)

@@ -6,6 +6,7 @@ far from every real frame is none either, whatever the network says.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 
 from ..encoders.perception import prepare_torch
-from ..networks.weights import initialise
+from ..networks.mlp import initialise
 
 FRAMES = 6_000
 HELD_OUT = 2_000
@@ -68,18 +69,9 @@ class Reader:
         return (details(images) @ self.references.T).amax(dim=1)
 
     def content(self) -> bytes:
-        """All that :meth:`load` needs, as safetensors."""
+        """All that :func:`load_reader` needs, as safetensors."""
         extra = {"references": self.references, "limits": self.limits}
         return save({**self.network.state_dict(), **extra})
-
-    def load(self, path: Path) -> Reader:
-        """Take up a file of :meth:`content`."""
-        tensors = load_file(path)
-        self.references = tensors.pop("references")
-        self.limits = tensors.pop("limits")
-        self.network.load_state_dict(tensors, assign=True)
-        self.network.requires_grad_(False)
-        return self
 
 
 def images_of(pictures: Array) -> Tensor:
@@ -173,43 +165,41 @@ class _Partners:
         return int(rng.choice(others))
 
 
+def _uniform(images: Tensor, generator: torch.Generator, low: float, high: float, bands: int = 1) -> Tensor:
+    """Numbers of an image each, or of each of its vertical bands. Shape (N, 1, 1, bands)."""
+    return low + (high - low) * torch.rand((len(images), 1, 1, bands), generator=generator)
+
+
+def _noise(images: Tensor, generator: torch.Generator) -> Tensor:
+    return torch.empty_like(images).normal_(generator=generator)
+
+
 def varied(images: Tensor, generator: torch.Generator) -> Tensor:
     """Images as an honest decoder may draw them: gray, lighter, flatter, softer, a little noisy, shaded in bands."""
-    rows = (len(images), 1, 1, 1)
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape or rows, generator=generator)
-
+    uniform = partial(_uniform, images, generator)
     gray = images.mean(dim=1, keepdim=True).expand_as(images)
     images = torch.where(uniform(0, 1) < 0.5, gray, images)
     softness = uniform(0, 0.7) * (uniform(0, 1) < 0.5)
     images = torch.lerp(
         images, functional.avg_pool2d(images, 3, stride=1, padding=1, count_include_pad=False), softness
     )
-    shade = uniform(-0.12, 0.12, len(images), 1, 1, 3).repeat_interleave(11, dim=3)[..., :_SIZE]
+    shade = uniform(-0.12, 0.12, bands=3).repeat_interleave(11, dim=3)[..., :_SIZE]
     images = images + shade * (uniform(0, 1) < 0.5)
     images = 0.5 + uniform(0.6, 1.3) * (images - 0.5) + uniform(-0.15, 0.15)
-    noise = torch.empty_like(images).normal_(generator=generator)
+    noise = _noise(images, generator)
     return (images + uniform(0, 0.03) * noise).clamp(0.0, 1.0)
 
 
 def spoiled(images: Tensor, others: Tensor, generator: torch.Generator) -> Tensor:
     """Pictures of nothing: blends with others, fog, noise, blanks and mush, of each image one."""
-
-    def uniform(low: float, high: float, like: Tensor) -> Tensor:
-        return low + (high - low) * torch.rand((len(like), 1, 1, 1), generator=generator)
-
-    def noise(like: Tensor) -> Tensor:
-        return torch.empty_like(like).normal_(generator=generator)
-
     half = len(images) // 2
     fogged, noisy, blank, mush = images[half:].chunk(4)
     small = functional.avg_pool2d(mush, 4)
     parts = (
-        torch.lerp(images[:half], others[:half], uniform(0.2, 0.8, images[:half])),
-        torch.lerp(fogged, uniform(0, 1, fogged).expand_as(fogged), uniform(0.85, 1.0, fogged)),
-        noisy + uniform(0.3, 0.8, noisy) * noise(noisy),
-        uniform(0, 1, blank) + uniform(0, 0.3, blank) * noise(blank),
+        torch.lerp(images[:half], others[:half], _uniform(images[:half], generator, 0.2, 0.8)),
+        torch.lerp(fogged, _uniform(fogged, generator, 0, 1).expand_as(fogged), _uniform(fogged, generator, 0.85, 1.0)),
+        noisy + _uniform(noisy, generator, 0.3, 0.8) * _noise(noisy, generator),
+        _uniform(blank, generator, 0, 1) + _uniform(blank, generator, 0, 0.3) * _noise(blank, generator),
         functional.interpolate(small, size=(_SIZE, _SIZE), mode="bilinear", align_corners=False),
     )
     return torch.cat(parts).clamp(0.0, 1.0)
@@ -217,4 +207,10 @@ def spoiled(images: Tensor, others: Tensor, generator: torch.Generator) -> Tenso
 
 def load_reader(spec: TaskSpec, path: Path) -> Reader:
     """The reader of a file of :meth:`Reader.content`."""
-    return Reader(tuple(len(values) for values in spec.macrostate_values)).load(path)
+    reader = Reader(tuple(len(values) for values in spec.macrostate_values))
+    tensors = load_file(path)
+    reader.references = tensors.pop("references")
+    reader.limits = tensors.pop("limits")
+    reader.network.load_state_dict(tensors, assign=True)
+    reader.network.requires_grad_(False)
+    return reader

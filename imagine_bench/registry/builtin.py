@@ -138,7 +138,7 @@ _WORLD_MODELS = "imagine_bench.agents.world_models"
 _SETTINGS = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
 WORLD_MODELS: dict[str, WorldModelEntry] = {
     "copy": WorldModelEntry(
-        make="imagine_bench.agents.world_models.limits:make_copy",
+        make="imagine_bench.agents.world_models.limits:Copy",
         title="copy the last frame",
         description="Says that nothing ever changes: one end of the scale.",
     ),
@@ -183,7 +183,7 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         description="The model of the agent factored: tables over discrete factors, whose structure it learns.",
     ),
     "exact": WorldModelEntry(
-        make="imagine_bench.agents.world_models.limits:make_exact",
+        make="imagine_bench.agents.world_models.limits:Exact",
         title="exact",
         privileged=True,
         description="The rules and the renderer (privileged): the other end of the scale.",

@@ -20,7 +20,7 @@ from imagine_bench.rules import states_of
 from imagine_bench.store.files import lock, make_folder, read_json, sha256
 
 _TRAIN = "imagine_bench.agents.encoders.cli:retrain"
-_FIT = "imagine_bench.agents.encoders.offered:fit_offered"
+_FIT = "imagine_bench.agents.encoders.training:fit_offered"
 _SUFFIX = ".safetensors"
 _PATIENCE_S = 3600.0
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import subprocess
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -124,17 +122,6 @@ def test_every_override_is_applied_allowed_and_has_a_reason(agent: str, group: s
     assert hyperparameters.resolve("published", own, group) == hyperparameters.resolve(name, {}, group)
 
 
-@pytest.mark.parametrize("agent", ALL)
-def test_every_setting_has_a_range(agent: str) -> None:
-    def fields_of(settings: Any) -> Iterator[dataclasses.Field[Any]]:
-        for field in dataclasses.fields(settings):
-            value = getattr(settings, field.name)
-            yield from fields_of(value) if dataclasses.is_dataclass(value) else [field]
-
-    published = next(iter(ALL[agent].groups.values())).published
-    assert all("allowed" in field.metadata for field in fields_of(published))
-
-
 def test_settings_load_no_torch() -> None:
     named = {entry.settings.partition(":")[0] for entry in registry.agents().values()} - {""}
     modules = ", ".join({*named, "imagine_bench.agents.regressors.settings"})
@@ -156,11 +143,6 @@ def test_the_imagining_agents_have_every_setting_of_the_dqn() -> None:
     assert ALL["dqn"].names() < ALL["imagination"].names()
 
 
-def test_an_override_replaces_one_value_of_the_preset() -> None:
-    before, after = flatten(resolve("fast", {})), flatten(resolve("fast", {"controller.discount": 0.5}))
-    assert {name for name in after if after[name] != before[name]} == {"controller.discount"}
-
-
 @pytest.mark.parametrize(
     ("name", "given", "kept"),
     [
@@ -174,11 +156,6 @@ def test_values_are_taken_as_json_gives_them(name: str, given: Any, kept: Any) -
     value = flatten(resolve("published", {name: given}))[name]
     assert value == kept
     assert type(value) is type(kept)
-
-
-def test_settings_cannot_be_changed() -> None:
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        Settings().controller.discount = 0.1  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(
@@ -203,17 +180,13 @@ def test_an_unknown_name_lists_what_exists(name: str, overrides: dict[str, Any],
     ("name", "value", "message"),
     [
         ("controller.discount", "high", "'controller.discount' was given 'high'; it takes float"),
-        ("controller.discount", True, "'controller.discount' was given True; it takes float"),
         ("controller.discount", 1.5, r"controller.discount is 1.5; it must lie in \[0, 1\]"),
         ("controller.hidden", (), r"controller.hidden is \(\); .* of one layer or more"),
         ("model.dropout", 0.001, r"model.dropout is 0.001; it must be 0 or lie in \[1/256, 255/256\]"),
-        ("controller.epsilon_decay", float("inf"), r"controller.epsilon_decay is inf; it must lie in \[0, 1e\+06\]"),
         ("controller.epsilon_min", 0.9, r"epsilon_min 0.9 is above controller.epsilon_max 0.8: exploration would rise"),
         ("imagination.start_episode", 1000, r"end_episode 1000 is not above imagination.start_episode 1000: nothing"),
-        ("model.gradient_clip", 0.0, "model.gradient_clip is 0.0; it must be above 0"),
         ("model.components", 2.5, "'model.components' was given 2.5; it takes int"),
         ("imagination.reduction", "median", "No value of setting imagination.reduction: 'median'"),
-        ("imagination.depth", 0, r"imagination.depth is 0; it must lie in \[1, 10000\]"),
         ("imagination.temperature", float("nan"), r"imagination.temperature is nan; it must lie in \[0, 1e\+06\]"),
         ("imagination.termination_threshold", 0.9, r"is 0.9; it must lie in \[0, 0.5\]: it bounds the less likely"),
     ],

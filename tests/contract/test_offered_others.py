@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from guest_packages import install
-from imagine_bench.agents.encoders import offered
+from imagine_bench.agents.encoders import training
 from imagine_bench.agents.encoders.encoder import Encoder
 from small_runs import Inline
 
@@ -77,8 +78,8 @@ def guest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(install(folder))
     monkeypatch.delitem(sys.modules, "their_things", raising=False)
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(offered, "_FRAMES", 600)
-    monkeypatch.setattr(offered, "_PROBE_STEPS", 300)
+    few = replace(training.OFFERED, frames=600, held_out_frames=150, probe_steps=300)
+    monkeypatch.setattr(training, "OFFERED", few)
     registry.offers.cache_clear()
     yield
     registry.offers.cache_clear()

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from imagine_bench.agents.dqn import Controller
 from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.model_only import ModelOnlyTraining
+from imagine_bench.agents.imagination.model_only import ModelOnlyAgent
 from imagine_bench.agents.imagination.rollouts import Counts, Imagination
 from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings
-from imagine_bench.agents.meters import Meters
-from imagine_bench.agents.replay import RealMemory, StartMemory
+from imagine_bench.agents.replay import RealMemory
 
 from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.seeding import SeedTree
@@ -76,9 +77,13 @@ class CountingModel:
         return 10.0 * next_z[:, 1], ends
 
 
-def make(*, filtered: bool, model: CountingModel, **changes: object) -> tuple[Imagination, Controller]:
+def chosen(changes: Mapping[str, Any]) -> ImaginationSettings:
     values = {"breadth": 3, "depth": 10, "temperature": 0.0, "threshold": 0.3, "weight_samples": T}
-    settings = Settings(imagination=ImaginationSettings(**(values | changes)))
+    return ImaginationSettings(**{**values, **changes})
+
+
+def make(*, filtered: bool, model: CountingModel, **changes: object) -> tuple[Imagination, Controller]:
+    settings = Settings(imagination=chosen(changes))
     imagination = Imagination(2, 2, settings, filtered=filtered, seeds=SeedTree(0), device=CPU)
     imagination.model = model  # type: ignore[assignment]
     return imagination, Controller(2, 2, settings.controller, torch.Generator().manual_seed(0))
@@ -93,18 +98,17 @@ def imagined(
     return imagination, counts
 
 
-def practising(
-    model: CountingModel, *, filtered: bool = False, **changes: object
-) -> tuple[ModelOnlyTraining, Meters, Callable[[], None]]:
-    """Model-only training in such a model, its meters, and how it imagines one more episode from (0, 0)."""
-    imagination, _ = make(filtered=filtered, model=model, **changes)
+def practising(model: CountingModel, *, filtered: bool = False, **changes: object) -> ModelOnlyAgent:
+    """An agent that trains in such a model alone, in episodes from (0, 0)."""
     controller = ControllerSettings(hidden=(8,), batch_size=4, epsilon_decay=0.1)
-    settings = Settings(imagination=imagination.settings, controller=controller)
-    training = ModelOnlyTraining(imagination, 2, settings, SeedTree(0), CPU)
-    starts = StartMemory(1, 2, CPU)
-    starts.add((torch.zeros(2), torch.zeros(2)))
-    meters = Meters()
-    return training, meters, lambda: training.episode(starts, remembering(4), meters)
+    settings = Settings(imagination=chosen(changes), controller=controller)
+    sees: Any = SimpleNamespace(latent_size=2)
+    agent = ModelOnlyAgent(sees, 2, settings, SeedTree(0), CPU, filtered=filtered)
+    agent.imagination.model = model  # type: ignore[assignment]
+    agent.starts.add((torch.zeros(2), torch.zeros(2)))
+    agent.real = remembering(4)
+    agent.steps = 1
+    return agent
 
 
 def remembering(count: int) -> RealMemory:

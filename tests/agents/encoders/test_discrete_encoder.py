@@ -101,7 +101,3 @@ def test_a_value_that_is_torn_by_a_narrow_gap_is_one(gap: float, values: int) ->
     assert owners[2] != owners[3]
     if values == 3:
         assert owners[0] == {0}, "the largest comes first, counted whole"
-
-
-def test_two_clouds_have_no_third_to_be_measured_by() -> None:
-    assert clouds(torn(0.15)[:800]).max() + 1 == 2

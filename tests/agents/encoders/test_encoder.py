@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 from encoder_frames import CHAPTER_5, QUICK, TINY, TINY_CONV, arrow_spec, draw
-from imagine_bench.agents.encoders import unfinished
-from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard, empty_vae, view
+from imagine_bench.agents.encoders import training
+from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard
 from imagine_bench.agents.encoders.probe import Latents, Probe, accuracy, train_probe
 from imagine_bench.agents.encoders.recipes import Recipe, recipe_named
 from imagine_bench.agents.encoders.training import (
@@ -26,9 +26,8 @@ from imagine_bench.agents.encoders.training import (
     train_encoder,
     train_vae,
 )
-from imagine_bench.agents.encoders.unfinished import Unfinished
-from imagine_bench.agents.encoders.vae import Vae, kl_from_standard_normal, standardise
-from imagine_bench.agents.networks.weights import initialise
+from imagine_bench.agents.encoders.vae import Vae, build_vae, kl_from_standard_normal, standardise
+from imagine_bench.agents.networks.mlp import initialise
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -36,10 +35,9 @@ from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError
 from imagine_bench.preprocessing import gray_cells
 
 
-def made_vae(recipe: Recipe, seed: int = 0) -> Vae:
-    vae = empty_vae(recipe, "gray_strips").to_empty(device="cpu")
-    vae.load_state_dict({key: torch.ones_like(value) * 0.5 for key, value in vae.state_dict().items()})
-    initialise(vae, torch.Generator().manual_seed(seed))
+def made_vae(recipe: Recipe, preprocessing: str = "gray_strips") -> Vae:
+    vae = build_vae(recipe, preprocessing)
+    initialise(vae, torch.Generator().manual_seed(0))
     return vae
 
 
@@ -103,25 +101,6 @@ def test_thesis_loss_is_bernoulli_and_summed_over_pixels() -> None:
     torch.testing.assert_close(vae.elbo(batch, torch.zeros(3, 8), beta=4.0).reconstruction, expected, rtol=1e-4, atol=0)
 
 
-def test_gradient_agrees_with_finite_differences() -> None:
-    vae = made_vae(TINY).double()
-    batch = images(2).double()
-    noise = torch.randn(2, vae.latent_size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    vae.elbo(batch, noise, 2.0).loss.backward()
-    step = 1e-6
-    for name, weight in vae.named_parameters():
-        flat = weight.data.view(-1)
-        slope = weight.grad.view(-1)
-        i = int(slope.abs().argmax())
-        around = []
-        for offset in (-step, 2 * step):
-            flat[i] += offset
-            around.append(vae.elbo(batch, noise, 2.0).loss.item())
-        flat[i] -= step
-        below, above = around
-        assert (above - below) / (2 * step) == pytest.approx(slope[i].item(), rel=5e-4, abs=2e-6), name
-
-
 def test_standardised_strips_do_not_see_light() -> None:
     strips = images(4).flatten(2)
     bright = standardise(0.3 + 0.5 * strips)
@@ -151,8 +130,7 @@ def test_strips_are_encoded_apart_with_shared_weights() -> None:
 def test_an_image_is_read_whole_and_comes_back_whole(
     recipe: Recipe, preprocessing: str, side: tuple[int, int], latents: int
 ) -> None:
-    vae = empty_vae(recipe, preprocessing).to_empty(device="cpu")
-    initialise(vae, torch.Generator().manual_seed(0))
+    vae = made_vae(recipe, preprocessing)
     batch = torch.rand(5, 3, *side, generator=torch.Generator().manual_seed(1))
     mu, log_variance = vae.posterior(batch)
     assert mu.shape == log_variance.shape == (5, latents)
@@ -172,7 +150,7 @@ def test_chapter_3_s_recipe_is_the_thesis() -> None:
 
 
 def test_thesis_network_is_that_of_ha_and_schmidhuber() -> None:
-    vae = empty_vae(CHAPTER_5["thesis"], "gray_strips")
+    vae = build_vae(CHAPTER_5["thesis"], "gray_strips")
     shapes = {name: tuple(weight.shape) for name, weight in vae.named_parameters() if name.endswith("weight")}
     convolutions = [(32, 3, 4, 4), (64, 32, 4, 4), (128, 64, 4, 4), (256, 128, 4, 4)]
     transposed = [(1024, 128, 5, 5), (128, 64, 5, 5), (64, 32, 6, 6), (32, 3, 6, 6)]
@@ -207,39 +185,29 @@ def test_impossible_recipes_are_named(change: dict[str, Any], error: type[Except
         replace(TINY, **change)
 
 
-def test_unknown_choices_are_named() -> None:
-    with pytest.raises(UnknownNameError, match=r"No encoder recipe 'thesiss'. Did you mean 'thesis'\? Known: thesis"):
-        recipe_named("thesiss", "chapter_5")
-    with pytest.raises(UnknownNameError, match=r"No appearance 'wild'. Did you mean 'mild'"):
-        train_encoder(arrow_spec(), recipe=TINY, appearance="wild", seed=0)
+def test_unknown_devices_are_named() -> None:
     with pytest.raises(UnknownNameError, match=r"No device 'gpu'.* Known: cpu, cuda"):
         trained(TINY, device="gpu")
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without an NVIDIA GPU")
-def test_a_device_that_is_not_there_is_named() -> None:
-    with pytest.raises(SetupError, match="torch finds no NVIDIA GPU here; use device 'cpu'"):
-        trained(TINY, device="cuda")
+    if not torch.cuda.is_available():
+        with pytest.raises(SetupError, match="torch finds no NVIDIA GPU here; use device 'cpu'"):
+            trained(TINY, device="cuda")
 
 
 # --- the probe -------------------------------------------------------------------------------------------------------
 
 
-def test_probe_reads_separable_latents_and_not_noise() -> None:
+@pytest.mark.parametrize("clear", [True, False])
+def test_probe_reads_separable_latents_and_not_noise(clear: bool) -> None:
     rng = np.random.default_rng(0)
     labels = rng.integers([4, 3], size=(600, 2))
     angle = labels[:, 0] * np.pi / 2
     mu = np.stack([np.cos(angle), np.sin(angle), labels[:, 1]], axis=1) * 3
-    clear = Latents(mu=torch.from_numpy(mu).float(), sigma=torch.full((600, 3), 0.2))
-    blind = Latents(mu=torch.from_numpy(rng.normal(size=mu.shape)).float(), sigma=torch.full((600, 3), 0.2))
-    scores = {}
-    for name, latents in (("clear", clear), ("blind", blind)):
-        probe = Probe(3, (4, 3), hidden=16)
-        train = Latents(mu=latents.mu[:400], sigma=latents.sigma[:400])
-        train_probe(probe, train, labels[:400], steps=300, generator=torch.Generator().manual_seed(0))
-        scores[name] = accuracy(probe, latents.mu[400:], labels[400:])
-    assert scores["clear"] == 1.0
-    assert scores["blind"] < 0.25  # chance is 1 / 12
+    latents = Latents(torch.from_numpy(mu if clear else rng.normal(size=mu.shape)).float(), torch.full((600, 3), 0.2))
+    probe = Probe(3, (4, 3), hidden=16)
+    train = Latents(latents.mu[:400], latents.sigma[:400])
+    train_probe(probe, train, labels[:400], steps=300, generator=torch.Generator().manual_seed(0))
+    score = accuracy(probe, latents.mu[400:], labels[400:])
+    assert score == 1.0 if clear else score < 0.25  # chance is 1 / 12
 
 
 # --- training --------------------------------------------------------------------------------------------------------
@@ -277,19 +245,6 @@ def test_a_gpu_repeats_itself_and_agrees_with_the_processor(recipe: Recipe) -> N
     assert on_gpu.card.versions["gpu"]
 
 
-@pytest.mark.slow
-def test_thesis_recipe_trains() -> None:
-    """It first learns the mean image; only after about 600 such steps do latents enter (measured), too long here."""
-    recipe = replace(CHAPTER_5["thesis"], frames=300, held_out_frames=100, steps=120, batch=32, probe_steps=10)
-    encoder = train_encoder(arrow_spec(), recipe=recipe, appearance="clean", seed=0)
-    strips = torch.from_numpy(gray_cells(frames(200, "clean")))
-    untrained = made_vae(recipe)
-    target = untrained.target(strips)
-    constant = (target - target.mean(dim=0)).square().mean()
-    assert encoder.card.reconstruction < 1.15 * constant
-    assert (untrained.mean(torch.zeros(200, 8)) - target).square().mean() > 2.0 * constant
-
-
 def test_probes_read_frames_and_looks_that_training_never_saw() -> None:
     drawn: list[tuple[str, np.ndarray]] = []
 
@@ -306,7 +261,7 @@ def test_probes_read_frames_and_looks_that_training_never_saw() -> None:
 
 
 def test_a_killed_training_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(unfinished, "_SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr(training, "SAVE_EVERY_S", 0.0)
     file = tmp_path / "unfinished.pt"
     finished = []
     whole = trained(QUICK, progress=lambda stage, done: finished.append(stage) if done == 1.0 else None)
@@ -329,7 +284,7 @@ def test_a_killed_training_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch:
         trained(QUICK, seed=1, unfinished=file)
     file.write_bytes(file.read_bytes()[:5000])
     with pytest.raises(ArtefactError, match=r"unfinished\.pt is damaged; remove it to begin anew"):
-        Unfinished(file, "").load()
+        trained(QUICK, unfinished=file)
 
 
 def test_gradients_of_parts_add_up_to_the_batch_s() -> None:
@@ -366,49 +321,33 @@ def test_saved_and_loaded_encoders_are_equal(encoder: Encoder, tmp_path: Path) -
     assert loaded.card == encoder.card == EncoderCard.from_json((tmp_path / "e.json").read_text())
 
 
-@pytest.mark.parametrize("n", [0, 1, 30])
-def test_shapes_types_and_ranges(encoder: Encoder, n: int) -> None:
-    size = {"tiny": 24, "tiny_conv": 8}[encoder.card.recipe.name]
-    assert encoder.latent_size == encoder.card.latent_size == size
-    mu, sigma = encoder.encode(frames(n))
-    assert mu.shape == sigma.shape == (n, size)
+@pytest.mark.parametrize("n", [0, 600])
+def test_shapes_types_and_ranges_also_beyond_one_chunk(encoder: Encoder, n: int) -> None:
+    many = np.random.default_rng(0).integers(256, size=(n, 64, 64, 3), dtype=np.uint8)
+    mu, sigma = encoder.encode(many)
+    assert mu.shape == sigma.shape == (n, encoder.latent_size)
     assert mu.dtype == sigma.dtype == torch.float32
     assert not mu.requires_grad
-    assert not mu.is_inference()
     assert (sigma > 0).all()
-    images = encoder.decode(mu)
-    assert images.shape == (n, 64, 64)
+    torch.testing.assert_close(encoder.encode(many[511:514])[0], mu[511:514], rtol=0, atol=1e-5)
+    images = encoder.decode(mu[:30])
+    assert images.shape == (min(n, 30), 64, 64)
     assert images.dtype == np.float32
     assert n == 0 or 0.0 <= images.min() < images.max() <= 1.0
     read = encoder.read_macrostate(mu)
     assert read.shape == (n, 4)
-    assert read.dtype == np.int64
     assert ((read >= 0) & (read < (4, 4, 4, 3))).all()
 
 
-def test_frames_beyond_one_chunk_are_encoded_alike(tiny: Encoder) -> None:
-    many = np.random.default_rng(0).integers(256, size=(600, 64, 64, 3), dtype=np.uint8)
-    mu, _ = tiny.encode(many)
-    torch.testing.assert_close(tiny.encode(many[511:514])[0], mu[511:514], rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (np.zeros((1, 64, 64, 3), dtype=np.float32), r"type float32 and shape \(1, 64, 64, 3\); give uint8"),
-        (np.zeros((64, 64, 3), dtype=np.uint8), r"shape \(64, 64, 3\); give uint8 of shape \(N, 64, 64, 3\)"),
-    ],
-)
-def test_wrong_frames_are_refused(tiny: Encoder, wrong: np.ndarray, message: str) -> None:
-    with pytest.raises(InvalidValueError, match=message):
+@pytest.mark.parametrize("wrong", [np.zeros((1, 64, 64, 3), np.float32), np.zeros((64, 64, 3), np.uint8)])
+def test_wrong_frames_are_refused(tiny: Encoder, wrong: np.ndarray) -> None:
+    with pytest.raises(InvalidValueError, match=rf"type {wrong.dtype} and shape \({wrong.shape[0]}, .*give uint8 of"):
         tiny.encode(wrong)
 
 
 def test_bad_files_are_named_and_left_untouched(tiny: Encoder, tmp_path: Path) -> None:
     good = tmp_path / "good.safetensors"
     tiny.save(good)
-    with pytest.raises(ArtefactError, match=r"No encoder at .*absent.safetensors; make one with"):
-        Encoder.load(tmp_path / "absent.safetensors")
     card = json.loads(tiny.card.to_json())
     state = {f"vae.{key}": value for key, value in tiny.network.state_dict().items()}
     state |= {f"probe.{key}": value for key, value in tiny.probe.state_dict().items()}
@@ -446,7 +385,7 @@ def test_saving_never_overwrites(tiny: Encoder, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError("No space left on device")])
-@pytest.mark.parametrize("at", [0, 1, 2])
+@pytest.mark.parametrize("at", [0, 2])
 def test_saving_that_fails_half_way_leaves_no_artefact_and_is_done_again(
     tiny: Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int, error: BaseException
 ) -> None:
@@ -469,10 +408,3 @@ def test_saving_that_fails_half_way_leaves_no_artefact_and_is_done_again(
     assert Encoder.load(path).card == tiny.card
     with pytest.raises(ArtefactError, match="exists already"):
         tiny.save(path, b"picture")
-
-
-def test_view_joins_strips_and_keeps_colors() -> None:
-    two = frames(2)
-    assert np.allclose(view(gray_cells(two), "gray_strips"), two[..., 0] / 255.0, atol=1e-5)
-    colors = np.random.default_rng(0).random((2, 3, 32, 32), dtype=np.float32)
-    assert np.array_equal(view(colors, "small_rgb")[1, 5, 7], colors[1, :, 5, 7])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +18,6 @@ from imagine_bench.agents.imagination.agent import ImaginingAgent
 from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError
 from imagine_bench.interfaces import AgentState, Observation
 from imagine_bench.interfaces.capabilities import Imaginer, ValueReader
-from imagine_bench.seeding import SeedTree
 
 MAKERS: dict[str, Callable[..., DQN]] = {
     "dqn": make_dqn,
@@ -28,36 +26,6 @@ MAKERS: dict[str, Callable[..., DQN]] = {
     "imagination_only": model_only.make,
     "imagination_only_uncertainty": model_only.make_uncertainty,
 }
-everyone = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
-
-
-@everyone
-def test_acting_greedily_is_constant_and_changes_nothing(make: Callable[..., DQN]) -> None:
-    agent = built(make)
-    live(agent, range(3), np.random.default_rng(0))
-    before = agent.state()
-    chosen = [agent.act(Observation(frame=frame(state)), explore=False) for state in (0, 1, 2, 3) * 5]
-    assert chosen[:4] * 5 == chosen
-    assert same(before, agent.state())
-    agent.act(Observation(frame=frame(0)), explore=True)
-    assert not same(before, agent.state()), "exploring draws from the agent's generator"
-
-
-@everyone
-def test_a_resumed_agent_equals_an_uninterrupted_one_to_the_bit(make: Callable[..., DQN]) -> None:
-    agent = built(make)
-    rng = np.random.default_rng(0)
-    live(agent, range(6), rng)
-    later = copy.deepcopy(rng)
-    saved = agent.state()
-    kept = copy.deepcopy(saved)
-    onward = live(agent, range(6, 16), rng)
-    assert same(saved, kept), "a snapshot must not follow later learning"
-    assert not same(saved, agent.state())
-    resumed = built(make, seeds=SeedTree(99))
-    resumed.restore(saved)
-    assert live(resumed, range(6, 16), later) == onward
-    assert same(agent.state(), resumed.state())
 
 
 def weights(agent: DQN) -> np.ndarray:
@@ -176,14 +144,9 @@ def test_imagine_changes_nothing_and_follows_its_generator(trained: ImaginingAge
     assert np.array_equal(first.actions, actions)
     assert np.array_equal(first.epistemic, again.epistemic)
     assert not np.array_equal(first.epistemic, other.epistemic)
-    shapes = {name: getattr(first, name).shape for name in first.__dataclass_fields__}
-    assert shapes == {
-        **dict.fromkeys(("actions", "rewards", "p_terminated", "epistemic", "aleatoric", "modal", "accepted"), (4,)),
-        "frames": (4, 64, 64),
-        "start_frame": (64, 64),
-        "q_values": (4, ACTIONS),
-        "macrostates": (4, 1),
-    }
+    assert first.frames.shape == (4, 64, 64)
+    assert first.q_values.shape == (4, ACTIONS)
+    assert first.aleatoric.shape == first.modal.shape == first.accepted.shape == (4,)
     assert np.array_equal(first.q_values[0], trained.q_values(Observation(frame=frame(1))))
     greedy = trained.imagine(frame(1), actions=None, depth=5, rng=np.random.default_rng(3))
     assert np.array_equal(greedy.actions, greedy.q_values.argmax(axis=1))
@@ -202,22 +165,6 @@ def test_nothing_to_imagine_is_an_error(
         trained.imagine(frame(0), actions=given, depth=depth, rng=np.random.default_rng(0))
 
 
-def test_shown_rollouts_stay_rejected_after_the_first_rejection() -> None:
-    def accepted(agent: ImaginingAgent) -> list[bool]:
-        shown = agent.imagine(frame(0), actions=np.array([0, 1, 2]), depth=3, rng=np.random.default_rng(0))
-        return list(shown.accepted)
-
-    strict, free = (
-        built(make, {"imagination.threshold": 0.0})
-        for make in (imagination_agents.make_uncertainty, imagination_agents.make)
-    )
-    assert not any(accepted(strict))
-    assert all(accepted(free))
-    once = iter([True, False, True])
-    free.imagination.keeps = lambda step, gathered: torch.tensor([next(once)])  # type: ignore[method-assign]
-    assert accepted(free) == [True, False, False]
-
-
 def test_diagnostics_are_means_since_the_last_call() -> None:
     agent = built(imagination_agents.make_uncertainty, {"imagination.threshold": 1e6})
     live(agent, range(4), np.random.default_rng(0))
@@ -227,13 +174,11 @@ def test_diagnostics_are_means_since_the_last_call() -> None:
     means |= {f"time/{name}_s" for name in ("model", "controller", "imagination")}
     means |= {"imagination/acceptance_rate", "imagination/mean_depth"}
     assert set(read) == means | counters
-    assert read["real_transitions"] == 8.0
-    assert read["imagination/acceptance_rate"] == 1.0
-    steps, rollouts, depth = 4, 3, 3
-    every = agent.settings.controller.updates_per_step + agent.settings.model.updates_per_step
-    assert read["gradient_updates"] == 8 * every + steps * agent.settings.imagination.updates_per_step
-    assert rollouts <= read["imagined_transitions"] / steps <= rollouts * depth
-    assert read["imagination/mean_depth"] == pytest.approx(read["imagined_transitions"] / (steps * rollouts))
+    assert (read["real_transitions"], read["imagination/acceptance_rate"]) == (8.0, 1.0)
+    settings = agent.settings
+    waking = settings.controller.updates_per_step + settings.model.updates_per_step
+    assert read["gradient_updates"] == 8 * waking + 4 * settings.imagination.updates_per_step
+    assert read["imagination/mean_depth"] == pytest.approx(read["imagined_transitions"] / (4 * 3))
     assert set(agent.diagnostics()) == counters
 
 
@@ -250,14 +195,13 @@ def test_a_dqn_beats_chance_on_a_small_contextual_task() -> None:
     assert np.mean(right) >= 5 / 6  # chance 1 / 3; all six by luck: 1 in 729
 
 
-@everyone
-def test_a_snapshot_that_does_not_fit_names_the_first_difference(make: Callable[..., DQN]) -> None:
-    agent = built(make)
+def test_a_snapshot_that_does_not_fit_names_the_first_difference() -> None:
+    agent = built(model_only.make_uncertainty)
     live(agent, range(3), np.random.default_rng(0))
     own = agent.state()
     missing = {name: array for name, array in own.arrays.items() if name != "real/mu"}
     wider = {**own.arrays, "real/mu": np.zeros((6, 9), np.float32)}
-    other = built(make, {"memory.real": 9}).state().values
+    other = built(model_only.make_uncertainty, {"memory.real": 9}).state().values
     for arrays, values, message in (
         (missing, own.values, "The snapshot lacks 'real/mu'"),
         (wider, own.values, r"'real/mu' in the snapshot is float32 \(6, 9\), in this agent float32 \(6, 4\)"),

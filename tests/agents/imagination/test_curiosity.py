@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from agent_states import same
 from counting_model import CountingModel, T, make
-from fake_latents import ACTIONS, SMALL, built, frame, live
+from fake_latents import ACTIONS, built, frame, live
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.uncertainty import decompose
 
-from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation
 from imagine_bench.interfaces.capabilities import NoveltyReader
 
@@ -60,14 +58,6 @@ def test_real_rewards_alone_are_paid_in_proportion() -> None:
     memory = agents[2].imagination.memory
     memory.add(plain)
     assert set(agents[2].draw_batch(memory).reward.tolist()) <= set(plain.reward.tolist())
-
-
-def test_curiosity_of_one_network_is_refused() -> None:
-    assert SMALL["imagination.weight_samples"] > 1
-    alone = {"imagination.curiosity": 1.0, "model.dropout": 0.0}
-    with pytest.raises(InvalidValueError, match=r"imagination\.curiosity compares .* above 1, or set it to 0\."):
-        built(imagination_agents.make, alone)
-    built(imagination_agents.make, {**alone, "model.members": 2})
 
 
 def test_the_novelty_of_a_frame_can_be_read_and_changes_nothing() -> None:

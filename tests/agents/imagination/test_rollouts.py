@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 import torch
 from counting_model import CPU, CountingModel, T, imagined, make, remembering
-from imagine_bench.agents.dqn import Controller
-from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.rollouts import LATENT_LIMIT, Imagination
+from imagine_bench.agents.imagination.rollouts import Imagination
 from imagine_bench.agents.imagination.settings import ImaginationSettings, Settings, WorldModelSettings
 from imagine_bench.agents.imagination.world_model import EnvironmentModel
-from imagine_bench.agents.replay import Batch
 
 from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.seeding import SeedTree
@@ -24,7 +21,6 @@ from imagine_bench.seeding import SeedTree
 @pytest.mark.parametrize(
     ("model", "filtered", "limits", "kept"),
     [
-        ({}, True, {}, 10),
         ({}, True, {"threshold": 0.0}, 10),  # as uncertain as the threshold
         ({"end_at": 4}, True, {}, 4),
         ({"uncertain_at": 5}, True, {}, 4),
@@ -32,14 +28,10 @@ from imagine_bench.seeding import SeedTree
         ({"uncertain_at": 1}, True, {}, 0),
         ({"uncertain_at": 5}, True, {"reduction": "max", "threshold": 4.0}, 4),  # the variance there is (5, 0)
         ({"uncertain_at": 5}, True, {"reduction": "mean", "threshold": 4.0}, 10),
-        ({"reward_uncertain_at": 5}, True, {}, 10),
         ({"reward_uncertain_at": 5}, True, {"reward_threshold": 1.9}, 4),
         ({"reward_uncertain_at": 5}, True, {"reward_threshold": 2.0}, 10),
-        ({"reward_uncertain_at": 5}, False, {"reward_threshold": 0.1}, 10),
-        ({"torn_at": 5}, True, {}, 10),
         ({"torn_at": 5}, True, {"termination_threshold": 0.2}, 4),
         ({"torn_at": 5}, True, {"termination_threshold": float(np.float32(0.3))}, 10),
-        ({"torn_at": 5}, False, {"termination_threshold": 0.2}, 10),
         ({"end_at": 4}, True, {"termination_threshold": 0.0}, 4),  # a certain end
     ],
 )
@@ -49,7 +41,7 @@ def test_rollouts_run_until_they_end_are_full_or_too_uncertain(
     imagination, counts = imagined(CountingModel(**model), filtered=filtered, **limits)
     end = model.get("end_at", 10)
     predicted = kept if kept == end else kept + 1
-    assert dataclasses.astuple(counts) == (3, 3 * predicted, 3 * kept)
+    assert counts == (3, 3 * predicted, 3 * kept)
     rows = imagination.memory.arrays()
     reached = rows["next_z"][:, 1]
     assert sorted(reached) == sorted(3 * list(range(1, kept + 1)))
@@ -89,15 +81,14 @@ def test_imagination_that_is_no_number_is_not_stored(part: str) -> None:
     assert len(imagination.memory) == 0
 
 
-@pytest.mark.parametrize("filtered", [False, True])
-def test_a_rollout_ends_before_its_variance_overflows(filtered: bool) -> None:
+def test_a_rollout_ends_before_its_variance_overflows() -> None:
     def exploding(sound: Mixture, z: torch.Tensor) -> Mixture:
         sigmas = sound.log_sigmas.clone()
         sigmas[:, z[:, 1].round() == 4] = 89.0  # a variance beyond float32
         return dataclasses.replace(sound, log_sigmas=sigmas)
 
-    imagination, counts = imagined(CountingModel(change=exploding), filtered=filtered, temperature=1.0)
-    assert dataclasses.astuple(counts) == (3, 15, 12)
+    imagination, counts = imagined(CountingModel(change=exploding), temperature=1.0)
+    assert counts == (3, 15, 12)
     assert sorted(imagination.memory.arrays()["next_z"][:, 1].round()) == sorted(3 * [1, 2, 3, 4])
     overflowed = torch.tensor([[0.1, 0.2], [0.1, torch.inf], [torch.nan, 0.2]])
     assert imagination.filter.score(overflowed).tolist() == [pytest.approx(0.2), torch.inf, torch.inf]
@@ -122,50 +113,24 @@ def test_a_closed_loop_that_runs_away_stays_a_number() -> None:
     assert not kept[-1].any(), "it did run away"
 
 
-def test_latents_below_the_limit_can_be_learned_from() -> None:
-    """A whole batch just below the limit leaves a trained controller finite; far beyond it would end the run.
-
-    Rewards are as large as a reward network gives them there: they grow with the latents.
-    """
-    draws = torch.Generator().manual_seed(1)
-    controller = Controller(24, 6, ControllerSettings(), draws)
-
-    def learn(size: float) -> float:
-        z, next_z = size * torch.randn(2, 64, 24, generator=draws).sign()
-        action = torch.randint(6, (64,), generator=draws)
-        return controller.update(Batch(z, action, 10.0 * next_z[:, 0], next_z, torch.zeros(64)))
-
-    for _ in range(30):
-        learn(1.0)
-    assert np.isfinite(learn(0.99 * LATENT_LIMIT))
-    assert all(bool(weight.isfinite().all()) for weight in controller.parameters())
-    with pytest.raises(DivergedError):
-        learn(1e20)
-
-
 _ALONE: dict[str, Any] = {"dropout": 0.0}
 
 
 @pytest.mark.parametrize(
-    ("model", "imagination", "filtered", "message"),
+    ("model", "imagination", "filtered", "reader"),
     [
-        (_ALONE, {}, True, r"^The filter .* there is one\. .*above 1, or choose the agent without the filter\.$"),
-        ({}, {"weight_samples": 1}, True, r"^The filter .* Set model\.dropout above 0 and imagination\.weight_samples"),
-        (_ALONE, {"curiosity": 0.5}, False, r"^imagination\.curiosity compares .*, or set it to 0\.$"),
-        (_ALONE, {"confidence_scale": 0.3}, False, r"^imagination\.confidence_scale compares .* or set it to null"),
-        (
-            {"dropout": 0.0, "members": 3},
-            {"reward_threshold": 1.0},
-            True,
-            r"dropout samples of the reward network.*model\.dropout above 0",
-        ),
+        (_ALONE, {}, True, "The filter"),
+        ({}, {"weight_samples": 1}, True, "The filter"),
+        (_ALONE, {"curiosity": 0.5}, False, "imagination.curiosity"),
+        (_ALONE, {"confidence_scale": 0.3}, False, "imagination.confidence_scale"),
+        ({**_ALONE, "members": 3}, {"reward_threshold": 1.0}, True, "imagination.reward_threshold"),
     ],
 )
 def test_a_single_weight_sample_cannot_be_compared(
-    model: dict[str, Any], imagination: dict[str, Any], filtered: bool, message: str
+    model: dict[str, Any], imagination: dict[str, Any], filtered: bool, reader: str
 ) -> None:
     settings = Settings(model=WorldModelSettings(**model), imagination=ImaginationSettings(**imagination))
-    with pytest.raises(InvalidValueError, match=message):
+    with pytest.raises(InvalidValueError, match=f"^{reader} compares .* here is one. Set model.dropout above 0"):
         Imagination(2, 2, settings, filtered=filtered, seeds=SeedTree(0), device=CPU)
     modest = dataclasses.replace(settings, imagination=ImaginationSettings(weight_samples=1))
     Imagination(2, 2, modest, filtered=False, seeds=SeedTree(0), device=CPU)
@@ -183,19 +148,6 @@ def test_rollouts_explore_at_least_as_the_settings_say(
     imagination.rollouts(controller, torch.zeros(2), remembering(1), epsilon)
     share = (imagination.memory.arrays()["action"] != greedy).mean()
     assert least <= share <= most
-
-
-def test_the_components_of_different_networks_are_not_averaged() -> None:
-    def swapped(sound: Mixture, z: torch.Tensor) -> Mixture:
-        """Two networks that say the same, z - 1 or z + 1, with their components in another order."""
-        order = torch.tensor([[-1.0, 1.0], [1.0, -1.0]]).repeat_interleave(T, dim=0)  # [2 T, K]
-        means = z[None, :, None, :] + order[:, None, :, None]  # [2 T, N, K, Z]
-        return Mixture(torch.full(means.shape[:3], -0.7), means, torch.full_like(means, -9.0))
-
-    model = CountingModel(change=swapped)
-    model.members = 2
-    imagination, _ = imagined(model, depth=1, breadth=50)
-    assert set(imagination.memory.arrays()["next_z"].ravel().tolist()) <= {-1.0, 1.0}
 
 
 @pytest.mark.parametrize(

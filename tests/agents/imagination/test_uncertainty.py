@@ -6,9 +6,7 @@ import pytest
 import torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.uncertainty import decompose, nll, reduction, sampled_component_variance
-
-from imagine_bench.errors import UnknownNameError
+from imagine_bench.agents.imagination.uncertainty import decompose, nll, sampled_component_variance
 
 T, N, K, Z = 6, 5, 3, 2
 
@@ -55,11 +53,6 @@ def test_single_samples_and_components_have_no_spread() -> None:
     assert decompose(single).epistemic.min() > 0.0
 
 
-@pytest.mark.parametrize(("name", "expected"), [("sum", 6.0), ("mean", 2.0), ("max", 3.0)])
-def test_reductions_by_name(name: str, expected: float) -> None:
-    assert reduction(name)(torch.tensor([[[1.0, 2.0, 3.0]] * 2])).tolist() == [[expected] * 2]
-
-
 def test_a_sampled_value_is_as_uncertain_as_its_component() -> None:
     """Two components far apart: noise 1 and weights that move the mean by 1, noise 9 and weights that agree."""
     means = torch.tensor([[[[0.0], [100.0]]], [[[2.0], [100.0]]]])  # [T = 2, N = 1, K = 2, Z = 1]
@@ -91,8 +84,3 @@ def test_nll_is_that_of_all_weight_samples_together() -> None:
     mixtures = samples(torch.float64)
     densities = [mdn.log_likelihood(mixtures.map(lambda part, t=t: part[t]), VALUES).exp() for t in range(T)]
     torch.testing.assert_close(nll(mixtures, VALUES), -torch.stack(densities).mean(dim=0).log())
-
-
-def test_an_unknown_reduction_lists_the_known_ones() -> None:
-    with pytest.raises(UnknownNameError, match=r"No uncertainty reduction 'men'. Did you mean 'mean'\? Known: sum, m"):
-        reduction("men")

@@ -8,14 +8,10 @@ import numpy as np
 import pytest
 import torch
 from counting_model import CountingModel, T, imagined, make, practising
-from fake_latents import built, frame, live
-from imagine_bench.agents.dqn import Controller
-from imagine_bench.agents.dqn_settings import ControllerSettings
-from imagine_bench.agents.imagination.agent import make as make_agent
+from fake_latents import built, frame
 from imagine_bench.agents.imagination.agent import make_uncertainty
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.vector_env import ImaginedVectorEnv
-from imagine_bench.agents.replay import Batch
 
 from imagine_bench.errors import InvalidValueError
 
@@ -56,14 +52,12 @@ def test_gathered_uncertainty_ends_rollouts_and_weighs_transitions(
         np.testing.assert_allclose(rows["weight"], confidence(depth, accumulates), rtol=1e-4)
 
 
-@accumulating
-def test_model_only_training_gathers_and_weighs_uncertainty(accumulates: bool) -> None:
-    uses = {"threshold": 0.35, "accumulates": accumulates, "confidence_scale": 0.2}
-    training, _, one_episode = practising(CountingModel(change=unsure), filtered=True, **uses)
-    one_episode()
-    depth = np.arange(1, 4 if accumulates else 11)
-    assert training.steps == len(depth)
-    np.testing.assert_allclose(training.arrays()["memory/weight"], confidence(depth, accumulates), rtol=1e-4)
+def test_model_only_training_gathers_and_weighs_uncertainty() -> None:
+    uses = {"threshold": 0.35, "accumulates": True, "confidence_scale": 0.2}
+    agent = practising(CountingModel(change=unsure), filtered=True, **uses)
+    agent.train_in_model()
+    weights = agent.imagined.arrays()["weight"]
+    np.testing.assert_allclose(weights, confidence(np.arange(1, 4), accumulates=True), rtol=1e-4)
 
 
 @accumulating
@@ -84,23 +78,6 @@ def test_an_environment_that_cannot_weigh_by_confidence_refuses_it() -> None:
         ImaginedVectorEnv(imagination, np.zeros((1, 2), np.float32))
 
 
-def test_the_controller_learns_by_weight() -> None:
-    """Twice the weight is twice the gradient, and without weight there is none."""
-    generator = torch.Generator().manual_seed(0)
-    controller = Controller(2, 2, ControllerSettings(hidden=(8,)), generator)
-    z, next_z = torch.randn(2, 6, 2, generator=generator)
-    batch = Batch(z, torch.zeros(6, dtype=torch.int64), torch.ones(6), next_z, torch.ones(6))
-
-    def gradient(weight: float) -> torch.Tensor:
-        controller.optimiser.zero_grad()
-        controller.loss(dataclasses.replace(batch, weight=torch.full((6,), weight))).backward()
-        return torch.cat([part.grad.ravel() for part in controller.network.parameters() if part.grad is not None])
-
-    assert gradient(1.0).any()
-    assert not gradient(0.0).any()
-    torch.testing.assert_close(gradient(1.0), 2.0 * gradient(0.5))
-
-
 def test_a_shown_rollout_is_accepted_as_far_as_it_has_gathered_little() -> None:
     def shown(**settings: float) -> tuple[np.ndarray, np.ndarray]:
         agent = built(make_uncertainty, {f"imagination.{name}": value for name, value in settings.items()})
@@ -113,13 +90,3 @@ def test_a_shown_rollout_is_accepted_as_far_as_it_has_gathered_little() -> None:
     assert accepted.tolist() == [True] * 4 + [False] * 4
     _, alone = shown(threshold=max(limit, float(epistemic.max())))
     assert alone.all(), "no step alone is too uncertain"
-
-
-def test_a_weighted_memory_comes_back() -> None:
-    agent, other = (built(make_agent, {"imagination.confidence_scale": 0.3}) for _ in range(2))
-    live(agent, range(6), np.random.default_rng(0))
-    other.restore(agent.state())
-    held, again = (each.imagination.memory.arrays()["weight"] for each in (agent, other))
-    assert len(held) > 0
-    assert 0.0 < held.min() < held.max() < 1.0
-    assert np.array_equal(held, again)

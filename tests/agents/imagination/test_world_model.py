@@ -76,18 +76,6 @@ def test_it_learns_a_small_deterministic_chain_and_members_disagree_beyond_it() 
     assert epistemic[1] > 20.0 * epistemic[0]
 
 
-def test_rewards_are_uncertain_where_none_was_seen() -> None:
-    """Between two known states whose rewards differ the samples disagree; at the known ones they hardly do."""
-    model = trained(200, dropout=0.25, dynamics_hidden=(8,))
-    weights = model.draw_reward_weights(50, draws(4))
-    assert weights is not None
-    known = CODES[:3]
-    elsewhere = 3.0 * CODES[4] - 2.0 * CODES[:3]  # past the rewarded state, where nothing was seen
-    action = torch.zeros(3, dtype=torch.int64)
-    stds = [model.reward_std(known, action, places, weights) for places in (known, elsewhere)]
-    assert stds[1].min() > 2.0 * stds[0].max()
-
-
 def test_a_predicted_change_is_added_to_where_it_began() -> None:
     batch = chain_batch(8, draws(1))
     place, change = (make(predict_change=changes).predict(batch.z, batch.action, None) for changes in (False, True))
@@ -118,18 +106,6 @@ def test_one_backward_pass_trains_three_independent_networks(clip: float | None)
         assert torch.equal(mine.weights[0], ruined.weights[0]) is same
         norm = torch.stack([weight.grad.norm() for weight in ruined.parameters()]).norm()
         assert clip is None or norm <= 1.001 * clip
-
-
-def test_a_shared_trunk_is_one_network_that_both_losses_train() -> None:
-    one, other, third = (make(shared_hidden=(16, 8)) for _ in range(3))
-    assert [network.sizes for network in one.networks[1:]] == [(Z, 16, 8, 2)]
-    batch = chain_batch(16, draws(1))
-    one.update(batch, draws(2))
-    other.update(dataclasses.replace(batch, reward=batch.reward * -7.0), draws(2))
-    third.update(dataclasses.replace(batch, terminated=1.0 - batch.terminated), draws(2))
-    for changed in (other, third):
-        assert torch.equal(one.dynamics.weights[0], changed.dynamics.weights[0])
-        assert not torch.equal(one.networks[1].weights[0], changed.networks[1].weights[0])
 
 
 def test_weight_samples_are_drawn_once_and_shared_by_every_state() -> None:
@@ -164,28 +140,6 @@ def test_reward_std_is_the_spread_of_a_loop_over_weight_samples(changes: dict[st
     expected = torch.stack(rewards).std(dim=0, correction=0)  # [4]
     assert expected.min() > 0.0, "weight samples must disagree"
     torch.testing.assert_close(model.reward_std(*transition, weights), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_dropout_acts_only_in_training_and_weight_sampling() -> None:
-    model = make()
-    batch = chain_batch(16, draws(1))
-    means = [model.predict(batch.z, batch.action, None).means for _ in range(2)]
-    rewards = [model.predict_outcome(batch.z, batch.action, batch.next_z)[0] for _ in range(2)]
-    assert torch.equal(*means)
-    assert torch.equal(*rewards)
-    generator = draws(2)
-    first, second = (losses(model, batch, generator) for _ in range(2))
-    assert (first != second).all()
-
-
-def test_weights_grow_as_far_as_the_max_norm() -> None:
-    def largest(max_norm: float | None) -> list[float]:
-        model = make(max_norm=max_norm, learning_rate=1.0)
-        model.update(chain_batch(16, draws(1)), draws(2))
-        return [max(weight.norm(dim=1).max().item() for weight in network.weights) for network in model.networks]
-
-    assert max(largest(0.5)) <= 0.5 + 1e-6
-    assert min(largest(None)) > 3.0, "beyond the limit that the settings have by default"
 
 
 def test_a_loss_that_is_no_number_stops_the_run() -> None:

@@ -16,7 +16,7 @@ def gradients(network: MemberMLP, output: torch.Tensor, x: torch.Tensor) -> list
     return list(torch.autograd.grad(weighted.square().sum(), [x, *network.parameters()]))
 
 
-@pytest.mark.parametrize("dropout", [0.5, 0.25, 0.125, 0.0625, 0.2, 0.75, 0.9])
+@pytest.mark.parametrize("dropout", [0.5, 0.0625, 0.2, 0.9])
 def test_masks_drop_the_right_share(dropout: float) -> None:
     mask = dropout_mask((200, 1001), dropout, generator())
     share = (mask == 0).double().mean().item()
@@ -55,13 +55,6 @@ def test_members_are_independent_networks() -> None:
         torch.testing.assert_close(together[member], alone)
 
 
-def test_a_network_is_random_with_masks_only() -> None:
-    network = MemberMLP((3, 32, 2), members=1, dropout=0.5, generator=generator())
-    x, masks = torch.ones(1, 4, 3), generator(1)
-    assert torch.equal(network(x), network(x))
-    assert not torch.equal(network(x, network.draw_masks(4, masks)), network(x, network.draw_masks(4, masks)))
-
-
 def test_hidden_layers_in_bfloat16_point_the_same_way() -> None:
     """Eight bits open or close a few of the gates: the gradient turns by less than 6 degrees and keeps its length.
 
@@ -82,19 +75,6 @@ def test_hidden_layers_in_bfloat16_point_the_same_way() -> None:
         assert abs(mine.norm() / other.norm() - 1.0) < 0.01
     with torch.no_grad():
         torch.testing.assert_close(network(x, masks), theirs, msg="predictions are float32")
-
-
-def test_gradients_under_dropout_against_finite_differences() -> None:
-    network = MemberMLP((3, 6, 5, 2), members=2, dropout=0.5, generator=generator()).double()
-    masks = network.draw_masks(4, generator(1))
-    x = torch.randn(2, 4, 3, dtype=torch.float64, generator=generator(2), requires_grad=True)
-    assert torch.autograd.gradcheck(lambda value: network(value, masks), (x,))
-    weight = network.weights[1]
-
-    def loss(value: torch.Tensor) -> torch.Tensor:
-        return torch.func.functional_call(network, {"weights.1": value}, (x.detach(), masks)).square().sum()
-
-    assert torch.autograd.gradcheck(loss, (weight.detach().clone().requires_grad_(),))
 
 
 def test_max_norm_limits_each_unit_and_leaves_the_others() -> None:

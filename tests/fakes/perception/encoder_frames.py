@@ -9,7 +9,7 @@ import numpy as np
 from imagine_bench.agents.encoders.recipes import RECIPES
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame, Outcome, RuleFacts, TaskSpec
+from imagine_bench.interfaces import Frame, RuleFacts, TaskSpec
 
 JITTER = {"clean": 0.1, "mild": 1.0, "strong": 2.0, "photo": 1.0, "photo_held_out": 1.0}
 """Pixels; turns and light scale with it."""
@@ -30,43 +30,28 @@ class ArrowRules:
     states = tuple(itertools.product(range(4), range(4), range(4), range(3)))
     start_states = states
 
-    def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
-        return (Outcome(1.0, macrostate, 0.0, False, False),)
-
-    def is_terminal(self, macrostate: tuple[int, ...]) -> bool:
-        return False
-
-    def optimal_action(self, macrostate: tuple[int, ...]) -> int:
-        return 0
-
-
-def _local(centre_xy: NDArray[np.float32], turn_rad: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
-    """Pixel coordinates in each cube's own frame, v along its arrow. Shapes (N, 64, 64)."""
-    dx = _YX[1] - centre_xy[:, 0, None, None]
-    dy = _YX[0] - centre_xy[:, 1, None, None]
-    sin, cos = np.sin(turn_rad)[:, None, None], np.cos(turn_rad)[:, None, None]
-    return dx * cos + dy * sin, dx * sin - dy * cos
-
 
 def draw(macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
-    """Gray cubes with dark arrows below a bright hand; direction 0 is up, each next one a quarter turn clockwise."""
-    n, jitter = len(macrostates), JITTER[appearance]
-    image = np.full((n, 64, 64), 0.4, dtype=np.float32)
+    """Bright cubes that are dark where they point, and a hand above one; 0 is up, 1 to the right, and so on."""
+    jitter = JITTER[appearance]
+    image = np.full((len(macrostates), 64, 64), 0.4)
+
+    def around(x: float | NDArray[np.float64], y: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """How far pixels lie right of and below a place that jitters. Each of shape (N, 64, 64)."""
+        right, down = rng.uniform(-jitter, jitter, (2, len(image), 1, 1))
+        return _YX[1] - np.reshape(x, (-1, 1, 1)) - right, _YX[0] - y - down
+
     for cube in range(3):
-        centre = np.array([10.5 + 21 * cube, 44.0]) + rng.uniform(-jitter, jitter, (n, 2))
-        turn = macrostates[:, cube] * np.pi / 2 + np.radians(4) * rng.uniform(-jitter, jitter, n)
-        u, v = _local(centre.astype(np.float32), turn.astype(np.float32))
-        image[np.maximum(np.abs(u), np.abs(v)) < 7.0] = 0.9
-        shaft = (np.abs(u) < 1.5) & (v > -5) & (v < 1)
-        head = (v >= 0) & (v < 5) & (np.abs(u) < 4.5 - v * 0.9)
-        image[shaft | head] = 0.1
-    tip = np.stack([10.5 + 21 * macrostates[:, 3], np.full(n, 30.0)], -1) + rng.uniform(-jitter, jitter, (n, 2))
-    u, v = _local(tip.astype(np.float32), np.radians(3) * rng.uniform(-jitter, jitter, n).astype(np.float32))
-    image[(np.abs(u) < 1.5) & (v > 0) & (v < 14)] = 0.75
-    image[(np.abs(u - 1) < 7) & (v >= 13)] = 0.75
-    image *= 1 + 0.08 * rng.uniform(-jitter, jitter, (n, 1, 1)).astype(np.float32)
-    image += rng.normal(0, 0.01, image.shape).astype(np.float32)
-    return np.repeat((image.clip(0, 1) * 255).astype(np.uint8)[..., None], 3, axis=-1)
+        right, down = around(10.5 + 21.0 * cube, 44.0)
+        turn = macrostates[:, cube, None, None] * np.pi / 2 + np.radians(4) * rng.uniform(-jitter, jitter)
+        own = np.maximum(np.abs(right), np.abs(down)) < 7.0
+        image[own] = 0.9
+        image[own & (np.sin(turn) * right - np.cos(turn) * down > 2.0)] = 0.1
+    right, down = around(10.5 + 21.0 * macrostates[:, 3], 20.0)
+    image[(np.abs(right) < 3.0) & (np.abs(down) < 8.0)] = 0.75
+    image *= 1.0 + 0.08 * rng.uniform(-jitter, jitter, (len(image), 1, 1))
+    image += rng.normal(0.0, 0.01, image.shape)
+    return np.repeat((image.clip(0.0, 1.0) * 255.0).astype(np.uint8)[..., None], 3, axis=-1)
 
 
 def arrow_spec() -> TaskSpec:
@@ -83,7 +68,7 @@ def arrow_spec() -> TaskSpec:
         macrostate_values=(directions, directions, directions, ("left", "middle", "right")),
         preprocessing="gray_strips",
         encoder="drawn_arrows",
-        rules=ArrowRules(),
+        rules=ArrowRules(),  # type: ignore[arg-type]
         facts=lambda: RuleFacts(chance_level=0.0, optimum=1.0, optimal_return=0.0, mean_plan_length=1.0),
         render_macrostates=draw,
     )
