@@ -20,7 +20,7 @@ def test_an_old_path_gives_the_objects_of_the_new_one_and_warns_once(old: str) -
         module = importlib.import_module(old)
     new = vars(importlib.import_module(MOVED[old]))
     public = [name for name in new if not name.startswith("__")]
-    assert public and all(getattr(module, name) is new[name] for name in public)
+    assert all(getattr(module, name) is new[name] for name in public)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert importlib.import_module(old) is module

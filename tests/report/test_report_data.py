@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from imagine_bench.report.bench import cost, success
 from imagine_bench.report.data import DIFFERENCE, SCORE, agent_title, collect, frames_before
 from imagine_bench.report.tables import DASH, count, seconds
 from imagine_bench.store import encoders
-from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
+from imagine_bench.store.results import BenchResult, Checkpoint, KeptEpisodes, RunResult
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +128,81 @@ def test_a_seed_solves_the_task_from_where_every_test_reaches_its_threshold(resu
         vars(data)["spec"] = dataclasses.replace(data.spec, success_threshold=threshold)
         (seeds,) = (table for table in success(data).tables if table.name == "seeds")
         assert [row[-1] for row in seeds.rows if row[0] == agent_title(agent)] == [reached] * 3
+
+
+# Start by start ----------------------------------------------------------------------------------------------------
+
+
+def kept(result: BenchResult) -> BenchResult:
+    """The result with test episodes that say which were solved, at random, and how."""
+    spec, rng = registry.task(result.protocol.task), np.random.default_rng(5)
+    starts = rng.choice(np.array(spec.rules.start_states), result.protocol.evaluation_episodes)
+
+    def told(_: RunResult, row: Checkpoint) -> Checkpoint:
+        solved = rng.permutation(np.arange(row.test_episodes) < row.successes)
+        zeros, lengths = np.zeros(row.test_episodes, dtype=np.int64), rng.integers(3, 11, row.test_episodes)
+        episodes = KeptEpisodes(
+            starts=starts, lengths=lengths, actions=np.zeros(lengths.sum(), dtype=np.int64), returns=zeros * 0.0,
+            success=solved, faults=zeros, fingerprints=zeros,
+        )  # fmt: skip
+        return dataclasses.replace(row, solved="".join("01"[int(each)] for each in solved), kept=episodes)
+
+    return rewritten(result, told)
+
+
+def shortest(start: tuple[int, ...]) -> int:
+    """The length of a shortest plan in the arrow puzzle, by trying out all plans of one length after the other."""
+    rules = registry.task("arrow_puzzle").rules
+    reached = [start]
+    for length in itertools.count(1):
+        outcomes = [rules.outcomes(state, action)[0] for state in reached for action in range(rules.n_actions)]
+        if any(outcome.success for outcome in outcomes):
+            return length
+        reached = [outcome.macrostate for outcome in outcomes if not outcome.terminated]
+    raise AssertionError("no plan")
+
+
+def solved_by(result: BenchResult, agent: str, place: int) -> str:
+    """Which tests all seeds of an agent solved at a budget, one seed behind the other."""
+    return "".join(str(run.checkpoints[place].solved) for run in result.of(agent))
+
+
+@pytest.mark.parametrize("seeds", [(0,), (0, 1, 7)])
+def test_the_same_starts_are_compared(seeds: tuple[int, ...], tmp_path: Path) -> None:
+    protocol = Protocol(task="arrow_puzzle", preset="smoke", seeds=seeds, budgets=(10, 20), evaluation_episodes=60)
+    plain = bench_result(tmp_path, protocol=protocol)
+    result = kept(plain)
+    data = collect(result)
+    compared = [record for record in data.records if "gain" in record]
+    assert len(compared) >= 4
+    for record in compared:
+        place = protocol.budgets.index(record["episodes"])
+        pairs = Counter(zip(*(solved_by(result, name, place) for name in (record["agent"], "dqn")), strict=True))
+        assert (record["alone"], record["dqn_alone"]) == (pairs["1", "0"], pairs["0", "1"])
+        untied = record["alone"] + record["dqn_alone"]
+        tail = sum(math.comb(untied, k) for k in range(min(record["alone"], record["dqn_alone"]) + 1))
+        assert record["p_mcnemar"] == pytest.approx(min(1.0, tail * 2 / 2**untied))
+        ours, theirs = (result.success_rates(name)[:, place] for name in (record["agent"], "dqn"))
+        wins = np.mean([0.5 * (a == b) + (a > b) for a in ours for b in theirs])
+        assert record["probability_of_improvement"] == wins
+    ordered = sorted(compared, key=lambda record: record["p_mcnemar"])
+    steps = [(len(ordered) - place) * record["p_mcnemar"] for place, record in enumerate(ordered)]
+    assert [record["p_mcnemar_holm"] for record in ordered] == pytest.approx(
+        [min(1.0, max(steps[: place + 1])) for place in range(len(steps))]
+    )
+    fewest = {tuple(start): shortest(tuple(start)) for start in plain.protocol.spec(testing=True).rules.start_states}
+    for record in data.records:
+        rows = [run.checkpoints[protocol.budgets.index(record["episodes"])].kept for run in result.of(record["agent"])]
+        beyond = []
+        for row in rows:
+            beyond += [row.lengths[test] - fewest[tuple(row.starts[test])] for test in np.flatnonzero(row.success)]
+        assert record["excess_macro_actions"] == pytest.approx(np.mean(beyond))
+
+
+@pytest.mark.parametrize("unknown", ["dqn", "imagination"])
+def test_an_agent_whose_tests_are_not_known_leaves_nothing_to_pair(result: BenchResult, unknown: str) -> None:
+    known = kept(result)
+    runs = [run if run.agent == unknown else each for run, each in zip(result.runs, known.runs, strict=True)]
+    data = collect(dataclasses.replace(known, runs=tuple(runs)))
+    assert not any("alone" in record for record in data.of("imagination"))
+    assert all("alone" in record for record in data.of("imagination_uncertainty")) == (unknown != "dqn")
