@@ -49,7 +49,6 @@ FOLDERS = (
     "imagine_bench/sweep",
     "imagine_bench/recording",
     "imagine_bench/report",
-    "imagine_bench/report/regression",
     "imagine_bench/adapters",
     "imagine_bench/testing",
     "imagine_bench/tools",

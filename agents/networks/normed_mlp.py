@@ -115,14 +115,15 @@ class NormedMLP(nn.Module):
             self.get_buffer(f"variance_{layer}").lerp_(variance, share)
 
     @torch.no_grad()
-    def folded(self) -> MemberMLP:
-        """The same networks with the running statistics folded into the weights: ``W (x - m) / s + b``."""
+    def folded(self, members: slice = slice(None)) -> MemberMLP:
+        """The same networks, or some, with the running statistics folded into the weights: ``W (x - m) / s + b``."""
         blank = torch.Generator(device=self.weights[0].device)
-        network = MemberMLP(self.sizes, members=self.members, dropout=self.dropout, generator=blank)
+        count = len(self.weights[0][members])
+        network = MemberMLP(self.sizes, members=count, dropout=self.dropout, generator=blank)
         for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             mean = self.get_buffer(f"mean_{layer}")
             variance = self.get_buffer(f"variance_{layer}")
             scaled = weight * (variance + EPSILON).rsqrt().mT  # [E, out, in]
-            network.weights[layer].copy_(scaled.mT)
-            network.biases[layer].copy_((bias - scaled @ mean).mT)
+            network.weights[layer].copy_(scaled.mT[members])
+            network.biases[layer].copy_((bias - scaled @ mean).mT[members])
         return network

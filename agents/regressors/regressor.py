@@ -9,147 +9,173 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentState, Floats
-from imagine_bench.interfaces.regression import Mixtures, Prediction, RegressionData, RegressorContext
+from imagine_bench.errors import DivergedError
+from imagine_bench.interfaces import Floats
+from imagine_bench.interfaces.regression import Mixtures, Prediction, RegressorContext
 
 from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn
 from ..imagination.mixture import Mixture
 from ..imagination.uncertainty import decompose, nll, sampled_component_variance
-from ..networks.mlp import MemberMLP, dropout_mask
-from ..networks.precision import settle
+from ..networks.adam import Adam
+from ..networks.mlp import clip_member_gradients, dropout_mask
+from ..networks.normed_mlp import NormedMLP
+from ..networks.precision import hidden_dtype, settle
 from ..networks.weight_samples import sample_outputs
-from ..snapshot import (
-    below,
-    generator_array,
-    jsonable,
-    load_generator,
-    load_training,
-    prefixed,
-    require_fit,
-    training_arrays,
-)  # fmt: skip
-from .bayesian_mdn import BayesianMDN, members
 from .settings import HYPERPARAMETERS, RegressorSettings
-from .stationarity import jensen_shannon
 
 _ROWS = 256
 """Rows predicted at a time: T mixtures of each are in memory."""
 _DRAWN = 16
 """Values of equation 4.8 drawn for each row."""
+_CHUNK = 2_000_000
+"""Component densities computed at a time."""
 
 
 class MixtureRegressor:
-    """E Bayesian mixture density networks.
+    """E Bayesian mixture density networks (Bishop 1994; thesis 4.4), or E ensembles of M of them.
 
-    Raises:
-        InvalidValueError: Data of unequal sizes, of wrong shapes, or not finite.
+    Every member has its generators, so that it is the same, up to rounding, whether it trains alone or among others.
     """
 
     def __init__(self, context: RegressorContext, settings: RegressorSettings) -> None:
-        _require_data(context)
         settings = dataclasses.replace(settings, precision=settle(settings.precision, context.device))
         self.settings = settings
-        self.networks = len(context.datasets)
         self._device = prepare_torch(context.device)
-        inputs = np.stack([data.inputs for data in context.datasets])
         targets = np.stack([data.targets for data in context.datasets])
+        inputs = self._tensor(np.stack([data.inputs for data in context.datasets]))
+        self._outputs = targets.shape[-1]
+        self._x = inputs.repeat_interleave(settings.members, dim=0)  # [E M, N, X]
         self._shift = self._tensor(targets.mean(axis=1))  # [E, D]
         self._scale = self._tensor(np.maximum(targets.std(axis=1), 1e-6))
-        self._x = self._tensor(inputs)
-        self._y = (self._tensor(targets) - self._shift[:, None]) / self._scale[:, None]
+        standardised = (self._tensor(targets) - self._shift[:, None]) / self._scale[:, None]
+        self._y = standardised.repeat_interleave(settings.members, dim=0)
         nodes = [seeds.child("member", m) for seeds in context.seeds for m in range(settings.members)]
-        self._generators = {  # of weights and dropout masks, of the order of rows
-            kind: [self._generator(node.child(kind).integer()) for node in nodes] for kind in ("network", "batches")
-        }
-        self._samples = [seeds.child("weight_samples") for seeds in context.seeds]
-        self._model = BayesianMDN(inputs.shape[-1], targets.shape[-1], settings, self._generators["network"])
-        self.epoch = 0
-        self.epochs = settings.epochs
-        self._losses: list[float] = []
-        self._folded: MemberMLP | None = None
+        self._orders = [self._generator(node.child("batches").integer()) for node in nodes]  # of the rows
+        self._draws = [self._generator(node.child("network").integer()) for node in nodes]  # of weights, then masks
+        self._samples = [seeds.child("weight_samples").integer() for seeds in context.seeds]
+        self._trained: list[Callable[[Tensor], Mixture]] = []
+        sizes = (inputs.shape[-1], *settings.hidden, mdn.output_size(settings.components, self._outputs))
+        precision = hidden_dtype(settings.precision, context.device)
+        self.network = NormedMLP(sizes, generators=self._draws, dropout=settings.dropout, precision=precision)
+        hidden = [*self.network.weights[:-1], *self.network.biases[:-1]]
+        output = [self.network.weights[-1], self.network.biases[-1]]
+        self.optimiser = Adam([(hidden, settings.weight_decay), (output, 0.0)], settings.learning_rate)
 
-    def train(self, epochs: int) -> None:
-        """Train for so many more epochs: in each, every member sees each of its rows once, in an order of its own."""
-        self._folded = None
+    def train(self, on_epoch: Callable[[int, int], None]) -> dict[str, float]:
+        """Train to the end: in each epoch every member sees each of its rows once, in an order of its own.
+
+        Returns the mean negative log-likelihood of the standardised targets.
+        """
+        settings = self.settings
         rows = self._x.shape[1]
-        batches = 1 if self.settings.batch_size is None else -(-rows // self.settings.batch_size)
-        owner = torch.arange(self.networks, device=self._device).repeat_interleave(self.settings.members)[:, None]
-        for _ in range(epochs):
-            self._model.optimiser.learning_rate = self._rate()
-            orders = torch.stack(
-                [torch.randperm(rows, generator=g, device=self._device) for g in self._generators["batches"]]
-            )
+        batches = 1 if settings.batch_size is None else -(-rows // settings.batch_size)
+        member = torch.arange(len(self._x), device=self._device)[:, None]
+        losses = []
+        for epoch in range(settings.epochs):
+            falling = 0.5 * (1.0 + math.cos(math.pi * epoch / settings.epochs))
+            share = settings.final_rate + (1.0 - settings.final_rate) * falling
+            self.optimiser.learning_rate = settings.learning_rate * share
+            orders = torch.stack([torch.randperm(rows, generator=g, device=self._device) for g in self._orders])
             chosen = orders.tensor_split(batches, dim=1)
-            losses = [self._model.update(self._x[owner, batch], self._y[owner, batch]) for batch in chosen]
-            self._losses.append(float(torch.stack(losses).mean()))
-            self.epoch += 1
+            updates = [self.update(self._x[member, batch], self._y[member, batch]) for batch in chosen]
+            losses.append(float(torch.stack(updates).mean()))
+            on_epoch(epoch + 1, settings.epochs)
+        self._trained = [self._weight_samples(network) for network in range(len(self._scale))]
+        return {"loss/likelihood": float(np.mean(losses))}
 
-    def _rate(self) -> float:
-        """The learning rate of the coming epoch."""
-        final = self.settings.final_rate
-        gone = min(1.0, self.epoch / self.epochs)
-        return self.settings.learning_rate * (final + (1.0 - final) * 0.5 * (1.0 + math.cos(math.pi * gone)))
+    def update(self, x: Tensor, y: Tensor) -> Tensor:
+        """One step of Adam on the mean negative log-likelihood of each member's own batch (equation 4.28).
 
-    def diagnostics(self) -> dict[str, float]:
-        """Mean negative log-likelihood of the standardised targets while training, since the last call."""
-        losses = self._losses
-        self._losses = []
-        return {"loss/likelihood": float(np.mean(losses))} if losses else {}
+        From ``x`` (E M, N, X) and ``y`` (E M, N, D) to the losses (E M,) before the step, in nats.
+
+        Raises:
+            DivergedError: A loss or gradient is NaN or infinite; weights and statistics are left as they were.
+        """
+        masks = self.network.draw_masks(x.shape[1], self._draws)
+        outputs = self.network(x.mT.contiguous(), masks).mT  # [E M, N, out]
+        losses = -mdn.log_likelihood(self._mixture(outputs), y).mean(dim=1)
+        self.optimiser.zero_grad()
+        losses.sum().backward()
+        norms = clip_member_gradients(self.network, self.settings.gradient_clip)
+        if not bool((losses + norms).isfinite().all()):
+            raise DivergedError(
+                "A likelihood is not finite, or its gradient. Are the data? If so, lower learning_rate or raise "
+                f"sigma_floor. Losses of the networks: {losses.tolist()}; norms of their gradients: {norms.tolist()}."
+            )
+        self.optimiser.step()
+        self.network.update_running_stats()
+        return losses.detach()
+
+    def _mixture(self, outputs: Tensor) -> Mixture:
+        """Network outputs (..., out) as mixtures of standardised targets."""
+        settings = self.settings
+        floor = math.log(settings.sigma_floor)
+        ceiling = math.log(settings.sigma_ceiling)
+        return mdn.from_outputs(outputs, settings.components, self._outputs, floor, ceiling)
 
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
         """Predict, with uncertainties; see :class:`imagine_bench.interfaces.regression.Regressor`."""
-        self._require_inputs(inputs)
-        own, other = (self._generator(int(rng.integers(2**62))) for _ in range(2))
-        networks = []
-        for e in range(self.networks):
-            parts = [self._predict_rows(e, rows, own, other) for rows in self._tensor(inputs[e]).split(_ROWS)]
-            networks.append({name: torch.cat([part[name] for part in parts]) for name in parts[0]})
-        found = _stacked(networks)
-        mixture = {name: found.pop(name) for name in ("weights", "means", "sigmas")}
-        return Prediction(predictive=Mixtures(**mixture), **found)
+        own = self._generator(int(rng.integers(2**62)))
+        other = self._generator(int(rng.integers(2**62)))
+        return Prediction(**self._by_rows(inputs, lambda samples: self._measure(samples, own, other)))
 
     def pooled(self, inputs: Floats) -> Mixtures:
         """All weight samples' mixtures side by side, equally likely."""
-        self._require_inputs(inputs)
-        networks = [self._weight_samples(e, self._tensor(inputs[e])) for e in range(self.networks)]
-        return Mixtures(**_stacked([_parts(mdn.average(samples, len(samples.means))) for samples in networks]))
+        return Mixtures(**self._by_rows(inputs, lambda samples: _parts(mdn.average(samples, len(samples.means)))))
 
-    def state(self) -> AgentState:
-        """Weights, moments, running statistics, generators, epochs."""
-        arrays = prefixed("network", training_arrays(self._model.network, self._model.optimiser))
-        arrays |= {f"statistics/{name}": b.cpu().numpy().copy() for name, b in self._model.network.named_buffers()}
-        for kind, generators in self._generators.items():
-            arrays[f"generators/{kind}"] = np.stack([generator_array(generator) for generator in generators])
-        values = {
-            "settings": dataclasses.asdict(self.settings),
-            "epoch": self.epoch,
-            "losses": self._losses,
-            "batches": self._model.network.batches,
+    def _by_rows(self, inputs: Floats, measure: Callable[[Mixture], dict[str, Tensor]]) -> dict[str, Floats]:
+        """Measures of the weight samples of each network at its inputs, a few rows at a time. Shapes (E, N, ...)."""
+        networks = []
+        for mixtures, x in zip(self._trained, self._tensor(inputs), strict=True):
+            parts = [measure(mixtures(rows)) for rows in x.split(_ROWS)]
+            networks.append({name: torch.cat([part[name] for part in parts]) for name in parts[0]})
+        return {name: torch.stack([n[name] for n in networks]).double().cpu().numpy() for name in networks[0]}
+
+    def _weight_samples(self, network: int) -> Callable[[Tensor], Mixture]:
+        """Inputs (N, X) to mixtures (T, N) in the units of the targets; the weight samples are always the same."""
+        settings = self.settings
+        first = network * settings.members
+        folded = self.network.folded(slice(first, first + settings.members))
+        masks = None
+        if settings.dropout > 0.0:
+            generator = self._generator(self._samples[network])
+            shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
+            masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
+        shift = self._shift[network]
+        scale = self._scale[network]
+
+        def mixtures(x: Tensor) -> Mixture:
+            samples = self._mixture(sample_outputs(folded, x, masks))
+            log_sigmas = samples.log_sigmas + scale.log()
+            return Mixture(samples.log_weights, samples.means * scale + shift, log_sigmas)
+
+        return mixtures
+
+    def _measure(self, samples: Mixture, generator: torch.Generator, other: torch.Generator) -> dict[str, Tensor]:
+        """Fields of a prediction of one network for a few rows."""
+        pooled = mdn.average(samples, len(samples.means))
+        uncertainty = decompose(samples)
+        predictive = mdn.average(samples, self.settings.members)
+        prediction = mdn.sample(predictive, 1.0, generator)
+        return {
+            **_parts(predictive),
+            "prediction": prediction,
+            "sampled_variance": sampled_component_variance(samples, predictive, prediction, self.settings.members),
+            "nll": nll(samples, prediction),
+            "mean": mdn.mean(samples).mean(dim=0),
+            "epistemic": uncertainty.epistemic,
+            "aleatoric": uncertainty.aleatoric,
+            "modal": uncertainty.modal,
+            "stationarity": jensen_shannon(samples, self.settings.divergence_draws, generator),
+            "drawn": torch.stack([mdn.sample(pooled, 1.0, other) for _ in range(_DRAWN)], dim=1),
         }
-        return AgentState(arrays=arrays, values=jsonable(values))
-
-    def restore(self, state: AgentState) -> None:
-        """Continue from ``state``, bit for bit; ArtefactError where it does not fit."""
-        require_fit(state, self.state(), equal=("settings",))
-        arrays = state.arrays
-        load_training(self._model.network, self._model.optimiser, below("network", arrays))
-        for name, buffer in self._model.network.named_buffers():
-            buffer.copy_(torch.tensor(arrays[f"statistics/{name}"]))
-        for kind, generators in self._generators.items():
-            for generator, array in zip(generators, arrays[f"generators/{kind}"], strict=True):
-                load_generator(generator, array)
-        self.epoch = state.values["epoch"]
-        self._model.network.batches = state.values["batches"]
-        self._losses = list(state.values["losses"])
-        self._folded = None
 
     def _tensor(self, values: Floats) -> Tensor:
         return torch.tensor(values, dtype=torch.float32, device=self._device)
@@ -157,85 +183,41 @@ class MixtureRegressor:
     def _generator(self, seed: int) -> torch.Generator:
         return torch.Generator(device=self._device).manual_seed(seed)
 
-    def _weight_samples(self, network: int, x: Tensor) -> Mixture:
-        """Mixtures (T, N) in the units of the targets; a network's weight samples are always the same ones."""
-        if self._folded is None:
-            self._folded = self._model.network.folded()
-        settings = self.settings
-        part = members(self._folded, network * settings.members, settings.members)
-        masks = None
-        if settings.dropout > 0.0:
-            generator = self._generator(self._samples[network].integer())
-            shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
-            masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
-        samples = self._model.mixture(sample_outputs(part, x, masks))
-        shift = self._shift[network]
-        scale = self._scale[network]
-        means = samples.means * scale + shift
-        return dataclasses.replace(samples, means=means, log_sigmas=samples.log_sigmas + scale.log())
-
-    def _predict_rows(
-        self, network: int, x: Tensor, generator: torch.Generator, other: torch.Generator
-    ) -> dict[str, Tensor]:
-        """Fields of a prediction of one network for a few rows, those of its mixture by themselves."""
-        samples = self._weight_samples(network, x)
-        pooled = mdn.average(samples, len(samples.means))
-        parts = decompose(samples)
-        predictive = mdn.average(samples, self.settings.members)
-        prediction = mdn.sample(predictive, 1.0, generator)
-        return {
-            "prediction": prediction,
-            "sampled_variance": sampled_component_variance(samples, predictive, prediction, self.settings.members),
-            "nll": nll(samples, prediction),
-            "mean": mdn.mean(samples).mean(dim=0),
-            "epistemic": parts.epistemic,
-            "aleatoric": parts.aleatoric,
-            "modal": parts.modal,
-            "stationarity": jensen_shannon(samples, self.settings.divergence_draws, generator),
-            "drawn": torch.stack([mdn.sample(pooled, 1.0, other) for _ in range(_DRAWN)], dim=1),
-            **_parts(predictive),
-        }
-
-    def _require_inputs(self, inputs: Floats) -> None:
-        wanted = (self.networks, "N", self._x.shape[-1])
-        shape = np.shape(inputs)
-        fits = len(shape) == 3 and shape[::2] == wanted[::2] and shape[1] > 0
-        if not (fits and np.isfinite(inputs).all()):
-            raise InvalidValueError(f"Inputs must be finite numbers of shape {wanted}, N at least 1, not {shape}.")
-
-
-def _require_data(context: RegressorContext) -> None:
-    datasets = context.datasets
-    if not datasets or len(datasets) != len(context.seeds):
-        raise InvalidValueError(
-            f"A regressor needs at least one dataset and a seed for each, not {len(datasets)} and {len(context.seeds)}."
-        )
-    first = _shapes(datasets[0])
-    if [len(shape) for shape in first] != [2, 2] or first[0][0] != first[1][0] or first[0][0] < 2:
-        raise InvalidValueError(f"Dataset 0 must have inputs (N, X) and targets (N, D), N at least 2, not {first}.")
-    for index, data in enumerate(datasets):
-        if _shapes(data) != first:
-            raise InvalidValueError(
-                f"Dataset {index} has inputs and targets of shapes {_shapes(data)}; all must have those of the first, "
-                f"{first}."
-            )
-        if not (np.isfinite(data.inputs).all() and np.isfinite(data.targets).all()):
-            raise InvalidValueError(f"Dataset {index} holds values that are not finite.")
-
-
-def _shapes(data: RegressionData) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    return np.shape(data.inputs), np.shape(data.targets)
-
 
 def _parts(mixture: Mixture) -> dict[str, Tensor]:
     """The fields of :class:`Mixtures`."""
     return {"weights": mixture.log_weights.exp(), "means": mixture.means, "sigmas": mixture.log_sigmas.exp()}
 
 
-def _stacked(networks: Sequence[dict[str, Tensor]]) -> dict[str, Floats]:
-    """Tensors by name as arrays whose first axis is the network."""
-    names = networks[0]
-    return {name: torch.stack([each[name] for each in networks]).double().cpu().numpy() for name in names}
+@torch.no_grad()
+def jensen_shannon(samples: Mixture, draws: int, generator: torch.Generator) -> Tensor:
+    """How much the predictive distribution itself changes with the weights: an epistemic score for any mixture.
+
+    The thesis (4.3) leaves as future work a measure of the variability of the distributions {p(y | x; w_t)}. Here it
+    is their Jensen-Shannon divergence with equal weights (Lin 1991, equation 5.1), which is the mutual information of
+    prediction and weights (Depeweg et al. 2018, equation 4):
+
+        J = (1/T) sum_t KL(p_t || p_mean) = H[p_mean] - (1/T) sum_t H[p_t]   in nats, 0 <= J <= log T.
+
+    Unlike the variance of the means it sees samples that put the same mean together from other branches, it does not
+    depend on the unit of y, and it treats all dimensions of y together. Estimated by Monte Carlo: every mixture is
+    drawn from equally often (stratified over t), so that only the value within it is chance: the standard error falls
+    as 1 / sqrt(T S) with ``draws`` S from each. Mixtures (T, N) give shape (N,), cut to [0, log T].
+    """
+    count, _, components, size = samples.means.shape
+    piece = max(1, _CHUNK // (draws * count * count * components * size))
+    parts = (samples.log_weights, samples.means, samples.log_sigmas)
+    found = []
+    for rows in zip(*(part.split(piece, dim=1) for part in parts), strict=True):
+        some = Mixture(*rows)
+        flat = some.map(lambda part: part.flatten(0, 1).repeat_interleave(draws, dim=0))
+        values = mdn.sample(flat, 1.0, generator).view(count, -1, draws, size).transpose(1, 2)  # [T, S, N, D]
+        every = some.map(lambda part: part[:, None, None])
+        log_p = mdn.log_likelihood(every, values.unsqueeze(0))  # every value under every mixture: [T', T, S, N]
+        log_mean = torch.logsumexp(log_p, dim=0) - math.log(count)
+        own = log_p.diagonal(dim1=0, dim2=1).movedim(-1, 0)
+        found.append((own - log_mean).mean(dim=(0, 1)).clamp(0.0, math.log(count)))
+    return torch.cat(found)
 
 
 def make_mc_dropout(context: RegressorContext) -> MixtureRegressor:

@@ -19,8 +19,8 @@ _BATCH_SIZE = between(8, 1_000_000, "layers are standardised over a batch")
 
 
 @dataclass(frozen=True, kw_only=True)
-class MDNSettings:
-    """A Bayesian mixture density network.
+class RegressorSettings:
+    """A regressor: Bayesian mixture density networks, and how long they train.
 
     Attributes:
         hidden: Units a hidden layer.
@@ -32,9 +32,15 @@ class MDNSettings:
         gradient_clip: Largest gradient norm of each network.
         sigma_floor, sigma_ceiling: Range of a component's standard deviation, in units of the network's outputs.
         precision: Products between hidden layers while training.
+        final_rate: Last epoch's learning rate as a share of the first's, to which it falls as a cosine (Loshchilov &
+            Hutter 2017). 1 keeps it, as the thesis does.
+        batch_size: Rows an update, at most; None for all, as the thesis names none.
+        members: Networks of an ensemble, M; 1 is a single network with dropout.
+        weight_samples: Dropout masks, T; of an ensemble, each member is one sample.
+        divergence_draws: Values sampled from each weight sample's mixture to estimate their divergence.
 
     Raises:
-        InvalidValueError: Dropout without two hidden layers.
+        InvalidValueError: Dropout without two hidden layers, or all weight samples would be the same.
     """
 
     hidden: tuple[int, ...] = setting((256, 256, 256), kinds.LAYERS)
@@ -46,31 +52,6 @@ class MDNSettings:
     sigma_floor: float = setting(1e-3, between(1e-9, 1.0))
     sigma_ceiling: float = setting(10.0, between(1.0, 1e9))
     precision: str = setting("float32", kinds.PRECISIONS)
-
-    def __post_init__(self) -> None:
-        if self.dropout > 0.0 and len(self.hidden) < 2:
-            raise InvalidValueError(
-                f"Setting hidden is {self.hidden}; dropout acts between hidden layers, so it needs at least two of "
-                "them. Add one."
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
-class RegressorSettings(MDNSettings):
-    """A regressor: its networks and how long they train.
-
-    Attributes:
-        final_rate: What the learning rate falls to after the last epoch, as a cosine, as a share of the first's
-            (Loshchilov & Hutter 2017). 1 keeps it, as the thesis does.
-        batch_size: Rows an update, at most; None for all, as the thesis names none.
-        members: Networks of an ensemble, M; 1 is a single network with dropout.
-        weight_samples: Dropout masks, T; of an ensemble, each member is one sample.
-        divergence_draws: Values sampled from each weight sample's mixture to estimate their divergence.
-
-    Raises:
-        InvalidValueError: All weight samples would be the same.
-    """
-
     epochs: int = setting(3000, kinds.ROWS)
     final_rate: float = setting(1.0, PROBABILITY)
     batch_size: int | None = setting(None, _BATCH_SIZE)
@@ -79,7 +60,11 @@ class RegressorSettings(MDNSettings):
     divergence_draws: int = setting(1, COUNT)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        if self.dropout > 0.0 and len(self.hidden) < 2:
+            raise InvalidValueError(
+                f"Setting hidden is {self.hidden}; dropout acts between hidden layers, so it needs at least two of "
+                "them. Add one."
+            )
         if self.members == 1 and self.dropout == 0.0:
             raise InvalidValueError(
                 "Settings members is 1 and dropout is 0: all weight samples would be the same, and their spread 0. "
@@ -87,50 +72,34 @@ class RegressorSettings(MDNSettings):
             )
 
 
-_BATCH = Override(1000, "where there are more data: few epochs, more steps (all at once was not tried here)")
+_SMALLEST = "shows that every part works, within seconds"
 _FALLING = Override(0.01, "a rate that stays leaves the mixtures blunt; the thesis names no schedule")
 _FORMAT = Override("auto", "CPU time; see docs/explanation/uncertainty_method.md for what it changes")
-
-_SMALLEST = "shows that every part works, within seconds"
 _SHORT = {
-    "batch_size": _BATCH, "learning_rate": Override(3e-3, "fewer epochs want larger steps"), "precision": _FORMAT,
-}  # fmt: skip
+    "batch_size": Override(1000, "where there are more data: few epochs, more steps (all at once was not tried here)"),
+    "learning_rate": Override(3e-3, "fewer epochs want larger steps"),
+    "precision": _FORMAT,
+}
 _SETS: dict[str, dict[str, Override]] = {
-    "minimal": {
-        "epochs": Override(20, _SMALLEST),
-        "weight_samples": Override(10, _SMALLEST),
-        **_SHORT,
-    },
+    "minimal": {"epochs": Override(20, _SMALLEST), "weight_samples": Override(10, _SMALLEST), **_SHORT},
     "fast": {"epochs": Override(600, "CPU time"), **_SHORT, "final_rate": _FALLING},
     "published": {"final_rate": _FALLING, "precision": _FORMAT},
 }
 """What each set changes of the thesis' values for one network with dropout."""
-
-_ENSEMBLE: dict[str, Override] = {
+_ENSEMBLE = {
     "members": Override(5, "as many as Lakshminarayanan et al. (2017) recommend"),
     "dropout": Override(0.0, "in an ensemble the members are the weight samples"),
     "batch_size": Override(250, "so few epochs want more steps in each"),
     "divergence_draws": Override(10, "five members then give as many values as 50 dropout samples"),
 }
 """What a deep ensemble changes of every set, beside its epochs."""
-
-
-def _ensemble_epochs(epochs: int) -> int:
-    """Epochs of each of five members where one network trains for ``epochs``.
-
-    A tenth of them, so that the ensemble costs half: it must not win by arithmetic. But at least 120, below which
-    members have hardly learned, where that costs no more than the one network.
-    """
-    return min(max(1, epochs // 5), max(120, epochs // 10))
-
-
-def _of_ensemble(changes: Mapping[str, Override]) -> dict[str, Override]:
-    of_one = kinds.replaced(RegressorSettings(), {name: change.value for name, change in changes.items()})
-    fewer = Override(_ensemble_epochs(of_one.epochs), "five members together must not cost more than one network")
-    return {**changes, **_ENSEMBLE, "epochs": fewer}
-
-
-_ENSEMBLE_SETS = {name: _of_ensemble(changes) for name, changes in _SETS.items()}
+_EPOCHS = {"minimal": 4, "fast": 120, "published": 300}
+"""Epochs of each of five members in every set: a tenth of the one network's, so that the ensemble costs half and does
+not win by arithmetic. But at least 120, below which members have hardly learned, where that costs no more."""
+_FEWER = "five members together must not cost more than one network"
+_ENSEMBLE_SETS = {
+    name: {**_SETS[name], **_ENSEMBLE, "epochs": Override(epochs, _FEWER)} for name, epochs in _EPOCHS.items()
+}
 HYPERPARAMETERS = Hyperparameters({
     "mc_dropout": ConfigGroup(RegressorSettings(), _SETS, unused=frozenset({"members"})),
     "ensemble": ConfigGroup(RegressorSettings(), _ENSEMBLE_SETS, unused=frozenset({"dropout"})),

@@ -101,8 +101,8 @@ class BenchObserver(RunObserver):
 OBSERVERS = (f"{__name__}:{BenchObserver.__name__}",)
 """What looks at every run of a control task, each as ``"module:attr"``."""
 RECORDERS = {
-    "toy_regression": "imagine_bench.recording.toy_regression:record",
-    "robot_ik": "imagine_bench.recording.robot_ik:record",
+    "toy_regression": "imagine_bench.recording.regression:record_toy",
+    "robot_ik": "imagine_bench.recording.regression:record_robot",
 }
 """Functions that record the regression tasks of this suite; another package's task names its own."""
 

@@ -14,7 +14,6 @@ from typing import Protocol
 import numpy as np
 
 from imagine_bench.arrays import Arrays, Floats
-from imagine_bench.interfaces.agent import AgentState
 from imagine_bench.interfaces.scene import Motion, Shape3D
 from imagine_bench.seeding import SeedTree
 from imagine_bench.values import Setting
@@ -34,85 +33,73 @@ Dataset = RegressionData
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mixtures:
-    """Diagonal Gaussian mixtures: weights (..., K) of sum 1, means and standard deviations above 0 (..., K, D)."""
+    """Diagonal Gaussian mixtures with any leading axes."""
 
-    weights: Floats
-    means: Floats
-    sigmas: Floats
-
-    def map(self, change: Callable[[Floats], Floats]) -> Mixtures:
-        """The mixtures with each array changed alike, in their leading axes."""
-        return Mixtures(weights=change(self.weights), means=change(self.means), sigmas=change(self.sigmas))
+    weights: Floats  #: coefficients, of sum 1. Shape (..., K).
+    means: Floats  #: shape (..., K, D)
+    sigmas: Floats  #: standard deviations, above 0. Shape (..., K, D).
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Prediction:
-    """What E networks predict, and how uncertain they are."""
+class Prediction(Mixtures):
+    """What E networks predict, and how uncertain they are: the mixtures that values are sampled from, and more."""
 
     prediction: Floats  #: one value sampled from the predictive mixture. Shape (E, N, D).
     mean: Floats  #: mean over the weight samples. Shape (E, N, D).
     epistemic: Floats  #: variance of the mean over weight samples (equation 4.25). Shape (E, N, D).
     aleatoric: Floats  #: mean variance of the components (equation 4.26). Shape (E, N, D).
     modal: Floats  #: mean spread of the components (equation 4.27). Shape (E, N, D).
-    stationarity: Floats  #: jensen-Shannon divergence of the weight samples' distributions, in nats. Shape (E, N).
+    stationarity: Floats  #: Jensen-Shannon divergence of the weight samples' distributions, in nats. Shape (E, N).
     #: Variance of the component that the prediction was sampled from, noise and weights together, summed over the
     #: outputs. Shape (E, N).
     sampled_variance: Floats
     nll: Floats  #: negative log-likelihood of the prediction under all weight samples together, in nats. Shape (E, N).
-    predictive: Mixtures  #: the mixture that predictions are sampled from. Leading axes (E, N).
-    #: values drawn as in equation 4.8, each from the mixture of one weight sample. Shape (E, N, S, D).
-    drawn: Floats
+    drawn: Floats  #: values drawn as in equation 4.8, each from the mixture of one weight sample. Shape (E, N, S, D).
+
+    @property
+    def scores(self) -> Arrays:
+        """One number a row, (E, N), by the names in :data:`SCORES`: the higher, the less sure.
+
+        Variances are summed over the outputs.
+        """
+        epistemic = self.epistemic
+        aleatoric = self.aleatoric
+        modal = self.modal
+        variances = (epistemic, aleatoric, modal, epistemic + aleatoric, epistemic + aleatoric + modal)
+        sums = [variance.sum(axis=-1) for variance in variances]
+        return dict(zip(SCORES, (*sums, self.stationarity, self.sampled_variance, self.nll), strict=True))
 
 
-SCORES: dict[str, Callable[[Prediction], Floats]] = {
-    "epistemic": lambda p: p.epistemic.sum(axis=-1),
-    "aleatoric": lambda p: p.aleatoric.sum(axis=-1),
-    "modal": lambda p: p.modal.sum(axis=-1),
-    "epistemic_plus_aleatoric": lambda p: (p.epistemic + p.aleatoric).sum(axis=-1),
-    "total": lambda p: (p.epistemic + p.aleatoric + p.modal).sum(axis=-1),
-    "stationarity": lambda p: p.stationarity,
-    "sampled_component": lambda p: p.sampled_variance,
-    "nll": lambda p: p.nll,
-}
-"""One number a row, (E, N), from a prediction: variances summed over the outputs. The higher, the less sure."""
+SCORES = (
+    "epistemic",
+    "aleatoric",
+    "modal",
+    "epistemic_plus_aleatoric",
+    "total",
+    "stationarity",
+    "sampled_component",
+    "nll",
+)
+"""Every measure of how unsure a prediction is."""
 
 
 class Regressor(Protocol):
-    """E networks that learn to predict distributions."""
+    """E networks that learn to predict distributions. Equal seeds give equal bits."""
 
-    @property
-    def epoch(self) -> int:
-        """Epochs done."""
+    def train(self, on_epoch: Callable[[int, int], None]) -> dict[str, float]:
+        """Train to the end, and return means of what was measured meanwhile, by slashed name.
 
-    @property
-    def epochs(self) -> int:
-        """Epochs to do, those done included."""
-
-    def train(self, epochs: int) -> None:
-        """Train for so many more epochs.
+        ``on_epoch`` is told now and then how many epochs are done, and how many there are in all.
 
         Raises:
             DivergedError: A loss is no longer finite.
         """
-
-    def diagnostics(self) -> dict[str, float]:
-        """Means since the last call, by slashed name."""
 
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
         """Predict from each network's own inputs (E, N, X); ``rng`` samples predictions and Monte-Carlo sums."""
 
     def pooled(self, inputs: Floats) -> Mixtures:
         """All weight samples' mixtures side by side: (E, N) of them, of T K components each. Inputs (E, N, X)."""
-
-    def state(self) -> AgentState:
-        """A snapshot for a checkpoint."""
-
-    def restore(self, state: AgentState) -> None:
-        """Continue from ``state``, bit for bit.
-
-        Raises:
-            ArtefactError: The snapshot does not fit.
-        """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,14 +117,9 @@ Predict = Callable[[Floats, str], Prediction]
 """Inputs (E, N, X) and a name, which stands for the random numbers, to what the networks predict for them."""
 
 
-class Evaluate(Protocol):
-    """A task's own measurements of trained networks."""
-
-    def __call__(self, variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arrays:
-        """What the task's figures and tables are made of, by name; the first axis is the network, if there is one.
-
-        ``variant`` is what the networks were trained on; ``seeds``, one node a network, draw test inputs.
-        """
+Evaluate = Callable[[str, Predict, tuple[SeedTree, ...]], Arrays]
+"""A task's own measurements of networks that were trained on a variant: the arrays, by name, that its figures and
+tables are made of. The first axis is the network, where there is one; one seed node a network draws test inputs."""
 
 
 class MovingScene(Protocol):
@@ -159,7 +141,7 @@ class RegressionSpec:
     description: str
     variants: tuple[str, ...]  #: those of the thesis, in its order
     #: Raises InvalidValueError or UnknownNameError for a variant that does not exist.
-    require_variant: Callable[[str], None]
+    require_variant: Callable[[str], object]
     training: Callable[[str, np.random.Generator], RegressionData]  #: data of a variant, drawn from a generator
     #: The given number of rows of the same process, never trained on.
     testing: Callable[[str, np.random.Generator, int], RegressionData]
@@ -172,4 +154,3 @@ class RegressionSpec:
     sections: str | None = None
     recorder: str | None = None  #: ``"module:attr"`` of the function that records them, or None
     scene: Callable[[], MovingScene] | None = None  #: gives the robot that carries out predictions, where there is one
-    reference: str | None = None  #: name of the thesis' tables

@@ -10,7 +10,6 @@ from imagine_bench.appearance import appearance_name
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.exact.splits import StartingFrom, split_of
 from imagine_bench.interfaces import (
-    DEVICES,
     EXECUTIONS,
     FRAME_PX,
     OBSERVATION_SIZES_PX,
@@ -27,11 +26,9 @@ from imagine_bench.protocols.data import (
     require_ascending,
     require_between,
     require_different,
-    require_seeds,
 )
 from imagine_bench.registry import agent_entry, task, task_entry
 from imagine_bench.registry import task_name as canonical
-from imagine_bench.registry.entries import entrant
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
@@ -197,10 +194,6 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _set(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
-        require_known("device", self.device, DEVICES)
-        require_seeds(self.seeds)
-        require_different("agents", self.agents)
         self._check_world()
         self._check_budget()
         self._check_tests()
@@ -289,8 +282,6 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     require_known("preset", preset, PRESETS)
     spec = task(task_name)
     values = {"config_group": spec.config_group, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
-    if "seeds" in values:  # in whatever order they are given, it is the same bench
-        values["seeds"] = tuple(sorted(values["seeds"]))
     values["execution"] = spec.execution(values.get("execution"))
     values["after"] = tuple(map(canonical, values.get("after", ())))
     if values.get("split") is not None:

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any, Self, get_type_hints
 
 from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
-from imagine_bench.errors import InvalidValueError, brief
+from imagine_bench.errors import InvalidValueError, brief, require_known
+from imagine_bench.interfaces import DEVICES
+from imagine_bench.registry.entries import entrant
 from imagine_bench.registry.old_names import FIRST, TODAY, agent_label, edition_of, name_in_edition_1
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
 from imagine_bench.values import Json, Setting
@@ -53,8 +55,17 @@ class ProtocolData(ABC):
     agent_names: int = field(default=TODAY, metadata=LATER)
 
     def __post_init__(self) -> None:
-        """Lists become tuples. Raises InvalidValueError: a value of another type than its field's."""
+        """Lists become tuples, and agents and seeds are written in one way: the same comparison has one hash.
+
+        Raises:
+            InvalidValueError: A value of another type than its field's, or out of range.
+        """
         require_types(self)
+        object.__setattr__(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
+        require_known("device", self.device, DEVICES)
+        require_seeds(self.seeds)
+        object.__setattr__(self, "seeds", tuple(sorted(self.seeds)))
+        require_different("agents", self.agents)
 
     def as_dict(self) -> dict[str, Any]:
         """A JSON-serialisable copy; fields marked :data:`LATER` are in it where they say something."""

@@ -21,6 +21,7 @@ from imagine_bench.running.task_types import load_bench, require_options, task_t
 from imagine_bench.store.bench_folder import BenchStore, bench_folder
 
 _SAVE_EVERY_S = 10.0
+_CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
 
 
 def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders]:
@@ -35,8 +36,11 @@ def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders
         ArtefactError: The task has no bundled encoder at this appearance level.
         SetupError: The device does not exist here.
     """
-    require_options(task, {name: value for name, value in options.items() if name != "encoder"})
-    return task_type(task).plan(task, preset, **options)
+    require_options(task, options)
+    wanted, paths = task_type(task).plan(task, preset, **options)
+    if wanted.device != "cpu":
+        registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
+    return wanted, paths
 
 
 def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launcher) -> Result:

@@ -24,8 +24,6 @@ from imagine_bench.store import encoders
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.values import Json
 
-_CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
-
 
 def plan_control(
     task: str, preset: str, *, encoder: str | None = None, dataset: Path | str | None = None, **changes: Any
@@ -45,8 +43,6 @@ def plan_control(
     if not registry.is_own(task):
         _require_sound(wanted)
     filled = {"settings_digest": digest(resolved_settings(wanted))}
-    if wanted.device != "cpu":
-        registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
     paths = _encoders(wanted, encoder)
     names = {"encoder": "latents", "codes": "codes"}
     filled |= {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}

@@ -21,7 +21,7 @@ from imagine_bench.values import Setting
 
 TASK_TYPES = {
     "control": "imagine_bench.running.control:CONTROL",
-    "regression": "imagine_bench.regression.task_type:REGRESSION",
+    "regression": "imagine_bench.regression.runner:REGRESSION",
 }
 """The types of task, each the ``"module:attr"`` of a :class:`.TaskType`."""
 

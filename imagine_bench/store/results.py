@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.store.files import first_difference
 from imagine_bench.values import Json, Setting
+
+P = TypeVar("P", bound=ProtocolData)
+R = TypeVar("R", bound="OneRun")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,14 +127,21 @@ class Checkpoint:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunResult:
-    """One finished run."""
+class OneRun:
+    """One finished run of any learner."""
 
-    agent: str  #: Registered agent
+    agent: str  #: Registered agent or regressor
     seed: int  #: The run's seed
-    checkpoints: tuple[Checkpoint, ...]  #: One a budget, in the protocol's order
     folder: Path  #: Where the run's files lie
-    settings: Mapping[str, Setting] = field(default_factory=dict)  #: The agent's settings as run; none if it was kept
+    settings: Mapping[str, Setting] = field(default_factory=dict)  #: The learner's as run; none if the run was kept
+    recording: Path | None = None  #: Its Rerun recording, or None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunResult(OneRun):
+    """One finished run of an agent."""
+
+    checkpoints: tuple[Checkpoint, ...]  #: One a budget, in the protocol's order
     #: Whether each training episode succeeded. Shape (episodes,), or (0,) if the run was kept for good.
     training_success: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     #: Macro-actions of each training episode. Shape (episodes,), or (0,) likewise.
@@ -139,60 +150,72 @@ class RunResult:
     training_starts: NDArray[np.int16] | None = None
     #: Macrostate, macro-action and the first episode in which it was tried there. Shape (pairs, M + 2). None likewise.
     tried: NDArray[np.int32] | None = None
-    recording: Path | None = None  #: Its Rerun recording, or None
     imagined: tuple[ComparedRollout, ...] = ()  #: Example rollouts at the last budget, for agents that imagine
     #: Several from one beginning at the last budget, where the rules leave something to chance.
     sampled_rollouts: tuple[ComparedRollout, ...] = ()
 
 
-def require_every_run(
-    folder: Path, protocol: ProtocolData, runs: Sequence[tuple[str, int, Path, Mapping[str, Setting]]]
-) -> None:
-    """Raise ArtefactError unless there is one run for each learner and seed, and all of a learner had equal settings.
-
-    Runs are agent, seed, folder and settings; kept results have no settings and pass.
-    """
-    wanted = sorted(itertools.product(protocol.agents, protocol.seeds))
-    found = sorted((agent, seed) for agent, seed, _, _ in runs)
-    if found != wanted:
-        raise ArtefactError(
-            f"{folder} should hold the runs {wanted} and holds {found}. Run the same bench command again for those "
-            "that are missing."
-        )
-    first: dict[str, tuple[Path, Mapping[str, Setting]]] = {}
-    for agent, _, where, settings in runs:
-        known, theirs = first.setdefault(agent, (where, settings))
-        difference = first_difference(theirs, settings) if settings and theirs else None
-        if difference is not None:
-            name, value, differs = difference
-            raise ArtefactError(
-                f"{known} ran with {name} {value!r} and {where} with {differs!r}, as another kind of machine may "
-                f"choose. Runs that are compared need one value: give it with --set {name}=..., or use one kind of "
-                "machine."
-            )
-
-
 @dataclass(frozen=True, kw_only=True)
-class BenchResult:
-    """All runs of a protocol. Every agent and seed is there, or this cannot be built.
+class AllRuns(Generic[P, R]):
+    """All runs of a protocol. Every learner and seed is there, or this cannot be built.
 
     Raises:
-        ArtefactError: A run of the protocol is missing, doubled or has other budgets, or other settings than another.
+        ArtefactError: A run is missing or doubled, or two runs of a learner had different settings.
     """
 
-    protocol: Protocol  #: What was compared
-    runs: tuple[RunResult, ...]  #: One an agent and seed
+    protocol: P  #: What was compared
+    runs: tuple[R, ...]  #: One a learner and seed
     environment: Mapping[str, Json]  #: Command, commit, versions, machine, GL renderer, threads; JSON-like
     folder: Path  #: Where the bench's files lie
     wall_s: float  #: Wall seconds of the bench, over all its sessions
+    missing: tuple[str, ...] = ()  #: What a part lacks, one sentence a run
+
+    def __post_init__(self) -> None:
+        wanted = sorted(itertools.product(self.protocol.agents, self.protocol.seeds))
+        found = sorted((run.agent, run.seed) for run in self.runs)
+        if found != wanted:
+            raise ArtefactError(
+                f"{self.folder} should hold the runs {wanted} and holds {found}. Run the same bench command again for "
+                "those that are missing."
+            )
+        first: dict[str, R] = {}
+        for run in self.runs:
+            known = first.setdefault(run.agent, run)
+            both = known.settings and run.settings  # kept results have none
+            difference = first_difference(known.settings, run.settings) if both else None
+            if difference is not None:
+                name, value, differs = difference
+                raise ArtefactError(
+                    f"{known.folder} ran with {name} {value!r} and {run.folder} with {differs!r}, as another kind of "
+                    f"machine may choose. Runs that are compared need one value: give it with --set {name}=..., or "
+                    "use one kind of machine."
+                )
+
+    @property
+    def protocol_hash(self) -> str:
+        """The hash of the whole protocol, which names the bench's folder."""
+        return self.protocol.hash
+
+    def of(self, agent: str) -> tuple[R, ...]:
+        """The runs of one learner, in the order of the protocol's seeds."""
+        by_seed = {run.seed: run for run in self.runs if run.agent == agent}
+        return tuple(by_seed[seed] for seed in self.protocol.seeds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchResult(AllRuns[Protocol, RunResult]):
+    """All runs of a bench of agents.
+
+    Raises:
+        ArtefactError: As :class:`AllRuns`, or a run has other budgets.
+    """
+
     certificate: Certificate | None = None  #: That of the world; None in results of before 2026-11-25
     whole: Protocol | None = None  #: The protocol of which this is a part; None if it is all of it
-    missing: tuple[str, ...] = ()  #: What a part lacks, one sentence a run
     made_with: str = ""  #: Of kept results, the hash that their protocol had then; names may have changed since
 
     def __post_init__(self) -> None:
-        runs = [(run.agent, run.seed, run.folder, run.settings) for run in self.runs]
-        require_every_run(self.folder, self.protocol, runs)
+        super().__post_init__()
         for run in self.runs:
             budgets = tuple(checkpoint.episodes for checkpoint in run.checkpoints)
             if budgets != self.protocol.budgets:
@@ -202,11 +225,6 @@ class BenchResult:
     def protocol_hash(self) -> str:
         """The hash of the whole protocol, which names the bench's folder."""
         return self.made_with or (self.whole or self.protocol).hash
-
-    def of(self, agent: str) -> tuple[RunResult, ...]:
-        """The runs of one agent, in the order of the protocol's seeds."""
-        by_seed = {run.seed: run for run in self.runs if run.agent == agent}
-        return tuple(by_seed[seed] for seed in self.protocol.seeds)
 
     @property
     def rows(self) -> list[tuple[RunResult, Checkpoint]]:

@@ -7,14 +7,16 @@ MuJoCo. Importing this module is cheap: MuJoCo loads with the first movement.
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy  # its parts load, slowly, when they are first used
 
 from imagine_bench.arrays import Arrays
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
-from imagine_bench.interfaces.regression import SCORES, Predict, RegressionData, RegressionSpec
+from imagine_bench.interfaces.regression import Predict, Prediction, RegressionData, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
 if TYPE_CHECKING:
@@ -33,14 +35,32 @@ MAX_SAMPLES = 1_000_000
 GRID = 45
 """Points a side of the maps of figures 4.2 and 4.3, over the square that holds the workspace and a margin."""
 MARGIN_M = 1.1
-_DRAWS = 1000
 
 
+@functools.cache
 def arm() -> PlanarArm:
     """This process' arm."""
-    from .planar_arm import planar_arm  # noqa: PLC0415  (MuJoCo loads with the first movement)
+    from .planar_arm import PlanarArm  # noqa: PLC0415  (MuJoCo loads with the first movement)
 
-    return planar_arm()
+    return PlanarArm()
+
+
+def forward(joints_rad: Floats) -> Floats:
+    """Equation 4.29: where joints (..., 3) put the tip, in metres. Shape (..., 2)."""
+    angles = np.cumsum(joints_rad, axis=-1)
+    return np.stack([np.cos(angles) @ LINKS_M, np.sin(angles) @ LINKS_M], axis=-1)
+
+
+def solve(point_m: Floats, rng: np.random.Generator) -> Floats:
+    """Joints (3,) that put the tip at a place (2,) within reach: least squares from up to 50 random starts."""
+    for _ in range(50):
+        start_rad = rng.uniform(LOW_RAD, HIGH_RAD)
+        found = scipy.optimize.least_squares(
+            lambda joints_rad: forward(joints_rad) - point_m, start_rad, bounds=(LOW_RAD, HIGH_RAD)
+        )
+        if found.cost < 1e-8:
+            break
+    return np.asarray(found.x)
 
 
 def distance_to_workspace(points_m: Floats) -> Floats:
@@ -59,12 +79,10 @@ def distance_to_workspace(points_m: Floats) -> Floats:
 def draw_targets(rng: np.random.Generator, count: int) -> Floats:
     """Points drawn uniformly from the workspace. Shape (count, 2), in metres."""
     found = np.empty((0, 2))
-    for _ in range(_DRAWS):
+    while len(found) < count:  # more than half of the square is workspace
         points = rng.uniform(-1.0, 1.0, size=(2 * count, 2))
         found = np.concatenate([found, points[distance_to_workspace(points) == 0]])
-        if len(found) >= count:
-            return found[:count]
-    raise AssertionError("half of the square is workspace")  # pragma: no cover
+    return found[:count]
 
 
 def draw_places(rng: np.random.Generator, count: int) -> Floats:
@@ -88,11 +106,6 @@ def samples_of(variant: str) -> int:
     return int(variant)
 
 
-def require_variant(variant: str) -> None:
-    """Raise InvalidValueError unless ``variant`` is a number of samples in the allowed range."""
-    samples_of(variant)
-
-
 def training(variant: str, rng: np.random.Generator) -> RegressionData:
     """Motor babbling: uniform joint configurations, carried out; the place reached, and the joints with noise."""
     return testing(variant, rng, samples_of(variant))
@@ -100,36 +113,17 @@ def training(variant: str, rng: np.random.Generator) -> RegressionData:
 
 def testing(variant: str, rng: np.random.Generator, count: int) -> RegressionData:
     """More of the same babbling."""
-    require_variant(variant)
-    if count < 1:
-        raise InvalidValueError(f"{count} test points say nothing; ask for at least 1.")
     joints_rad = rng.uniform(LOW_RAD, HIGH_RAD, size=(count, 3))
     noise_rad = NOISE_RAD * rng.standard_normal(joints_rad.shape)
     return RegressionData(inputs=arm().execute(joints_rad), targets=joints_rad + noise_rad)
 
 
 def errors(variant: str, inputs: Floats, predictions: Floats) -> Floats:
-    """Distance between the place asked for and the place reached by the predicted joints, in metres. Shape (N,).
+    """How far from places (N, 2) the tip comes to rest when joints (N, 3) are carried out, in metres. Shape (N,).
 
-    Raises:
-        InvalidValueError: A place lies outside of the workspace.
+    A place out of reach is missed by its distance from the workspace at least.
     """
-    require_variant(variant)
-    outside_m = distance_to_workspace(inputs)
-    wrong = outside_m > 1e-6  # a stretched arm rests on the edge
-    if wrong.any():
-        farthest = int(outside_m.argmax())
-        raise InvalidValueError(
-            f"{int(wrong.sum())} of {len(inputs)} targets are unreachable; the farthest, "
-            f"{np.round(inputs[farthest], 3).tolist()} m, lies {outside_m[farthest]:.3f} m outside of the workspace. "
-            "Choose targets whose distance_to_workspace is 0."
-        )
-    return missed(inputs, predictions)
-
-
-def missed(points_m: Floats, joints_rad: Floats) -> Floats:
-    """How far from points (N, 2) the tip comes to rest when joints (N, 3) are carried out, in metres. Shape (N,)."""
-    return np.linalg.norm(arm().execute(joints_rad) - points_m, axis=-1)
+    return np.linalg.norm(arm().execute(predictions) - inputs, axis=-1)
 
 
 def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arrays:
@@ -137,9 +131,9 @@ def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arr
 
     Returns:
         ``decision/...``: ``points`` and where the tip came to rest instead, ``reached`` (E, DECISIONS, CANDIDATES, 2),
-        ``error``, ``joints``, ``outside_m`` and one entry a score of the same leading shape, ``mink_error`` of the
-        first candidate of each choice (E, DECISIONS).
-        ``disc/...``: the same but ``mink_error`` of choices among points of the whole disc of the stretched arm, some
+        ``error``, ``joints`` and one entry a score of the same leading shape, and of the first candidate of each
+        choice the error of inverse kinematics with the true arm, ``known_model`` (E, DECISIONS).
+        ``disc/...``: the same but ``known_model`` of choices among points of the whole disc of the stretched arm, some
         of them out of reach.
         ``map/...``: ``points`` (G, 2), ``outside_m`` (G,), ``error`` (E, G), NaN where unreachable, ``stationarity``
         (E, G), and the three uncertainties a joint (E, G, 3). ``babbling``: the first network's places (N, 2).
@@ -147,37 +141,31 @@ def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arr
     count = DECISIONS * CANDIDATES
     within = np.stack([draw_targets(node.child("candidates").generator(), count) for node in seeds])
     anywhere = np.stack([draw_places(node.child("disc").generator(), count) for node in seeds])
-    parts = {
-        "map": _map(variant, predict, len(seeds)),
-        "decision": _decide(within, predict, "decisions"),
-        "disc": _decide(anywhere, predict, "disc"),
+    known = []
+    for points_m, node in zip(within[:, ::CANDIDATES], seeds, strict=True):
+        rng = node.child("known_model").generator()
+        known.append(errors(variant, points_m, np.stack([solve(point_m, rng) for point_m in points_m])))
+    return {
+        **_map(variant, predict, len(seeds)),
+        **_decide("decision", within, predict(within, "decisions")),
+        **_decide("disc", anywhere, predict(anywhere, "disc")),
+        "decision/known_model": np.stack(known),
+        "babbling": training(variant, seeds[0].child("data").generator()).inputs,
     }
-    measured = {f"{part}/{name}": values for part, found in parts.items() for name, values in found.items()}
-    measured["decision/mink_error"] = _mink_errors(measured["decision/points"][:, :, 0], seeds)
-    measured["babbling"] = training(variant, seeds[0].child("data").generator()).inputs
-    return measured
 
 
-def _decide(points_m: Floats, predict: Predict, purpose: str) -> Arrays:
+def _decide(part: str, points_m: Floats, predicted: Prediction) -> Arrays:
     """Candidates (E, DECISIONS CANDIDATES, 2): how far each would be missed, and every score of it."""
-    shape = (len(points_m), DECISIONS, CANDIDATES)
-    predicted = predict(points_m, purpose)
     reached = np.stack([arm().execute(joints_rad) for joints_rad in predicted.prediction])
     measured = {
         "points": points_m,
         "error": np.linalg.norm(reached - points_m, axis=-1),
         "reached": reached,
         "joints": predicted.prediction,
-        "outside_m": distance_to_workspace(points_m),
-        **{name: score(predicted) for name, score in SCORES.items()},
+        **predicted.scores,
     }
-    return {name: values.reshape(*shape, *values.shape[2:]) for name, values in measured.items()}
-
-
-def _mink_errors(points_m: Floats, seeds: tuple[SeedTree, ...]) -> Floats:
-    """Errors of inverse kinematics with the true arm at places (E, N, 2). Shape (E, N)."""
-    solved = [arm().solve(p, node.child("mink").generator()) for p, node in zip(points_m, seeds, strict=True)]
-    return np.stack([missed(*pair) for pair in zip(points_m, solved, strict=True)])
+    shape = (len(points_m), DECISIONS, CANDIDATES)
+    return {f"{part}/{name}": values.reshape(*shape, *values.shape[2:]) for name, values in measured.items()}
 
 
 def _map(variant: str, predict: Predict, networks: int) -> Arrays:
@@ -187,15 +175,15 @@ def _map(variant: str, predict: Predict, networks: int) -> Arrays:
     inside = outside_m == 0
     predicted = predict(np.broadcast_to(points, (networks, *points.shape)), "map")
     error = np.full((networks, len(points)), np.nan)
-    error[:, inside] = [errors(variant, points[inside], each[inside]) for each in predicted.prediction]
+    error[:, inside] = [errors(variant, points[inside], joints_rad[inside]) for joints_rad in predicted.prediction]
     return {
-        "points": points,
-        "outside_m": outside_m,
-        "error": error,
-        "stationarity": predicted.stationarity,
-        "epistemic": predicted.epistemic,
-        "aleatoric": predicted.aleatoric,
-        "modal": predicted.modal,
+        "map/points": points,
+        "map/outside_m": outside_m,
+        "map/error": error,
+        "map/stationarity": predicted.stationarity,
+        "map/epistemic": predicted.epistemic,
+        "map/aleatoric": predicted.aleatoric,
+        "map/modal": predicted.modal,
     }
 
 
@@ -207,7 +195,7 @@ SPEC = RegressionSpec(
         "angles lead to a place. Then it may choose one of 20 places to reach for: does it choose one it can reach?"
     ),
     variants=("1000", "2000", "3000"),
-    require_variant=require_variant,
+    require_variant=samples_of,
     training=training,
     testing=testing,
     errors=errors,
@@ -215,5 +203,4 @@ SPEC = RegressionSpec(
     wrong_above=0.1,
     evaluate=evaluate,
     scene=arm,
-    reference="robot_ik",
 )

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,24 @@ class Compared:
     bold: bool = True  # false where a difference to that side is no finding
 
 
+@functools.cache
+def table(path: str) -> list[dict[str, str]]:
+    """The rows of a kept CSV file."""
+    with (RESULTS / path).open() as file:
+        return list(csv.DictReader(file))
+
+
+@functools.cache
+def _json(path: str) -> Any:
+    return json.loads((RESULTS / path).read_text())
+
+
+def picked(path: str, **wanted: str) -> list[dict[str, str]]:
+    """The rows of a kept CSV file that have these values; agents by today's names."""
+    labels = [{**row, "agent": label_today(row["agent"])} if "agent" in row else row for row in table(path)]
+    return [row for row in labels if all(row[name] == value for name, value in wanted.items())]
+
+
 # Benches of agents -----------------------------------------------------------------------------------------------
 
 
@@ -44,10 +63,9 @@ def runs(where: str) -> Runs:
     """Rows of one agent in a folder, ``FOLDER/AGENT``, by budget, each in the order of seeds."""
     folder, _, agent = where.rpartition("/")
     found: Runs = {}
-    with (RESULTS / folder / "results.csv").open() as file:
-        for row in csv.DictReader(file):
-            if agent_label(row["agent"], _json(f"{folder}/bench.json")["protocol"]) == agent:
-                found.setdefault(int(row["episodes"]), []).append(row)
+    for row in table(f"{folder}/results.csv"):
+        if agent_label(row["agent"], _json(f"{folder}/bench.json")["protocol"]) == agent:
+            found.setdefault(int(row["episodes"]), []).append(row)
     if not found:
         raise ValueError(f"{where}: no such runs")
     return {budget: sorted(rows, key=lambda row: int(row["seed"])) for budget, rows in found.items()}
@@ -231,13 +249,8 @@ def thesis_gain(budget: str, task: str, agent: str) -> str:
 # Studies, models, policies, plans --------------------------------------------------------------------------------
 
 
-@functools.cache
-def _study(folder: str) -> dict[tuple[str, int], list[dict[str, str]]]:
-    found: dict[tuple[str, int], list[dict[str, str]]] = {}
-    with (RESULTS / folder / "results.csv").open() as file:
-        for row in csv.DictReader(file):
-            found.setdefault((row["variant"], int(row["episodes"])), []).append(row)
-    return found
+def _study(folder: str, variant: str, budget: str) -> list[dict[str, str]]:
+    return picked(f"{folder}/results.csv", variant=variant, episodes=budget)
 
 
 def study(budget: str, folder: str, *variants: str) -> str:
@@ -247,7 +260,7 @@ def study(budget: str, folder: str, *variants: str) -> str:
 
 def study_right(budget: str, folder: str, variant: str) -> str:
     """What a variant's models hold rightly of one macro-action, %: mean."""
-    right = [float(row["imagined_right"]) for row in _study(folder)[variant, int(budget)] if row["imagined_right"]]
+    right = [float(row["imagined_right"]) for row in _study(folder, variant, budget) if row["imagined_right"]]
     return percent(float(np.mean(right))) if right else "–"
 
 
@@ -255,57 +268,28 @@ def study_difference(budget: str, folder: str, *variants: str) -> list[Compared]
     """Against what each is compared with, points [95 %]."""
     found, tests = [], STUDIES["factors"].evaluation_episodes
     for variant in variants:
-        against = _study(folder)[variant, int(budget)][0]["against"]
+        against = _study(folder, variant, budget)[0]["against"]
         pair = np.array(_success(folder, variant, budget)), np.array(_success(folder, against, budget))
         found.append(_compared(signed(statistics.difference(*pair, trials=tests)), *pair, tests))
     return found
 
 
 def _success(folder: str, variant: str, budget: str) -> list[float]:
-    return [float(row["success"]) for row in _study(folder)[variant, int(budget)]]
-
-
-@functools.cache
-def _json(path: str) -> Any:
-    return json.loads((RESULTS / path).read_text())
-
-
-def _answers(folder: str, agent: str, path: str) -> np.ndarray:
-    runs = _json(f"{folder}/generalisation.json")["runs"]
-    values: list[Any] = [run for run in runs if label_today(run["agent"]) == agent]
-    for name in path.split("/"):
-        values = [value[name] for value in values]
-    return np.array(values, dtype=float)
+    return [float(row["success"]) for row in _study(folder, variant, budget)]
 
 
 def answers(folder: str, agent: str, path: str) -> str:
     """What the models of a bench answered, %: mean [95 % over seeds]."""
-    values = _answers(folder, agent, path)
-    return interval(values.mean(), *statistics.interval(values, trim=0.0, share=True))
+    runs = _json(f"{folder}/generalisation.json")["runs"]
+    values: list[Any] = [run for run in runs if label_today(run["agent"]) == agent]
+    for name in path.split("/"):
+        values = [value[name] for value in values]
+    return interval(np.mean(values), *statistics.interval(values, trim=0.0, share=True))
 
 
 def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
     """One of two answers of which a row speaks."""
     return answers(folder, agent, paths[int(which)])
-
-
-def policy(agent: str, episodes: str, length: str) -> str:
-    """Starts so many turns from a goal that a greedy policy solves, %: mean over seeds and starts."""
-    with (RESULTS / "arrow_puzzle_hard-policy" / "by_length.csv").open() as file:
-        rows = [
-            row for row in csv.DictReader(file) if (label_today(row["agent"]), row["episodes"]) == (agent, episodes)
-        ]
-    return percent(float(np.mean([float(row["success"]) for row in rows if row["optimal_length"] == length])))
-
-
-def policy_failure(agent: str, episodes: str) -> str:
-    """Starts from which it breaks a rule, %: mean [95 % over seeds]."""
-    groups = _json("arrow_puzzle_hard-policy/policy.json")
-    chosen = [run for group in groups for run in group["runs"]]
-    values = np.array(
-        [run["failure"] for run in chosen if (label_today(run["agent"]), str(run["episodes"])) == (agent, episodes)]
-    )
-    return interval(values.mean(), *statistics.interval(values, trim=0.0, share=True))
 
 
 def caused(agent: str, episodes: str, cause: str) -> str:
@@ -347,16 +331,14 @@ def thesis_plans(key: str) -> str:
 
 def futures(folder: str, agent: str, measure: str, depth: str) -> str:
     """Imagined against exact distributions at a depth, mean over runs."""
-    with (RESULTS / folder / "futures.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if (label_today(row["agent"]), row["depth"]) == (agent, depth)]
+    rows = picked(f"{folder}/futures.csv", agent=agent, depth=depth)
     value = float(np.mean([float(row[measure]) for row in rows]))
     return f"{value:.1f}" if measure in ("missed", "hallucinated") else f"{value:.3f}"
 
 
 def judged(folder: str, model: str, transitions: str, score: str) -> str:
     """A score of the judge: interquartile mean over the seeds in which it is a number [95 %]."""
-    with (RESULTS / folder / "scores.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if (row["model"], row["transitions"]) == (model, transitions)]
+    rows = picked(f"{folder}/scores.csv", model=model, transitions=transitions)
     values = [float(row[score]) for row in rows if row[score]]
     if not values:
         return "–"
@@ -378,8 +360,7 @@ def judged_after(folder: str, model: str, score: str, transitions: str) -> str:
 
 def choice(folder: str, network: str, measure: str, criterion: str) -> str:
     """A cell of choices.csv: mean (standard deviation), or ratio [95 %]."""
-    with (RESULTS / folder / "choices.csv").open() as file:
-        (row,) = [row for row in csv.DictReader(file) if (row["network"], row["measure"]) == (network, measure)]
+    (row,) = picked(f"{folder}/choices.csv", network=network, measure=measure)
     return row[criterion]
 
 
@@ -390,15 +371,13 @@ def thesis_error(criterion: str, samples: str) -> str:
 
 def claim(folder: str, network: str, text: str, column: str) -> str:
     """A cell of claims.csv."""
-    with (RESULTS / folder / "claims.csv").open() as file:
-        (row,) = [row for row in csv.DictReader(file) if (row["network"], row["claim"]) == (network, text)]
+    (row,) = picked(f"{folder}/claims.csv", network=network, claim=text)
     return row[column]
 
 
 def decomposed(folder: str, network: str, where: str, column: str) -> str:
     """A cell of the table of equation 4.8."""
-    with (RESULTS / folder / f"decomposition_{network}.csv").open() as file:
-        rows = {next(iter(row.values())): row for row in csv.DictReader(file)}
+    rows = {next(iter(row.values())): row for row in table(f"{folder}/decomposition_{network}.csv")}
     return rows[where][column]
 
 
@@ -468,13 +447,6 @@ def certified(world: str, field: str) -> str:
 
 
 CELLS: dict[str, Callable[..., str | list[Compared]]] = {
-    function.__name__: function
-    for function in (
-        iqm, ahead, mean_std, average, worst_best, seeds, difference, gain, area, episodes_to,
-        mean_episodes_to, thesis, thesis_mean, thesis_gain, study, study_difference, study_right, answers,
-        first_of, last_of, two_answers, thesis_plans, policy, policy_failure, caused, plans, futures, judged,
-        judged_after, choice,
-        thesis_error, claim, decomposed, speed, fidelity, probe, margin, walked, goals_and_starts, chance_exact,
-        shortest, price, price_to, coverage, certified,
-    )
-}  # fmt: skip
+    name: function for name, function in globals().items() if isinstance(function, FunctionType)
+}
+"""The words of comments: every function above."""

@@ -194,20 +194,16 @@ def test_the_study_on_a_page_could_be_run(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "agents"),
-    [("own_agent", "random own_agent"), ("own_task", "random oracle")],
+    ("name", "words", "leaves"),
+    [
+        ("own_agent", "--budgets 3 --evaluation-episodes 3 --seeds 1 --agents random own_agent", "*/*/*/seed_1/DONE"),
+        ("own_task", "--budgets 3 --evaluation-episodes 3 --seeds 1 --agents random oracle", "*/*/*/seed_1/DONE"),
+        ("own_world_model", "--seeds 1 --workers 1", "*/own_model-seed1-*.json"),
+    ],
 )
-def test_scripts_run(name: str, agents: str, tmp_path: Path) -> None:
-    words = ["--out", str(tmp_path), *f"--budgets 3 --evaluation-episodes 3 --seeds 1 --agents {agents}".split()]
-    script = [sys.executable, EXAMPLES / f"{name}.py", *words]
+def test_scripts_run(name: str, words: str, leaves: str, tmp_path: Path) -> None:
+    script = [sys.executable, EXAMPLES / f"{name}.py", "--out", str(tmp_path), *words.split()]
     done = subprocess.run(script, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "Report:" in done.stdout and len(list(tmp_path.glob("*/*/*/seed_1/DONE"))) == 2
-
-
-@pytest.mark.slow
-def test_the_script_of_a_world_model_runs(tmp_path: Path) -> None:
-    script = [sys.executable, EXAMPLES / "own_world_model.py", "--seeds", "1", "--workers", "1", "--out", tmp_path]
-    done = subprocess.run(script, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "Report:" in done.stdout and len(list(tmp_path.glob("*/own_model-seed1-*.json"))) == 2
+    assert "Report:" in done.stdout
+    assert len(list(tmp_path.glob(leaves))) == 2

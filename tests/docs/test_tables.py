@@ -10,14 +10,13 @@ from pathlib import Path
 import pytest
 from doc_cells import RESULTS, ROOT, iqm
 from doc_tables import PAGES, rewritten, tables, unmarked
+from kept_commands import FOLDERS
 from matplotlib.figure import Figure
 
 from imagine_bench.registry import TASKS
 from imagine_bench.running.task_types import read_protocol
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult
-
-KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json") if path.parent.name != "report")
 
 
 def name(path: Path) -> str:
@@ -49,7 +48,7 @@ def test_an_unmarked_number_would_be_found() -> None:
     assert unmarked("| agent | success |\n|---|---|\n| dqn | 96.7 |\n") == ["| agent | success |"]
 
 
-@pytest.mark.parametrize("folder", KEPT, ids=name)
+@pytest.mark.parametrize("folder", FOLDERS, ids=name)
 def test_kept_benches_are_read(folder: Path) -> None:
     facts = json.loads((folder / "bench.json").read_text())
     assert list(facts)[:4] == ["protocol", "protocol_hash", "environment", "sessions"]

@@ -18,6 +18,7 @@ from types import FrameType
 
 ROOT = Path(__file__).parents[2]
 ROOMS = ("imagine_bench", "tasks", "agents")
+PLACES = tuple(f"{ROOT / room}/" for room in ROOMS)
 SMOKE = (
     *("--task", "arrow_puzzle", "--preset", "smoke", "--execution", "kinematic", "--workers", "1"),
     *("--agents", "random", "dqn", "--seeds", "0", "--budgets", "3", "--evaluation-episodes", "2"),
@@ -26,41 +27,24 @@ Executed = dict[str, set[str]]
 """Functions by file, a path below the repository."""
 
 
-class Watcher:
-    """Notes the project's functions that are called outside of imports."""
-
-    def __init__(self) -> None:
-        self.executed: Executed = {}
-        self._imports = 0
-        self._names: dict[str, str] = {}
-
-    def __call__(self, frame: FrameType, event: str, _: object) -> None:
-        """See :func:`sys.setprofile`."""
-        code = frame.f_code
-        if event not in ("call", "return"):
-            return
-        if code.co_name == "<module>":
-            self._imports += 1 if event == "call" else -1
-        elif event == "call" and not self._imports and (name := self._name(code.co_filename)):
-            self.executed.setdefault(name, set()).add(code.co_name)
-
-    def _name(self, path: str) -> str:
-        """The path below the repository of a file of the project, or an empty text."""
-        if path not in self._names:
-            project = path.startswith(str(ROOT)) and path.endswith(".py")
-            below = Path(path).relative_to(ROOT).as_posix() if project else ""
-            self._names[path] = below if below.startswith(tuple(f"{room}/" for room in ROOMS)) else ""
-        return self._names[path]
-
-
 @contextlib.contextmanager
 def watched() -> Iterator[Executed]:
-    """The project's functions that are called within, by any thread."""
-    watcher = Watcher()
-    threading.setprofile(watcher)
-    sys.setprofile(watcher)
+    """The project's functions that are called within, by any thread, outside of imports."""
+    executed: Executed = {}
+    imports = 0
+
+    def watch(frame: FrameType, event: str, _: object) -> None:
+        nonlocal imports
+        code = frame.f_code
+        if code.co_name == "<module>":
+            imports += {"call": 1, "return": -1}.get(event, 0)
+        elif event == "call" and not imports and code.co_filename.startswith(PLACES):
+            executed.setdefault(Path(code.co_filename).relative_to(ROOT).as_posix(), set()).add(code.co_name)
+
+    threading.setprofile(watch)
+    sys.setprofile(watch)
     try:
-        yield watcher.executed
+        yield executed
     finally:
         sys.setprofile(None)
         threading.setprofile(None)  # type: ignore[arg-type]

@@ -14,13 +14,15 @@ from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, WorldModelSettings
 from imagine_bench.agents.imagination.world_model import EnvironmentModel, log_cosh
 from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
-from imagine_bench.agents.networks.precision import settle
 from imagine_bench.agents.networks.weight_samples import sample_outputs
-from imagine_bench.agents.regressors.bayesian_mdn import BayesianMDN
-from imagine_bench.agents.regressors.settings import MDNSettings
+from imagine_bench.agents.regressors.regressor import MixtureRegressor
+from imagine_bench.agents.regressors.settings import RegressorSettings
 from imagine_bench.agents.replay import Batch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from imagine_bench.interfaces.regression import RegressionData, RegressorContext
+from imagine_bench.seeding import SeedTree
 
 LATENTS, ACTIONS = 24, 6
 """Those of the arrow puzzle's bundled encoders."""
@@ -146,11 +148,19 @@ def weight_samples(rows: int, samples: int, rounds: int) -> dict[str, float]:
 
 def training(networks: int, rows: int, updates: int, rounds: int) -> dict[str, float]:
     """A number of updates of E regressors: as one batch, and one network after another."""
-    prepare_torch("cpu")
-    settings = MDNSettings(precision=settle("auto", "cpu"))
-    draws = [torch.Generator().manual_seed(index) for index in range(networks)]
-    together, alone = BayesianMDN(2, 3, settings, draws), [BayesianMDN(2, 3, settings, [one]) for one in draws]
-    x, y = (torch.randn(networks, rows, size, generator=draws[0]) for size in (2, 3))
+    draws = torch.Generator().manual_seed(0)
+    x = torch.randn(networks, rows, 2, generator=draws)
+    y = torch.randn(networks, rows, 3, generator=draws)
+    data = RegressionData(inputs=x[0].double().numpy(), targets=y[0].double().numpy())
+
+    def regressors(count: int) -> MixtureRegressor:
+        seeds = tuple(map(SeedTree, range(count)))
+        return MixtureRegressor(
+            RegressorContext(datasets=(data,) * count, seeds=seeds), RegressorSettings(precision="auto")
+        )
+
+    together = regressors(networks)
+    alone = [regressors(1) for _ in range(networks)]
 
     def as_one() -> None:
         for _ in range(updates):

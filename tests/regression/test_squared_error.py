@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.uncertainty import decompose
 from imagine_bench.tasks import toy_regression as toy
-
-from imagine_bench.protocols.runs import RunSpec
-from imagine_bench.regression.results import RegressionResult
-from imagine_bench.regression.runner import run
-from imagine_bench.report.regression.toy_regression import sections, squared_error_terms
-from imagine_bench.running.bench import plan
 
 PAIRS = 400_000
 SURE = 4.5
@@ -73,29 +65,3 @@ def test_the_error_is_the_sum_of_its_causes_and_of_no_fewer(means_only: bool) ->
     for name in terms:
         left = sum(value for other, value in terms.items() if other != name)
         assert squared.mean() - left > SURE * error, f"{name} could be left out"
-
-
-def test_networks_err_by_the_sum_of_the_causes(tmp_path: Path) -> None:
-    """Of any network, however bad: what is measured minus the sum of the terms is 0 but for sampling."""
-    settings = {"components": 3, "epochs": 20, "hidden": (16, 16), "weight_samples": 5, "learning_rate": 0.01}
-    protocol, _ = plan(
-        "toy_regression", "smoke", test_points=2, recorded=False, overrides=tuple(settings.items()),
-        agents=("mc_dropout",), variants=("base", "high_noise"),
-    )  # fmt: skip
-    done = run(RunSpec(protocol=protocol, agent="mc_dropout", seed=0), tmp_path, lambda _: None)
-    result = RegressionResult(protocol=protocol, runs=(done,), environment={}, folder=tmp_path, wall_s=1.0)
-    for pair in result.pairs:
-        terms = squared_error_terms(pair)
-        rest = terms.pop("measured") - sum(terms.values())
-        error = rest.std() / np.sqrt(rest.size)
-        assert abs(rest.mean()) < SURE * error
-        found = pair.first
-        np.testing.assert_allclose(terms["bias²"], (found["true_mean"] - found["mean"]) ** 2, atol=1e-6)
-        np.testing.assert_array_equal(terms["true aleatoric"][0], toy.noise_sigma(pair.variant, found["x"]) ** 2)
-        for name in ("true modal", "spread"):
-            assert (rest + terms[name]).mean() > SURE * error, f"{name} could be left out"
-    (table,) = sections(result)[-1].tables
-    assert [row[0] for row in table.rows[:3]] == ["base: data", "base: region", "base: beyond"] and len(table.rows) == 6
-    for row in table.rows:
-        rest, interval = (float(part.replace("−", "-")) for part in str(row[-1]).split(" ± "))
-        assert abs(rest) < SURE / 1.96 * interval, row

@@ -1,8 +1,9 @@
-"""Batched networks against networks alone, weight samples against a loop, and the divergence of known mixtures."""
+"""Networks among others and alone, weight samples against a loop, what is predicted, and divergences that are known."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,14 +13,15 @@ from imagine_bench.agents.imagination.uncertainty import decompose
 from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
 from imagine_bench.agents.networks.normed_mlp import NormedMLP
 from imagine_bench.agents.networks.weight_samples import sample_outputs
-from imagine_bench.agents.regressors.bayesian_mdn import BayesianMDN
-from imagine_bench.agents.regressors.settings import MDNSettings
-from imagine_bench.agents.regressors.stationarity import jensen_shannon
+from imagine_bench.agents.regressors.regressor import MixtureRegressor, jensen_shannon, make_ensemble, make_mc_dropout
 from scipy import integrate, stats
 
 from imagine_bench.errors import DivergedError
+from imagine_bench.interfaces.regression import RegressionData, RegressorContext
+from imagine_bench.regression.calibration import log_score
+from imagine_bench.seeding import SeedTree
 
-_SMALL = MDNSettings(hidden=(16, 16), components=3)
+MAKERS = {"mc_dropout": make_mc_dropout, "ensemble": make_ensemble}
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -32,40 +34,41 @@ def data(networks: int, rows: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
     return x, torch.sin(3 * x) + 0.1 * torch.randn(networks, rows, 2, generator=g)
 
 
+def regressor(name: str, sets: list[RegressionData], seeds: list[int], **settings: Any) -> MixtureRegressor:
+    overrides = {"hidden": (16, 16), "components": 3, "batch_size": None, "precision": "float32", **settings}
+    context = RegressorContext(
+        datasets=tuple(sets), seeds=tuple(map(SeedTree, seeds)), hyperparameters="minimal", overrides=overrides
+    )
+    return MAKERS[name](context)
+
+
+def among(seeds: list[int], **settings: Any) -> MixtureRegressor:
+    """Networks with dropout, each on a dataset of its own."""
+    pairs = zip(*data(3), strict=True)
+    sets = [RegressionData(inputs=x.double().numpy(), targets=y.double().numpy()) for x, y in pairs]
+    return regressor("mc_dropout", [sets[seed] for seed in seeds], seeds, **settings)
+
+
+def silent(done: int, epochs: int) -> None:
+    pass
+
+
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_a_network_among_others_is_the_network_alone(precision: str) -> None:
-    settings = MDNSettings(hidden=(16, 16), components=3, precision=precision, gradient_clip=1.0)
-    x, y = data(3)
-    together = BayesianMDN(2, 2, settings, [generator(i) for i in range(3)])
-    losses = [together.update(x, y) for _ in range(15)]
+    settings = {"precision": precision, "gradient_clip": 1.0, "epochs": 15}
+    together = among([0, 1, 2], **settings)
+    together.train(silent)
+    tolerance = 2e-4 if precision == "float32" else 0.05
     for index in range(3):
-        alone = BayesianMDN(2, 2, settings, [generator(index)])
-        own = [alone.update(x[index : index + 1], y[index : index + 1]) for _ in range(15)]
-        tolerance = 2e-4 if precision == "float32" else 0.05
-        torch.testing.assert_close(
-            torch.stack(losses)[:, index], torch.stack(own)[:, 0], rtol=tolerance, atol=tolerance
-        )
-    assert losses[-1].mean() < losses[0].mean()  # they learned meanwhile
-
-
-def test_clipping_one_member_leaves_the_others() -> None:
-    settings = MDNSettings(hidden=(16,), components=2, gradient_clip=0.5, dropout=0.0)
-    x, y = data(2)
-    wild = y.clone()
-    wild[0] *= 1e3
-    results = []
-    for targets in (y, wild):
-        model = BayesianMDN(2, 2, settings, [generator(i) for i in range(2)])
-        for _ in range(3):
-            model.update(x, targets)
-        results.append([p.detach()[1].clone() for p in model.network.parameters()])
-    for mine, theirs in zip(*results, strict=True):
-        torch.testing.assert_close(mine, theirs)
+        alone = among([index], **settings)
+        alone.train(silent)
+        for all_of_it, own in zip(together.network.parameters(), alone.network.parameters(), strict=True):
+            torch.testing.assert_close(all_of_it[index], own[0], rtol=tolerance, atol=tolerance)
 
 
 def test_hidden_layers_decay_and_the_output_layer_does_not() -> None:
     """Without a gradient, Adam moves what decays and leaves the rest."""
-    model = BayesianMDN(2, 2, MDNSettings(hidden=(16, 16), components=2), [generator()])
+    model = among([0])
     before = [parameter.detach().clone() for parameter in model.network.parameters()]
     for parameter in model.network.parameters():
         parameter.grad = torch.zeros_like(parameter)
@@ -74,24 +77,68 @@ def test_hidden_layers_decay_and_the_output_layer_does_not() -> None:
     assert moved == [True, True, False, True, False, False], "weights, then biases; hidden biases begin at 0"
 
 
-def test_folding_gives_what_the_normed_network_gives() -> None:
-    network = NormedMLP((2, 16, 16, 3), generators=[generator(0), generator(1)], dropout=0.0)
-    x, _ = data(2, rows=300)
-    for _ in range(3):
-        expected = network(x.mT.contiguous(), None).mT  # the same batch again: the running statistics are its own
-        network.update_running_stats()
-    torch.testing.assert_close(network.folded()(x), expected, rtol=1e-4, atol=1e-4)
+@pytest.mark.parametrize(("batch_size", "updates"), [(None, 1), (600, 1), (250, 3), (8, 75)])
+def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int | None, updates: int) -> None:
+    line = RegressionData(inputs=np.linspace(-1, 1, 600)[:, None], targets=np.ones((600, 1)))
+    model = regressor("mc_dropout", [line], [0], hidden=(4, 4), batch_size=batch_size, epochs=2)
+    model.train(silent)
+    assert model.network.batches == 2 * updates
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_variances_and_nll_are_those_of_pooled_weight_samples(name: str) -> None:
+    """Of targets far from 0 and from unit variance, so that they must be scaled back rightly."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(64, 1))
+    curve = RegressionData(inputs=x, targets=300.0 + 50.0 * (np.sin(x) + 0.3 * rng.normal(size=(64, 1))))
+    model = regressor(name, [curve, curve], [0, 1], batch_size=32, epochs=4)
+    model.train(silent)
+    inputs = rng.normal(size=(2, 20, 1))
+    predicted = model.predict(inputs, rng)
+    pooled = model.pooled(inputs)
+    weights = pooled.weights[..., None]
+    mean = (weights * pooled.means).sum(axis=-2, keepdims=True)
+    variance = (weights * (pooled.sigmas**2 + (pooled.means - mean) ** 2)).sum(axis=-2)
+    np.testing.assert_allclose(predicted.epistemic + predicted.aleatoric + predicted.modal, variance, rtol=1e-3)
+    np.testing.assert_allclose(predicted.scores["total"], variance[..., 0], rtol=1e-3)
+    np.testing.assert_allclose(predicted.mean, mean[..., 0, :], rtol=1e-5)
+    assert 10.0 < np.sqrt(variance).mean() < 250.0
+    assert abs(mean.mean() - 300.0) < 100.0
+    np.testing.assert_allclose(predicted.nll, log_score(pooled, predicted.prediction), atol=1e-3)
+    drawn = (predicted.drawn - mean) / np.sqrt(variance)[..., None, :]  # [E, N, S, D]
+    assert drawn.shape == (2, 20, 16, 1)
+    assert abs(drawn.mean()) < 0.2
+    assert abs(drawn.var() - 1.0) < 0.25
+    assert len(np.unique(drawn)) == drawn.size
+
+
+def test_two_branches_are_modal_uncertainty() -> None:
+    """Chance: |y| is uniform in [0.5, 1.5], so a network that ignores x cannot go below log 2 = 0.69 nats."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1, 1, (600, 1))
+    y = np.where(rng.random((600, 1)) < 0.5, 1.0, -1.0) * (1 + 0.5 * x) + 0.05 * rng.standard_normal((600, 1))
+    both = RegressionData(inputs=x, targets=y)
+    settings = {"hidden": (32, 32), "epochs": 40, "batch_size": 50, "learning_rate": 1e-2, "final_rate": 0.01}
+    model = regressor("ensemble", [both], [5], **settings)
+    model.train(silent)
+    predicted = model.predict(x[None], rng)
+    assert log_score(predicted, y[None]).mean() < 0.2
+    half = (1 + 0.5 * x[:, 0]) ** 2  # half the distance between the branches, squared
+    assert np.corrcoef(predicted.modal[0, :, 0], half)[0, 1] > 0.3  # chance: 0
 
 
 def test_dropped_units_are_dropped_after_folding_too() -> None:
     """With one mask for all rows, training and folded prediction see the same statistics and give the same."""
-    network = NormedMLP((2, 16, 16, 3), generators=[generator(0)], dropout=0.5)
-    x, _ = data(1, rows=200)
+    network = NormedMLP((2, 16, 16, 3), generators=[generator(0), generator(1)], dropout=0.5)
+    x, _ = data(2, rows=200)
     mask = [dropout_mask((1, 16), 0.5, generator(5)) for _ in range(2)]
-    spread = [each.view(1, 16, 1).expand(1, 16, 200).contiguous() for each in mask]
+    spread = [each.view(1, 16, 1).expand(2, 16, 200).contiguous() for each in mask]
     expected = network(x.mT.contiguous(), spread).mT
     network.update_running_stats()
-    torch.testing.assert_close(sample_outputs(network.folded(), x[0], mask)[0], expected[0], rtol=1e-3, atol=1e-3)
+    for member in range(2):
+        folded = network.folded(slice(member, member + 1))
+        found = sample_outputs(folded, x[member], mask)[0]
+        torch.testing.assert_close(found, expected[member], rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("rows", [1, 300])
@@ -129,18 +176,6 @@ def test_first_units_bend_all_over_the_data() -> None:
     assert all(not bias.detach().any() for bias in list(network.biases)[1:])
 
 
-def test_decay_leaves_first_units_their_bends() -> None:
-    """Where only weights decayed, bends at -b / w would leave the data: a quarter of the units would be dead here."""
-    x = torch.rand(2, 300, 1, generator=generator(5)) * 2.0 - 1.0
-    y = torch.sin(6.0 * x) + 0.1 * torch.randn(x.shape, generator=generator(6))
-    settings = MDNSettings(hidden=(64, 32), components=2, learning_rate=1e-2)
-    model = BayesianMDN(1, 1, settings, [generator(0), generator(1)])
-    for _ in range(250):
-        model.update(x, y)
-    spread = model.network.get_buffer("variance_1")
-    assert (spread < 1e-6 * spread.amax()).float().mean() < 0.1
-
-
 def gaussians(means: list[float], sigma: float) -> Mixture:
     """T mixtures of one component for one row of one dimension."""
     count = len(means)
@@ -175,12 +210,13 @@ def test_divergence_sees_what_the_variance_of_means_does_not() -> None:
 
 
 def test_a_likelihood_that_is_not_finite_changes_nothing() -> None:
-    model = BayesianMDN(2, 2, _SMALL, [generator(0), generator(1)])
+    model = among([0, 1])
     x, y = data(2)
     y[1, 3, 0] = math.nan
     before = [values.clone() for values in model.network.state_dict().values()]
-    with pytest.raises(DivergedError, match="likelihood of network 1 of 2 is no longer finite"):
+    with pytest.raises(DivergedError, match=r"A likelihood is not finite, .* Losses of the networks: \[\d.*, nan\]"):
         model.update(x, y)
     after = model.network.state_dict().values()
     assert len(before) > len(list(model.network.parameters())), "the running statistics must be among them"
-    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True)) and model.network.batches == 0
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert model.network.batches == 0

@@ -1,0 +1,130 @@
+"""Recordings of chapter 4: the toy functions and what a network says of them, and the arm choosing and reaching."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from imagine_bench.arrays import Arrays
+from imagine_bench.interfaces import Floats
+from imagine_bench.interfaces.regression import RegressionSpec
+from imagine_bench.recording.blueprint import playing
+from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
+from imagine_bench.recording.stream import Recording, recording_file
+
+_KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86, 180, 233)}
+_BLUE = (0, 114, 178)
+_GRAY = (150, 150, 150)
+_RED = (200, 30, 60)
+_TICKS = 100
+"""Steps of the timeline per unit of x: a timeline counts whole numbers."""
+_TIMELINE = "x_hundredths"
+CHOICES = 6
+"""Decisions of the first network that are shown: the first ones, not the best."""
+_STILL_S = 2.5
+_HEIGHT_M = 0.02
+
+
+def record_toy(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, name: str, path: Path) -> Path:
+    """Record the first network of every variant: data, predictions, each uncertainty beside its true value, along x.
+
+    ``evaluations`` are by variant; ``name`` is the regressor's. ``path``, which is returned, ends in ``.rrd``. Timeline
+    ``x_hundredths``, entities ``/<variant>/...``.
+    """
+    columns = []
+    for variant in evaluations:
+        words = {"y": f"data and predictions ({name})", **{kind: f"{kind} (std of y)" for kind in _KINDS}}
+        views = [
+            rrb.TimeSeriesView(origin=f"/{variant}/{part}", name=f"{variant}: {text}, over 100 x")
+            for part, text in words.items()
+        ]
+        columns.append(rrb.Vertical(*views))
+    layout = rrb.Blueprint(rrb.Horizontal(*columns), rrb.TimePanel(timeline=_TIMELINE), collapse_panels=True)
+    with recording_file(path, task.id, layout) as recording:
+        for variant, data in evaluations.items():
+            x = data["x"]
+            order = data["training_x"].argsort()
+            dots = {"training": (data["training_x"][order], data["training_y"][order], _GRAY)}
+            dots["prediction"] = (x, data["prediction"][0], _BLUE)
+            for dot, (places, values, color) in dots.items():
+                points = rr.SeriesPoints(colors=color, marker_sizes=1.5)
+                _curve(recording, f"/{variant}/y/{dot}", points, places, values)
+            for kind, color in _KINDS.items():
+                true = np.atleast_2d(data[f"true_{kind}"])[0]
+                for line, variances, shade in (("estimated", data[kind][0], color), ("true", true, _GRAY)):
+                    look = rr.SeriesLines(colors=shade)
+                    _curve(recording, f"/{variant}/{kind}/{line}", look, x, np.sqrt(variances))
+    return path
+
+
+def _curve(recording: Recording, path: str, look: rr.AsComponents, x: Floats, y: Floats) -> None:
+    recording.log(path, look, static=True)
+    times = rr.TimeColumn(_TIMELINE, sequence=np.round(x * _TICKS).astype(np.int64))
+    recording.stream.send_columns(path, indexes=[times], columns=rr.Scalars.columns(scalars=y), strict=True)
+
+
+def record_robot(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, name: str, path: Path) -> Path:
+    """Record the first choices of the first network that learned from the last variant, and how the arm reaches.
+
+    ``evaluations`` are by variant; ``name`` is the regressor's. ``path``, which is returned, ends in ``.rrd``.
+    Timelines ``sim_time`` (the arm moves) and ``choice`` (one a decision), entities ``/scene/...``, ``/choice/...``.
+    """
+    assert task.scene is not None, "this recorder needs a scene"
+    scene = task.scene()
+    variant, data = list(evaluations.items())[-1]
+    view = rrb.Spatial3DView(
+        origin="/", contents=[f"{ROOT}/**", "/choice/**"], name="The arm, and where it could reach"
+    )
+    text = rrb.TextDocumentView(origin="/choice/text", name="What happens")
+    curve = rrb.TimeSeriesView(origin="/choice/error", name="Error of each choice (m)")
+    layout = playing(rrb.Horizontal(view, rrb.Vertical(text, curve)))
+    with recording_file(path, task.id, layout) as recording:
+        log_shapes(recording, scene.shapes())
+        clock_s = 0.0
+        for choice in range(CHOICES):
+            scores = data["decision/epistemic"][0, choice]
+            errors = data["decision/error"][0, choice]
+            chosen = int(scores.argmin())
+            words = (
+                f"### Choice {choice + 1}\n\nA network ({name}) learned from {variant} random movements which joint "
+                "angles lead to a place. Green places it is surest of, orange ones least (epistemic uncertainty); it "
+                f"reaches for the one in the ring.\n\nIts uncertainty there is {scores[chosen]:.3g} rad², the largest "
+                f"of the 20 is {scores.max():.3g} rad²."
+            )
+            missed = (
+                f"\n\n**It misses by {100 * errors[chosen]:.1f} cm** (red line). A random choice misses by "
+                f"{100 * errors.mean():.1f} cm on average, the best by {100 * errors.min():.1f} cm, the worst by "
+                f"{100 * errors.max():.1f} cm."
+            )
+            recording.set_clocks(clock_s, choice=choice + 1)
+            _show_candidates(recording, data["decision/points"][0, choice], scores)
+            recording.text("/choice/text", words)
+            motion = scene.movement(data["decision/joints"][0, choice, chosen], 25.0)
+            clock_s += float(motion.time_s[-1])
+            log_motion(recording, motion, end_s=clock_s, sequences={"choice": choice + 1}, only_moved=False)
+            recording.set_clocks(clock_s, choice=choice + 1)
+            ends = _lifted(np.stack([data[f"decision/{end}"][0, choice, chosen] for end in ("reached", "points")]))
+            recording.log("/choice/error_line", rr.LineStrips3D([ends], colors=_RED, radii=0.009))
+            recording.scalar("/choice/error", float(errors[chosen]))
+            recording.text("/choice/text", words + missed)
+            clock_s += _STILL_S
+    return path
+
+
+def _lifted(points: Floats) -> Floats:
+    """Places in the plane, (N, 2), as places above the table, (N, 3)."""
+    return np.insert(points, 2, _HEIGHT_M, axis=1)
+
+
+def _show_candidates(recording: Recording, points: Floats, scores: Floats) -> None:
+    ranks = scores.argsort().argsort()[:, None] / (len(scores) - 1)  # 0 the surest
+    colors = (1 - ranks) * _KINDS["modal"] + ranks * np.array([213, 94, 0])
+    recording.log("/choice/candidates", rr.Points3D(_lifted(points), colors=colors.astype(np.uint8), radii=0.022))
+    angle = np.linspace(0, 2 * np.pi, 33)
+    ring = points[scores.argmin()] + 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    recording.log("/choice/chosen", rr.LineStrips3D([_lifted(ring)], colors=_BLUE, radii=0.007))
+    recording.clear("/choice/error_line")

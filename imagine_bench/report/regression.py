@@ -1,0 +1,387 @@
+"""The page of a regression bench: the task's own sections, then calibration.
+
+The toy regression shows a number for every claim of thesis 4.5.1, figure 4.1 and equation 4.8; the robot table 4.1 and
+figures 4.2 and 4.3. Another package's task names the function that makes its sections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
+from imagine_bench import reference, registry, statistics
+from imagine_bench.arrays import Arrays, Floats
+from imagine_bench.interfaces.regression import SCORES
+from imagine_bench.regression.calibration import CRPS_POINTS
+from imagine_bench.regression.results import PairResult, RegressionResult
+from imagine_bench.report.figures import GRAY, INK, image, small_multiples
+from imagine_bench.report.page import made
+from imagine_bench.report.tables import DASH, Page, Section, Table, decimals, estimate, mean_std, number
+from imagine_bench.store.files import table_text
+
+Cells = dict[str, str]
+"""A row of a table, by column."""
+_BLUE = "#0072b2"
+_ORANGE = "#d55e00"
+_EDGE = 30.0
+"""Where the toy data ends; beyond, networks extrapolate."""
+_REGION = 10.0
+"""Half the width of the region around 0 where the toy datasets differ."""
+_KINDS = {"epistemic": 60, "modal": 60, "aleatoric": 20}
+"""The kinds of uncertainty, and the top of each one's axis in figure 4.1."""
+_CALIBRATION = {
+    "coverage_0.5": "in 50 % interval",
+    "coverage_0.8": "in 80 % interval",
+    "coverage_0.95": "in 95 % interval",
+    "transform_distance": "PIT distance",
+    "crps_shared": "CRPS",
+}
+_COMPARED = (
+    "Every model is a Bayesian mixture density network: it predicts a mixture of Gaussians, and its weights are "
+    "uncertain, so that each weight sample predicts another mixture. The spread of their means is epistemic "
+    "uncertainty (too little data), the mean variance of the Gaussians is aleatoric (noise), the spread of the "
+    "Gaussians of one mixture is modal (several outcomes are possible); the three add up to the whole predictive "
+    "variance. Stationarity is a second epistemic measure: how much the predicted distribution itself changes from "
+    "weight sample to weight sample (Jensen-Shannon divergence, in nats). Two more are about the one value that was "
+    "predicted: the variance of the sampled component, the Gaussian it was sampled from, noise and weights together; "
+    "and its negative log-likelihood (nll) under all weight samples."
+)
+
+
+def report_page(result: RegressionResult) -> Page:
+    """The page, with results.csv and a CSV a table beside it."""
+    protocol = result.protocol
+    spec = registry.regression(protocol.task)
+    own = registry.load(spec.sections) if spec.sections else _SECTIONS.get(spec.id, lambda _: [])
+    sections = [*own(result), _calibration(result)]
+    rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
+    tables = [table for section in sections for table in section.tables]
+    answers = [answer for section in sections for answer in section.answers]
+    return Page(
+        title=f"{spec.title}: does the model know what it does not know?",
+        subtitle=f"Preset {protocol.preset} · networks a dataset: {protocol.networks} · protocol {protocol.hash}",
+        question=spec.description,
+        answers=answers,
+        sections=[Section("What was compared", (_COMPARED,)), *sections],
+        files={"results.csv": table_text(rows), **{f"{table.name}.csv": table.csv for table in tables}},
+        summary="\n\n".join([sections[0].title, tables[0].text, *answers]),
+        **made(result, {pair.agent: pair.title for pair in result.pairs.values()}),
+    )
+
+
+def _calibration(result: RegressionResult) -> Section:
+    spec = registry.regression(result.protocol.task)
+    points = result.protocol.test_points
+    calibration = [
+        {
+            "": f"{pair.label}: {words}",
+            **_means(pair, {f"{prefix}{name}": title for name, title in _CALIBRATION.items()}),
+        }
+        for pair in result.pairs.values()
+        for prefix, words in (("", "predicts with"), ("pooled_", "all weight samples"))
+    ]
+    found = {"wrong": "wrong", **{f"auroc_{name}": f"AUROC of {_words(name)}" for name in SCORES}}
+    detection = [{"": pair.label, **_means(pair, found)} for pair in result.pairs.values()]
+    return Section(
+        title="Calibration: as sure as it may be?",
+        words=(
+            f"Each network is asked about {points} unseen points. An interval that is said to hold 80 % "
+            "of the outcomes should hold 80 %; the probability integral transform should be uniform (its distance "
+            "from that is given, 0 is best); the CRPS is a distance between prediction and outcome, lower is better, "
+            f"computed at the first {min(CRPS_POINTS, points)} of the points. "
+            "Two distributions are judged: the one that predictions are sampled from, and all weight samples pooled.",
+            f"A prediction is called wrong where its error, the {spec.error_name}, is above {spec.wrong_above:g}. The "
+            "second table says how well each uncertainty finds the wrong ones: the probability that a wrong "
+            "prediction has the higher uncertainty of two (AUROC; 0.5 is chance, 1 is perfect). Means (standard "
+            "deviations) over networks.",
+        ),
+        tables=(
+            Table.of("calibration", calibration),
+            Table.of("auroc", detection, why_dash="all predictions of a network are wrong, or none"),
+        ),
+    )
+
+
+def _means(pair: PairResult, titles: Mapping[str, str]) -> Cells:
+    """Mean and standard deviation over networks of some measures, by title."""
+    return {title: mean_std(pair.values(name)) for name, title in titles.items()}
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+# The toy regression ---------------------------------------------------------------------------------------------------
+
+
+def _toy(result: RegressionResult) -> list[Section]:
+    claims = [claim for agent in result.protocol.agents for claim in _claims(result, agent)]
+    variants = result.protocol.variants
+    return [
+        Section(
+            title="The thesis' claims, in numbers",
+            words=(
+                "Mean over the region [−10, 10] of the uncertainty of networks trained with little data (or much "
+                "noise) there, divided by that of the base networks. Truth: the noise is 9 times as large in the noisy "
+                "region. Rank correlation with distance: from the data, for x from 30 to 40. Rank correlation with "
+                "the truth: along x inside the training range [−30, 30], of standard deviations; true epistemic "
+                "uncertainty is equation 4.6, the squared error of the mean plus its variance, which is the estimate "
+                "itself: the correlation is with the error alone. Values are the median over networks, in brackets "
+                "the smallest and the largest. Little data and much noise are compared where base is run too.",
+            ),
+            tables=(Table.of("claims", claims, why_dash="the truth is constant"),),
+            answers=[" ".join(filter(None, claim.values())) for claim in claims if claim["asked"]],
+        ),
+        Section(
+            title="Figure 4.1: what is uncertain, and why",
+            words=(
+                "The first network of each dataset. Top: training data (gray) and predictions (blue). Below: standard "
+                "deviation of each kind of uncertainty (blue) and its true value (black). Shaded: gray where the "
+                "datasets differ, red where the networks extrapolate.",
+            ),
+            images=[
+                image(
+                    f"figure_4_1_{agent}",
+                    partial(figure_4_1, {variant: result.pairs[agent, variant].first for variant in variants}),
+                    result.pairs[agent, variants[0]].title,
+                )
+                for agent in result.protocol.agents
+            ],
+        ),
+        Section(
+            title="Equation 4.8: the squared error, cause by cause",
+            words=(
+                "The expected squared error of a value drawn from one weight sample's mixture is the sum of five: "
+                "squared bias of the mean and its variance over weight samples (together equation 4.6), true noise, "
+                "true distance of the branches, and the spread of what is drawn (estimated aleatoric and modal). "
+                "Measured: against targets drawn anew; what remains is 0 but for sampling (95 %). Means over x, in y².",
+            ),
+            tables=(
+                Table.of("decomposition", [row for pair in result.pairs.values() for row in _decomposition(pair)]),
+            ),
+        ),
+    ]
+
+
+_CLAIMS = (
+    ("low_data", "epistemic", "little data: epistemic there, times base", "≥ 3"),
+    ("low_data", "aleatoric", "little data: aleatoric there, times base", "≤ 2"),
+    ("high_noise", "aleatoric", "much noise: aleatoric there, times base (truth 9)", "≥ 4"),
+    ("high_noise", "epistemic", "much noise: epistemic there, times base", "≤ 2"),
+    ("low_data", "stationarity", "little data: stationarity there, times base", ""),
+    ("base", "epistemic", "extrapolation: rank correlation of epistemic with distance", "> 0"),
+    ("base", "aleatoric", "extrapolation: rank correlation of aleatoric with distance", "> 0"),
+)
+"""The variant that a claim needs beside the base, the uncertainty it is about, its words, and the condition on it."""
+_SIGNS = {"≥": np.greater_equal, "≤": np.less_equal, ">": np.greater}
+
+
+def _claims(result: RegressionResult, agent: str) -> list[Cells]:
+    pairs = {variant: result.pairs[agent, variant] for variant in result.protocol.variants}
+    rows = []
+    for variant, kind, words, asked in _CLAIMS:
+        if {variant, "base"} <= pairs.keys():
+            rows.append(claim(pairs["base"].title, words, change(pairs[variant], pairs["base"], kind), asked))
+    for variant, pair in pairs.items():
+        for kind in _KINDS:
+            words = f"{_words(variant)}: {kind}, rank correlation with the truth"
+            rows.append(claim(pair.title, words, agreement(pair, kind)))
+    return rows
+
+
+def claim(network: str, words: str, values: Floats, asked: str = "") -> Cells:
+    """A row: median, smallest and largest over networks, (E,), and how many of them meet ``asked``, such as ``≥ 3``."""
+    met = ""
+    if asked:
+        sign, limit = asked.split()
+        met = f"{_SIGNS[sign](values, float(limit)).sum()} of {len(values)}"
+    spread = f"{number(float(np.median(values)))} [{number(values.min())}, {number(values.max())}]"
+    return {"network": network, "claim": words, "measured": spread, "asked": asked, "networks that hold": met}
+
+
+def change(pair: PairResult, base: PairResult, kind: str) -> Floats:
+    """Mean uncertainty in the region over that of the base networks; of the base, its rise with distance. Shape (E,).
+
+    The rise is Spearman's correlation with the distance from the data, where x > 30.
+    """
+    x = pair.first["x"]
+    if pair.variant == base.variant:
+        rows = pair.arrays(kind)[:, x > _EDGE]
+        return _rank_correlations(rows, np.broadcast_to(x[x > _EDGE], rows.shape))
+    inside = np.abs(x) <= _REGION
+    return pair.arrays(kind)[:, inside].mean(axis=1) / base.arrays(kind)[:, inside].mean(axis=1)
+
+
+def agreement(pair: PairResult, kind: str) -> Floats:
+    """Spearman's correlation of an uncertainty with its true value along x, where there is data. Shape (E,)."""
+    inside = np.abs(pair.first["x"]) <= _EDGE
+    terms = squared_error_terms(pair)
+    # equation 4.6 contains the estimate, which would agree with itself: the rest is the error of the mean
+    true = terms["bias²" if kind == "epistemic" else f"true {kind}"]
+    return _rank_correlations(pair.arrays(kind)[:, inside], true[:, inside])
+
+
+def _rank_correlations(values: Floats, others: Floats) -> Floats:
+    """Spearman's correlation row by row, not a number where the other is constant. Shape (E,)."""
+    rows = zip(values, others, strict=True)
+    return np.array([stats.spearmanr(*pair).statistic if np.ptp(pair[1]) else np.nan for pair in rows])
+
+
+def squared_error_terms(pair: PairResult) -> dict[str, Floats]:
+    """The terms of equation 4.8 by name, and ``measured``, their sum from draws of targets and values. (E, GRID) each.
+
+    The thesis' first term, true epistemic uncertainty, is split into ``bias²`` and ``epistemic`` (equation 4.6).
+    """
+    epistemic = pair.arrays("epistemic")
+    return {
+        "bias²": pair.arrays("true_epistemic") - epistemic,
+        "epistemic": epistemic,
+        "true aleatoric": np.broadcast_to(pair.first["true_aleatoric"], epistemic.shape),
+        "true modal": np.broadcast_to(pair.first["true_modal"], epistemic.shape),
+        "spread": pair.arrays("aleatoric") + pair.arrays("modal"),
+        "measured": pair.arrays("squared_error"),
+    }
+
+
+def _decomposition(pair: PairResult) -> list[Cells]:
+    x = pair.first["x"]
+    rows = []
+    for words, here in (("data", np.abs(x) <= _EDGE), ("region", np.abs(x) <= _REGION), ("beyond", x > _EDGE)):
+        terms = {name: values[:, here] for name, values in squared_error_terms(pair).items()}
+        rest = 2 * terms["measured"] - np.sum(list(terms.values()), axis=0)
+        means = {name: number(float(values.mean())) for name, values in terms.items()}
+        interval = f"{number(rest.mean())} ± {number(1.96 * rest.std() / np.sqrt(rest.size))}"
+        rows.append({"": f"{pair.label}: {words}", **means, "measured − sum": interval})
+    return rows
+
+
+def figure_4_1(data: Mapping[str, Arrays]) -> Figure:
+    """A column a dataset; four rows: data and predictions, epistemic, modal, aleatoric."""
+    figure = Figure(figsize=(3.9 * len(data) + 0.4, 9.6), layout="constrained")
+    grid = figure.subplots(4, len(data), squeeze=False, sharex=True, sharey="row")
+    for (variant, found), (first, *others) in zip(data.items(), grid.T, strict=True):
+        first.scatter(found["training_x"], found["training_y"], s=2, color=GRAY)
+        first.scatter(found["x"], found["prediction"][0], s=2.5, color=_BLUE)
+        first.set(title=_words(variant), ylim=(-120, 140))
+        for axes, (kind, top) in zip(others, _KINDS.items(), strict=True):
+            axes.plot(found["x"], np.sqrt(np.atleast_2d(found[f"true_{kind}"])[0]), color=INK)
+            axes.plot(found["x"], np.sqrt(found[kind][0]), color=_BLUE)
+            axes.set(ylim=(0, top), title=f"{kind} (std of y)")
+        for axes in (first, *others):
+            axes.axvspan(_EDGE, 40, color=_ORANGE, alpha=0.15)
+            axes.axvspan(-_REGION, _REGION, color=GRAY, alpha=0.15)
+    return figure
+
+
+# Robot inverse kinematics ---------------------------------------------------------------------------------------------
+
+
+def _robot(result: RegressionResult) -> list[Section]:
+    pairs = result.pairs.values()
+    rows = [row for pair in pairs for part in ("decision", "disc") for row in choices(pair, part)]
+    printed = reference.load("robot_ik")["cumulative_error"]["criteria"]
+    for variant in (each for each in result.protocol.variants if each in printed["random"]):
+        thesis = {_words(name): "{:.2f} ({:.2f})".format(*values[variant]) for name, values in printed.items()}
+        rows.append({**dict.fromkeys(rows[0], DASH), "measure": "thesis", "network": variant, **thesis})
+    return [
+        Section(
+            "Table 4.1: which place can the robot trust itself to reach?",
+            (
+                "The robot is shown 20 places and reaches for the one with the least uncertainty; the distance by "
+                "which it misses is cumulated over 50 choices: mean (standard deviation) over networks, in metres. "
+                "Random is the expectation of a choice by chance, min and max are the best and the worst choice in "
+                "hindsight, known model is the error of inverse kinematics with a known model of the arm. Ratios are "
+                "to the random choice by the same networks, in brackets their 95 % interval (Fieller): below 1 a "
+                "criterion beats chance. The simulated arm carries out every predicted configuration, and the place "
+                "its tip comes to rest at is measured.",
+                "Rows named disc: the 20 places lie anywhere on the disc of the stretched arm, whose left part no "
+                "configuration reaches. A place out of reach is missed by its distance from the workspace at least: "
+                "does the robot know which places it cannot reach? In the other rows no place outside of the workspace "
+                "is asked for. The thesis draws its points 'over the workspace' and does not say how.",
+            ),
+            tables=(Table.of("choices", rows, why_dash="not measured there"),),
+            answers=[
+                f"{row['network']} samples, {row['measure']} of the choice of least uncertainty: epistemic "
+                f"{row['epistemic']}, nll {row['nll']}."
+                for row in rows
+                if "ratio" in row["measure"]
+            ],
+        ),
+        Section(
+            "Figures 4.2 and 4.3: the workspace",
+            (
+                "Of the first network: how far the arm misses a place that it reaches for, and, as dots, where its tip "
+                "was while babbling; stationarity; the standard deviation of each joint by cause. The line is the edge "
+                "of the workspace: the arm is not sent to places outside (white in the error map), and the "
+                "uncertainties show what the network would say of them.",
+            ),
+            [image(f"figures_4_2_4_3_{p.agent}_{p.variant}", partial(workspace, p.first), p.label) for p in pairs],
+        ),
+    ]
+
+
+def choices(pair: PairResult, part: str) -> list[Cells]:
+    """Two rows: the errors of the chosen candidates by criterion of choice, and their ratios to a random choice's.
+
+    Each score chooses the candidate of which it is least. ``min`` and ``max`` are the best and the worst choice in
+    hindsight, and ``random`` the mean over the candidates, which a choice by chance may expect. Errors are summed over
+    the choices of each network, in metres. ``part`` is ``"decision"``, whose candidates are within reach, or
+    ``"disc"``, whose candidates need not be.
+    """
+    errors = pair.arrays(f"{part}/error")  # [E, choices, candidates]
+    found = {}
+    for name in SCORES:
+        pick = pair.arrays(f"{part}/{name}").argmin(axis=-1)
+        found[name] = np.take_along_axis(errors, pick[..., None], axis=-1)[..., 0]
+    found |= {"min": errors.min(axis=-1), "max": errors.max(axis=-1), "random": errors.mean(axis=-1)}
+    for name in ("known_model", "mink_error"):  # the latter in runs of before 2026-11-28
+        if f"{part}/{name}" in pair.first:
+            found["known_model"] = pair.arrays(f"{part}/{name}")
+    sums = {name: each.sum(axis=1) for name, each in found.items()}
+    ratios = {name: statistics.ratio(sums[name], sums["random"], paired=True) for name in SCORES}
+    blank = dict.fromkeys(("measure", "network", *map(_words, (*sums, "known_model"))), DASH)
+    prefix = "" if part == "decision" else f"{part}_"
+    return [
+        {
+            **blank,
+            "measure": f"{prefix}{measure}",
+            "network": pair.label,
+            **{_words(name): cells[name] for name in cells},
+        }
+        for measure, cells in (
+            ("error_m", {name: mean_std(values) for name, values in sums.items()}),
+            ("ratio_to_random", {name: str(estimate(ratio, decimals)) for name, ratio in ratios.items()}),
+        )
+    ]
+
+
+def workspace(data: Arrays) -> Figure:
+    """Figures 4.2 and 4.3: values over the map, a panel each, in colors up to the 99th percentile within reach."""
+    points = data["map/points"]
+    side = round(len(points) ** 0.5)
+    x, y = points.T.reshape(2, side, side)
+    outside_m = data["map/outside_m"]
+    fields = {
+        "error of reaching (m), training data": data["map/error"][0],
+        "stationarity (nats)": data["map/stationarity"][0],
+    }
+    for kind in _KINDS:
+        for joint, variances in enumerate(data[f"map/{kind}"][0].T, 1):
+            fields[f"{kind}, q{joint} (rad)"] = np.sqrt(variances)
+    figure, panels = small_multiples(len(fields), 3, width=3.4, height=3.0)
+    panels[0].scatter(data["babbling"][:, 0], data["babbling"][:, 1], s=1, color=INK, zorder=3)
+    for axes, (title, values) in zip(panels, fields.items(), strict=True):
+        top = np.percentile(values[outside_m == 0], 99)
+        shades = axes.pcolormesh(x, y, values.reshape(side, side), vmin=0, vmax=top)
+        figure.colorbar(shades, ax=axes, extend="max")
+        axes.contour(x, y, outside_m.reshape(side, side), levels=[1e-3], colors=_ORANGE)
+        axes.set(title=title, aspect="equal")
+    return figure
+
+
+_SECTIONS: dict[str, Callable[[RegressionResult], list[Section]]] = {"toy_regression": _toy, "robot_ik": _robot}
+"""Sections of the suite's own tasks."""
