@@ -18,7 +18,7 @@ from imagine_bench.arrays import Arrays, Floats
 from imagine_bench.interfaces.regression import SCORES
 from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.results import PairResult, RegressionResult
-from imagine_bench.report.figures import GRAY, INK, image, small_multiples
+from imagine_bench.report.figures import INK, image, small_multiples
 from imagine_bench.report.page import made
 from imagine_bench.report.tables import DASH, Page, Section, Table, decimals, estimate, mean_std, number
 from imagine_bench.store.files import table_text
@@ -26,6 +26,7 @@ from imagine_bench.store.files import table_text
 Cells = dict[str, str]
 """A row of a table, by column."""
 _BLUE = "#0072b2"
+_GRAY = "#8c8c8c"
 _ORANGE = "#d55e00"
 _EDGE = 30.0
 """Where the toy data ends; beyond, networks extrapolate."""
@@ -264,7 +265,7 @@ def figure_4_1(data: Mapping[str, Arrays]) -> Figure:
     figure = Figure(figsize=(3.9 * len(data) + 0.4, 9.6), layout="constrained")
     grid = figure.subplots(4, len(data), squeeze=False, sharex=True, sharey="row")
     for (variant, found), (first, *others) in zip(data.items(), grid.T, strict=True):
-        first.scatter(found["training_x"], found["training_y"], s=2, color=GRAY)
+        first.scatter(found["training_x"], found["training_y"], s=2, color=_GRAY)
         first.scatter(found["x"], found["prediction"][0], s=2.5, color=_BLUE)
         first.set(title=_words(variant), ylim=(-120, 140))
         for axes, (kind, top) in zip(others, _KINDS.items(), strict=True):
@@ -273,7 +274,7 @@ def figure_4_1(data: Mapping[str, Arrays]) -> Figure:
             axes.set(ylim=(0, top), title=f"{kind} (std of y)")
         for axes in (first, *others):
             axes.axvspan(_EDGE, 40, color=_ORANGE, alpha=0.15)
-            axes.axvspan(-_REGION, _REGION, color=GRAY, alpha=0.15)
+            axes.axvspan(-_REGION, _REGION, color=_GRAY, alpha=0.15)
     return figure
 
 
