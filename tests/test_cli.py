@@ -115,7 +115,7 @@ def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFix
         ),
         (["report", "--task", "pick", "--out", str(tmp_path)], "No task 'pick'. Did you mean 'pick_place'?"),
         (["report", "robot_ik", "--out", str(tmp_path)], "There is no bench of robot_ik below"),
-        (["verify", "--causes", "--out", str(tmp_path)], "There is no bench of robot_ik below"),
+        (["verify", "--causes", "--out", str(tmp_path)], "There is no bench of arrow_puzzle or"),
         (["verify", "--encoder", "x"], "--encoder goes with --causes"),
         (["report", str(tmp_path)], "protocol.json, a bench's protocol."),
         (["view", "--out", str(tmp_path)], "There is no recording below"),
