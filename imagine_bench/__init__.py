@@ -54,6 +54,6 @@ MOVED_NAMES = {
 }
 """Where each name lies now, by the place that it had: names of moved modules, and of those loaded here."""
 
-keep_old_paths(MOVED, MOVED_NAMES)
+keep_old_paths(__name__, MOVED | MOVED_NAMES)
 for _entry in TASKS.values():
     register_env(_entry)

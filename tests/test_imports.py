@@ -7,11 +7,18 @@ that names a module, such as those of the registry and of ``import_module``.
 from __future__ import annotations
 
 import ast
+import importlib
+import pkgutil
 import re
+import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+import imagine_bench
+from imagine_bench import MOVED
 
 _TOP = Path(__file__).parent.parent
 LOOSE = "loose modules"
@@ -307,3 +314,37 @@ def test_each_offence_would_be_seen(file: str, line: str, offence: str) -> None:
 )
 def test_imports_that_go_down_are_allowed(file: str, line: str) -> None:
     assert offences(_TOP / file, line) == []
+
+
+@pytest.mark.parametrize("old", MOVED)
+def test_an_old_path_gives_the_objects_of_the_new_one_and_warns_once(old: str) -> None:
+    sys.modules.pop(old, None)
+    with pytest.warns(DeprecationWarning, match=f"{old} is now {MOVED[old]}; import it from there"):
+        module = importlib.import_module(old)
+    new = vars(importlib.import_module(MOVED[old]))
+    public = [name for name in new if not name.startswith("__")]
+    assert public or "__path__" in new, "a package may have no names of its own"
+    assert all(getattr(module, name) is new[name] for name in public)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert importlib.import_module(old) is module
+
+
+def test_a_path_that_never_was_is_not_found() -> None:
+    with pytest.raises(ModuleNotFoundError, match=r"imagine_bench\.never_was"):
+        importlib.import_module("imagine_bench.never_was")
+
+
+def test_an_old_path_hides_no_function_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``imagine_bench.bench`` may become a function: the import of a module that was called so leaves it."""
+
+    def bench() -> None: ...
+
+    monkeypatch.setattr(imagine_bench, "bench", bench, raising=False)
+    for old in ("imagine_bench.bench", "imagine_bench.bench.bench"):
+        sys.modules.pop(old, None)
+    with pytest.warns(DeprecationWarning):
+        module = importlib.import_module("imagine_bench.bench.bench")
+    assert imagine_bench.bench is bench and module.plan is importlib.import_module(MOVED[module.__name__]).plan
+    names = [module.name for module in pkgutil.iter_modules(imagine_bench.__path__)]
+    assert "bench" not in names and not set(names) & {old.split(".")[1] for old in MOVED if old.count(".") == 1}

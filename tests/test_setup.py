@@ -119,13 +119,6 @@ def test_without_a_usable_interpreter_each_is_named(checkout: Checkout) -> None:
     ]
 
 
-def test_one_version_is_not_tried_under_two_names(checkout: Checkout) -> None:
-    for name in ("python3", "python3.12"):
-        checkout.python(name, "3.12.1", install=FAILS)
-    assert checkout.setup()[0] == 1
-    assert [line for line in checkout.log() if line.startswith("made")] == ["made by python3"]
-
-
 def test_an_interpreter_that_was_named_is_the_only_one(ready: Checkout) -> None:
     ready.python("python3.11", "3.11.7")
     code, out = ready.setup(PYTHON="python3.10")
@@ -270,11 +263,8 @@ def test_variables_become_options(make: Callable[..., tuple[int, str]], words: s
     assert (code, did) == (0, expected.format("arrow_puzzle"))
 
 
-def test_a_variable_of_the_environment_counts(make: Callable[..., tuple[int, str]]) -> None:
+def test_variables_of_the_environment_count_and_unknown_ones_are_refused(make: Callable[..., tuple[int, str]]) -> None:
     assert make("report", TASK="pick_place")[1].endswith("report --task pick_place")
-
-
-def test_unknown_variables_are_refused(make: Callable[..., tuple[int, str]]) -> None:
     code, error = make("bench", "AGENT=dqn", "SEEDS=0")
     assert code == 2 and "'make bench' takes no AGENT. It takes AGENTS APPEARANCE ARGS BUDGETS " in error
     code, error = make("doctor", "TASK=arrow_puzzle")

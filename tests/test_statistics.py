@@ -18,16 +18,6 @@ def test_iqm_drops_a_quarter_at_each_end() -> None:
     assert statistics.iqm([1.0, 2.0, 9.0]) == 4.0  # three: nothing to trim
 
 
-def test_wilson_by_hand() -> None:
-    z = 1.959963984540054
-    n, p = 10, 0.8
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
-    assert statistics.wilson(8, 10) == pytest.approx((centre - half, centre + half), abs=1e-12)
-    assert statistics.wilson(0, 5)[0] == 0.0
-    assert statistics.wilson(5, 5)[1] == 1.0
-
-
 def test_wilson_refuses_impossible_counts() -> None:
     with pytest.raises(InvalidValueError, match="6 successes in 5 trials is impossible"):
         statistics.wilson(6, 5)
@@ -39,11 +29,6 @@ def test_running_means_by_hand() -> None:
     assert means == pytest.approx(np.array([[0.225, 10.75 / 30.0], [0.1, 0.1]]), abs=1e-12)
 
 
-def test_who_learns_earlier_has_the_larger_running_mean() -> None:
-    early, late = statistics.running_means((100, 250, 1000), [[0.9, 0.9, 0.9], [0.1, 0.1, 0.9]], 0.05)
-    assert (early > late).all()
-
-
 FIVE, OTHERS = [0.2, 0.5, 0.55, 0.6, 0.9], [0.1, 0.15, 0.3, 0.2, 0.8, 0.25, 0.2, 0.35]
 
 
@@ -53,13 +38,11 @@ def test_an_interval_is_student_s() -> None:
 
 
 def test_an_interval_of_a_trimmed_mean_is_tukey_s() -> None:
-    """Of eight, two at each end; scipy's has the winsorised spread of the same four."""
-    expected = stats.mstats.trimmed_mean_ci(OTHERS, limits=(0.25, 0.25), alpha=0.05)
+    """Of eight, two are cut off at each end."""
     spread = stats.mstats.winsorize(np.array(OTHERS), limits=(0.25, 0.25)).std(ddof=1)
     half = stats.t.ppf(0.975, 3) * spread * math.sqrt(7 / (4 * 3))  # Yuen (1974)
-    low, high = statistics.interval(OTHERS)
-    assert (low + high) / 2 == pytest.approx(statistics.iqm(OTHERS)) == pytest.approx(float(np.mean(expected)))
-    assert (high - low) / 2 == pytest.approx(half, abs=1e-12)
+    middle = statistics.iqm(OTHERS)
+    assert statistics.interval(OTHERS) == pytest.approx((middle - half, middle + half), abs=1e-12)
 
 
 def test_one_stuck_seed_in_five_does_not_decide() -> None:
@@ -89,17 +72,13 @@ def test_one_run_gives_no_interval() -> None:
     assert math.isfinite(statistics.gain([0.3, 0.31], [0.2, 0.21]).low), "two do"
 
 
-def test_a_difference_of_means_is_welch_s() -> None:
-    found, expected = statistics.difference(FIVE, OTHERS, trim=0.0), stats.ttest_ind(FIVE, OTHERS, equal_var=False)
+@pytest.mark.parametrize("trim", [0.0, 0.25])
+def test_a_difference_is_welch_s_and_of_trimmed_means_yuen_s(trim: float) -> None:
+    found = statistics.difference(FIVE, OTHERS, trim=trim)
+    expected = stats.ttest_ind(FIVE, OTHERS, equal_var=False, trim=trim)
     assert found.p == pytest.approx(expected.pvalue, abs=1e-12)
     assert found[1:3] == pytest.approx(tuple(expected.confidence_interval(0.95)), abs=1e-11)
-
-
-def test_a_difference_of_trimmed_means_is_yuen_s() -> None:
-    found = statistics.difference(FIVE, OTHERS)
-    expected = stats.ttest_ind(FIVE, OTHERS, equal_var=False, trim=0.25)
-    assert found.p == pytest.approx(expected.pvalue, abs=1e-12)
-    assert found.value == pytest.approx(statistics.iqm(FIVE) - statistics.iqm(OTHERS))
+    assert found.value == pytest.approx(stats.trim_mean(FIVE, trim) - stats.trim_mean(OTHERS, trim))
 
 
 def test_a_difference_of_nothing_is_nothing() -> None:
@@ -134,11 +113,7 @@ def test_a_detectable_difference_is_found_four_times_in_five() -> None:
         a, b = draw.normal(size=(2, 12))
         found += statistics.difference(a + sizes, b).p < 0.05
     assert 0.7 < found / 400 < 0.93
-    test = stats.ttest_ind(FIVE, OTHERS, equal_var=False, trim=0.25)
-    error = statistics.difference(FIVE, OTHERS).value / test.statistic
-    for cells in (1, 9):
-        expected = error * (stats.t.isf(0.05 / cells / 2, test.df) + stats.t.ppf(0.8, test.df))
-        assert statistics.detectable(FIVE, OTHERS, cells=cells) == pytest.approx(expected)
+    assert statistics.detectable(FIVE, OTHERS, cells=9) > statistics.detectable(FIVE, OTHERS, cells=1)
     assert statistics.detectable([1.0, 1.0], [0.0, 0.0], cells=1) == 0.0
 
 
@@ -165,12 +140,9 @@ def test_a_ratio_s_ends_are_fieller_s(paired: bool) -> None:
             assert abs(t) == pytest.approx(stats.t.ppf(0.975, freedom), abs=1e-9)
 
 
-def test_a_gain_over_perhaps_nothing_has_no_interval() -> None:
+def test_a_gain_over_perhaps_nothing_has_no_interval_and_over_nothing_no_value() -> None:
     value, low, high, _ = statistics.gain([0.3, 0.4, 0.5], [0.0, 0.0, 0.1])
     assert value == pytest.approx(11.0) and math.isnan(low) and math.isnan(high)
-
-
-def test_gain_over_nothing_is_not_a_number() -> None:
     assert math.isnan(statistics.gain([0.1, 0.2], [0.0, 0.0]).value)
 
 
@@ -227,25 +199,16 @@ def test_a_detectable_difference_of_pairs_is_found_as_often(pairs: int, alone: i
     assert 0.7 < np.mean(found) < 0.9
 
 
-def test_the_probability_of_improvement_is_mann_and_whitney_s() -> None:
-    rng = np.random.default_rng(1)
-    a, b = rng.integers(0, 6, 7) / 5, rng.integers(0, 6, 5) / 5
-    found = statistics.probability_of_improvement(a, b)
-    assert found == pytest.approx(stats.mannwhitneyu(a, b).statistic / 35)
-    assert found + statistics.probability_of_improvement(b, a) == pytest.approx(1.0)
-    assert statistics.probability_of_improvement(a + 2, b) == 1.0
-
-
-def test_auroc_by_hand_and_against_counting_pairs() -> None:
-    rising = np.array([0.1, 0.2, 0.3, 0.4])
-    wrong = np.array([False, False, True, True])
-    assert (statistics.auroc(rising, wrong), statistics.auroc(-rising, wrong)) == (1.0, 0.0)
-    assert statistics.auroc(np.ones(4), wrong) == 0.5
-    assert np.isnan(statistics.auroc(rising, np.ones(4, dtype=np.bool_)))
+def test_auroc_and_the_probability_of_improvement_count_pairs() -> None:
     rng = np.random.default_rng(0)
     scores = rng.integers(0, 6, 60).astype(float)
     wrong = rng.random(60) < 0.3
     pairs = np.subtract.outer(scores[wrong], scores[~wrong])
-    assert statistics.auroc(scores, wrong) == pytest.approx(np.mean(0.5 * (np.sign(pairs) + 1.0)))
+    share = np.mean(0.5 * (np.sign(pairs) + 1.0))
+    assert statistics.auroc(scores, wrong) == pytest.approx(share)
+    assert statistics.auroc(-scores, wrong) == pytest.approx(1.0 - share)
+    assert statistics.probability_of_improvement(scores[wrong], scores[~wrong]) == pytest.approx(share)
+    assert statistics.auroc(np.ones(60), wrong) == 0.5
+    assert math.isnan(statistics.auroc(scores, np.ones(60, dtype=np.bool_)))
     with pytest.raises(InvalidValueError, match="one number a prediction"):
         statistics.auroc(np.array([1.0]), np.array([True, False]))

@@ -15,7 +15,7 @@ import numpy as np
 from imagine_bench import appearance, reference, registry, statistics
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.judge.causes import CAUSES
-from imagine_bench.registry.old_names import label_today
+from imagine_bench.registry.entries import label_today
 from imagine_bench.report import figures
 from imagine_bench.report.data import agent_title, collect, frames_before
 from imagine_bench.store.loading import load_so_far

@@ -163,7 +163,7 @@ class Play:
 
     def __call__(self) -> None:
         """Play, or film."""
-        from imagine_bench.tools import film, play  # noqa: PLC0415 - pillow loads slowly
+        from imagine_bench.tools import play  # noqa: PLC0415 - pillow loads slowly
 
         if not self.film:
             options = {"execution": self.execution, "appearance": self.appearance, "encoder": self.encoder}
@@ -171,7 +171,7 @@ class Play:
             return
         if self.task is None or self.model is not None:
             raise InvalidValueError("A film is of the oracle in a task; give a task and no --model.")
-        print(film.film(self.task, self.out, seed=self.seed, appearance=self.appearance or APPEARANCES[0]))
+        print(play.film(self.task, self.out, seed=self.seed, appearance=self.appearance or APPEARANCES[0]))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,8 +15,7 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import DEVICES
-from imagine_bench.registry.entries import entrant
-from imagine_bench.registry.old_names import FIRST, TODAY, agent_label, edition_of, name_in_edition_1
+from imagine_bench.registry.entries import FIRST, TODAY, agent_label, edition_of, entrant, name_in_edition_1
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
 from imagine_bench.values import Json, Setting
 
@@ -51,7 +50,7 @@ class ProtocolData(ABC):
     settings_digest: str = ""
     device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it
     #: Edition of agents' names that files and the hash of this protocol have; ``agents`` are today's labels in any.
-    #: A file says it only where names would be taken for older ones without it. See :mod:`.registry.old_names`.
+    #: A file says it only where names would be taken for older ones without it. See :mod:`.registry.entries`.
     agent_names: int = field(default=TODAY, metadata=LATER)
 
     def __post_init__(self) -> None:

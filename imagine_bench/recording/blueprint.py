@@ -18,6 +18,11 @@ def scene_view(target_m: NDArray[np.float64]) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(origin=ROOT, name=name, eye_controls=eye, background=[214, 222, 230], line_grid=False)
 
 
+def sheet_view(origin: str, name: str) -> rrb.Spatial2DView:
+    """A large image on white."""
+    return rrb.Spatial2DView(origin=origin, name=name, background=[255, 255, 255])
+
+
 def blueprint(
     *, target_m: NDArray[np.float64], values: bool, imagines: bool, several: bool, sees: bool, explores: bool
 ) -> rrb.Blueprint:
@@ -34,10 +39,11 @@ def blueprint(
     top = rrb.Horizontal(scene_view(target_m), rrb.Vertical(*side), column_shares=[1.1, 1.0])
     pages: list[rrb.Container | rrb.View] = [_over_time(values=values, explores=explores)]
     if imagines:
-        pages = [_imagined_now(), *([_sampled_rollouts()] if several else []), *pages, _by_depth()]
+        futures = [sheet_view("/imagined/sampled_rollouts", "Several futures from the current frame")]
+        pages = [_imagined_now(), *(futures if several else []), *pages, _by_depth()]
     if sees:
         name = "What it has learned to see: a color a factor, and beside it a look of each of its values"
-        pages = [rrb.Spatial2DView(origin="/seen/factors", name=name, background=[255, 255, 255]), *pages]
+        pages = [sheet_view("/seen/factors", name), *pages]
     bottom = rrb.Tabs(*pages, active_tab=0)
     return playing(rrb.Vertical(top, bottom, row_shares=[1.45, 1.0]))
 
@@ -54,17 +60,11 @@ def playing(layout: rrb.Container) -> rrb.Blueprint:
 
 def _imagined_now() -> rrb.Horizontal:
     name = "The agent's own plan from here: what would really happen (above), what it imagines (below)"
-    strip = rrb.Spatial2DView(origin="/imagined/filmstrip", name=name, background=[255, 255, 255])
+    strip = sheet_view("/imagined/filmstrip", name)
     name = "Uncertainty by depth: epistemic pink, aleatoric blue, modal green"
     hidden = rrb.PlotLegend(visible=False)
     bars = rrb.BarChartView(origin="/imagined/uncertainty", name=name, plot_legend=hidden)
     return rrb.Horizontal(strip, bars, column_shares=[1.9, 1.0], name="Imagination from the current frame")
-
-
-def _sampled_rollouts() -> rrb.Spatial2DView:
-    return rrb.Spatial2DView(
-        origin="/imagined/sampled_rollouts", name="Several futures from the current frame", background=[255, 255, 255]
-    )
 
 
 def _over_time(*, values: bool, explores: bool) -> rrb.Horizontal:

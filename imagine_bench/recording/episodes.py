@@ -29,7 +29,7 @@ from imagine_bench.interfaces.capabilities import (
 from imagine_bench.judge.open_loop import compare_rollout, sampled_rollouts_from
 from imagine_bench.recording.blueprint import blueprint
 from imagine_bench.recording.filmstrips import filmstrip, rgb, sampled_filmstrips
-from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, look_target_m, macro_duration_s
+from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
 from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.rules import is_random
 from imagine_bench.seeding import SeedTree, episode_seed
@@ -208,7 +208,7 @@ class _EpisodeRecorder:
         remembered = truth
         if isinstance(self._agent, MemoryReader):
             remembered = self._agent.read_memory(frame, [len(values) for values in spec.macrostate_values])
-        names = [spec.value_names(each) for each in (truth, info.get("shown", truth), remembered)]
+        names = map(spec.value_names, (truth, info.get("shown", truth), remembered))
         seen = ""
         for name, now, shown, recalled in zip(spec.macrostate_names, *names, strict=True):
             recall = f"; memory: {recalled}" if isinstance(self._agent, MemoryReader) else ""
@@ -221,16 +221,14 @@ class _EpisodeRecorder:
             return
         names = self._spec.action_names
         values = self._agent.q_values(observation)
-        for name, value in zip(names, values, strict=True):
-            self._recording.scalar(f"/real/q_values/{entity_name(name)}", value)
+        self._recording.curves("/real/q_values", names, values)
         self._recording.text("/real/q_table", q_table(names, values, action))
 
     def _log_novelty(self, observation: Observation, episode: int, step: int) -> None:
         """How unknown each macro-action is to the agent, a curve each."""
         novelty = _novelty(self._agent, observation, SeedTree(self._seed).child("novelty", episode, step))
         if novelty is not None:
-            for name, value in zip(self._spec.action_names, novelty, strict=True):
-                self._recording.scalar(f"/real/novelty/{entity_name(name)}", value)
+            self._recording.curves("/real/novelty", self._spec.action_names, novelty)
 
     def _clear_predictions(self) -> None:
         """Remove what was predicted from the frame before: at an episode's end nothing more is carried out."""

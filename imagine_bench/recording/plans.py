@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from imagine_bench.environments import Env
 from imagine_bench.interfaces import SceneReader
 from imagine_bench.judge.plans import PlanResult, carry_out, make_env
-from imagine_bench.recording.blueprint import playing, scene_view
+from imagine_bench.recording.blueprint import playing, scene_view, sheet_view
 from imagine_bench.recording.episodes import MOTION_HZ
 from imagine_bench.recording.filmstrips import filmstrip, rgb
 from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
@@ -144,9 +144,5 @@ def _layout(scene: Env, trained: Trained) -> rrb.Blueprint:
     )
     text = rrb.TextDocumentView(origin="/real/text", name="The plan")
     top = rrb.Horizontal(scene_view(look_target_m(scene)), rrb.Vertical(text, frames), column_shares=[1.1, 1.0])
-    strip = rrb.Spatial2DView(
-        origin="/imagined/filmstrip",
-        name=f"{trained.task.title}: the plan, real above and imagined below",
-        background=[255, 255, 255],
-    )
+    strip = sheet_view("/imagined/filmstrip", f"{trained.task.title}: the plan, real above and imagined below")
     return playing(rrb.Vertical(top, strip, row_shares=[1.45, 1.0]))

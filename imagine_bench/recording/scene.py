@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Motion, SceneReader, Shape3D
-from imagine_bench.recording.stream import Recording
+from imagine_bench.recording.stream import Recording, entity_name
 
 ROOT = "/scene"
 _STILL_M = 1e-6  # bodies whose poses (metres; quaternions) change by less in a macro-action get no new transforms
@@ -22,17 +21,12 @@ _SMALL_M = 0.07
 _KINEMATIC_STEP_S = 1.0
 
 
-def extent_m(shape: Shape3D) -> float:
+def _extent_m(shape: Shape3D) -> float:
     """Roughly how far a shape reaches from its origin along its longest axis, in metres."""
     return float(shape.size.max() if shape.vertices is None else np.abs(shape.vertices).max())
 
 
-def entity_name(words: str) -> str:
-    """``"Turn left (cube 1)"`` as ``"turn_left_cube_1"``: lower_snake, as entity paths want it."""
-    return re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
-
-
-def body_path(body: str) -> str:
+def _body_path(body: str) -> str:
     """Entity path of a body."""
     return f"{ROOT}/{entity_name(body)}"
 
@@ -41,9 +35,13 @@ def log_shapes(recording: Recording, shapes: Sequence[Shape3D]) -> None:
     """Log every shape once, for all times, below its body; a backdrop as wide as a room is left out."""
     recording.log(ROOT, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for shape in shapes:
-        if extent_m(shape) > _BACKDROP_M:
+        if _extent_m(shape) > _BACKDROP_M:
             continue
-        path = f"{body_path(shape.body)}/{entity_name(shape.name)}"
+        path = f"{_body_path(shape.body)}/{entity_name(shape.name)}"
+        pose = shape.pose_in_body
+        recording.log(
+            path, rr.Transform3D(translation=pose[:3], quaternion=rr.Quaternion(xyzw=_xyzw(pose[3:]))), static=True
+        )
         recording.log(path, _drawable(shape), static=True)
 
 
@@ -63,7 +61,7 @@ def log_motion(
         if only_moved and np.abs(poses - poses[0]).max() < _STILL_M:
             continue
         columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:]))
-        recording.stream.send_columns(body_path(body), indexes=times, columns=columns, strict=True)
+        recording.stream.send_columns(_body_path(body), indexes=times, columns=columns, strict=True)
 
 
 def macro_duration_s(scene: Env) -> float:
@@ -76,31 +74,28 @@ def look_target_m(scene: Env) -> NDArray[np.float64]:
     if not isinstance(scene, SceneReader):
         return np.zeros(3)
     motion = scene.motion()
-    large = {shape.body for shape in scene.shapes() if extent_m(shape) > _SMALL_M}
+    large = {shape.body for shape in scene.shapes() if _extent_m(shape) > _SMALL_M}
     small = [index for index, body in enumerate(motion.body_names) if body not in large]
     chosen = small or list(range(len(motion.body_names)))
     return np.asarray(motion.poses_in_world[0, chosen, :3].mean(axis=0))
 
 
 def _drawable(shape: Shape3D) -> rr.AsComponents:
-    center = shape.pose_in_body[None, :3]
-    quaternion = _xyzw(shape.pose_in_body[None, 3:])
     color = (np.clip(shape.rgba, 0.0, 1.0) * 255).astype(np.uint8)
     style: dict[str, Any] = {"colors": [color], "fill_mode": "solid"}
+    size = shape.size
     if shape.kind == "mesh":
         return _mesh(shape, color)
     if shape.kind == "box":
-        return rr.Boxes3D(half_sizes=[shape.size], centers=center, quaternions=quaternion, **style)
-    if shape.kind in {"sphere", "ellipsoid"}:
-        radii = shape.size if shape.kind == "ellipsoid" else np.full(3, shape.size[0])
-        return rr.Ellipsoids3D(half_sizes=[radii], centers=center, quaternions=quaternion, **style)
-    radius = [shape.size[0]]
-    length = 2.0 * shape.size[1]
+        return rr.Boxes3D(half_sizes=[size], **style)
+    if shape.kind == "ellipsoid":
+        return rr.Ellipsoids3D(half_sizes=[size], **style)
+    if shape.kind == "sphere":
+        return rr.Ellipsoids3D(half_sizes=[np.full(3, size[0])], **style)
     if shape.kind == "cylinder":
-        return rr.Cylinders3D(lengths=[length], radii=radius, centers=center, quaternions=quaternion, **style)
+        return rr.Cylinders3D(lengths=[2.0 * size[1]], radii=size[:1], **style)
     if shape.kind == "capsule":  # Rerun's begins at its origin, ours has it in the middle
-        begin = center + rotated(shape.pose_in_body[3:], np.array([0.0, 0.0, -length / 2]))
-        return rr.Capsules3D(lengths=[length], radii=radius, translations=begin, quaternions=quaternion, **style)
+        return rr.Capsules3D(lengths=[2.0 * size[1]], radii=size[:1], translations=[[0.0, 0.0, -size[1]]], **style)
     raise InvalidValueError(f"Shape {shape.name!r} is of kind {shape.kind!r}, which a recording cannot draw.")
 
 
@@ -108,7 +103,7 @@ def _mesh(shape: Shape3D, color: NDArray[np.uint8]) -> rr.Mesh3D:
     """Flat-shaded: every face has its own three corners, so that edges stay sharp."""
     if shape.vertices is None or shape.faces is None:
         raise InvalidValueError(f"Shape {shape.name!r} is a mesh without vertices or faces.")
-    corners = rotated(shape.pose_in_body[3:], shape.vertices[shape.faces]) + shape.pose_in_body[:3]  # [F, 3, 3]
+    corners = shape.vertices[shape.faces]  # [F, 3, 3]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return rr.Mesh3D(
@@ -117,14 +112,6 @@ def _mesh(shape: Shape3D, color: NDArray[np.uint8]) -> rr.Mesh3D:
         triangle_indices=np.arange(3 * len(corners)).reshape(-1, 3),
         albedo_factor=color,
     )
-
-
-def rotated(quaternion_wxyz: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotate vectors (..., 3) by a unit quaternion (w, x, y, z)."""
-    w = quaternion_wxyz[0]
-    axis = quaternion_wxyz[1:]
-    twice = 2.0 * np.cross(axis, vectors)
-    return np.asarray(vectors + w * twice + np.cross(axis, twice))
 
 
 def _xyzw(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,6 +17,11 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.recording.filmstrips import png
+
+
+def entity_name(words: str) -> str:
+    """``"Turn left (cube 1)"`` as ``"turn_left_cube_1"``: lower_snake, as entity paths want it."""
+    return re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
 
 
 class Recording:
@@ -38,6 +43,11 @@ class Recording:
     def scalar(self, path: str, value: float) -> None:
         """Log one value of a curve."""
         self.log(path, rr.Scalars(float(value)))
+
+    def curves(self, path: str, names: Sequence[str], values: NDArray[np.floating]) -> None:
+        """Log one value of a curve for each name."""
+        for name, value in zip(names, values, strict=True):
+            self.scalar(f"{path}/{entity_name(name)}", value)
 
     def text(self, path: str, markdown: str) -> None:
         """Log a text."""

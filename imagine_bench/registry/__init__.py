@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -27,26 +27,50 @@ from imagine_bench.errors import (
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.interfaces.regression import RegressionSpec, Regressor, RegressorContext
-from imagine_bench.registry.builtin import AGENTS as AGENTS
-from imagine_bench.registry.builtin import DEMONSTRATOR as DEMONSTRATOR
-from imagine_bench.registry.builtin import REGRESSIONS as REGRESSIONS
-from imagine_bench.registry.builtin import REGRESSORS as REGRESSORS
-from imagine_bench.registry.builtin import TASKS as TASKS
-from imagine_bench.registry.builtin import WORLD_MODELS as WORLD_MODELS
-from imagine_bench.registry.entries import AgentEntry as AgentEntry
-from imagine_bench.registry.entries import EncoderEntry as EncoderEntry
-from imagine_bench.registry.entries import RegressorEntry as RegressorEntry
-from imagine_bench.registry.entries import TaskEntry as TaskEntry
-from imagine_bench.registry.entries import WorldModelEntry as WorldModelEntry
-from imagine_bench.registry.entries import entrant, parse_options, read_mapping
-from imagine_bench.registry.guests import Guest, guest_of, guests
-from imagine_bench.registry.old_names import LABEL_OF_OLD_AGENT
+from imagine_bench.registry.builtin import (
+    AGENTS,
+    DEMONSTRATOR,
+    REGRESSIONS,
+    REGRESSORS,
+    TASKS,
+    WORLD_MODELS,
+    Guest,
+    guests,
+)
+from imagine_bench.registry.entries import (
+    LABEL_OF_OLD_AGENT,
+    AgentEntry,
+    EncoderEntry,
+    RegressorEntry,
+    TaskEntry,
+    WorldModelEntry,
+    entrant,
+    parse_options,
+    read_mapping,
+)
 from imagine_bench.values import Setting
 
-TASK_GROUP, AGENT_GROUP, ENCODER_GROUP = (f"imagine_bench.{name}" for name in ("tasks", "agents", "encoders"))
-REGRESSION_GROUP, REGRESSOR_GROUP, STUDY_GROUP, WORLD_MODEL_GROUP = (
-    f"imagine_bench.{name}" for name in ("regressions", "regressors", "studies", "world_models")
-)
+__all__ = [
+    "AGENTS",
+    "DEMONSTRATOR",
+    "REGRESSIONS",
+    "REGRESSORS",
+    "TASKS",
+    "WORLD_MODELS",
+    "AgentEntry",
+    "EncoderEntry",
+    "RegressorEntry",
+    "TaskEntry",
+    "WorldModelEntry",
+]
+
+TASK_GROUP = "imagine_bench.tasks"
+AGENT_GROUP = "imagine_bench.agents"
+ENCODER_GROUP = "imagine_bench.encoders"
+REGRESSION_GROUP = "imagine_bench.regressions"
+REGRESSOR_GROUP = "imagine_bench.regressors"
+STUDY_GROUP = "imagine_bench.studies"
+WORLD_MODEL_GROUP = "imagine_bench.world_models"
 """Entry points in which installed packages offer what is theirs: each the ``"module:attr"`` of a TaskEntry, AgentEntry,
 EncoderEntry, RegressionSpec, RegressorEntry, Study or WorldModelEntry."""
 
@@ -56,20 +80,20 @@ class _Group(NamedTuple):
 
     what: str  #: one of it, in words
     kind: type  #: the class of its objects
-    own: Callable[[], Iterable[str]]  #: gives the names that are this suite's
+    own: Sequence[Container[str]]  #: where the names are that are this suite's
 
 
 _GROUPS = {
-    TASK_GROUP: _Group("task", TaskEntry, lambda: (*TASKS, *REGRESSIONS)),
-    AGENT_GROUP: _Group("agent", AgentEntry, lambda: (*AGENTS, *REGRESSORS)),
-    ENCODER_GROUP: _Group("encoder", EncoderEntry, tuple),
-    REGRESSION_GROUP: _Group("regression task", RegressionSpec, lambda: (*TASKS, *REGRESSIONS)),
-    REGRESSOR_GROUP: _Group("regressor", RegressorEntry, lambda: (*AGENTS, *REGRESSORS)),
-    WORLD_MODEL_GROUP: _Group("world model", WorldModelEntry, lambda: WORLD_MODELS),
+    TASK_GROUP: _Group("task", TaskEntry, (TASKS, REGRESSIONS)),
+    AGENT_GROUP: _Group("agent", AgentEntry, (AGENTS, REGRESSORS)),
+    ENCODER_GROUP: _Group("encoder", EncoderEntry, ()),
+    REGRESSION_GROUP: _Group("regression task", RegressionSpec, (TASKS, REGRESSIONS)),
+    REGRESSOR_GROUP: _Group("regressor", RegressorEntry, (AGENTS, REGRESSORS)),
+    WORLD_MODEL_GROUP: _Group("world model", WorldModelEntry, (WORLD_MODELS,)),
 }
 
 
-def describe_group(group: str, *, what: str, kind: type, own: Iterable[str]) -> None:
+def describe_group(group: str, *, what: str, kind: type, own: Container[str]) -> None:
     """Say what packages offer in a group; a room above the registry says it of its own group when it is imported.
 
     Args:
@@ -78,7 +102,7 @@ def describe_group(group: str, *, what: str, kind: type, own: Iterable[str]) -> 
         kind: The class of its objects.
         own: The names that are this suite's.
     """
-    _GROUPS[group] = _Group(what, kind, lambda: own)
+    _GROUPS[group] = _Group(what, kind, (own,))
 
 
 def load(target: str) -> Any:
@@ -129,8 +153,8 @@ def usable(group: str) -> dict[str, Any]:
 
 def refused_offers() -> dict[str, SetupError]:
     """What installed packages offer and cannot be used, by name: why."""
-    everything = {name: entry for group in _GROUPS for name, entry in offers(group).items()}
-    return {name: entry for name, entry in everything.items() if isinstance(entry, SetupError)}
+    everything = [pair for group in _GROUPS for pair in offers(group).items()]
+    return {name: entry for name, entry in everything if isinstance(entry, SetupError)}
 
 
 @functools.cache
@@ -141,11 +165,10 @@ def offers(group: str) -> Mapping[str, Any]:
     """
     found: dict[str, Any] = {}
     for point in entry_points(group=group):
-        what = _GROUPS[group].what
-        kind = _GROUPS[group].kind
+        what, kind, own = _GROUPS[group]
         package = point.dist.name if point.dist else point.module
         offer = f"The package {package} offers {point.value} as {what} {point.name}"
-        if point.name in found or point.name in _GROUPS[group].own():
+        if point.name in found or any(point.name in names for names in own):
             found.setdefault(f"{package}:{point.name}", SetupError(f"{offer}, a name that is taken; give it another."))
             continue
         try:
@@ -165,16 +188,17 @@ def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
     """What has a name in a group: this suite's own, or a package's. Raises as :func:`task_entry`."""
     if isinstance(name, str) and name in own:
         return own[name]
+    what = _GROUPS[group].what
     there = offers(group)
     if group == AGENT_GROUP and name in LABEL_OF_OLD_AGENT and name not in there:
         raise InvalidValueError(f"Agent {name!r} is now called {LABEL_OF_OLD_AGENT[name]!r}; give that name.")
-    guest = guest_of(name, group) if name not in there else None
-    if guest is not None:
-        raise SetupError(
-            f"The {_GROUPS[group].what} {name} is in the package {guest.package}, which is not installed. "
-            f"Install it with: {guest.install}"
-        )
-    entry = there[require_known(_GROUPS[group].what, name, {**own, **there})]
+    for guest in guests():
+        if name in guest.names.get(group, ()) and name not in there:
+            raise SetupError(
+                f"The {what} {name} is in the package {guest.package}, which is not installed. "
+                f"Install it with: {guest.install}"
+            )
+    entry = there[require_known(what, name, {**own, **there})]
     if isinstance(entry, SetupError):
         raise entry
     return entry
@@ -186,16 +210,17 @@ def absent_guests() -> list[Guest]:
     return [guest for guest in guests() if guest.package not in installed]
 
 
-def guest_packages() -> dict[str, frozenset[str]]:
+def guest_packages() -> dict[str, set[str]]:
     """The installed packages that offer anything, by name, and where their entries lie: names of top modules.
 
     None of them is imported.
     """
-    found: dict[str, frozenset[str]] = {}
+    found: dict[str, set[str]] = {}
     everything = entry_points()
-    for point in (point for group in {*_GROUPS, STUDY_GROUP} for point in everything.select(group=group)):
-        if point.dist:
-            found[point.dist.name] = found.get(point.dist.name, frozenset()) | {point.module.partition(".")[0]}
+    for group in {*_GROUPS, STUDY_GROUP}:
+        for point in everything.select(group=group):
+            if point.dist:
+                found.setdefault(point.dist.name, set()).add(point.module.partition(".")[0])
     return dict(sorted(found.items()))
 
 
@@ -212,7 +237,7 @@ def task_entry(name: str) -> TaskEntry:
         entry: TaskEntry = offered(name, TASKS, TASK_GROUP)
     else:
         line: TaskEntry = offered(base, TASKS, TASK_GROUP)
-        with _guests_faults(f"Task {name} ({line.spec})", own=base in TASKS):
+        with _guests_faults(f"Task {name}", line.spec):
             options = {**line.options, **_options(base, line, said)}
             spec: TaskSpec = load(line.spec)(**options)
             horizon = line.horizon and spec.horizon
@@ -314,24 +339,23 @@ def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Setting],
         InvalidValueError: A value of the wrong type or out of its range.
     """
     entry = agent_entry(agent)
-    own = entrant(agent).agent in AGENTS
-    with _guests_faults(f"Agent {agent} (settings {entry.settings})", own=own):
+    with _guests_faults(f"Agent {agent}, its settings", entry.settings):
         given = own_settings(agent, overrides)
         return load(entry.settings).resolve(hyperparameters, given, group) if entry.settings else None
 
 
 @contextmanager
-def _guests_faults(what: str, *, own: bool) -> Iterator[None]:
+def _guests_faults(what: str, target: str) -> Iterator[None]:
     """Whatever code of another package does wrong is one sentence; of this suite's own a traceback says more."""
     try:
         yield
     except ImagineBenchError:
         raise
     except Exception as error:
-        if own:
+        if target.startswith("imagine_bench."):
             raise
         why = f"{type(error).__name__}: {plain(error)}".partition("\n")[0]
-        raise SetupError(f"{what} cannot be used ({why}); mend or uninstall its package.") from error
+        raise SetupError(f"{what} ({target}) cannot be used ({why}); mend or uninstall its package.") from error
 
 
 def task(name: str) -> TaskSpec:
@@ -343,7 +367,7 @@ def task(name: str) -> TaskSpec:
     """
     entry = task_entry(name)
     known = tasks()
-    with _guests_faults(f"Task {name} ({entry.spec})", own=name in TASKS):
+    with _guests_faults(f"Task {name}", entry.spec):
         loaded = load(entry.spec)
         spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
         if not isinstance(spec, TaskSpec):
@@ -369,11 +393,13 @@ def task(name: str) -> TaskSpec:
 
 def make_agent(name: str, context: AgentContext) -> Agent:
     """A new agent by its registered name. Raises SetupError: that of a package cannot be made."""
-    entry = agent_entry(name)
-    own = entrant(name).agent in AGENTS
-    with _guests_faults(f"Agent {name} ({entry.make})", own=own):
-        agent: Agent = load(entry.make)(context)
+    agent: Agent = _made(f"Agent {name}", agent_entry(name).make, context)
     return agent
+
+
+def _made(what: str, target: str, *given: Any) -> Any:
+    with _guests_faults(what, target):
+        return load(target)(*given)
 
 
 def regression(name: str) -> RegressionSpec:
@@ -414,16 +440,11 @@ def world_model_entry(name: str) -> WorldModelEntry:
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
     """A new regressor by its registered name. Raises as :func:`make_agent`."""
-    entry = regressor_entry(name)
-    own = entrant(name).agent in REGRESSORS
-    with _guests_faults(f"Regressor {name} ({entry.make})", own=own):
-        regressor: Regressor = load(entry.make)(context)
+    regressor: Regressor = _made(f"Regressor {name}", regressor_entry(name).make, context)
     return regressor
 
 
 def make_world_model(name: str, *given: Any) -> WorldModel:
     """A new world model by its registered name, from what its entry says. Raises as :func:`make_agent`."""
-    entry = world_model_entry(name)
-    with _guests_faults(f"World model {name} ({entry.make})", own=entrant(name).agent in WORLD_MODELS):
-        model: WorldModel = load(entry.make)(*given)
+    model: WorldModel = _made(f"World model {name}", world_model_entry(name).make, *given)
     return model

@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
 
 from imagine_bench.interfaces import OBSERVATIONS
 from imagine_bench.registry.entries import AgentEntry, RegressorEntry, TaskEntry, WorldModelEntry
@@ -134,8 +139,6 @@ REGRESSORS: dict[str, RegressorEntry] = {
     ),
 }
 
-_WORLD_MODELS = "imagine_bench.agents.world_models"
-_SETTINGS = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
 WORLD_MODELS: dict[str, WorldModelEntry] = {
     "copy": WorldModelEntry(
         make="imagine_bench.agents.world_models.limits:Copy",
@@ -143,41 +146,41 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         description="Says that nothing ever changes: one end of the scale.",
     ),
     "convolutional": WorldModelEntry(
-        make=f"{_WORLD_MODELS}.convolutional:make",
+        make="imagine_bench.agents.world_models.convolutional:make",
         title="convolutional",
         description="A convolutional network from the latest frame and the action to the next frame, in plain torch.",
     ),
     "gaussian": WorldModelEntry(
-        make=f"{_WORLD_MODELS}.latent:make_gaussian",
+        make="imagine_bench.agents.world_models.latent:make_gaussian",
         title="VAE + one Gaussian",
         encoder_kind="latents",
-        settings=_SETTINGS,
+        settings=_IMAGINATION_SETTINGS,
         description="The thesis' model with a single Gaussian, which cannot hold two outcomes apart.",
     ),
     "mdn_dropout": WorldModelEntry(
-        make=f"{_WORLD_MODELS}.latent:make_dropout",
+        make="imagine_bench.agents.world_models.latent:make_dropout",
         title="VAE + MDN, MC dropout",
         encoder_kind="latents",
-        settings=_SETTINGS,
+        settings=_IMAGINATION_SETTINGS,
         description="The thesis' model: a mixture density network between latents, uncertain by Monte-Carlo dropout.",
     ),
     "mdn_ensemble": WorldModelEntry(
-        make=f"{_WORLD_MODELS}.latent:make_ensemble",
+        make="imagine_bench.agents.world_models.latent:make_ensemble",
         title="VAE + MDN, ensemble",
         encoder_kind="latents",
-        settings=_SETTINGS,
+        settings=_IMAGINATION_SETTINGS,
         description="Three mixture density networks between latents, uncertain where they disagree.",
     ),
     "mdn_thesis": WorldModelEntry(
-        make=f"{_WORLD_MODELS}.latent:make_thesis",
+        make="imagine_bench.agents.world_models.latent:make_thesis",
         title="VAE + MDN, thesis' settings",
         encoder_kind="latents",
-        settings=_SETTINGS,
+        settings=_IMAGINATION_SETTINGS,
         description="The same at the settings that the thesis prints; a minute to fit, so judged only when named.",
         by_default=False,
     ),
     "structured": WorldModelEntry(
-        make=f"{_WORLD_MODELS}.structured:make",
+        make="imagine_bench.agents.world_models.structured:make",
         title="structured",
         encoder_kind="codes",
         description="The model of the agent factored: tables over discrete factors, whose structure it learns.",
@@ -190,3 +193,27 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
     ),
 }
 """World models that ``imagine-bench judge`` judges."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Guest:
+    """A package of this suite that is installed apart from it, known by name also where it is not installed."""
+
+    package: str  #: its name as pip knows it
+    names: Mapping[str, tuple[str, ...]]  #: what it offers, by group of entry points
+    install: str  #: the command line that installs it
+
+
+@functools.cache
+def guests() -> tuple[Guest, ...]:
+    """All guests of this suite, installed or not, in the order of their folders.
+
+    Their ``pyproject.toml`` files lie in the checkout and in the wheel; a guest's code is in its own package alone.
+    """
+    found = []
+    for file in sorted(Path(str(resources.files("imagine_bench.agents"))).glob("guests/*/pyproject.toml")):
+        project = tomllib.loads(file.read_text())["project"]
+        names = {group: tuple(points) for group, points in project["entry-points"].items()}
+        what = f"-e {file.parent}" if (file.parent / "src").is_dir() else project["name"]
+        found.append(Guest(package=project["name"], names=names, install=f"pip install {what}"))
+    return tuple(found)

@@ -7,7 +7,6 @@ import importlib.util
 import os
 import platform
 import shlex
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -51,7 +50,7 @@ def command() -> str:
 def commit() -> str | None:
     """The checkout's commit, None outside one; code that differs, new files too, adds ``+changes.`` and its digest."""
     top = PACKAGE_FOLDER.parent
-    if not (top / ".git").exists() or shutil.which("git") is None:
+    if not (top / ".git").exists():
         return None
     head = _output("git", "-C", str(top), "rev-parse", "--short=12", "HEAD")
     changes = _changes(top)
@@ -60,10 +59,10 @@ def commit() -> str | None:
 
 def _changes(top: Path) -> str:
     """Beginning of a digest of all files of code that differ from the commit or are new; empty if none do."""
-    differing = _output("git", "-C", str(top), "diff", "--name-only", "HEAD", "--", *_CODE) or ""
-    new = _output("git", "-C", str(top), "ls-files", "--others", "--exclude-standard", "--", *_CODE) or ""
+    options = ("--porcelain", "-z", "--no-renames", "--untracked-files=all")
+    found = _output("git", "-C", str(top), "status", *options, "--", *_CODE) or ""
+    names = sorted(entry.split(maxsplit=1)[1] for entry in found.split("\0") if entry)
     digest = hashlib.sha256()
-    names = sorted({*differing.splitlines(), *new.splitlines()})
     for name in names:
         digest.update(name.encode())
         if (top / name).is_file():
@@ -87,9 +86,10 @@ def _sources(modules: Iterable[str]) -> str:
     """Beginning of a digest of the Python files of top modules, none of which is imported; those that lack add none."""
     digest = hashlib.sha256()
     for spec in filter(None, map(importlib.util.find_spec, sorted(modules))):
-        folders = spec.submodule_search_locations
-        files = [Path(spec.origin)] if spec.origin and not folders else []
-        for path in files + sorted(path for folder in folders or () for path in Path(folder).rglob("*.py")):
+        files = [Path(spec.origin)] if spec.origin else []
+        if spec.submodule_search_locations:
+            files = sorted(path for folder in spec.submodule_search_locations for path in Path(folder).rglob("*.py"))
+        for path in files:
             digest.update(path.name.encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
@@ -119,20 +119,14 @@ def machine() -> dict[str, Any]:
 
 def cpu_model() -> str:
     """The processor's name as the system gives it."""
-    if sys.platform == "darwin":
-        return _output("sysctl", "-n", "machdep.cpu.brand_string") or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.machine()
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.machine())
+    known = Path("/proc/cpuinfo")
+    lines = known.read_text().splitlines() if known.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else _output("sysctl", "-n", "machdep.cpu.brand_string") or platform.machine()
 
 
 def gpu_model() -> str | None:
     """The first NVIDIA GPU's name, or None."""
-    if shutil.which("nvidia-smi") is None:
-        return None
     names = _output("nvidia-smi", "--query-gpu=name", "--format=csv,noheader")
     return names.splitlines()[0] if names else None
 

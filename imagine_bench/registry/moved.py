@@ -8,59 +8,65 @@ import warnings
 from collections.abc import Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from types import ModuleType
+from types import FunctionType, ModuleType
 
 
-class _MovedModules(MetaPathFinder, Loader):
-    """Finds a module by its old path and fills it with the names of the new one."""
+class _OldPaths(MetaPathFinder, Loader):
+    """Finds modules by their old paths and fills them with the names of the new ones."""
 
-    def __init__(self, moved: Mapping[str, str], names: Mapping[str, str]) -> None:
-        self._moved = moved
-        self._names = names
+    def __init__(self, moved: Mapping[str, str]) -> None:
+        self.moved = moved
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        return ModuleSpec(fullname, self, is_package=True) if fullname in self._moved else None
+        return ModuleSpec(fullname, self, is_package=True) if fullname in self.moved else None
 
     def exec_module(self, module: ModuleType) -> None:
-        new = self._moved[module.__name__]
-        _warn(module.__name__, new)
-        names = vars(importlib.import_module(new))
+        names = vars(self.new(module.__name__))
         module.__dict__.update({name: value for name, value in names.items() if not name.startswith("__")})
-        find_old_names(module, self._names)
+        self.find_names(module)
+
+    def find_names(self, module: ModuleType) -> None:
+        """Give a module the single names that it had."""
+
+        def find(name: str) -> object:
+            old = f"{module.__name__}:{name}"
+            if old not in self.moved:
+                raise AttributeError(f"module {module.__name__!r} has no attribute {name!r}")
+            found = getattr(self.new(old), self.moved[old].partition(":")[2])
+            setattr(module, name, found)
+            return found
+
+        vars(module)["__getattr__"] = find
+
+    def new(self, old: str) -> ModuleType:
+        """The module in which it lies now, after a warning."""
+        message = f"{old} is now {self.moved[old]}; import it from there. The old path goes in version 1.0."
+        warnings.warn(message, DeprecationWarning, stacklevel=3)
+        return importlib.import_module(self.moved[old].partition(":")[0])
 
 
-def keep_old_paths(moved: Mapping[str, str], names: Mapping[str, str]) -> None:
-    """Let Python find modules and names by their old paths; a second call changes nothing.
+class _Package(ModuleType):
+    """A package whose functions stay when a module is imported by an old path of the same name."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (isinstance(value, ModuleType) and isinstance(vars(self).get(name), FunctionType)):
+            super().__setattr__(name, value)
+
+
+def keep_old_paths(package: str, moved: Mapping[str, str]) -> None:
+    """Let Python find modules of a package, and names in them, by their old paths; a second call changes nothing.
 
     Args:
-        moved: The new path of each module that moved, by its old one.
-        names: The new ``"module:name"`` of each name, by its old one. Its old module is a moved one, or is loaded.
+        package: The package's name.
+        moved: The new path of each module that moved, by its old one, and the new ``"module:name"`` of each name, by
+            its old one, whose module is a moved one or is loaded.
     """
-    if any(isinstance(finder, _MovedModules) for finder in sys.meta_path):
+    if any(isinstance(finder, _OldPaths) for finder in sys.meta_path):
         return
-    sys.meta_path.append(_MovedModules(moved, names))
-    for module in {old.partition(":")[0] for old in names} - moved.keys():
-        find_old_names(sys.modules[module], names)
-
-
-def find_old_names(module: ModuleType, names: Mapping[str, str]) -> None:
-    """Give a module the names that it had, which ``names`` maps as for :func:`keep_old_paths`."""
-
-    def find(name: str) -> object:
-        old = f"{module.__name__}:{name}"
-        if old not in names:
-            raise AttributeError(f"module {module.__name__!r} has no attribute {name!r}")
-        _warn(old, names[old])
-        new, _, attribute = names[old].partition(":")
-        found = getattr(importlib.import_module(new), attribute)
-        setattr(module, name, found)
-        return found
-
-    vars(module)["__getattr__"] = find
-
-
-def _warn(old: str, new: str) -> None:
-    message = f"{old} is now {new}; import it from there. The old path goes in version 1.0."
-    warnings.warn(message, DeprecationWarning, stacklevel=3)
+    paths = _OldPaths(moved)
+    sys.meta_path.insert(0, paths)  # a folder that is left of a module that moved is none
+    sys.modules[package].__class__ = _Package
+    for module in {old.partition(":")[0] for old in moved} & sys.modules.keys():
+        paths.find_names(sys.modules[module])

@@ -13,8 +13,7 @@ from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.runs import Result, RunSpec
-from imagine_bench.registry.entries import entrant
-from imagine_bench.registry.old_names import agent_label
+from imagine_bench.registry.entries import agent_label, entrant
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
 from imagine_bench.store.checkpoints import load_newest

@@ -19,8 +19,7 @@ from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest
-from imagine_bench.registry.entries import file_name
-from imagine_bench.registry.old_names import agent_label
+from imagine_bench.registry.entries import agent_label, file_name
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import KEPT, BenchStore, bench_facts, is_archive, read_control
 from imagine_bench.store.checkpoints import unpack

@@ -20,7 +20,7 @@ import numpy as np
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.data import ProtocolData
 from imagine_bench.protocols.runs import RunSpec
-from imagine_bench.registry.old_names import agent_label
+from imagine_bench.registry.entries import agent_label
 from imagine_bench.store.checkpoints import (
     STATE,
     checkpoints_in,

@@ -27,15 +27,19 @@ def describe_task(name: str) -> str:
         rows = {"learned from": f"data, in the variants {', '.join(data.variants)}", "error": data.error_name}
         return _page(data.title, data.description, rows)
     spec = registry.task(name)
-    facts, states = spec.facts(), states_of(spec.rules)
+    facts = spec.facts()
     factors = (f"{n} ({', '.join(v)})" for n, v in zip(spec.macrostate_names, spec.macrostate_values, strict=True))
     chance = "some macro-actions have several outcomes" if is_random(spec.rules) else "none: each has one outcome"
+    family, _, options = spec.id.partition(":")  # the family's id needs no look-up first
+    made_by = spec.env_id
+    if options and registry.has_task(family):
+        made_by = f"{registry.task_entry(family).env_id}, with {options.replace(',', ', ')}"
     rows = {
-        "Gymnasium id": _made_by(spec),
+        "Gymnasium id": made_by,
         "observation": f"64 x 64 RGB frame, for encoders preprocessed as {spec.preprocessing}",
         "macro-actions": f"{spec.n_actions}: {'; '.join(spec.action_names)}",
         "macrostate": "; ".join(factors),
-        "macrostates": f"{len(states):,}, {len(spec.rules.start_states):,} of them starts",
+        "macrostates": f"{len(states_of(spec.rules)):,}, {len(spec.rules.start_states):,} of them starts",
         "chance": chance,
         "horizon": f"{spec.horizon} macro-actions",
         "chance level": f"{100 * facts.chance_level:.1f} % of episodes solved by blind choice",
@@ -79,13 +83,6 @@ def _plan_lengths(spec: TaskSpec) -> str:
     if len(lengths) > _MOST:
         return f"{min(lengths):g} to {max(lengths):g}"
     return ", ".join(f"{length:g} ({lengths[length]} starts)" for length in sorted(lengths))
-
-
-def _made_by(spec: TaskSpec) -> str:
-    """Its id, or that of its family, which needs no look-up first, and the keywords."""
-    base, _, said = spec.id.partition(":")
-    known = said and registry.has_task(base)
-    return f"{registry.task_entry(base).env_id}, with {said.replace(',', ', ')}" if known else spec.env_id
 
 
 def _encoders(spec: TaskSpec) -> str:

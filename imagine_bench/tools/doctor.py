@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
@@ -19,7 +18,6 @@ from imagine_bench.registry.machine import commit, gl_renderer, installed, machi
 from imagine_bench.version import PACKAGE_FOLDER
 
 _SOFTWARE_GL = ("llvmpipe", "softpipe", "swrast")
-_FRAMES = 200
 _NEEDED_DISK_GIB = 1.0
 EXTRAS_OF_A_BENCH = ("agents", "report", "rerun")
 """Extras that make an installation of environments one of benches."""
@@ -49,11 +47,19 @@ class Examination:
 
 
 def examine() -> Examination:
-    """Look at versions, GL, threads, GPU and disk; draws a few frames of the first task."""
-    found, here = versions(), machine()
+    """Look at versions, GL, threads, GPU and disk; draws a frame of the first task."""
+    here = machine()
     complaints = unmet_requirements()
-    gl, frame, gl_complaint = _drawing()
-    complaints += [gl_complaint] if gl_complaint else []
+    try:
+        gl = gl_renderer()
+        task = registry.task(next(iter(registry.TASKS)))
+        task.render_macrostates(np.array(task.rules.start_states[:1]), "clean", np.random.default_rng(0))
+    except ImagineBenchError as error:
+        gl = "none"
+        complaints.append(str(error))
+    except Exception as error:  # a broken installation fails anywhere: it is what is looked for
+        gl = "none"
+        complaints.append(f"Drawing a frame failed with {type(error).__name__}: {error}. Run 'make setup' anew.")
     free_gib = 0.0
     try:
         free_gib = shutil.disk_usage(Path.cwd()).free / 2**30
@@ -64,13 +70,12 @@ def examine() -> Examination:
     facts = {
         "command": sys.executable,
         "commit": commit() or "not in a checkout",
-        **found,
+        **versions(),
         "system": here["system"],
         "processor": f"{here['cpu']}, {here['cores']} cores usable, {here['memory_gib']} GiB",
         "NVIDIA GPU": here["gpu"] or "none",
         "threads a run": "1",
         "GL renderer": gl,
-        "64x64 frame": frame,
         "free disk": f"{free_gib:.1f} GiB",
     }
     notes = _notes(here["gpu"], gl) + unlocked_versions() + missing_extras()
@@ -84,26 +89,22 @@ def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str
         version_of: The installed version of a package, ``"missing"`` where there is none.
     """
     complaints = []
-    for text in metadata.requires("imagine-bench") or []:
-        wanted = Requirement(text)
+    for wanted in _requirements():
         extra = _extra_of(wanted)
         version = version_of(wanted.name)
-        if extra is None or (extra and version == "missing"):
+        missing = version == "missing"
+        unwanted = version_of(_DM_CONTROL) == "missing" if extra == _DM_CONTROL else missing and extra
+        if extra is None or unwanted or (not missing and wanted.specifier.contains(version, prereleases=True)):
             continue
-        if extra == _DM_CONTROL and version_of(_DM_CONTROL) == "missing":
-            continue
-        if version == "missing" or not wanted.specifier.contains(version, prereleases=True):
-            state = "is missing" if version == "missing" else f"{version} is installed"
-            complaints.append(
-                f"{wanted.name} {state}, but {wanted.specifier} is needed.{_REASONS.get(wanted.name, '')} {_repair()}"
-            )
+        state = "is missing" if missing else f"{version} is installed"
+        reason = _REASONS.get(wanted.name, "")
+        repair = "Run 'make setup' in a fresh .venv" if _LOCK.exists() else "Run pip install --upgrade imagine-bench"
+        complaints.append(f"{wanted.name} {state}, but {wanted.specifier} is needed.{reason} {repair}.")
     return complaints
 
 
-def _repair() -> str:
-    if _LOCK.exists():
-        return "Run 'make setup' in a fresh .venv."
-    return "Run pip install --upgrade imagine-bench."
+def _requirements() -> list[Requirement]:
+    return [Requirement(text) for text in metadata.requires("imagine-bench") or []]
 
 
 def _extra_of(wanted: Requirement) -> str | None:
@@ -115,8 +116,11 @@ def _extra_of(wanted: Requirement) -> str | None:
 
 def missing_extras(version_of: Callable[[str], str] = installed) -> list[str]:
     """A sentence that names the extras of a bench that are not installed, or none; ``version_of`` as above."""
-    wanted = [Requirement(text) for text in metadata.requires("imagine-bench") or []]
-    lacks = {_extra_of(each) for each in wanted if version_of(each.name) == "missing"} - {"", _DM_CONTROL, None}
+    lacks = {_extra_of(each) for each in _requirements() if version_of(each.name) == "missing"} - {
+        "",
+        _DM_CONTROL,
+        None,
+    }
     if not lacks:
         return []
     names = ",".join(sorted(str(extra) for extra in lacks))
@@ -142,27 +146,6 @@ def unlocked_versions(lock: Path = _LOCK, version_of: Callable[[str], str] = ins
         f"Versions differ from .ci/requirements.lock, and so may the last bits of results: {', '.join(others)}. "
         "'rm .venv/.ready && make setup' brings them back."
     ]
-
-
-def _drawing() -> tuple[str, str, str | None]:
-    """GL renderer, milliseconds a frame, and what is wrong."""
-    try:
-        name = gl_renderer()
-        return name, f"{_frame_ms():.3f} ms", None
-    except ImagineBenchError as error:
-        return "none", "none", str(error)
-    except Exception as error:  # a broken installation fails anywhere: it is what is looked for
-        return "none", "none", f"Drawing a frame failed with {type(error).__name__}: {error}. Run 'make setup' anew."
-
-
-def _frame_ms() -> float:
-    spec = registry.task(next(iter(registry.TASKS)))
-    states = np.array([spec.rules.start_states[0]] * _FRAMES, dtype=np.int64)
-    rng = np.random.default_rng(0)
-    spec.render_macrostates(states[:1], "clean", rng)
-    start_s = time.process_time()
-    spec.render_macrostates(states, "clean", rng)
-    return 1e3 * (time.process_time() - start_s) / _FRAMES
 
 
 def _notes(gpu: str | None, gl: str) -> list[str]:

@@ -1,14 +1,18 @@
-"""``imagine-bench play``: a task by keyboard, and beside it what a learned world model imagines of the same keys."""
+"""``imagine-bench play``: a task by keyboard, and beside it what a learned world model imagines of the same keys.
+
+Or, with ``--film``, an episode of optimal macro-actions in the same window, as a GIF.
+"""
 
 from __future__ import annotations
 
+import io
 import string
 import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, SupportsFloat, cast
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -16,17 +20,27 @@ from PIL import Image, ImageDraw, ImageFont
 
 from imagine_bench import registry
 from imagine_bench.arrays import Action, Info, State
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.interfaces import Frame, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.running.trained import load_trained
+from imagine_bench.seeding import episode_seed
 from imagine_bench.statistics import wilson
+from imagine_bench.store.files import make_folder, write_bytes
 
 KEYS = "123456789" + string.ascii_lowercase
 """Of the macro-actions, in their order."""
-_FPS, _HOLD = 25, 50
-"""Images a second, and those for which the end of an episode stands still."""
-_WIDTH, _HEIGHT, _PANEL, _FRAME, _TOP = 640, 480, 284, 192, 36
+_FPS = 25
+_FILM_FPS = 10
+"""Images a second of the window, and of a film."""
+_HOLD = 50
+_FILM_HOLD = 8
+"""Images for which the end of an episode stands still, and in a film the scene between two macro-actions."""
+_WIDTH = 640
+_HEIGHT = 480
+_PANEL = 284
+_FRAME = 192
+_TOP = 36
 """Pixels: the scene, the width of a panel beside it, the edge of a frame in that, and where it begins."""
 _Step = tuple[Frame, SupportsFloat, bool, bool, Info]
 
@@ -44,27 +58,38 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
     def __init__(self, env: gymnasium.Env[Frame, Action], task: TaskSpec, imaginer: Imaginer | None, seed: int) -> None:
         super().__init__(env)
         self.action_space = gymnasium.spaces.Discrete(task.n_actions + 1)
-        self._task, self._imaginer, self._seed = task, imaginer, seed
+        self._task = task
+        self._imaginer = imaginer
+        self._seed = seed
         self._reset_seed: int | None = seed
-        self._scene = cast(Any, env.unwrapped)
-        self._scene.capture_motion_hz = float(_FPS)
-        self.episodes = self.solved = self.foreseen = self.imagined = 0
+        scene: Any = env.unwrapped
+        scene.capture_motion_hz = float(_FPS)
+        self._scene = scene
+        self.episodes = 0
+        self.solved = 0
+        self.foreseen = 0
+        self.imagined = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Frame, Info]:
         """Begin an episode; only the first one is seeded, or all would begin alike."""
         self._frame, self._info = self.env.reset(seed=self._reset_seed, options=options)
-        self._reset_seed, self._start, self._actions = None, self._frame, list[int]()
+        self._reset_seed = None
+        self._start = self._frame
+        self._actions: list[int] = []
         self._rollout: ImaginedRollout | None = None
         self._due: _Step | None = None
-        self._said, self._released = "press a key", False
-        self._images, self._image = iter(list[Frame]()), self._window()
+        self._said = "press a key"
+        self._released = False
+        self._images: Iterator[Frame] = iter(())
+        self._image = self._window()
         return self._frame, self._info
 
     def step(self, action: Action) -> _Step:
         """Show one more image, else return what came of a macro-action, else wait or carry one out."""
         waits = action == self._task.n_actions
         self._released |= waits
-        image, due = next(self._images, None), self._due
+        image = next(self._images, None)
+        due = self._due
         if image is not None:
             self._image = image
         elif due is not None:
@@ -72,7 +97,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
             return due
         elif self._released and not waits:
             self._released = False
-            self._act(int(action))
+            self._due, self._images = self.act(int(action))
         return self._frame, 0.0, False, False, self._info
 
     def render(self) -> Frame:
@@ -81,7 +106,8 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
 
     def summary(self) -> str:
         """How often the person solved the task, beside chance and optimum, and how often the model foresaw it."""
-        facts, said = self._task.facts(), "No episode was finished"
+        facts = self._task.facts()
+        said = "No episode was finished"
         if self.episodes:
             low, high = wilson(self.solved, self.episodes)
             share = f"{self.solved / self.episodes:.1%}, 95 % interval {low:.1%} to {high:.1%}"
@@ -89,30 +115,30 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         foreseen = f"\nThe model foresaw {self.foreseen} of {self.imagined} macrostates." if self.imagined else ""
         return f"{said}; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%}.{foreseen}"
 
-    def _act(self, action: int) -> None:
+    def act(self, action: int) -> tuple[_Step, Iterator[Frame]]:
+        """Carry out a macro-action: what came of it, and images of it, each drawn when it is due."""
         self._said = self._task.action_names[action]
         if self._imaginer is not None:  # the same draws each time, so that what was imagined before stays as it was
             self._actions.append(action)
-            actions, rng = np.array(self._actions), np.random.default_rng(self._seed)
+            actions = np.array(self._actions)
+            rng = np.random.default_rng(self._seed)
             self._rollout = self._imaginer.imagine(self._start, actions=actions, depth=len(actions), rng=rng)
-        self._due = self.env.step(action)
-        self._images = self._showing(*self._due)
+        done = self.env.step(action)
+        return done, self._showing(done)
 
-    def _showing(
-        self, frame: Frame, reward: SupportsFloat, terminated: bool, truncated: bool, info: Info
-    ) -> Iterator[Frame]:
-        """Images of a macro-action, each drawn when it is due, and of what came of it."""
+    def _showing(self, done: _Step) -> Iterator[Frame]:
         for _ in getattr(self._scene, "replay", tuple)():
             yield self._window()
-        self._frame, self._info = frame, info
+        self._frame, reward, terminated, truncated, self._info = done
+        solved = bool(self._info["is_success"])
         self.episodes += terminated or truncated
-        self.solved += bool(info["is_success"])
+        self.solved += solved
         if self._rollout is not None:
             self.imagined += 1
-            shown = self._task.as_observed(info["shown"] if "shown" in info else info["macrostate"])
+            shown = self._task.as_observed(self._info.get("shown", self._info["macrostate"]))
             self.foreseen += tuple(self._rollout.macrostates[-1].tolist()) == shown
-        end = "solved" if info["is_success"] else "an illegal end" if terminated else "out of time" if truncated else ""
-        self._said += f"\nreward {float(reward):+g}" + f", {end}" * bool(end) + ", a fault" * bool(info["fault"])
+        end = "solved" if solved else "an illegal end" if terminated else "out of time" if truncated else ""
+        self._said += f"\nreward {float(reward):+g}" + f", {end}" * bool(end) + ", a fault" * bool(self._info["fault"])
         yield from [self._window()] * (_HOLD if end else 1)
 
     def _window(self) -> Frame:
@@ -123,10 +149,12 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         if self._imaginer is not None:
             panels.append(("what the model imagines", *self._imagination()))
         canvas = Image.new("RGB", (_WIDTH + len(panels) * _PANEL, _HEIGHT), "white")
-        view = getattr(self._scene, "human_view", None)  # others' tasks may show the agent's frame alone
-        scene = Image.fromarray(self._frame if view is None else view(_WIDTH, _HEIGHT))
-        canvas.paste(scene.resize((_HEIGHT, _HEIGHT) if view is None else (_WIDTH, _HEIGHT)), (0, 0))
-        draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(14)
+        if hasattr(self._scene, "human_view"):
+            canvas.paste(Image.fromarray(self._scene.human_view(_WIDTH, _HEIGHT)))
+        else:  # others' tasks may show the agent's frame alone
+            canvas.paste(Image.fromarray(self._frame).resize((_HEIGHT, _HEIGHT)))
+        draw = ImageDraw.Draw(canvas)
+        font = ImageFont.load_default(14)
         for column, (title, image, words) in enumerate(panels):
             left = _WIDTH + 8 + column * _PANEL
             draw.text((left, _TOP // 3), title, "black", font)
@@ -135,13 +163,12 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         return np.array(canvas)
 
     def _imagination(self) -> tuple[Frame, str]:
-        """The latest imagined image, and in words what the model predicts and how sure it is."""
+        """The latest imagined image, gray or RGB, and in words what the model predicts and how sure it is."""
         rollout = self._rollout
         if rollout is None:
             return np.full_like(self._start, 200), "nothing yet"
-        image = np.rint(255 * np.clip(rollout.frames[-1], 0.0, 1.0)).astype(np.uint8)
         kept = "would be learned from" if rollout.accepted[-1] else "would be filtered out"
-        return np.broadcast_to(image if image.ndim == 3 else image[..., None], (*image.shape[:2], 3)), (
+        return np.rint(255 * np.clip(rollout.frames[-1], 0.0, 1.0)).astype(np.uint8), (
             f"reward {rollout.rewards[-1]:+.1f}, end {rollout.p_terminated[-1]:.0%}\n\nuncertainty\n"
             f"    epistemic {rollout.epistemic[-1]:.3g}\n    aleatoric {rollout.aleatoric[-1]:.3g}\n"
             f"    modal {rollout.modal[-1]:.3g}\n{kept}\n\nforeseen {self.foreseen} of {self.imagined}"
@@ -149,9 +176,14 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
 
 
 def play(
-    task: str | None, *, model: Path | None = None, seed: int = 0, execution: str | None = None,
-    appearance: str | None = None, encoder: str | None = None,
-) -> str:  # fmt: skip
+    task: str | None,
+    *,
+    model: Path | None = None,
+    seed: int = 0,
+    execution: str | None = None,
+    appearance: str | None = None,
+    encoder: str | None = None,
+) -> str:
     """Open a window in which a person plays until it is closed, and say how often the person succeeded.
 
     ``model`` is a run's folder, whose agent imagines beside the person; it also says what is None, else the task's
@@ -167,8 +199,9 @@ def play(
         trained = load_trained(model, encoder=encoder)
         if task not in (None, trained.task.id):
             raise InvalidValueError(f"{model} was trained on {trained.task.id!r}, not on {task!r}; leave the task out.")
-        task, imaginer, protocol = trained.task.id, trained.imaginer, trained.spec.protocol
-        chosen = {**protocol.world, "appearance": protocol.appearance}
+        task = trained.task.id
+        imaginer = trained.imaginer
+        chosen = {**trained.spec.protocol.world, "appearance": trained.spec.protocol.appearance}
     if task is None:
         raise InvalidValueError("There is nothing to play; give a task or --model.")
     spec = registry.task(task)
@@ -184,3 +217,45 @@ def play(
     with closing(KeyboardGame(env, spec, imaginer, seed)) as game:
         keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)
     return game.summary()
+
+
+def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> Path:
+    """Film one episode of optimal macro-actions in contact physics.
+
+    Args:
+        task: Registered task.
+        out: The GIF; an existing file is not overwritten.
+        seed: Chooses the episode.
+        appearance: Appearance level.
+
+    Raises:
+        UnknownNameError: No such task or appearance.
+        InvalidValueError: ``out`` is no GIF.
+        SetupError: ``out`` exists or cannot be written, or there is no GL.
+    """
+    if out.suffix.lower() != ".gif":
+        raise InvalidValueError(f"{out} does not end in .gif, the only format of films; give such an --out.")
+    if out.exists():
+        raise SetupError(f"{out} exists and is not overwritten; delete it or give another --out.")
+    make_folder(out.parent)
+    spec = registry.task(task)
+    env = gymnasium.make(spec.env_id, appearance=appearance, disable_env_checker=True)
+    scene: Any = env.unwrapped
+    with closing(KeyboardGame(env, spec, None, episode_seed("recording", seed, 0))) as game:
+        scene.capture_motion_hz = float(_FILM_FPS)
+        _, info = game.reset()
+        images = [game.render()] * _FILM_HOLD
+        over = False
+        while not over:
+            action = spec.rules.optimal_action(tuple(info["macrostate"].tolist()))
+            (_, _, terminated, truncated, info), shown = game.act(action)
+            images += shown
+            images += images[-1:] * _FILM_HOLD
+            over = terminated or truncated
+    colors = Image.fromarray(images[0]).quantize(128)
+    frames = [Image.fromarray(each).quantize(palette=colors, dither=Image.Dither.NONE) for each in images]
+    whole = io.BytesIO()
+    duration = 1000 // _FILM_FPS
+    frames[0].save(whole, "GIF", save_all=True, append_images=frames[1:], duration=duration, loop=0, optimize=True)
+    write_bytes(out, whole.getvalue())
+    return out

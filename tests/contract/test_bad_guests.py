@@ -61,7 +61,7 @@ _TASK, _AGENT = ("task", "lamps"), ("agent", "clumsy")
         (_AGENT, "self.n_actions = context.n_actions", "self.n_actions = context.actions",
          "Agent clumsy (clumsy:Clumsy) cann"),
         (_AGENT, 'title="Clumsy"', 'settings="clumsy:NONE"',
-         "Agent clumsy (settings clumsy:NONE) cannot be used (Attribu"),
+         "Agent clumsy, its settings (clumsy:NONE) cannot be used (Attribu"),
     ],
 )  # fmt: skip
 def test_a_guests_fault_is_said_before_anything_runs(

@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 
 from imagine_bench import registry
 from imagine_bench.cli import main
-from imagine_bench.registry.guests import guests
+from imagine_bench.registry.builtin import guests
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = sorted(file.parent for file in (ROOT / "agents" / "guests").glob("*/pyproject.toml"))

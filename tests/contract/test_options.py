@@ -7,7 +7,7 @@ import pytest
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.registry.guests import guests
+from imagine_bench.registry.builtin import guests
 from imagine_bench.running.control import plan_control
 from imagine_bench.testing.common import NotOffered
 from imagine_bench.testing.of_agents import checked_agent

@@ -25,8 +25,8 @@ from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
 from imagine_bench.judge.open_loop import compare_rollout
 from imagine_bench.recording import episodes, stream
 from imagine_bench.recording.episodes import q_table, record_run
-from imagine_bench.recording.scene import entity_name, log_motion, log_shapes, rotated
-from imagine_bench.recording.stream import open_in_viewer, recording_file
+from imagine_bench.recording.scene import log_motion, log_shapes
+from imagine_bench.recording.stream import entity_name, open_in_viewer, recording_file
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
@@ -69,6 +69,8 @@ def test_entities_and_timelines(imagined: Path) -> None:
         assert found[path] >= {"sim_time", "env_step", "episode"}
     assert found["/scene/cube_1/cube_1_arrow"] == set()  # for all times
     assert all("imagined_depth" in found[path] for path in BY_DEPTH)
+    assert times(imagined, "/real/frame", "imagined_depth") == {0}, "the first start alone is real there"
+    assert times(imagined, "/imagined/episode_1/frame", "imagined_depth") == set(range(1 + episodes.IMAGINED_DEPTH))
 
 
 def test_the_scene_stands_as_every_frame_shows_it(imagined: Path) -> None:
@@ -92,16 +94,6 @@ def test_at_an_episode_s_end_nothing_more_is_expected(imagined: Path) -> None:
     assert len(ends) == 2 and ends[-1] == max(times(imagined, "/real/frame", "env_step"))
     for entity in ("/imagined/filmstrip", "/imagined/uncertainty/modal"):
         assert cleared(imagined, entity) == ends
-
-
-def test_on_the_depth_timeline_only_the_first_start_is_real(imagined: Path) -> None:
-    depths = [
-        depth
-        for chunk in RrdReader(imagined).stream()
-        if chunk.entity_path == "/real/frame" and "imagined_depth" in chunk.timeline_names
-        for depth in chunk.to_record_batch().column("imagined_depth").to_pylist()
-    ]
-    assert depths == [0]
 
 
 class _HandsOver(FakeImaginer):
@@ -170,16 +162,6 @@ def test_application_and_blueprint(imagined: Path) -> None:
     reader = RrdReader(imagined)
     assert [store.application_id for store in reader.recordings()] == ["imagine_bench_arrow_puzzle"]
     assert [store.application_id for store in reader.blueprints()] == ["imagine_bench_arrow_puzzle"]
-
-
-def test_depths_are_those_of_the_rollout(imagined: Path) -> None:
-    depths = [
-        depth
-        for chunk in RrdReader(imagined).stream()
-        if chunk.entity_path == "/imagined/episode_1/frame"
-        for depth in chunk.to_record_batch().column("imagined_depth").to_pylist()
-    ]
-    assert depths == list(range(1 + episodes.IMAGINED_DEPTH))
 
 
 def logged(path: Path) -> dict[tuple[str, str], list[str]]:
@@ -271,11 +253,6 @@ def test_viewing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(SetupError, match=r"No display here .* run 'rerun there.rrd'"):
         open_in_viewer(there)
-
-
-def test_a_viewer_that_fails_says_how_to_look_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    there = tmp_path / "there.rrd"
-    there.write_bytes(b"")
     monkeypatch.setenv("DISPLAY", ":99")
     failed = subprocess.CompletedProcess[str]([], returncode=1)
     monkeypatch.setattr(stream.subprocess, "run", lambda *_, **__: failed)
@@ -284,33 +261,14 @@ def test_a_viewer_that_fails_says_how_to_look_elsewhere(tmp_path: Path, monkeypa
 
 
 def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
-    rows = q_table(("left", "right turn"), np.array([-1.0, 2.5], dtype=np.float32), 1).splitlines()
-    assert rows[1].startswith("  left")
-    assert rows[2].startswith("> right turn   +2.50 ")
-    assert rows[1].count("█") == 1
-    assert rows[2].count("█") == 16
+    _, left, right, *_ = q_table(("left", "right turn"), np.array([-1.0, 2.5], dtype=np.float32), 1).splitlines()
+    assert left.startswith("  left") and right.startswith("> right turn   +2.50 ")
+    assert (left.count("█"), right.count("█")) == (1, 16)
     assert "nan" not in q_table(("a", "b"), np.zeros(2, dtype=np.float32), 0)
 
 
 def test_entity_names_are_lower_snake() -> None:
     assert entity_name("Turn left (cube 1)") == "turn_left_cube_1"
-
-
-def test_rotation_against_the_matrix() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        quaternion = rng.normal(size=4)
-        quaternion /= np.linalg.norm(quaternion)
-        w, x, y, z = quaternion
-        matrix = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        vectors = rng.normal(size=(5, 3))
-        np.testing.assert_allclose(rotated(quaternion, vectors), vectors @ matrix.T, atol=1e-12)
 
 
 def shape(kind: str, **changes: object) -> Shape3D:
@@ -341,28 +299,6 @@ def test_bodies_that_stand_still_get_no_new_poses(tmp_path: Path) -> None:
     assert "/scene/still" not in found
 
 
-def test_compared_rollouts_follow_the_rules_and_hold_the_end() -> None:
-    spec = registry.task("arrow_puzzle")
-    rng = np.random.default_rng(0)
-    start = np.array(spec.rules.start_states[0])
-    frame: Frame = spec.render_macrostates(start[None], "clean", rng)[0]
-    rollout = FakeImaginer().imagine(frame, actions=None, depth=8, rng=rng)
-
-    showing = dataclasses.replace(spec, render_macrostates=labelled)
-    compared = compare_rollout(showing, frame=frame, macrostate=start, rollout=rollout, appearance="clean", rng=rng)
-    state, over = tuple(int(value) for value in start), False
-    for depth, action in enumerate(rollout.actions):
-        reward = 0.0
-        if not over:
-            (outcome,) = spec.rules.outcomes(state, int(action))
-            state, reward, over = outcome.macrostate, outcome.reward, outcome.terminated
-        assert tuple(compared.real_macrostates[depth]) == state
-        assert tuple(compared.real_frames[depth, 0, : len(state), 0]) == state, "the frames must show what is real"
-        assert (compared.real_rewards[depth], compared.real_terminated[depth]) == (reward, over)
-    assert over, "the case never met an end: choose another seed"
-    assert compared.real_frames.shape == (8, 64, 64, 3)
-
-
 def labelled(states: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Frames that say their macrostates in numbers; 255 for what is hidden."""
     frames = np.zeros((len(states), 64, 64, 3), np.uint8)
@@ -371,7 +307,7 @@ def labelled(states: NDArray[np.int64], appearance: str, rng: np.random.Generato
 
 
 @pytest.mark.parametrize("before", [0, 1, 4])
-def test_real_frames_are_as_late_as_the_agent_s_and_hide_as_much(before: int) -> None:
+def test_compared_rollouts_follow_the_rules_as_late_as_the_agent_s_frames_and_hide_as_much(before: int) -> None:
     """With a lag of 2 and a human who points once: a frame shows two macro-actions ago, and the hand at the start."""
     spec = dataclasses.replace(registry.task("arrows:gesture=first,lag=2"), render_macrostates=labelled)
     rng, episode = np.random.default_rng(0), [spec.rules.start_states[0]]
@@ -383,10 +319,15 @@ def test_real_frames_are_as_late_as_the_agent_s_and_hide_as_much(before: int) ->
         spec, frame=np.zeros((64, 64, 3), np.uint8), macrostate=np.array(episode[-1]), rollout=rollout,
         appearance="clean", rng=rng, before=episode[:-1],
     )  # fmt: skip
-    states, over = list(episode), False
+    states = list(episode)
+    rewards = []
+    over = False
     for action in rollout.actions:
         (outcome,) = spec.rules.outcomes(states[-1], int(action))
-        states, over = [*states, states[-1] if over else outcome.macrostate], over or outcome.terminated
+        states.append(states[-1] if over else outcome.macrostate)
+        rewards.append(0.0 if over else outcome.reward)
+        over = over or outcome.terminated
+    assert compared.real_rewards.tolist() == rewards and bool(compared.real_terminated[-1]) == over
     for depth in range(6):
         source = max(0, before + depth + 1 - 2)
         *directions, pointed = states[source]

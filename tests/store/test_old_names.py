@@ -13,7 +13,7 @@ from small_runs import Inline, final_arrays
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.control import Protocol, protocol
-from imagine_bench.registry.old_names import agent_label, edition_of, label_today, name_in_edition_1
+from imagine_bench.registry.entries import agent_label, edition_of, label_today, name_in_edition_1
 from imagine_bench.report import figures
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.task_types import read_protocol

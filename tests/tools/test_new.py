@@ -7,18 +7,14 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import pytest
-from fake_reader import BlindReader
 from guest_packages import install
 from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.cli import main
-from imagine_bench.judge import judgement as study
-from imagine_bench.judge.judgement import Judgement, judge, kept
 from imagine_bench.rules import facts
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.tools.new import new_package
@@ -54,18 +50,6 @@ def test_the_new_packages_own_tests_find_a_fault(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     said = subprocess.run(words, capture_output=True, text=True, env=environment, cwd=site, check=False).stdout
     assert "1 failed, 6 passed" in said and "put back in the same environment, it goes on otherwise" in said
-
-
-def test_the_new_model_is_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    new_package("model", "my_own", tmp_path)
-    monkeypatch.syspath_prepend(install(tmp_path / "my_own"))
-    registry.offers.cache_clear()
-    monkeypatch.setattr(study, "_reader", lambda *_: BlindReader(1))
-    few: dict[str, Any] = {"sizes": (100,), "seeds": (1000,), "samples": 1}
-    judgement = Judgement(task="arrow_puzzle_easy", models=("my_own", "copy"), **few)
-    folder, failed = judge(judgement, tmp_path, workers=1)
-    own, copy = kept(folder, judgement)
-    assert not failed and own["value_loss"] == own["reward_error"] == 0.0 < copy["value_loss"]
 
 
 def test_the_new_agent_learns_the_new_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

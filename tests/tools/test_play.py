@@ -11,13 +11,14 @@ import gymnasium
 import numpy as np
 import pytest
 from fake_agents import FakeAgent, FakeImaginer
+from PIL import Image, ImageSequence
 from worlds import draw_quickly
 
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.tools import play as module
-from imagine_bench.tools.play import KEYS, KeyboardGame, play
+from imagine_bench.tools.play import KEYS, KeyboardGame, film, play
 
 pygame = pytest.importorskip("pygame")  # of the extra play
 WAIT = 6
@@ -49,6 +50,11 @@ def until_done(game, action):
         images.append(game.render())
         seen.append(game.step(WAIT))
     return seen, images
+
+
+def panel(column):
+    """The frame that stands enlarged in a panel beside the scene."""
+    return column[36 : 36 + 192 : 3, 8 : 8 + 192 : 3]
 
 
 def test_keys_do_what_the_environment_does():
@@ -114,37 +120,24 @@ def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
 
     class Imaginer(FakeImaginer):
         def imagine(self, frame, *, actions, depth, rng):
-            asked.append((frame, actions.tolist(), depth, rng.random()))
+            asked.append((actions.tolist(), frame.tobytes(), rng.random()))
             rollout = super().imagine(frame, actions=actions, depth=depth, rng=rng)
             right = registry.task("arrow_puzzle").rules.outcomes(START, 4)[0].macrostate
             return dataclasses.replace(rollout, macrostates=np.array([right] * depth))  # of the first, not the second
 
     monkeypatch.setattr(module, "_HOLD", 1)
     game = game_of(Imaginer(), execution="kinematic")
-    blank = game.reset(options={"macrostate": START}) and game.render()
-    frame = game._start
+    frame, _ = game.reset(options={"macrostate": START})
+    blank = game.render()[:, -284:]
     for action in (4, 4):
         seen, _ = until_done(game, action)
-    assert [each[1:3] for each in asked] == [([4], 1), ([4, 4], 2)]
-    assert all(np.array_equal(each[0], frame) for each in asked)
-    assert asked[0][3] == asked[1][3]  # the same draws: the imagined past stays
-    image, words = game._imagination()
-    gray = frame.mean(axis=2)
-    np.testing.assert_allclose(image[..., 0], 0.9 * gray, atol=1)
-    for said in (
-        "reward -1.0, end 10%",
-        "epistemic 0.1\n",
-        "aleatoric 0.05\n",
-        "modal 0.01\n",
-        "would be learned from",
-    ):
-        assert said in words
-    left = game.render()[:, :-284]
-    right, empty = game.render()[:, -284:], blank[:, -284:]
-    assert not np.array_equal(right, empty)
-    shown = right[36 : 36 + 192 : 3, 8 : 8 + 192 : 3]
-    np.testing.assert_array_equal(shown, image)
-    np.testing.assert_array_equal(left[36 : 36 + 192 : 3, -276 : -276 + 192 : 3], seen[-1][0])
+    assert [each[0] for each in asked] == [[4], [4, 4]]
+    assert asked[0][1:] == asked[1][1:], "the same draws from the same frame: the imagined past stays"
+    assert asked[0][1] == frame.tobytes()
+    sees, imagines = game.render()[:, -568:-284], game.render()[:, -284:]
+    np.testing.assert_allclose(panel(imagines)[..., 0], 0.9 * frame.mean(axis=2), atol=1)
+    np.testing.assert_array_equal(panel(sees), seen[-1][0])
+    assert not np.array_equal(imagines[240:], blank[240:]), "words about what it predicts"
     assert game.summary().endswith("\nThe model foresaw 1 of 2 macrostates.")
     game.close()
 
@@ -216,7 +209,7 @@ def test_a_task_of_others_shows_the_agent_s_frame():
     assert np.abs(game.render()[:480, :480][::15, ::15].astype(int) - frame[::2, ::2]).mean() < 8
     seen, _ = until_done(game, 3)
     assert not np.array_equal(seen[-1][0], frame)
-    np.testing.assert_array_equal(game.render()[36 : 36 + 192 : 3, 648 : 648 + 192 : 3], seen[-1][0])
+    np.testing.assert_array_equal(panel(game.render()[:, 640:]), seen[-1][0])
     Bare.inner.close()
 
 
@@ -249,3 +242,21 @@ def test_what_cannot_be_played_is_refused(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(SetupError, match=r"imagine-bench\[play\]"):
         play("arrow_puzzle")
+
+
+@pytest.mark.slow
+def test_a_film_reaches_the_goal_and_is_never_overwritten(tmp_path):
+    out = film("arrow_puzzle", tmp_path / "new" / "turn.gif", seed=0)
+    with Image.open(out) as gif:
+        gray = [np.asarray(picture.convert("L"), dtype=np.float32) for picture in ImageSequence.Iterator(gif)]
+    pictures = np.stack(gray)
+    assert len(pictures) > 20 and pictures.shape[1:] == (480, 924)
+    scene = pictures[:, :, :640]
+    eye = pictures[:, 36 : 36 + 192, 648 : 648 + 192]
+    assert np.abs(np.diff(scene, axis=0)).max(axis=(1, 2)).max() > 50, "the arm is seen moving"
+    assert np.abs(eye[-1] - eye[0]).max() > 50, "what the agent sees at the end is not what it saw at first"
+    assert [path.name for path in out.parent.iterdir()] == ["turn.gif"]
+    before = out.read_bytes()
+    with pytest.raises(SetupError, match="exists and is not overwritten"):
+        film("arrow_puzzle", out, seed=1)
+    assert out.read_bytes() == before
