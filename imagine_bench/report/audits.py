@@ -22,8 +22,8 @@ from imagine_bench.judge.verify import Verdict, verify_runs
 from imagine_bench.recording.filmstrips import filmstrip, png
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.report.bench import bench_page
-from imagine_bench.report.exact import HEAD, causes_table
 from imagine_bench.report.page import texts, write_page
+from imagine_bench.report.sections import HEAD, causes_table
 from imagine_bench.report.tables import DASH, Table, percent
 from imagine_bench.running.progress import counted
 from imagine_bench.running.task_types import load_bench, task_type
@@ -50,6 +50,18 @@ from imagine_bench.store.loading import load_so_far
 
 RECORDING = "recording.rrd"
 _SHOWN = 6  # the first plans, and the first that failed, as filmstrips
+_COUNTS = {
+    "attempted": "plans",
+    "solved": "solved",
+    "optimal": "of these optimal",
+    "refused": "refused as too uncertain",
+    "shortest": "macro-actions of a solved plan, the fewest",
+    "longest": "the most",
+    "mean_length": "mean",
+    "steps": "macro-actions carried out",
+    "steps_as_imagined": "that led where imagined",
+    "faults": "faults of the physics",
+}
 _CELLS = {"report.md": r"^\|.*$", "index.html": r"<t[dh][^>]*>(.*?)</t[dh]>"}
 """What is compared of a report's pages: the cells of their tables; of other files it is every line."""
 Record = Callable[..., Path]  # records plans: :func:`imagine_bench.recording.plans.record_plans`
@@ -143,17 +155,12 @@ def plan_table(plans: Sequence[PlanResult], task: TaskSpec) -> Table:
     found = summarise(plans)
     thesis = {} if task.reference is None else reference.load(task.reference).get("plans", {})
     low, high = statistics.wilson(int(found["solved"]), len(plans))
-    share = f"{percent(found['solved'] / len(plans))} % [{percent(low)}, {percent(high)}]"
-    lengths = f"{found['shortest']} to {found['longest']}, mean {found['mean_length']:.2f}" if found["solved"] else DASH
-    rows = [
-        ["plans", f"{len(plans)}", f"{thesis.get('attempted', DASH)}"],
-        ["solved", f"{found['solved']} = {share}", f"{thesis.get('solved', DASH)}"],
-        ["of these optimal", f"{found['optimal']}", f"{thesis.get('optimal_among_solved', DASH)}"],
-        ["refused as too uncertain", f"{found['refused']}", DASH],
-        ["macro-actions of a solved plan", lengths, f"{thesis['shortest']} to {thesis['longest']}" if thesis else DASH],
-        ["macro-actions that led where imagined", f"{found['steps_as_imagined']} of {found['steps']}", DASH],
-        ["faults of the physics", f"{found['faults']}", DASH],
-    ]
+    rows = []
+    for name, words in _COUNTS.items():
+        here = f"{found[name]:.4g}"
+        if name == "solved":
+            here += f" = {percent(found[name] / len(plans))} % [{percent(low)}, {percent(high)}]"
+        rows.append([words, here, str(thesis.get("optimal_among_solved" if name == "optimal" else name, DASH))])
     return Table("plans", ["open-loop plans, carried out blindly", "here", "thesis"], rows)
 
 

@@ -7,13 +7,13 @@ lists them in the order of the page.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from imagine_bench import reference
-from imagine_bench.report import exact, figures, imagination
+from imagine_bench.report import figures, sections
 from imagine_bench.report.data import (
     AREA,
     BASE_AGENT,
@@ -28,7 +28,6 @@ from imagine_bench.report.data import (
     estimated,
     frames_before,
     known_agent,
-    learner_cpu_s,
     open_loop_csv,
     summary_csv,
 )
@@ -58,7 +57,7 @@ def bench_page(result: BenchResult) -> Page:
     data = collect(result)
     protocol = result.protocol
     files = {**archive_files(result), "summary.csv": summary_csv(data)}
-    if data.open_loop:
+    if any(row.open_loop for _, row in result.rows):
         files["open_loop.csv"] = open_loop_csv(result)
     dataset = f"; trained first on dataset {protocol.dataset}" if protocol.dataset else ""
     split = f"; tests start where training never does, {protocol.split}" if protocol.split else ""
@@ -167,19 +166,19 @@ def success(data: ReportData) -> Section:
 
 def _scores(data: ReportData) -> Table:
     """Ours, the thesis' below it, and the exact ends of the scale."""
-    budgets = set(data.result.protocol.budgets).union(*data.thesis.values())
-    columns = {budget: f"{budget:,}" for budget in sorted(budgets)}
-    first = "solved (%) after"
-    rows: list[dict[str, str | Cell]] = []
+    budgets = sorted(set(data.result.protocol.budgets).union(*data.thesis.values()))
+
+    def row(title: str, cells: Mapping[int, str | Cell]) -> dict[str, str | Cell]:
+        return {"solved (%) after": title, **{f"{budget:,}": cells.get(budget, DASH) for budget in budgets}}
+
+    rows = []
     for agent in data.result.protocol.agents:
-        own = {record["episodes"]: estimated(record, SCORE) for record in data.of(agent)}
-        rows.append({first: agent_title(agent), **{name: own.get(budget, DASH) for budget, name in columns.items()}})
+        rows.append(row(agent_title(agent), {each["episodes"]: estimated(each, SCORE) for each in data.of(agent)}))
         if agent in data.thesis:
             printed = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
-            cells = {name: printed.get(budget, DASH) for budget, name in columns.items()}
-            rows.append({first: f"{agent_title(agent)}, thesis", **cells})
-    for name, level in (("chance level", data.facts.chance_level), ("optimum", data.facts.optimum)):
-        rows.append({first: name, **dict.fromkeys(columns.values(), percent(level))})
+            rows.append(row(f"{agent_title(agent)}, thesis", printed))
+    rows.append(row("chance level", dict.fromkeys(budgets, percent(data.facts.chance_level))))
+    rows.append(row("optimum", dict.fromkeys(budgets, percent(data.facts.optimum))))
     source = f" Thesis: {reference.success_source(str(data.spec.reference))}." if data.thesis else ""
     return Table.of("scores", rows, f"Columns: real training episodes.{source}", "not tested")
 
@@ -271,7 +270,6 @@ def cost(data: ReportData) -> Section:
             "frames its encoder saw before": count(frames_before(data, agent)),
             "gradient updates": count(last["gradient_updates"]),
             "training (CPU s)": seconds(last["train_cpu_s"]),
-            "of which learning": seconds(float(np.mean([learner_cpu_s(run) for run in runs]))),
             "all tests (CPU s)": seconds(sum(row.eval_cpu_s for row in tests) / len(runs)),
             "faults in all tests": f"{sum(row.faults for row in tests)} of {played:,}",
         })  # fmt: skip
@@ -312,15 +310,15 @@ def success_figure(data: ReportData) -> Figure:
 SECTIONS: tuple[Callable[[ReportData], Section | None], ...] = (
     compared,
     success,
-    exact.world,
+    sections.world,
     area,
     gain,
-    exact.policies,
-    exact.causes,
-    imagination.acceptance,
-    imagination.open_loop,
-    imagination.rollouts,
-    imagination.encoders_used,
+    sections.policies,
+    sections.causes,
+    sections.acceptance,
+    sections.open_loop,
+    sections.rollouts,
+    sections.encoders_used,
     cost,
 )
 """The sections of the page, in their order. A new one is a function and a line here."""

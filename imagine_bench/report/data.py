@@ -8,7 +8,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -23,7 +22,7 @@ from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import Estimate
 from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
-from imagine_bench.store.results import BenchResult, Checkpoint, OpenLoop, RunResult
+from imagine_bench.store.results import BenchResult, OpenLoop
 
 Record = dict[str, Any]
 """An agent at one budget: columns of summary.csv, as far as they apply to it, and what it cost until then."""
@@ -83,92 +82,55 @@ class ReportData:
     """The numbers of a bench."""
 
     result: BenchResult
-
-    @cached_property
-    def spec(self) -> TaskSpec:
-        """The task."""
-        return known_task(self.result.protocol.task)
+    spec: TaskSpec  # the task
+    facts: RuleFacts  # chance level and optimum of the tests; the bench's certificate knows what frames hide
+    learners: list[str]  # the agents that learn
+    compared: list[str]  # those that are compared with DQN, where it was run
+    thesis: dict[str, dict[int, tuple[float, float]]]  # its mean and standard deviation of success by agent and budget
+    records: list[Record]  # one an agent and budget, p-values corrected over all that are compared with DQN
 
     @property
     def installed(self) -> bool:
         """Whether the task's package is here."""
         return bool(self.spec.action_names)
 
-    @cached_property
-    def facts(self) -> RuleFacts:
-        """Chance level and optimum of the tests; the bench's certificate knows what frames hide."""
-        facts = self.spec.facts()
-        protocol = self.result.protocol
-        if protocol.split is not None and self.installed:
-            facts = rule_facts(protocol.spec(testing=True).rules, self.spec.horizon)
-        known = self.result.certificate
-        if known is None:
-            return facts
-        return dataclasses.replace(facts, chance_level=known.chance_level, optimum=known.optimum)
-
-    @cached_property
-    def learners(self) -> list[str]:
-        """The agents that learn."""
-        return [agent for agent in self.result.protocol.agents if known_agent(agent).learns]
-
-    @cached_property
-    def compared(self) -> list[str]:
-        """The learners that are compared with DQN, where it was run."""
-        return [agent for agent in self.learners if agent != BASE_AGENT and BASE_AGENT in self.learners]
-
-    @cached_property
-    def thesis(self) -> dict[str, dict[int, tuple[float, float]]]:
-        """Mean and standard deviation of success in the thesis, by agent and budget."""
-        source = self.spec.reference
-        found = {agent: reference.success(source, agent) for agent in self.result.protocol.agents} if source else {}
-        return {agent: rows for agent, rows in found.items() if rows}
-
-    @cached_property
-    def records(self) -> list[Record]:
-        """One an agent and budget, p-values corrected over all of them that are compared with DQN."""
-        protocol = self.result.protocol
-        places = range(len(protocol.budgets))
-        found = [_record(self, agent, place) for agent in protocol.agents for place in places]
-        compared = [record for record in found if record["agent"] in self.compared]
-        for name in ("p", "p_mcnemar"):
-            adjusted = statistics.holm([record.get(name, math.nan) for record in compared])
-            for record, p in zip(compared, adjusted.tolist(), strict=True):
-                record[f"{name}_holm"] = p
-        return found
-
-    @cached_property
-    def fewest(self) -> Callable[[State], int]:
-        """The fewest macro-actions from a start, by the rules."""
-        return functools.cache(functools.partial(fewest_actions, self.spec.rules))
-
     def of(self, agent: str) -> list[Record]:
         """The records of an agent, in the order of budgets."""
         return [record for record in self.records if record["agent"] == agent]
 
-    @cached_property
-    def open_loop(self) -> dict[str, Arrays]:
-        """Quality of imagination by depth at the last budget, by agent: means over runs, and the sum of counts.
-
-        NaN where a measure is known in no run: the filter keeps nothing, or none or all are wrong.
-        """
-        found = {}
-        for agent in self.result.protocol.agents:
-            loops = [run.checkpoints[-1].open_loop for run in self.result.of(agent)]
-            if known := [loop for loop in loops if loop is not None]:
-                with warnings.catch_warnings(action="ignore"):  # of what is NaN in every run
-                    found[agent] = {
-                        name: np.nanmean([getattr(loop, name) for loop in known], axis=0) for name in _LOOP_COLUMNS
-                    }
-                found[agent]["count"] *= len(known)
-        return found
-
 
 def collect(result: BenchResult) -> ReportData:
-    """The numbers of a report; each is computed when it is first asked for."""
-    return ReportData(result)
+    """The numbers of a report."""
+    protocol = result.protocol
+    spec = known_task(protocol.task)
+    learners = [agent for agent in protocol.agents if known_agent(agent).learns]
+    compared = [agent for agent in learners if agent != BASE_AGENT and BASE_AGENT in learners]
+    thesis = {agent: reference.success(spec.reference, agent) for agent in protocol.agents if spec.reference}
+    thesis = {agent: rows for agent, rows in thesis.items() if rows}
+    data = ReportData(result, spec, _facts(result, spec), learners, compared, thesis, [])
+    fewest = functools.cache(functools.partial(fewest_actions, spec.rules))
+    for agent in protocol.agents:
+        for place in range(len(protocol.budgets)):
+            data.records.append(_record(data, agent, place, fewest))
+    tested = [record for record in data.records if record["agent"] in compared]
+    for name in ("p", "p_mcnemar"):
+        adjusted = statistics.holm([record.get(name, math.nan) for record in tested])
+        for record, p in zip(tested, adjusted.tolist(), strict=True):
+            record[f"{name}_holm"] = p
+    return data
 
 
-def _record(data: ReportData, agent: str, place: int) -> Record:
+def _facts(result: BenchResult, spec: TaskSpec) -> RuleFacts:
+    facts = spec.facts()
+    if result.protocol.split is not None and spec.action_names:
+        facts = rule_facts(result.protocol.spec(testing=True).rules, spec.horizon)
+    known = result.certificate
+    if known is None:
+        return facts
+    return dataclasses.replace(facts, chance_level=known.chance_level, optimum=known.optimum)
+
+
+def _record(data: ReportData, agent: str, place: int, fewest: Callable[[State], int]) -> Record:
     """An agent at the budget of this place; p-values are not corrected yet."""
     result = data.result
     protocol = result.protocol
@@ -191,8 +153,12 @@ def _record(data: ReportData, agent: str, place: int) -> Record:
     }
     if budget in data.thesis.get(agent, {}):
         record["thesis_mean"], record["thesis_std"] = data.thesis[agent][budget]
+    beyond = []
+    for kept in (row.kept for row in rows if row.kept is not None and data.installed):
+        for test in np.flatnonzero(kept.success):
+            beyond.append(int(kept.lengths[test]) - fewest(tuple(kept.starts[test].tolist())))
     some = {
-        "excess_macro_actions": mean(_beyond_shortest(data, rows)),
+        "excess_macro_actions": mean(beyond),
         "acceptance": mean(row.diagnostics.get("imagination/acceptance_rate", math.nan) for row in rows),
     }
     record |= {name: value for name, value in some.items() if not math.isnan(value)}
@@ -226,15 +192,6 @@ def _against_dqn(data: ReportData, agent: str, place: int) -> Record:
     return found
 
 
-def _beyond_shortest(data: ReportData, rows: list[Checkpoint]) -> list[int]:
-    """Macro-actions of the solved tests that were kept, beyond the fewest that the rules allow."""
-    found = []
-    for kept in (row.kept for row in rows if row.kept is not None and data.installed):
-        for test in np.flatnonzero(kept.success):
-            found.append(int(kept.lengths[test]) - data.fewest(tuple(kept.starts[test].tolist())))
-    return found
-
-
 def mean(values: Iterable[float]) -> float:
     """Mean of the finite values; NaN where there is none."""
     known = [value for value in values if math.isfinite(value)]
@@ -250,16 +207,20 @@ def frames_before(data: ReportData, agent: str) -> float:
     return math.nan if card is None or card.get("offer") else int(card["recipe"]["frames"])
 
 
-def learner_cpu_s(run: RunResult) -> float:
-    """CPU seconds in the agent's ``time/*_s`` diagnostics, which are means a real step since the last budget."""
-    total = math.nan
-    before = 0
-    for row in run.checkpoints:
-        parts = [value for name, value in row.diagnostics.items() if name.startswith("time/")]
-        if parts:
-            total = np.nansum([total, sum(parts) * (row.env_steps - before)])
-        before = row.env_steps
-    return float(total)
+def open_loop_means(result: BenchResult) -> dict[str, Arrays]:
+    """Quality of imagination by depth at the last budget, by agent: means over runs, and the sum of counts.
+
+    NaN where a measure is known in no run: the filter keeps nothing, or none or all are wrong.
+    """
+    found = {}
+    for agent in result.protocol.agents:
+        loops = [run.checkpoints[-1].open_loop for run in result.of(agent)]
+        if known := [loop for loop in loops if loop is not None]:
+            with warnings.catch_warnings(action="ignore"):  # of what is NaN in every run
+                columns = ((name, [getattr(loop, name) for loop in known]) for name in _LOOP_COLUMNS)
+                found[agent] = {name: np.nanmean(column, axis=0) for name, column in columns}
+            found[agent]["count"] *= len(known)
+    return found
 
 
 def open_loop_csv(result: BenchResult) -> str:

@@ -72,14 +72,12 @@ def colors(agents: Iterable[str]) -> dict[str, str]:
     return {agent_title(agent): color(agent) for agent in agents}
 
 
-def small_multiples(
-    count: int, columns: int, *, width: float, height: float, sharey: bool = False
-) -> tuple[Figure, list[Axes]]:
+def small_multiples(count: int, columns: int, *, width: float, height: float) -> tuple[Figure, list[Axes]]:
     """A figure of ``count`` panels in so many columns, each of this width and height in inches."""
     columns = min(columns, count)
     lines = -(-count // columns)
     figure = Figure(figsize=(width * columns + 0.8, height * lines + 0.7), layout="constrained")
-    every = list(figure.subplots(lines, columns, squeeze=False, sharey=sharey).ravel())
+    every = list(figure.subplots(lines, columns, squeeze=False).ravel())
     for spare in every[count:]:
         spare.set_visible(False)
     return figure, every[:count]

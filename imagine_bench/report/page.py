@@ -44,7 +44,7 @@ def texts(page: Page) -> dict[str, str]:
 
 
 def made(result: Any, titles: Mapping[str, str]) -> dict[str, Any]:
-    """How a result of any kind was made: the fields ``facts``, ``settings``, ``protocol`` and ``recordings`` of a Page.
+    """How a result of any kind was made: the fields ``facts``, ``settings`` and ``protocol`` of a Page.
 
     ``titles`` are those of its learners. All seeds of one have the same settings.
     """
@@ -52,7 +52,6 @@ def made(result: Any, titles: Mapping[str, str]) -> dict[str, Any]:
     environment = result.environment
     commit = str(environment.get("commit") or "").split("+")[0]
     where = f"git checkout {commit} && " if commit else ""
-    paths = [run.recording for run in result.runs if run.recording]
     settings = {title: flat("", result.of(name)[0].settings) for name, title in titles.items()}
     return {
         "facts": [
@@ -63,7 +62,6 @@ def made(result: Any, titles: Mapping[str, str]) -> dict[str, Any]:
         ],
         "settings": {title: rows for title, rows in settings.items() if rows},
         "protocol": [(name, str(value)) for name, value in protocol.as_dict().items()],
-        "recordings": [str(p.relative_to(result.folder) if p.is_relative_to(result.folder) else p) for p in paths],
     }
 
 

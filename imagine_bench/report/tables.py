@@ -122,7 +122,6 @@ class Page:
     facts: Sequence[tuple[str, str]] = ()  # how it was made: name and value
     settings: Mapping[str, Sequence[tuple[str, str]]] = field(default_factory=dict)  # each learner's, by title
     protocol: Sequence[tuple[str, str]] = ()  # the complete protocol: name and value
-    recordings: Sequence[str] = ()  # paths of the recordings, below the bench
     summary: str = ""  # the report on a terminal
 
 

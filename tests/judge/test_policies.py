@@ -18,8 +18,8 @@ from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.judge.values import Terminations, optimal_length, terminations
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.data import collect
-from imagine_bench.report.exact import policies
-from imagine_bench.report.tables import Cell, Table
+from imagine_bench.report.sections import policies
+from imagine_bench.report.tables import Table
 from imagine_bench.rules import fewest_actions, greedy, states_of
 from imagine_bench.running import bench as benches
 from imagine_bench.store.files import lock
@@ -169,7 +169,11 @@ def test_a_report_follows_what_was_held_from_every_start(tmp_path: Path) -> None
 
     (whole,) = page_of(one_astray)
     bad = ends_of(HARD, other_way)
-    assert whole.rows[0] == ["DQN", *map(Cell, ["100.0", *["0.0"] * 4, "3.27"])]
+    rows = [dict(zip(whole.header, row, strict=True)) for row in whole.cells]
+    assert [cell.text for cell in whole.cells[0][1:6]] == ["100.0", *["0.0"] * 4]
+    near = bad.success[optimal_length(HARD, STARTS) == 2].mean()
+    assert [row["solved from 2 away"].text for row in rows] == ["100.0", f"{50 + 50 * near:.1f}"]
+    assert rows[0]["macro-actions"].text == "3.27"
     assert str(whole.rows[1][1]).startswith(f"{50 + 50 * bad.success.mean():.1f} [")
     assert page_of(lambda run: None) == ()
 
@@ -185,7 +189,7 @@ def test_an_analysis_is_made_by_one_process_at_a_time(tmp_path: Path, capsys: py
     ("folder", "complaint"),
     [
         ("docs/results/arrow_puzzle_hard-thesis", "holds kept results and no agents; give a bench's own folder"),
-        ("docs/results/toy_regression-thesis", "is of a regression task, in which no agent acts"),
+        ("docs/results/toy_regression-thesis", "in which no agent acts"),
         ("docs", "There is no docs/protocol.json"),
     ],
 )

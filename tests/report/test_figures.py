@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from imagine_bench.report import figures
 from imagine_bench.report.bench import success_figure
-from imagine_bench.report.data import ReportData, agent_title, collect
-from imagine_bench.report.imagination import open_loop_figure
+from imagine_bench.report.data import ReportData, agent_title, collect, open_loop_means
+from imagine_bench.report.sections import open_loop_figure
 from imagine_bench.statistics import Estimate
 
 
@@ -40,11 +40,9 @@ def test_the_success_figure_draws_scores_bands_and_the_thesis(data: ReportData) 
 
 def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(data: ReportData) -> None:
     drawn = []
-    loop = data.open_loop["imagination"]
+    loop = open_loop_means(data.result)["imagination"]
     for each in (loop, {**loop, "aleatoric": np.zeros_like(loop["aleatoric"])}):
-        changed = ReportData(data.result)
-        vars(changed)["open_loop"] = {"imagination": each}
-        drawn.append({axes.get_title(): lines(axes) for axes in open_loop_figure(changed).axes})
+        drawn.append({axes.get_title(): lines(axes) for axes in open_loop_figure({"imagination": each}).axes})
     assert [len(panels["aleatoric"]) for panels in drawn] == [1, 0]
     assert all(len(panels["reward error"]) == 1 for panels in drawn)
 
