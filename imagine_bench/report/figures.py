@@ -94,7 +94,7 @@ def curve(axes: Axes, values: Mapping[Any, float | Estimate], **style: Any) -> N
 def lines(
     panels: Mapping[str, Mapping[str, Mapping[Any, float | Estimate]]], by_name: Mapping[str, str], xlabel: str
 ) -> Figure:
-    """A curve a name in each panel, three panels a row; names have the same color everywhere and stand below."""
+    """A curve a name in each panel, three panels a row; names have the same color everywhere and stand above."""
     columns = min(3, len(panels))
     figure, every = small_multiples(len(panels), columns, width=9.0 / columns, height=max(2.2, 5.0 / columns))
     for axes, (title, curves) in zip(every, panels.items(), strict=True):
@@ -103,13 +103,13 @@ def lines(
         axes.set_title(title, fontsize=9.5)
         axes.margins(y=0.06)  # lines along an axis are seen whole
     figure.supxlabel(xlabel)
-    names_below(figure)
+    names_above(figure)
     return figure
 
 
-def names_below(figure: Figure) -> None:
-    """The names of the first panel's curves, below all panels."""
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+def names_above(figure: Figure) -> None:
+    """The names of the first panel's curves, above all panels."""
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
 
 
 def radar_figure(spokes: Sequence[str], scores: Mapping[str, Sequence[Estimate]]) -> Figure:
@@ -124,5 +124,5 @@ def radar_figure(spokes: Sequence[str], scores: Mapping[str, Sequence[Estimate]]
     axes.set(ylim=(0.0, 1.0), yticks=(0.25, 0.5, 0.75, 1.0))
     axes.set_xticks(angles[:-1], [spoke.replace("_", " ") for spoke in spokes])
     axes.tick_params(axis="x", pad=20)
-    names_below(figure)
+    names_above(figure)
     return figure
