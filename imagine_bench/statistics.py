@@ -226,13 +226,15 @@ def ratio(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None, pai
     under = _location(b, trials, 0.0)
     shared = float(np.cov(a, b)[0, 1]) / len(a) if paired else 0.0
     freedom = len(a) - 1 if paired else _welch(over, under)
-    square = float(scipy.stats.t.ppf(0.5 + LEVEL / 2.0, freedom)) ** 2
-    lead = mean_b**2 - square * under.error**2
-    if lead <= 0.0:
+    t = float(scipy.stats.t.ppf(0.5 + LEVEL / 2.0, freedom))
+    g = (t * under.error / mean_b) ** 2
+    if g >= 1.0:
         return Estimate(value, math.nan, math.nan)
-    middle = (mean_a * mean_b - square * shared) / lead
-    half = math.sqrt(max(middle**2 - (mean_a**2 - square * over.error**2) / lead, 0.0))
-    return Estimate(value, middle - half, middle + half)
+    inner = over.error**2 - 2.0 * value * shared + (value * under.error) ** 2
+    inner -= g * (over.error**2 - (shared / under.error) ** 2 if under.error > 0.0 else 0.0)
+    middle = value - (g * shared / under.error**2 if under.error > 0.0 else 0.0)
+    half = t / abs(mean_b) * math.sqrt(max(inner, 0.0))
+    return Estimate(value, (middle - half) / (1.0 - g), (middle + half) / (1.0 - g))
 
 
 def _location(values: Floats, trials: int | None, trim: float) -> _Location:
