@@ -34,7 +34,6 @@ from imagine_bench.report.data import (
 from imagine_bench.report.page import made
 from imagine_bench.report.tables import (
     DASH,
-    Cell,
     Page,
     Section,
     Table,
@@ -168,7 +167,7 @@ def _scores(data: ReportData) -> Table:
     """Ours, the thesis' below it, and the exact ends of the scale."""
     budgets = sorted(set(data.result.protocol.budgets).union(*data.thesis.values()))
 
-    def row(title: str, cells: Mapping[int, str | Cell]) -> dict[str, str | Cell]:
+    def row(title: str, cells: Mapping[int, str]) -> dict[str, str]:
         return {"solved (%) after": title, **{f"{budget:,}": cells.get(budget, DASH) for budget in budgets}}
 
     rows = []
@@ -239,20 +238,20 @@ def gain(data: ReportData) -> Section | None:
     return Section("Gain over DQN", [words], tables=tables)
 
 
-def _difference(record: Record) -> Cell:
+def _difference(record: Record) -> str:
     return estimated(record, DIFFERENCE, signed_percent)
 
 
-def _gain(record: Record) -> Cell:
+def _gain(record: Record) -> str:
     printed = record.get("thesis_gain")
-    return estimated(record, GAIN, signed_percent, "" if printed is None else f"thesis {signed_percent(printed)}")
+    return estimated(record, GAIN, signed_percent, "" if printed is None else f"; thesis {signed_percent(printed)}")
 
 
-def _alone(record: Record) -> Cell:
-    note = f"ahead in {percent(record['probability_of_improvement'])} % of pairs of runs"
-    if "alone" not in record:
-        return Cell(DASH, note=note)
-    return Cell(f"{record['alone']:,} : {record['dqn_alone']:,}", f"({p_value(record['p_mcnemar_holm'])})", note)
+def _alone(record: Record) -> str:
+    alone = DASH
+    if "alone" in record:
+        alone = f"{record['alone']:,} : {record['dqn_alone']:,} ({p_value(record['p_mcnemar_holm'])})"
+    return f"{alone}; ahead in {percent(record['probability_of_improvement'])} % of pairs of runs"
 
 
 def cost(data: ReportData) -> Section:

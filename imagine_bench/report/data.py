@@ -16,7 +16,7 @@ from imagine_bench import reference, registry, statistics
 from imagine_bench.arrays import Arrays
 from imagine_bench.errors import SetupError, UnknownNameError
 from imagine_bench.interfaces import RenderMacrostates, RuleFacts, Rules, State, TaskSpec
-from imagine_bench.report.tables import Cell, Table, estimate, percent
+from imagine_bench.report.tables import Table, estimate, percent
 from imagine_bench.rules import facts as rule_facts
 from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import Estimate
@@ -241,7 +241,7 @@ def summary_csv(data: ReportData) -> str:
 
 
 def by_budget(
-    data: ReportData, name: str, first: str, column: str, cell: Callable[[Record], str | Cell], *texts: str
+    data: ReportData, name: str, first: str, column: str, cell: Callable[[Record], str], *texts: str
 ) -> Table:
     """A row an agent whose records have a column, and a column a budget; each record is put into words."""
     rows = []
@@ -252,6 +252,6 @@ def by_budget(
     return Table.of(name, rows, *texts)
 
 
-def estimated(record: Record, columns: Sequence[str], words: Callable[[float], str] = percent, note: str = "") -> Cell:
+def estimated(record: Record, columns: Sequence[str], words: Callable[[float], str] = percent, note: str = "") -> str:
     """An estimate from its columns, with its interval."""
     return estimate(Estimate(*(record[column] for column in columns)), words, note)

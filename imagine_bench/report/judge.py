@@ -25,7 +25,7 @@ from imagine_bench.judge.scores import COVERAGES
 from imagine_bench.recording.filmstrips import TileRow, png, transition_sheet
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report.page import flat, write_page
-from imagine_bench.report.tables import DASH, Cell, Image, Page, Section, Table, estimate, number, over_seeds, p_value
+from imagine_bench.report.tables import DASH, Image, Page, Section, Table, estimate, number, over_seeds, p_value
 from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import difference, holm, iqm
 from imagine_bench.store.files import read_json, table_text
@@ -186,7 +186,7 @@ def _by_model(
     found: Judged, name: str, columns: Mapping[str, Callable[[Scores], float]], caption: str, folded: str = ""
 ) -> Table:
     """A row a model and number of transitions, a column a number over seeds; NaN where a model has none."""
-    rows: list[list[str | Cell]] = []
+    rows: list[list[str]] = []
     for (model, size), cells in found.cells.items():
         transitions = DASH if runs_of(model) else f"{size:,}"  # those of a trained agent are its bench's to say
         rows.append([_title(model), transitions])
@@ -250,7 +250,7 @@ def compared(found: Judged) -> Section:
     best = sorted(learned, key=lambda model: iqm(values[model]))[:2]
     pairs = list(itertools.combinations(values, 2))
     differences = [difference(values[a], values[b]) for a, b in pairs]
-    rows: list[list[str | Cell]] = []
+    rows: list[list[str]] = []
     answers = []
     for pair, each, p in zip(pairs, differences, holm([each.p for each in differences]), strict=True):
         cell = estimate(each, number)
@@ -276,7 +276,7 @@ def where(found: Judged) -> Section:
             for kind, each in cell["where"].items():
                 for name, value in each.items():
                     groups.setdefault((kind, name), {}).setdefault(model, []).append(value)
-    rows: list[dict[str, str | Cell]] = []
+    rows: list[dict[str, str]] = []
     for (kind, name), values in groups.items():
         rows.append({"by": kind, "which": name})
         for model in found.last:

@@ -355,7 +355,7 @@ def choices(pair: PairResult, part: str) -> list[Cells]:
         }
         for measure, cells in (
             ("error_m", {name: mean_std(values) for name, values in sums.items()}),
-            ("ratio_to_random", {name: str(estimate(ratio, decimals)) for name, ratio in ratios.items()}),
+            ("ratio_to_random", {name: estimate(ratio, decimals) for name, ratio in ratios.items()}),
         )
     ]
 

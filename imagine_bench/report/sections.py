@@ -21,7 +21,7 @@ from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
 from imagine_bench.report.data import ReportData, agent_title, by_budget, known_agent, open_loop_means
 from imagine_bench.report.page import flat
-from imagine_bench.report.tables import DASH, Cell, Image, Section, Table, decimals, over_seeds, percent, printed
+from imagine_bench.report.tables import DASH, Image, Section, Table, decimals, over_seeds, percent, printed
 from imagine_bench.rules import greedy
 from imagine_bench.store import encoders
 from imagine_bench.store.files import reading
@@ -90,7 +90,7 @@ def policies(data: ReportData) -> Section | None:
         if all(kept):
             actions = [greedy(one.action.astype(np.int64), data.spec.n_actions) for one in kept if one]
             found = [terminations(data.spec, policy, starts) for policy in actions]
-            row: dict[str, str | Cell] = {"agent, %": agent_title(agent)}
+            row: dict[str, str] = {"agent, %": agent_title(agent)}
             for name, words in _SHARES.items():
                 row[words] = over_seeds([float(getattr(one, name).mean()) for one in found], share=True)
             for need in np.unique(needs):

@@ -12,7 +12,6 @@ from imagine_bench.report.data import agent_title
 from imagine_bench.report.page import flat
 from imagine_bench.report.tables import (
     DASH,
-    Cell,
     Page,
     Section,
     Table,
@@ -56,7 +55,7 @@ def study_page(study: Study, lines: Sequence[Line]) -> Page:
 
 def _variants(study: Study, lines: Sequence[Line]) -> tuple[Table, str]:
     """A row a variant and budget, as a table and as CSV."""
-    rows: list[dict[str, str | Cell]] = []
+    rows: list[dict[str, str]] = []
     records: list[Row] = []
     for line in lines:
         for place, budget in enumerate(study.budgets):
@@ -158,7 +157,7 @@ def _scores(result: SuiteResult) -> Section:
     image = figures.image("radar", lambda: figures.radar_figure(spokes, by_agent), caption)
     rows = []
     for each, scores in zip(experiments, found, strict=True):
-        rows.append([f"{each.name}: {each.dial}", *(str(estimate(score, decimals)) for score in scores)])
+        rows.append([f"{each.name}: {each.dial}", *(estimate(score, decimals) for score in scores)])
     rows.append(["training of all levels and seeds (CPU s)", *(_cpu_s(result, agent) for agent in result.agents)])
     words = (
         "Scores with 95 % intervals: Student's over seeds, and at least that of the tests. 0 is chance, 1 the exact "

@@ -19,52 +19,33 @@ DASH = "–"  # printed where there is no number; the table's caption says why
 
 
 @dataclass(frozen=True)
-class Cell:
-    """A cell of a table: a value, its interval in brackets, and a second value to compare it with."""
-
-    text: str
-    interval: str = ""
-    note: str = ""
-
-    def __str__(self) -> str:
-        """The cell in one line, as terminal, Markdown and CSV have it."""
-        value = f"{self.text} {self.interval}".strip()
-        return f"{value}; {self.note}" if self.note else value
-
-
-@dataclass(frozen=True)
 class Table:
     """A table of finished texts; one type for pages, Markdown, CSV and the terminal."""
 
     name: str  # its id in the page, and the name of its CSV file where it has one
     header: Sequence[str]  # names of the columns
-    rows: Sequence[Sequence[str | Cell]]  # as many cells each
+    rows: Sequence[Sequence[str]]  # as many cells each
     caption: str = ""  # the text below it
     why_dash: str = ""  # why a cell may hold a dash instead of a number; shown where one does
     folded: str = ""  # words to unfold it by; empty for a table that is always shown
     prose: bool = False  # whether its cells hold sentences, which are aligned to the left
 
     @classmethod
-    def of(cls, name: str, rows: Sequence[Mapping[str, str | Cell]], caption: str = "", why_dash: str = "") -> Table:
+    def of(cls, name: str, rows: Sequence[Mapping[str, str]], caption: str = "", why_dash: str = "") -> Table:
         """A table of rows by column, each with the same ones."""
         header = list(rows[0]) if rows else []
         return cls(name, header, [list(row.values()) for row in rows], caption, why_dash)
 
     @property
-    def cells(self) -> list[list[Cell]]:
-        """The rows, every cell in full."""
-        return [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in self.rows]
-
-    @property
     def remark(self) -> str:
         """The caption, and the meaning of a dash where there is one."""
-        dash = any(cell.text == DASH for row in self.cells for cell in row)
+        dash = any(cell.startswith(DASH) for row in self.rows for cell in row)
         return f"{self.caption} {DASH}: {self.why_dash}.".strip() if dash and self.why_dash else self.caption
 
     @property
     def text(self) -> str:
         """The table for a terminal."""
-        rows = [list(map(str, row)) for row in (self.header, *self.rows)]
+        rows = [self.header, *self.rows]
         first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
         lines = []
         for name, *others in rows:
@@ -169,17 +150,17 @@ def p_value(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
 
 
-def estimate(found: statistics.Estimate, words: Callable[[float], str] = percent, note: str = "") -> Cell:
-    """``61.3`` with ``[55.0, 67.2]``, or without the brackets where there is no interval."""
-    interval = "" if math.isnan(found.low) else f"[{words(found.low)}, {words(found.high)}]"
-    return Cell(words(found.value), interval, note)
+def estimate(found: statistics.Estimate, words: Callable[[float], str] = percent, note: str = "") -> str:
+    """``61.3 [55.0, 67.2]`` and a note, without the brackets where there is no interval."""
+    interval = "" if math.isnan(found.low) else f" [{words(found.low)}, {words(found.high)}]"
+    return f"{words(found.value)}{interval}{note}"
 
 
-def over_seeds(values: Sequence[float], words: Callable[[float], str] = percent, *, share: bool = False) -> Cell:
+def over_seeds(values: Sequence[float], words: Callable[[float], str] = percent, *, share: bool = False) -> str:
     """Interquartile mean over seeds with its 95 % interval, of a ``share`` in [0, 1]; a dash for no number."""
     known = [value for value in values if not math.isnan(value)]
     if not known:
-        return Cell(DASH)
+        return DASH
     low, high = statistics.interval(known, share=share)
     return estimate(statistics.Estimate(statistics.iqm(known), math.nan if low == high else low, high), words)
 

@@ -169,11 +169,11 @@ def test_a_report_follows_what_was_held_from_every_start(tmp_path: Path) -> None
 
     (whole,) = page_of(one_astray)
     bad = ends_of(HARD, other_way)
-    rows = [dict(zip(whole.header, row, strict=True)) for row in whole.cells]
-    assert [cell.text for cell in whole.cells[0][1:6]] == ["100.0", *["0.0"] * 4]
+    rows = [dict(zip(whole.header, row, strict=True)) for row in whole.rows]
+    assert whole.rows[0][1:6] == ["100.0", *["0.0"] * 4]
     near = bad.success[optimal_length(HARD, STARTS) == 2].mean()
-    assert [row["solved from 2 away"].text for row in rows] == ["100.0", f"{50 + 50 * near:.1f}"]
-    assert rows[0]["macro-actions"].text == "3.27"
+    assert [row["solved from 2 away"] for row in rows] == ["100.0", f"{50 + 50 * near:.1f}"]
+    assert rows[0]["macro-actions"] == "3.27"
     assert str(whole.rows[1][1]).startswith(f"{50 + 50 * bad.success.mean():.1f} [")
     assert page_of(lambda run: None) == ()
 

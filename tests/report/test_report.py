@@ -23,7 +23,8 @@ from imagine_bench.report.bench import shown, verdict
 from imagine_bench.report.data import agent_title, collect
 from imagine_bench.report.page import texts
 from imagine_bench.report.sections import encoder_readers
-from imagine_bench.report.tables import DASH, Cell, Page, Table, markdown_text, percent, signed_percent
+from imagine_bench.report.tables import DASH, Page, Table, estimate, markdown_text, percent, signed_percent
+from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 
@@ -77,13 +78,13 @@ def test_tables_show_the_columns_of_the_summary(
     page: Page, name: str, columns: tuple[str, ...], words: Callable[[float], str]
 ) -> None:
     found = table(page, name)
-    cells = {row[0].text: dict(zip(found.header, row, strict=True)) for row in found.cells}
+    cells = {row[0]: dict(zip(found.header, row, strict=True)) for row in found.rows}
     rows = [row for row in records(page, "summary.csv") if row[columns[0]]]
     assert len(rows) > 5
     for row in rows:
         cell = cells[agent_title(row["agent"])][f"{int(row['episodes']):,}"]
         value, low, high = (words(float(row[column])) for column in columns)
-        assert (cell.text, cell.interval) == (value, f"[{low}, {high}]")
+        assert cell.partition(";")[0] == f"{value} [{low}, {high}]"
 
 
 def test_every_seed_is_the_one_of_the_csv(page: Page) -> None:
@@ -106,12 +107,12 @@ def test_open_loop_csv_has_every_depth_of_every_budget(result: BenchResult, page
 def test_the_thesis_stands_below_ours(page: Page) -> None:
     found = table(page, "scores")
     assert found.header[1:] == ["250", "2,000", "3,000", "4,000", "5,000", "6,000"]
-    rows = {str(row[0]): list(map(str, row[1:])) for row in found.rows}
+    rows = {row[0]: row[1:] for row in found.rows}
     assert [rows["DQN, thesis"][at] for at in (0, 1, -1)] == [DASH, "42.2 (6.0)", "92.2 (2.6)"]
     for agent in ("dqn", "imagination", "imagination_uncertainty"):
         printed = [percent(mean) for mean, _ in reference.success("arrow_puzzle", agent).values()]
         assert [cell.split()[0] for cell in rows[f"{agent_title(agent)}, thesis"][1:]] == printed
-    assert "thesis +47.4" in [cell.note for row in table(page, "gains").cells for cell in row]
+    assert any(cell.endswith("; thesis +47.4") for row in table(page, "gains").rows for cell in row)
 
 
 def test_chapter_3_is_quoted_without_a_standard_deviation(tmp_path: Path) -> None:
@@ -121,7 +122,7 @@ def test_chapter_3_is_quoted_without_a_standard_deviation(tmp_path: Path) -> Non
     plain = bench_result(tmp_path, protocol=protocol)
     runs = tuple(dataclasses.replace(run, imagined=()) for run in plain.runs)
     found = table(bench_page(dataclasses.replace(plain, runs=runs)), "scores")
-    assert [list(map(str, row)) for row in found.rows if "thesis" in str(row[0])] == [
+    assert [row for row in found.rows if "thesis" in row[0]] == [
         ["DQN, thesis", DASH, "98.0"], ["imagination only, thesis", DASH, "78.0"],
     ]  # fmt: skip
     assert "mean of 10 runs, 100 test episodes each" in found.caption
@@ -277,7 +278,7 @@ def test_a_dash_is_explained_only_where_there_is_one() -> None:
     found = Table.of("t", [{"a": "x", "b": "1"}], "Numbers.", "not measured")
     assert found.remark == "Numbers."
     assert dataclasses.replace(found, rows=[["x", DASH]]).remark == "Numbers. –: not measured."
-    assert str(Cell("61.3", "[55.0, 67.2]", "thesis 60.0")) == "61.3 [55.0, 67.2]; thesis 60.0"
+    assert estimate(Estimate(0.613, 0.55, 0.672), note="; thesis 60.0") == "61.3 [55.0, 67.2]; thesis 60.0"
     assert found.text.splitlines() == ["a  b", "----", "x  1"]
     assert found.markdown.splitlines() == ["| a | b |", "|---|---|", "| x | 1 |"]
 
