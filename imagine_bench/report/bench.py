@@ -6,6 +6,7 @@ lists them in the order of the page.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 
@@ -206,7 +207,7 @@ def area(data: ReportData) -> Section | None:
         "Mean success (%) over all real episodes up to each budget: straight lines between the tests, from the chance "
         "level at episode 0. It is the area under the curve with a linear axis, so early learning counts."
     )
-    table = by_budget(data, "areas", "mean success (%) up to", "area", lambda record: estimated(record, AREA))
+    table = by_budget(data, "areas", "mean success (%) up to", "area", functools.partial(estimated, columns=AREA))
     return Section("Area under the success curve", [words], tables=[table]) if table.rows else None
 
 
@@ -221,14 +222,15 @@ def gain(data: ReportData) -> Section | None:
         "McNemar's exact test (Holm-corrected); it compares these trained agents, not two ways of training."
     )
     sizes = [record["detectable_difference"] for record in data.records if "gain" in record]
-    detectable = (
-        ""
-        if math.isnan(sizes[0])
-        else (f"p-values are Holm-corrected for {len(sizes)} cells. The smallest difference that would be shown with ")
-    )
-    detectable += f"probability 80 % is {percent(min(sizes))} to {percent(max(sizes))} points, by cell."
+    detectable = ""
+    if not math.isnan(sizes[0]):
+        detectable = (
+            f"p-values are Holm-corrected for {len(sizes)} cells. The smallest difference that would be shown with "
+            f"probability 80 % is {percent(min(sizes))} to {percent(max(sizes))} points, by cell."
+        )
+    difference = functools.partial(estimated, columns=DIFFERENCE, words=signed_percent)
     tables = [
-        by_budget(data, "differences", "difference (points) after", "gain", _difference, detectable),
+        by_budget(data, "differences", "difference (points) after", "gain", difference, detectable),
         by_budget(data, "gains", "gain (%) after", "gain", _gain, "", "DQN solved nothing to compare with"),
         by_budget(
             data, "paired", "solved alone : by DQN alone, after", "gain", _alone, "",
@@ -236,10 +238,6 @@ def gain(data: ReportData) -> Section | None:
         ),
     ]  # fmt: skip
     return Section("Gain over DQN", [words], tables=tables)
-
-
-def _difference(record: Record) -> str:
-    return estimated(record, DIFFERENCE, signed_percent)
 
 
 def _gain(record: Record) -> str:

@@ -8,7 +8,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -100,19 +99,8 @@ class Judged:
 
     folder: Path
     judgement: Judgement
-
-    @cached_property
-    def cells(self) -> dict[tuple[str, int], list[Scores]]:
-        """Kept cells, one a seed, by model and transitions."""
-        grouped: dict[tuple[str, int], list[Scores]] = {}
-        for cell in kept(self.folder, self.judgement):
-            grouped.setdefault((cell["model"], cell["transitions"]), []).append(cell)
-        return grouped
-
-    @cached_property
-    def spec(self) -> TaskSpec:
-        """The task."""
-        return registry.task(self.judgement.task)
+    spec: TaskSpec  # the task
+    cells: dict[tuple[str, int], list[Scores]]  # one a seed, by model and transitions
 
     @property
     def last(self) -> dict[str, list[Scores]]:
@@ -124,15 +112,13 @@ class Judged:
         """What models had learned from; nothing where all are trained agents, which learned in their benches."""
         return f" after {self.judgement.sizes[-1]:,} transitions" if self.judgement.learning else ""
 
-    @cached_property
-    def images(self) -> dict[str, Arrays]:
-        """Arrays of the images that are kept, by model."""
-        return shown(self.folder, self.judgement)
-
 
 def judgement_report(folder: Path, judgement: Judgement) -> str:
     """Write ``folder / "report"`` and return the short table and where everything lies."""
-    page = judgement_page(Judged(folder, judgement))
+    cells: dict[tuple[str, int], list[Scores]] = {}
+    for cell in kept(folder, judgement):
+        cells.setdefault((cell["model"], cell["transitions"]), []).append(cell)
+    page = judgement_page(Judged(folder, judgement, registry.task(judgement.task), cells))
     return f"{page.summary}\n\nReport: {write_page(folder / 'report', page)}"
 
 
@@ -287,15 +273,16 @@ def where(found: Judged) -> Section:
 
 def images(found: Judged) -> Section | None:
     """One rollout, transitions after the end of an episode and the worst ten of each model, real and as imagined."""
-    shown = [_sheet(found, "futures", "The same macro-actions from one real start.", "futures", found.images)]
-    for model, arrays in found.images.items():
+    arrays_of = shown(found.folder, found.judgement)
+    sheets = [_sheet(found, "futures", "The same macro-actions from one real start.", "futures", arrays_of)]
+    for model, arrays in arrays_of.items():
         if not arrays["worst_right"].all():
             caption = f"The ten worst transitions of {_title(model)}."
-            shown.append(_sheet(found, f"worst_{file_name(model)}", caption, "worst", {model: arrays}))
-    ended = {model: arrays for model, arrays in found.images.items() if "after_before" in arrays}
+            sheets.append(_sheet(found, f"worst_{file_name(model)}", caption, "worst", {model: arrays}))
+    ended = {model: arrays for model, arrays in arrays_of.items() if "after_before" in arrays}
     caption = "Macro-actions after the end of an episode, which no data contains."  # the thesis' figure 5.9
-    shown.append(_sheet(found, "after_the_end", caption, "after", ended))
-    return Section("Real, and as each model imagines it", images=[each for each in shown if each])
+    sheets.append(_sheet(found, "after_the_end", caption, "after", ended))
+    return Section("Real, and as each model imagines it", images=[each for each in sheets if each])
 
 
 def _sheet(found: Judged, name: str, caption: str, kind: str, models: Mapping[str, Arrays]) -> Image | None:

@@ -192,6 +192,7 @@ def test_one_seed_gets_an_interval_over_episodes_and_no_verdict(tmp_path: Path) 
     assert {row["interval_over"] for row in records(page, "summary.csv")} == {"episodes"}
     assert all(row["gain_low_95"] in ("", "nan") for row in records(page, "summary.csv"))
     assert all(line.endswith("One seed does not show which is better.") for line in page.answers)
+    assert table(page, "differences").caption == "", "one seed tells no size"
     check_texts(text_of(page))
 
 
