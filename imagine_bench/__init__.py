@@ -10,6 +10,7 @@ from imagine_bench.registry.moved import keep_old_paths
 from imagine_bench.version import __version__ as __version__
 
 MOVED = {
+    "imagine_bench.agents.factored.learned_perception": "imagine_bench.agents.factored.perception",
     "imagine_bench.agents.factored_own": "imagine_bench.agents.factored",
     "imagine_bench.agents.factored_own.agent": "imagine_bench.agents.factored.learned",
     "imagine_bench.agents.library": "imagine_bench.agents.encoders",

@@ -1,58 +1,63 @@
-"""``CodeAgent``: a structured model of codes and plans in it, for ``factored`` and ``factored:given``."""
+"""``CodeAgent``: a structured model of codes and plans in it; and ``factored:given``, whose codes an encoder gives.
+
+Which imagined outcome ``factored:given`` asks an oracle about: of all that the dynamics surely lead to, through ends of
+episodes too, that which is most probably decided by something untested. This is uncertainty sampling (Lewis & Gale
+1994) on imagined transitions.
+"""
 
 from __future__ import annotations
-
-import importlib
-import warnings
-from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import AgentState, Floats, Frame, Observation, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout, Label, planned_actions
 from imagine_bench.seeding import SeedTree
 
 from .. import snapshot
+from ..encoders.perception import prepare_torch
 from ..meters import Meters
 from ..settings import flatten
-from .factors import Code, CodeReplay, CodeTransition, Memory
+from .factors import Code, CodeTransition, Ints, as_arrays, from_arrays
 from .model import FactoredModel
-from .planner import TIE, Planner
-from .settings import FactoredSettings
+from .perception import CodePerception, LearnedPerception, load_code_perception
+from .planner import TIE, Objective, Planner
+from .settings import HYPERPARAMETERS, FactoredSettings
 
+ACCEPTED = 0.5
+"""A transition of which more than this is unknown is not accepted, and neither is what follows from it."""
 _EXPECTED = 0.9
 """A transition held less probable than this is unexpected, as is any that would still be explored."""
+_TERMINAL = 0.5
+"""Predicted probability above which an imagined episode ends."""
+_SURE = 0.5
+"""Probability with which each macro-action of a query must lead where it is imagined to."""
 
 
-class FactorReader(Protocol):
-    """Frames to codes; ``sizes`` are the numbers of values of the P factors."""
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Length P."""
-
-    def code(self, frame: Frame) -> Code:
-        """The code of a frame (64, 64, 3)."""
-
-
-PerceptionT = TypeVar("PerceptionT", bound=FactorReader)
-
-
-class CodeAgent(Generic[PerceptionT]):
+class CodeAgent:
     """Learns from codes alone; every transition is replayed, and the model is a function of the replay memory."""
 
-    def __init__(self, perception: PerceptionT, n_actions: int, settings: FactoredSettings, seeds: SeedTree) -> None:
+    perception: CodePerception | LearnedPerception
+
+    def __init__(
+        self,
+        perception: CodePerception | LearnedPerception,
+        n_actions: int,
+        settings: FactoredSettings,
+        seeds: SeedTree,
+    ) -> None:
         self.n_actions = n_actions
         self.settings = settings
         self.rng = seeds.child("exploration").generator()
         self.perception = perception
-        self.replay = CodeReplay(len(self.perception.sizes))
+        self.replay: list[CodeTransition] = []
+        """Every transition that happened or was asked about, in that order; none is dropped."""
         self.meters = Meters()
         self._reset_model()
 
     def _reset_model(self) -> None:
         """An empty model; the first ``learned`` of the replayed transitions are in it."""
-        self.model = FactoredModel(self.perception.sizes, self.n_actions, self.settings, self._memory)
+        self.model = FactoredModel(self.perception.sizes, self.n_actions, self.settings, self.perception.memory)
         self.planner = Planner(self.model, self.settings.planning)
         self.learned = 0
         self.tasks: list[int] = []
@@ -64,17 +69,12 @@ class CodeAgent(Generic[PerceptionT]):
         return self.model.outcomes.causes is not None
 
     @property
-    def _memory(self) -> Memory | None:
-        """Of which factor the last value of a code is a memory; None where it is seen as all are."""
-        return None
-
-    @property
     def _left(self) -> int | None:
         """How many macro-actions an episode has left, where that is known."""
         return None
 
-    def _values(self, code: Code) -> Floats:
-        return self.planner.values(code, left=self._left) if self._ready else np.zeros(self.n_actions)
+    def _values(self, code: Code, objective: Objective = "value") -> Floats:
+        return self.planner.values(code, objective, self._left) if self._ready else np.zeros(self.n_actions)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """The action of the largest value; exploring, that which leads to the most unknown as long as there is any."""
@@ -89,10 +89,10 @@ class CodeAgent(Generic[PerceptionT]):
     def _exploring_values(self, code: Code) -> Floats:
         planning = self.settings.planning
         if planning.exploration == "optimism":
-            return self.planner.values(code, "optimistic", self._left)
+            return self._values(code, "optimistic")
         if planning.exploration == "random":
             return np.zeros(self.n_actions) if self.rng.random() < planning.epsilon else self._values(code)
-        novelty = self.planner.values(code, "novelty", self._left)
+        novelty = self._values(code, "novelty")
         curious = novelty.max() >= planning.exploration_threshold
         self.meters.add("exploration/share", float(curious))
         self.meters.add("exploration/novelty", float(novelty.max()))
@@ -106,7 +106,7 @@ class CodeAgent(Generic[PerceptionT]):
             row = CodeTransition(code, transition.action, following, transition.reward, transition.terminated)
             (probability,), (unknown,) = self.model.probabilities([row])
             unexpected = bool(probability < _EXPECTED or unknown > self.settings.planning.exploration_threshold)
-            self.replay.add(row)
+            self.replay.append(row)
             if unexpected:
                 self.learn()
         self.meters.add("model/unexpected", float(unexpected))
@@ -114,11 +114,10 @@ class CodeAgent(Generic[PerceptionT]):
 
     def learn(self, end: int | None = None) -> None:
         """Bring the model from the first ``learned`` transitions to the first ``end``, or all, and plan anew."""
-        rows = self.replay.rows(self.learned, end)
-        for row in rows:
+        for row in self.replay[self.learned : end]:
             self.model.add(row)
         self.model.outcomes.fit()
-        self.planner.learned({row.action for row in rows if row.has_dynamics})
+        self.planner.learned()
         self.learned = len(self.replay) if end is None else end
 
     def _relearn(self, tasks: list[int], learned: int) -> None:
@@ -139,7 +138,7 @@ class CodeAgent(Generic[PerceptionT]):
     def _begin_task(self) -> None:
         self.tasks.append(self.learned)
         self.model.outcomes.reset_for_new_task()
-        self.planner.learned(())
+        self.planner.learned()
 
     def q_values(self, observation: Observation) -> NDArray[np.float32]:
         """Value of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
@@ -150,28 +149,32 @@ class CodeAgent(Generic[PerceptionT]):
         del rng
         if not self._ready:
             return None
-        code = self.perception.code(observation.frame)
-        return self.planner.values(code, "novelty", self._left).astype(np.float32)
+        return self._values(self.perception.code(observation.frame), "novelty").astype(np.float32)
 
     def diagnostics(self) -> dict[str, float]:
         """Means since the last call (``time/*`` in CPU seconds a real step), and the counters now."""
-        began = self.tasks[-1] if self.tasks else 0
-        real = self.replay.count_real(began)
-        labels = self.replay.count_labels(began)
-        outcomes = len(self.model.outcomes.outcomes)
+        of_task = self.replay[self.tasks[-1] if self.tasks else 0 :]
         counters = {
-            "real_transitions": real, "gradient_updates": 0, "oracle/labels": labels, "model/outcomes": outcomes
-        }  # fmt: skip
+            "real_transitions": sum(row.has_dynamics for row in of_task),
+            "gradient_updates": 0,
+            "oracle/labels": sum(row.has_reward and not row.has_dynamics for row in of_task),
+            "model/outcomes": len(self.model.outcomes.outcomes),
+        }
         return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
 
     def state(self) -> AgentState:
         """A snapshot: what is replayed, how much of it is learned, the generator, measurements."""
+        sizes = self.perception.sizes
         values = {
-            "learned": self.learned, "tasks": list(self.tasks), "exploration": self.rng.bit_generator.state,
-            "meters": self.meters.state(), "settings": snapshot.jsonable(flatten(self.settings)),
-            "code_sizes": list(self.perception.sizes), "n_actions": self.n_actions,
-        }  # fmt: skip
-        return AgentState(arrays=snapshot.prefixed("replay", self.replay.arrays()), values=values)
+            "learned": self.learned,
+            "tasks": list(self.tasks),
+            "exploration": self.rng.bit_generator.state,
+            "meters": self.meters.state(),
+            "settings": snapshot.jsonable(flatten(self.settings)),
+            "code_sizes": list(sizes),
+            "n_actions": self.n_actions,
+        }
+        return AgentState(arrays=snapshot.prefixed("replay", as_arrays(self.replay, len(sizes))), values=values)
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot by learning from all that is replayed once more.
@@ -182,20 +185,131 @@ class CodeAgent(Generic[PerceptionT]):
         self._take_up(state)
 
     def _take_up(self, state: AgentState) -> None:
-        self.replay.load(snapshot.below("replay", state.arrays))
+        self.replay = from_arrays(snapshot.below("replay", state.arrays))
         self._relearn(state.values["tasks"], state.values["learned"])
         self.meters.restore(state.values["meters"])
         self.rng.bit_generator.state = state.values["exploration"]
 
 
-def __getattr__(name: str) -> object:
-    """The names that moved to :mod:`.given`; they warn, and go in version 1.0."""
-    moved = {"FactoredAgent": "GivenPerceptionAgent", "make": "make"}
-    if name not in moved:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    new = importlib.import_module(".given", __package__)
-    message = f"{__name__}:{name} is now {new.__name__}:{moved[name]}; import it from there."
-    warnings.warn(message, DeprecationWarning, stacklevel=2)
-    found: object = getattr(new, moved[name])
-    globals()[name] = found
-    return found
+class FactoredAgent(CodeAgent):
+    """Sees with an encoder, and so can show what it imagines, be read by a probe, and ask an oracle."""
+
+    perception: CodePerception
+
+    def query(self, observation: Observation) -> Ints | None:
+        """The macro-actions (D,) whose last one has the most uncertain outcome; the fewest among equals.
+
+        None where nothing is uncertain enough; what got no label is not asked about again.
+        """
+        if not self._ready:
+            return None
+        settings = self.settings.planning
+        without = {(row.code, row.action) for row in self.replay if not row.has_dynamics and not row.has_reward}
+        with self.meters.cpu_time("time/model_s"):
+            best = settings.exploration_threshold
+            chosen = None
+            start = self.perception.code(observation.frame)
+            front = [start]
+            ways: dict[Code, tuple[int, ...]] = {start: ()}  # the actions that lead to each code
+            for _ in range(settings.depth):
+                if not front or len(ways) > settings.states:
+                    break
+                following, sure = self.model.likeliest(np.array(front))
+                untested = self.model.untested(np.array(front), following)
+                further = []
+                for row, action in np.argwhere(sure >= _SURE).tolist():
+                    way = (*ways[front[row]], action)
+                    if untested[row, action] > best and (front[row], action) not in without:
+                        best = untested[row, action]
+                        chosen = np.array(way)
+                    after = tuple(following[row, action].tolist())
+                    if after not in ways:
+                        ways[after] = way
+                        further.append(after)
+                front = further
+        return chosen
+
+    def learn_label(self, observation: Observation, actions: Ints, label: Label | None) -> None:
+        """Learn the outcome of an imagined transition, and nothing of the dynamics, or that it has no label."""
+        codes = [self.perception.code(observation.frame)]
+        for action in actions.tolist():
+            following, _ = self.model.likeliest(np.array(codes[-1:]))
+            codes.append(tuple(following[0, action].tolist()))
+        told = label or Label(0.0, False)
+        asked = CodeTransition(codes[-2], int(actions[-1]), codes[-1], told.reward, told.terminated, has_dynamics=False)
+        self.replay.append(asked._replace(has_reward=label is not None))
+        with self.meters.cpu_time("time/model_s"):
+            self.learn()
+
+    def imagine(self, frame: Frame, *, actions: Ints | None, depth: int, rng: np.random.Generator) -> ImaginedRollout:
+        """Imagine up to ``depth`` transitions from ``frame``; see :class:`.capabilities.Imaginer`.
+
+        ``epistemic`` is the probability that something untested decides the transition, ``modal`` that it does not
+        lead where it most probably leads; a categorical model knows no Gaussian noise, so ``aleatoric`` is 0.
+        InvalidValueError if there is no depth to imagine, or actions are none.
+        """
+        planned = planned_actions(actions, depth, self.n_actions)
+        codes = [self.perception.code(frame)]
+        chosen: list[int] = []
+        values: list[Floats] = []
+        outcomes: list[tuple[float, float, float, float]] = []  # reward, P(it ends), unknown, P(it leads elsewhere)
+        for index in range(depth if planned is None else len(planned)):
+            values.append(self._values(codes[-1]))
+            chosen.append(int(values[-1].argmax()) if planned is None else planned[index])
+            following, outcome = self._imagined(codes[-1], chosen[-1], rng)
+            codes.append(following)
+            outcomes.append(outcome)
+            if planned is None and outcome[1] > _TERMINAL:
+                break
+        images = self.perception.images(codes)
+        reward, p_terminated, unknown, p_other = np.array(outcomes, dtype=np.float32).T.copy()
+        return ImaginedRollout(
+            actions=np.array(chosen),
+            frames=images[1:],
+            start_frame=images[0],
+            rewards=reward,
+            p_terminated=p_terminated,
+            q_values=np.array(values, dtype=np.float32),
+            epistemic=unknown,
+            aleatoric=np.zeros_like(unknown),
+            modal=p_other,
+            accepted=np.logical_and.accumulate(unknown <= ACCEPTED),
+            macrostates=self.perception.macrostates(codes[1:]),
+        )
+
+    def _imagined(
+        self, code: Code, action: int, rng: np.random.Generator
+    ) -> tuple[Code, tuple[float, float, float, float]]:
+        """A drawn next code; reward, P(the episode ends), P(something untested decides), P(it leads elsewhere)."""
+        if not self._ready:
+            return code, (0.0, 0.0, 1.0, 0.0)
+        following, p_likeliest = self.model.sample(code, action, rng)
+        reward, p_terminated, unknown = (float(each[action]) for each in self.planner.outcome(code))
+        return following, (reward, p_terminated, unknown, 1.0 - p_likeliest)
+
+    def read_frames(self, frames: Frame) -> Ints:
+        """What a probe reads; see :class:`.capabilities.FrameReader`."""
+        return self.perception.macrostates(self.perception.codes(frames))
+
+    def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
+        """What its planner plans with; see :class:`.capabilities.OutcomePredictor`."""
+        codes = self.perception.codes(frames)
+        if not self._ready:
+            nothing = np.zeros((len(codes), self.n_actions))
+            where = np.repeat(self.perception.macrostates(codes)[:, None, None], self.n_actions, axis=1)
+            return ExpectedOutcomes(macrostates=where, p_continues=nothing[..., None], reward=nothing)
+        where = np.array(codes)
+        moves = self.model.moves(where)
+        found = self.model.results(where, moves)
+        read = self.perception.macrostates(moves.following.reshape(-1, where.shape[1]))
+        return ExpectedOutcomes(
+            macrostates=read.reshape(*found.p_continues.shape, -1), p_continues=found.p_continues, reward=found.reward
+        )
+
+
+def make(context: AgentContext) -> FactoredAgent:
+    """The agent ``factored:given``; InvalidValueError if the context's encoder gives no codes."""
+    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    prepare_torch(context.device)
+    perception = load_code_perception(context, factored=settings.dynamics.factored)
+    return FactoredAgent(perception, context.n_actions, settings, context.seeds)

@@ -27,10 +27,9 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats, Frame
 
-from .factors import Codes
+from .factors import Codes, Ints, Mask
 
 Images = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 SHIFT_PX = 5
 """Crops are compared at all shifts of so many pixels up, down, left and right."""
@@ -78,12 +77,12 @@ class Part(NamedTuple):
 
     mask: Mask  #: its pixels. Shape (64, 64).
     exemplars: Images  #: crops. Shape (E, D).
-    values: NDArray[np.int64]  #: what each shows. Shape (E,).
+    values: Ints  #: what each shows. Shape (E,).
     flat: float  #: energy that crops without contours count as
     reach: float  #: distance beyond which a crop is like no exemplar
     rests: Images | None = None  #: where it is in front of noise, what :func:`quiet` needs. Shape (K, 64, 64, 3).
 
-    def read(self, shapes: Images) -> tuple[NDArray[np.int64], Mask]:
+    def read(self, shapes: Images) -> tuple[Ints, Mask]:
         """The value that each of N frames' contours shows, and whether it is known. Two arrays (N,)."""
         apart = distances(crops(shapes, self.mask), self.exemplars, self.mask, self.flat)
         return self.values[apart.argmin(axis=1)], apart.min(axis=1) <= self.reach
@@ -95,7 +94,7 @@ class SeenFactor(NamedTuple):
     parts: tuple[Part, ...]
     joint: Codes
 
-    def read(self, shapes: Images, still: Images) -> tuple[NDArray[np.int64], Mask]:
+    def read(self, shapes: Images, still: Images) -> tuple[Ints, Mask]:
         """As of a part, ``still``: without noise; of joint values not seen the one that differs in the fewest parts."""
         pairs = [part.read(shapes if part.rests is None else still) for part in self.parts]
         found = np.stack([value for value, _ in pairs], axis=1)
@@ -114,7 +113,7 @@ def read(factors: list[SeenFactor], frames: Frame) -> tuple[Codes, Mask]:
     return np.stack([value for value, _ in pairs], axis=1), np.stack([known for _, known in pairs], axis=1)
 
 
-def find(frames: Frame, begins: Mask | None = None, actions: NDArray[np.int64] | None = None) -> list[SeenFactor]:
+def find(frames: Frame, begins: Mask | None = None, actions: Ints | None = None) -> list[SeenFactor]:
     """The factors of frames (N, 64, 64, 3) in the order in which they were seen; none where nothing changes.
 
     ``begins``: which are the first of an episode, (N,); none if not given. ``actions``: which led from each frame to
@@ -135,9 +134,7 @@ def find(frames: Frame, begins: Mask | None = None, actions: NDArray[np.int64] |
     return [SeenFactor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
 
 
-def _parts(
-    images: Images, shapes: Images, begins: Mask, actions: NDArray[np.int64]
-) -> list[tuple[Part, NDArray[np.int64]]]:
+def _parts(images: Images, shapes: Images, begins: Mask, actions: Ints) -> list[tuple[Part, Ints]]:
     """Regions that have values, and those (N,); where hardly a look is seen twice, those that hide the noise."""
     change = changes(images)
     often = _often(change, begins)
@@ -160,8 +157,8 @@ def _parts(
 def _often(change: Mask, begins: Mask) -> Mask:
     """Pixels (64, 64) that change in enough of the steps (N - 1, 64, 64), or of those to the first of an episode."""
     of = ((change, _CHANGES), (change[begins[1:]], _STARTS))
-    counts = ((steps.sum(axis=0), max(least, share * min(len(steps), _ENOUGH))) for steps, (least, share) in of)
-    return np.any([count >= enough for count, enough in counts], axis=0)
+    enough = [max(least, share * min(len(steps), _ENOUGH)) for steps, (least, share) in of]
+    return np.any([steps.sum(axis=0) >= few for (steps, _), few in zip(of, enough, strict=True)], axis=0)
 
 
 def _resting(images: Images, change: Mask, noise: Mask) -> Images:
@@ -193,18 +190,18 @@ def quiet(images: Images, rests: Images) -> Images:
     return np.where(shown[..., None], images, np.float32(_MEDIAN_COLOR))
 
 
-def _numbers(joint: Codes) -> NDArray[np.int64]:
+def _numbers(joint: Codes) -> Ints:
     """Joint values (N, parts) as numbers (N,)."""
     return np.unique(joint, axis=0, return_inverse=True)[1].ravel()
 
 
-def _first_bound(values: list[NDArray[np.int64]]) -> tuple[int, int] | None:
+def _first_bound(values: list[Ints]) -> tuple[int, int] | None:
     """The first two factors, by their values (N,), that do not vary freely, or None."""
     pairs = itertools.combinations(range(len(values)), 2)
     return next(((one, other) for one, other in pairs if bound(values[one], values[other])), None)
 
 
-def bound(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
+def bound(one: Ints, other: Ints) -> bool:
     """Whether two factors (N,) have no more joint values than one of them could have had alone or in turns.
 
     So have a factor and a copy of it, and things of which one excludes the other; unless chance may explain it.
@@ -330,7 +327,7 @@ def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
     return np.maximum(1.0 - (best + flat) / energy, 0.0).astype(np.float64)
 
 
-def _part(shapes: Images, mask: Mask, actions: NDArray[np.int64]) -> tuple[Part | None, float]:
+def _part(shapes: Images, mask: Mask, actions: Ints) -> tuple[Part | None, float]:
     """The part at a mask, None where all of its crops are alike; and the share of looks that were seen once."""
     own = crops(shapes, mask)
     energy = (own**2).sum(axis=1)
@@ -339,7 +336,7 @@ def _part(shapes: Images, mask: Mask, actions: NDArray[np.int64]) -> tuple[Part 
     before = np.flatnonzero(actions >= 0)
     while True:
         apart = distances(own[chosen], own[chosen], mask, flat)
-        tried: list[tuple[Part, NDArray[np.int64], NDArray[np.int64], Mask]] = []
+        tried: list[tuple[Part, Ints, Ints, Mask]] = []
         for values, reach in _finer(np.minimum(apart, apart.T)):
             rows = _exemplars(apart, values)
             part = Part(mask, own[chosen[rows]], values[rows], flat, reach)
@@ -358,7 +355,7 @@ def _part(shapes: Images, mask: Mask, actions: NDArray[np.int64]) -> tuple[Part 
         chosen = np.union1d(chosen, strange[:_COMPARED])
 
 
-def _finer(apart: Floats) -> Iterator[tuple[NDArray[np.int64], float]]:
+def _finer(apart: Floats) -> Iterator[tuple[Ints, float]]:
     """Groups of crops as :func:`groups` gives them: below the widest gap, then each time below the next one."""
     below = np.inf
     while (found := groups(apart, below))[1] < below:
@@ -366,7 +363,7 @@ def _finer(apart: Floats) -> Iterator[tuple[NDArray[np.int64], float]]:
         below = found[1]
 
 
-def follows(values: NDArray[np.int64], actions: NDArray[np.int64], following: NDArray[np.int64]) -> float:
+def follows(values: Ints, actions: Ints, following: Ints) -> float:
     """Logarithm of how likely values and actions (N,) make the values after them, all tables being alike before."""
     contexts = np.unique(np.stack([values, actions]), axis=1, return_inverse=True)[1].ravel()
     table = np.zeros((contexts.max(initial=-1) + 1, following.max(initial=0) + 1))
@@ -376,7 +373,7 @@ def follows(values: NDArray[np.int64], actions: NDArray[np.int64], following: ND
     return float(log(table + 1.0).sum() + (log(width) - log(width + table.sum(axis=1))).sum())
 
 
-def groups(apart: Floats, below: float = np.inf) -> tuple[NDArray[np.int64], float]:
+def groups(apart: Floats, below: float = np.inf) -> tuple[Ints, float]:
     """Groups (N,) of crops by their distances (N, N), numbered as they come, and the distance that parts them.
 
     Only gaps ``below`` a distance count; where there is none, all are one group.
@@ -394,7 +391,7 @@ def groups(apart: Floats, below: float = np.inf) -> tuple[NDArray[np.int64], flo
     return np.argsort(np.argsort(first))[inverse.ravel()], cut
 
 
-def _exemplars(apart: Floats, values: NDArray[np.int64]) -> NDArray[np.int64]:
+def _exemplars(apart: Floats, values: Ints) -> Ints:
     """Rows of crops that stand for each value: each further one is the least like those before."""
     rows: list[int] = []
     for value in range(int(values.max()) + 1):

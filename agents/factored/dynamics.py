@@ -12,14 +12,14 @@ Or a factor changes by itself, in the same way whatever the action.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections import Counter
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats
 
-from .factors import Codes, strides, table_size
+from .factors import Codes, Ints, strides, table_size
 from .settings import DynamicsSettings
 
 _LARGEST_TABLE = 1 << 16
@@ -36,8 +36,7 @@ EVERY = slice(None)
 """All actions."""
 
 
-@dataclass(frozen=True, slots=True)
-class FactorPrediction:
+class FactorPrediction(NamedTuple):
     """What each action would make of one factor in N codes."""
 
     expected: Floats  #: predictive probability of each value. Shape (N, A, K).
@@ -55,60 +54,49 @@ class FactorDynamics:
         self._others = max(1, self.values - 1)
         others = [other for other in range(len(sizes)) if other != factor]
         sets = [(factor, *more) for size in range(settings.parents) for more in itertools.combinations(others, size)]
-        sets = [parents for parents in sets if table_size(parents, sizes) <= _LARGEST_TABLE] or [(factor,)]
-        self.parents = sets
-        """Of each Dirichlet table the factors that the next value depends on."""
-        rows = [table_size(parents, sizes) for parents in sets]
+        self.parents = [parents for parents in sets if table_size(parents, sizes) <= _LARGEST_TABLE] or [(factor,)]
+        """Of each Dirichlet table the factors that the next value depends on; of the first, the factor alone."""
+        rows = [table_size(parents, sizes) for parents in self.parents]
         self._first = np.cumsum(rows) - rows
-        self._strides = np.zeros((len(sizes), len(sets)))
-        for index, parents in enumerate(sets):
-            self._strides[list(parents), index] = strides(parents, sizes)
+        self._strides = np.zeros((len(sizes), len(rows)))
+        for column, parents in zip(self._strides.T, self.parents, strict=True):
+            column[list(parents)] = strides(parents, sizes)
         self.counts = np.zeros((sum(rows), n_actions, self.values))
         """Of the next values: a row for every setting of the parents of every table. Shape (R, A, K)."""
-        self._total = np.zeros((sum(rows), n_actions))
-        same_size = [sum(len(parents) == len(other) for other in sets) for parents in sets]
-        prior = np.array(
-            [settings.parent_decay ** (len(parents) - 1) / n for parents, n in zip(sets, same_size, strict=True)]
-        )
+        of_size = Counter(map(len, self.parents))
+        prior = np.array([settings.parent_decay ** (len(each) - 1) / of_size[len(each)] for each in self.parents])
         prior *= (1.0 - settings.persistence) / prior.sum()
-        both = np.concatenate([(1.0 - settings.alike) * prior, settings.alike * prior])
-        both *= 1.0 - settings.by_itself
+        both = np.outer([1.0 - settings.alike, settings.alike], prior) * (1.0 - settings.by_itself)
         by_itself = (1.0 - settings.persistence) * settings.by_itself
-        self.evidence = np.tile(np.log([settings.persistence, by_itself, *both]), (n_actions, 1))
+        self.evidence = np.tile(np.log([settings.persistence, by_itself, *both.ravel()]), (n_actions, 1))
         """Log prior plus log evidence that the action leaves the factor alone, that it changes by itself, then of each
         table, then of each whose rows are alike. Shape (A, 2 + 2T)."""
-        self.tried = np.zeros(n_actions)
-        self.stayed = np.zeros(n_actions)
-        """How often each action was tried, and left the factor at its value. Shape (A,)."""
         self.fails = settings.fails
         """How often any action that changes the factor is expected to leave it at its value."""
-        self._turns = np.zeros((self.values, self.values))
-        """How often each value came after each, whatever the action. Shape (K, K)."""
         self._pool_turns()
 
     def add(self, code: Codes, action: int, value: int) -> None:
         """Learn that ``action`` in ``code`` (P,) led to ``value``."""
-        slip = self.settings.slip
-        pseudo = self._pseudo
-        others = self._others
         own = code[self.factor]
         stayed = value == own
         rows = self._rows(code[None])[0]
-        tables = _TABLES + len(self.parents)
-        counts = self.counts[rows, action, value]
-        total = self._total[rows, action]
+        seen = self.counts[rows, action]  # [T, K]
+        total = seen.sum(axis=1)
         fails = self._fails()[action]
-        moved = total - self.counts[rows, action, own]
-        goes = (1.0 - fails) * (counts + pseudo / others) / (moved + pseudo)
-        self.evidence[action, 0] += np.log(1.0 - slip if stayed else slip / others)
-        self.evidence[action, 1] += np.log(self._by_itself[own, value])
-        self.evidence[action, _TABLES:tables] += np.log((counts + self.settings.concentration) / (total + pseudo))
-        self.evidence[action, tables:] += np.log(fails if stayed else goes)
-        self.tried[action] += 1.0
-        self.stayed[action] += stayed
-        self._turns[own, value] += 1.0
+        goes = (1.0 - fails) * (seen[:, value] + self._pseudo / self._others) / (total - seen[:, own] + self._pseudo)
+        likelihood = [
+            [1.0 - self.settings.slip if stayed else self.settings.slip / self._others],
+            [self._by_itself[own, value]],
+            (seen[:, value] + self.settings.concentration) / (total + self._pseudo),
+            np.full(len(rows), fails) if stayed else goes,
+        ]
+        self.evidence[action] += np.log(np.concatenate(likelihood))
         self.counts[rows, action, value] += 1.0
-        self._total[rows, action] += 1.0
+
+    def _tried(self) -> tuple[Floats, Floats]:
+        """How often each action was tried, and left the factor at its value. Two arrays (A,)."""
+        by_own_value = self.counts[: self.values]  # [K, A, K]
+        return by_own_value.sum(axis=(0, 2)), np.einsum("kak->a", by_own_value)
 
     def weights(self) -> Floats:
         """Posterior probability of each structure, an action. Shape (A, 2 + 2 tables)."""
@@ -118,8 +106,9 @@ class FactorDynamics:
     def pool(self) -> Floats:
         """Learn how it changes by itself; how often actions that change it were tried, and left it as it was: (2,)."""
         self._pool_turns()
-        changes = np.where(self.stayed < self.tried, 1.0 - self.weights()[:, 0], 0.0)
-        return np.array([changes @ self.tried, changes @ self.stayed])
+        tried, stayed = self._tried()
+        changes = np.where(stayed < tried, 1.0 - self.weights()[:, 0], 0.0)
+        return np.array([changes @ tried, changes @ stayed])
 
     def predict(self, codes: Codes, actions: slice = EVERY) -> FactorPrediction:
         """Predict the next values after some actions in ``codes`` (N, P)."""
@@ -128,12 +117,12 @@ class FactorDynamics:
 
     def seen(self, codes: Codes) -> Floats:
         """Frequencies of the next values without any prior; zeros for an action that was never tried. (N, A, K)."""
-        failed = self.stayed / np.maximum(self.tried, 1.0)
+        tried, stayed = self._tried()
         turns = self._pooled / np.maximum(self._pooled.sum(axis=1, keepdims=True), 1.0)
-        seen, _ = self._average(codes, EVERY, 0.0, failed, turns)
-        return seen * (self.tried[:, None] > 0.0)
+        seen, _ = self._average(codes, EVERY, 0.0, stayed / np.maximum(tried, 1.0), turns)
+        return seen * (tried[:, None] > 0.0)
 
-    def happens(self, codes: Codes, actions: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    def happens(self, codes: Codes, actions: Ints) -> tuple[Floats, Floats]:
         """How probable each value is after one action (N,) each, as it was seen to happen, or as expected where never.
 
         Returns these, (N, K), and the weight of the prior, (N,).
@@ -157,31 +146,25 @@ class FactorDynamics:
             fails: How often each action leaves the factor at its value, where rows are alike. One a macro-action.
             by_itself: Next values of a factor that changes by itself. Shape (K, K).
         """
+        if len(codes) > _AT_ONCE:
+            some = (codes[first : first + _AT_ONCE] for first in range(0, len(codes), _AT_ONCE))
+            means, priors = zip(*(self._average(few, actions, pseudo, fails, by_itself) for few in some), strict=True)
+            return np.concatenate(means), np.concatenate(priors)
         weight = self.weights()[actions]
         weight[weight <= _NEGLIGIBLE] = 0.0
-        firsts = range(0, len(codes), _AT_ONCE)
-        some = [codes[first : first + _AT_ONCE] for first in firsts]
-        averages = [self._average_of_few(few, actions, pseudo, fails[actions], by_itself, weight) for few in some]
-        expected, unknown = zip(*averages, strict=True)
-        return np.concatenate(expected), np.concatenate(unknown)
-
-    def _average_of_few(
-        self, codes: Codes, actions: slice, pseudo: float, fails: Floats, by_itself: Floats, weight: Floats
-    ) -> tuple[Floats, Floats]:
-        """Average over the structures for a few codes; see :meth:`_average`. ``weight``: (A, 2 + 2T)."""
+        fails = fails[actions]
         apart, alike = weight[:, _TABLES:].T.reshape(2, len(self.parents), -1)  # [T, A]
         matters = np.flatnonzero((apart + alike).any(axis=1))
         alike = alike[matters]
-        rows = self._rows(codes)[:, matters]
         each = np.arange(len(codes))
         own = codes[:, self.factor]
-        counts = self.counts[rows, actions]  # [N, T, A, K]
-        total = self._total[rows, actions]  # [N, T, A]
+        counts = self.counts[self._rows(codes)[:, matters], actions]  # [N, T, A, K]
+        total = counts.sum(axis=3)
         stayed = counts[each, ..., own]
         least = 0.0 if pseudo else 1.0
         tables = apart[matters] / np.maximum(total + pseudo, least)
         goes = alike * (1.0 - fails) / np.maximum(total - stayed + pseudo, least)
-        unsure = fails * pseudo / np.maximum(self.tried[actions] + pseudo, least)
+        unsure = fails * pseudo / np.maximum(self._tried()[0][actions] + pseudo, least)
         expected = weight[None, :, :1] * np.eye(self.values)[own][:, None, :]
         expected = expected + weight[:, 1, None] * by_itself[own][:, None]
         expected += ((tables + goes)[..., None] * counts).sum(axis=1)
@@ -190,21 +173,22 @@ class FactorDynamics:
         unknown = weight[:, 1] * self._unsure[own][:, None]
         return expected, unknown + ((tables + goes) * pseudo + alike * unsure).sum(axis=1)
 
-    def _rows(self, codes: Codes) -> NDArray[np.int64]:
+    def _rows(self, codes: Codes) -> Ints:
         """The row of each table T that holds for each code (N, P). Shape (N, T)."""
         return np.asarray((codes @ self._strides).astype(np.int64) + self._first)  # floats are fast, and exact here
 
     def _pool_turns(self) -> None:
         """Learn how it changes by itself, from each value to each, (K, K), and the weight of the prior, (K,)."""
-        self._pooled = self._turns.copy()
+        self._pooled = self.counts[: self.values].sum(axis=1)
         total = self._pooled.sum(axis=1, keepdims=True) + self._pseudo
         self._by_itself = (self._pooled + self.settings.concentration) / total
         self._unsure = self._pseudo / total[:, 0]
 
     def _fails(self) -> Floats:
         """How often each action leaves the factor at its value, where rows are alike. Shape (A,)."""
+        tried, stayed = self._tried()
         pseudo = self.settings.pseudo_fails
-        return np.asarray((self.stayed + pseudo * self.fails) / (self.tried + pseudo))
+        return np.asarray((stayed + pseudo * self.fails) / (tried + pseudo))
 
 
 class Dynamics:
@@ -215,25 +199,29 @@ class Dynamics:
     ) -> None:
         factors = range(len(sizes) if moving is None else moving)
         self.factors = [FactorDynamics(factor, sizes, n_actions, settings) for factor in factors]
-        self._settings = settings
+        self.settings = settings
         self._seen = 0
-        self.pooled_at = 0
+        self._pooled_at = 0
+        self.changed_at = np.zeros(n_actions, dtype=np.int64)
+        """How many transitions were seen when what is predicted of each action changed last. Shape (A,)."""
 
     def add(self, code: Codes, action: int, following: Codes) -> None:
         """Learn from one transition from a code (P,) to values of those that move."""
         for factor, value in zip(self.factors, following.tolist(), strict=True):
             factor.add(code, action, value)
         self._seen += 1
-        if self._seen >= _GROWTH * self.pooled_at:
+        self.changed_at[action] = self._seen
+        if self._seen >= _GROWTH * self._pooled_at:
             self._pool()
 
     def _pool(self) -> None:
         """Learn anew how factors change by themselves, and how often actions fail, of each factor and of all."""
-        pseudo = self._settings.pseudo_fails
-        self.pooled_at = self._seen
+        pseudo = self.settings.pseudo_fails
+        self._pooled_at = self._seen
+        self.changed_at[:] = self._seen
         each = [factor.pool() for factor in self.factors]
         tried, stayed = np.sum(each, axis=0)
-        fails = (stayed + self._settings.fails) / (tried + 1.0)
+        fails = (stayed + self.settings.fails) / (tried + 1.0)
         for factor, (own_tried, own_stayed) in zip(self.factors, each, strict=True):
             factor.fails = float((own_stayed + pseudo * fails) / (own_tried + pseudo))
 

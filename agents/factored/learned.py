@@ -3,37 +3,43 @@
 All that it sees is remembered, up to a bound. As soon as something has no known value, or much more was seen, factors
 and values are found anew (:mod:`.appearance`), remembered transitions get their codes anew, and dynamics and outcomes
 are learned from them once more: nothing that happened is lost. Then it also decides what it had better remember of an
-episode (:mod:`.memory`). Once as many frames are remembered as may be, perception stays as it is.
+episode (:func:`.model.choose`). Once as many frames are remembered as may be, perception stays as it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import compress
 
 import numpy as np
+from numpy.typing import NDArray
 
-from imagine_bench.arrays import Arrays
-from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.interfaces.capabilities import Perceived
 
 from .. import snapshot
 from ..encoders.perception import prepare_torch
 from . import appearance
 from .agent import CodeAgent
-from .factors import CodeTransition, Memory
-from .image import image
-from .learned_perception import LearnedPerception
-from .memory import choose, contradictions, remembering
+from .factors import CodeTransition, contradictions, remembering
+from .model import choose
+from .perception import LearnedPerception
 from .settings import LEARNED, LearnedSettings
 
 _CONTRADICTIONS = 0.01
 """Share of transitions that may contradict one another by a misread frame."""
+_SCALE = 5
+"""Times that the image of what is seen is drawn larger."""
+_COLORS = np.array(
+    [[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [213, 94, 0], [86, 180, 233], [240, 228, 66]]
+)
+"""Told apart by the color-blind (Okabe and Ito 2008)."""
 
 
-class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
+class LearnedPerceptionAgent(CodeAgent):
     """Learns perception, dynamics and outcomes together; its codes have a meaning for nobody else."""
 
+    perception: LearnedPerception
     settings: LearnedSettings
     _acted = 0
     """Macro-actions that the agent itself chose in this episode."""
@@ -49,14 +55,8 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
         self.perception.begin_episode()
 
     @property
-    def _memory(self) -> Memory | None:
-        return self.perception.memory
-
-    @property
     def _left(self) -> int | None:
-        if self._longest is None:
-            return None
-        return self._longest - max(self._acted, self._observed)
+        return None if self._longest is None else self._longest - max(self._acted, self._observed)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """Act as on any codes, and count."""
@@ -75,10 +75,12 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
                 before = transition.observation.frame
                 after = transition.next_observation.frame
                 perception.remember(before, transition.action, after, begins=self._observed == 1)
-                found = (perception.found, perception.found_in)
+                found = perception.found
+                found_in = perception.found_in
                 if perception.renew():
-                    self._recode(*found)
-                    perception.history += [perception.found_in] if perception.found_in not in perception.history else []
+                    self._recode(found, found_in)
+                    if perception.found_in not in perception.history:
+                        perception.history.append(perception.found_in)
             self.meters.count("time/perception_s")
         super().observe(transition, episode=episode)
         if transition.terminated or transition.truncated:
@@ -95,29 +97,28 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
         rows = self._rows()
         few = _CONTRADICTIONS * (count - of_task.start)
         if found and contradictions(rows[of_task]) > few:
-            now = (perception.found, perception.found_in)
+            found_now = perception.found
+            found_now_in = perception.found_in
             perception.take(found, found_in)
             earlier = self._rows()
             if contradictions(earlier[of_task]) > few:
-                perception.take(*now)
+                perception.take(found_now, found_now_in)
             else:
                 rows = earlier
-        perception.memory = choose(
-            rows[of_task], perception.begins[of_task], perception.seen_sizes, self.n_actions, self.settings
-        )
-        rows = remembering(rows, perception.begins[:count], perception.memory)
-        self.replay.recode([(row.code, row.following) for row in rows], len(perception.sizes))
+        begins = perception.begins
+        perception.memory = choose(rows[of_task], begins[of_task], perception.seen_sizes, self.n_actions, self.settings)
+        self.replay = remembering(rows, begins[:count], perception.memory)
         self._relearn(self.tasks, count)
         perception.begin_episode()
-        if rows and perception.memory and not perception.begins[count]:
-            perception.recall(rows[-1].following[-1])
+        if self.replay and perception.memory and not begins[count]:
+            perception.recall(self.replay[-1].following[-1])
 
     def _rows(self) -> list[CodeTransition]:
         """What is replayed, with the codes that its frames have now, as far as they are seen."""
         codes, _ = self.perception.codes(np.stack(self.perception.frames))
         return [
             row._replace(code=codes[before], following=codes[after])
-            for row, (before, after) in zip(self.replay.rows(), self.perception.transitions, strict=False)
+            for row, (before, after) in zip(self.replay, self.perception.transitions, strict=False)
         ]
 
     def perceived(self) -> Iterator[Perceived]:
@@ -137,11 +138,9 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
         """A snapshot: also the frames that it remembers."""
         perception = self.perception
         common = super().state()
-        values = {key: value for key, value in common.values.items() if key != "code_sizes"}
-        return AgentState(
-            arrays={**common.arrays, **perception.arrays()},
-            values={**values, **perception.values(), "longest": self._longest},
-        )
+        values = {**common.values, **perception.values(), "longest": self._longest}
+        del values["code_sizes"]  # they change as it learns
+        return AgentState(arrays={**common.arrays, **perception.arrays()}, values=values)
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot: find the same factors in the same frames, and learn from all that is replayed.
@@ -156,10 +155,17 @@ class LearnedPerceptionAgent(CodeAgent[LearnedPerception]):
 
 def _flat(state: AgentState) -> AgentState:
     """A snapshot whose codes are in one row: how many factors they are of changes as it learns."""
-    codes: Arrays = {
-        name: state.arrays[name].ravel() for name in ("replay/code", "replay/following") if name in state.arrays
-    }
+    codes = {name: array.ravel() for name, array in state.arrays.items() if name in ("replay/code", "replay/following")}
     return AgentState(arrays={**state.arrays, **codes}, values=state.values)
+
+
+def image(found: Sequence[appearance.SeenFactor], frames: Frame) -> NDArray[np.uint8]:
+    """The mean of ``frames`` (N, 64, 64, 3) in gray, with a color a factor that was found. Shape (320, 320, 3)."""
+    drawn = np.repeat(frames.mean(axis=(0, 3))[..., None], 3, axis=2)
+    for factor, color in zip(found, _COLORS, strict=False):
+        mask = np.any([part.mask for part in factor.parts], axis=0)
+        drawn[mask] = 0.55 * drawn[mask] + 0.45 * color
+    return drawn.round().astype(np.uint8).repeat(_SCALE, axis=0).repeat(_SCALE, axis=1)
 
 
 def make(context: AgentContext) -> LearnedPerceptionAgent:

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 
 from imagine_bench.interfaces import Floats
 
 from .dynamics import EVERY, Dynamics
-from .factors import Code, Codes, CodeTransition, Memory, as_codes
+from .factors import Code, Codes, CodeTransition, Memory, contradictions, remembering
 from .outcomes import OutcomeModel
-from .settings import FactoredSettings
+from .settings import FactoredSettings, LearnedSettings
 
 _LEAST = 1e-3
 """No transition counts as less probable where models are compared."""
+_ROUNDING = 1e-9
+_FEWEST = 3
+"""Values of a factor worth remembering: one that tells nothing, and two to tell apart."""
+_NONE_SEEN = 1e6
+"""Pseudo-count beside which no transition counts that was seen: it would explain a part of what a memory explains."""
 
 
-@dataclass(frozen=True, slots=True)
-class Moves:
+class Moves(NamedTuple):
     """Where actions would lead from N codes, as far as dynamics alone say; B branches each."""
 
     following: Codes  #: next codes. Shape (N, A, B, P).
@@ -27,8 +33,7 @@ class Moves:
     known: Floats  #: probability that nothing untested decides. Shape (N, A).
 
 
-@dataclass(frozen=True, slots=True)
-class Results:
+class Results(NamedTuple):
     """What these moves would bring."""
 
     p_continues: Floats  #: probability that this branch comes about and the episode goes on. Shape (N, A, B).
@@ -57,7 +62,7 @@ class FactoredModel:
     def add(self, row: CodeTransition) -> None:
         """Take in one transition, as far as it shows what follows what and what it brings."""
         if row.has_dynamics:
-            self.dynamics.add(as_codes(row.code), row.action, as_codes(row.following[: self._moving]))
+            self.dynamics.add(np.array(row.code), row.action, np.array(row.following[: self._moving]))
         if row.has_reward:
             self.outcomes.add(row)
 
@@ -82,10 +87,6 @@ class FactoredModel:
         seen = outcome >= 0
         probability = np.where(seen, moved * brought[each, outcome], 0.0)
         return probability, np.where(seen, 1.0 - (1.0 - untested) * known, 1.0)
-
-    def log_likelihood(self, rows: Sequence[CodeTransition]) -> float:
-        """Return the log likelihood of transitions, of which each counts as at least 0.1 % probable."""
-        return float(np.log(np.maximum(self.probabilities(rows)[0], _LEAST)).sum())
 
     def moves(self, codes: Codes, actions: slice = EVERY) -> Moves:
         """Where some actions would lead from ``codes`` (N, P)."""
@@ -114,6 +115,25 @@ class FactoredModel:
             unknown=1.0 - moves.known * (1.0 - (chance * untested).sum(axis=2)),
         )
 
+    def likeliest(self, codes: Codes) -> tuple[Codes, Floats]:
+        """Where every action most probably leads from ``codes`` (N, P), and how probably: (N, A, P) and (N, A).
+
+        For an action of which nothing is known the probability is 0: a prior for staying is no knowledge.
+        """
+        factors = self.dynamics.predict(codes)
+        following = np.stack([factor.expected.argmax(axis=2) for factor in factors], axis=2)
+        sure = np.prod([factor.expected.max(axis=2) for factor in factors], axis=0)
+        nothing = 1.0 - self.dynamics.settings.persistence - _ROUNDING
+        untried = np.all([factor.unknown > nothing for factor in factors], axis=0)
+        return following, np.where(untried, 0.0, sure)
+
+    def untested(self, codes: Codes, following: Codes) -> Floats:
+        """P(something untested decides what actions from ``codes`` (N, P) to codes (N, A, P) bring). Shape (N, A)."""
+        count, actions, factors = following.shape
+        before = np.repeat(codes, actions, axis=0)
+        after = following.reshape(-1, factors)
+        return self.outcomes.predict(before, np.tile(np.arange(actions), count), after)[1].reshape(count, actions)
+
     def sample(self, code: Code, action: int, rng: np.random.Generator) -> tuple[Code, float]:
         """Draw one next code of ``action`` in ``code`` as it was seen to happen; as expected where it never was.
 
@@ -122,7 +142,7 @@ class FactoredModel:
         following = []
         p_likeliest = 1.0
         for factor in self.dynamics.factors:
-            (chance,), _ = factor.happens(as_codes(code)[None], np.array([action]))
+            (chance,), _ = factor.happens(np.array([code]), np.array([action]))
             following.append(int(rng.choice(len(chance), p=chance)))
             p_likeliest *= float(chance.max())
         if self.memory is not None:
@@ -150,3 +170,37 @@ class FactoredModel:
         chance = np.pad(np.where(chance < least, 0.0, chance), spare)
         codes = np.stack(np.unravel_index(np.pad(numbers, spare), self.sizes[: self._moving]), axis=-1)
         return (chance / chance.sum(axis=1, keepdims=True)).reshape(shape), codes.reshape(*shape, -1)
+
+
+def choose(
+    rows: Sequence[CodeTransition],
+    begins: Sequence[bool],
+    sizes: tuple[int, ...],
+    n_actions: int,
+    settings: LearnedSettings,
+) -> Memory | None:
+    """The memory that explains transitions between codes best; None unless it does so much better than none.
+
+    Which factor is remembered, and which of its values tells nothing, is learned: where the same code and action have
+    brought different outcomes, every such memory is tried. What is learned with it from every second episode predicts
+    the others, and these the first. ``begins`` tells which transitions are the first of an episode.
+    """
+    if not contradictions(rows):
+        return None
+    half = np.cumsum(begins) % 2 == 0  # every second episode
+    causes_alone = replace(settings, outcomes=replace(settings.outcomes, pseudo_seen=_NONE_SEEN))
+    candidates = [Memory(f, hidden) for f, size in enumerate(sizes) if size >= _FEWEST for hidden in range(size)]
+    likelihood: dict[Memory | None, float] = {}
+    for memory in (None, *candidates):
+        remembered = remembering(rows, begins, memory)
+        of_codes = sizes if memory is None else (*sizes, sizes[memory.factor])
+        likelihood[memory] = 0.0
+        for learned in (half, ~half):
+            model = FactoredModel(of_codes, n_actions, causes_alone, memory)
+            for row in compress(remembered, learned):
+                model.add(row)
+            model.outcomes.fit()
+            chance, _ = model.probabilities(list(compress(remembered, ~learned)))
+            likelihood[memory] += float(np.log(np.maximum(chance, _LEAST)).sum())
+    best = max(likelihood, key=lambda memory: likelihood[memory])
+    return best if likelihood[best] > likelihood[None] + settings.memory_evidence else None

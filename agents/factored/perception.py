@@ -1,38 +1,28 @@
-"""Frames to codes of factors, and imagined codes back to images and macrostates for people."""
+"""Frames to codes of factors: by an encoder that is given, or by what is found in an agent's own frames."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch.nn import functional
 
+from imagine_bench.arrays import Arrays
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, Floats, Frame
-from imagine_bench.interfaces.capabilities import ImaginedRollout
+from imagine_bench.interfaces import AgentContext, AgentState, Frame
+from imagine_bench.values import Json
 
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception
-from .factors import Code
+from . import appearance
+from .factors import Code, Codes, Ints, Mask, Memory
+from .settings import LearnedPerceptionSettings
 
-ACCEPTED = 0.5
-"""A transition of which more than this is unknown is not accepted, and neither is what follows from it."""
-
-
-@dataclass(frozen=True, slots=True)
-class ImaginedCode:
-    """One imagined transition to ``code``, with expected reward and the probability that the episode ends."""
-
-    action: int
-    code: Code
-    reward: float
-    p_terminated: float
-    values: Floats  #: value of every action before it. Shape (A,).
-    unknown: float  #: probability that something untested decides
-    p_other: float  #: probability that it leads elsewhere than to the likeliest code
+_FIRST = 4
+_RECENT = 4
+"""Frames after which it looks for factors first; frames whose codes are kept."""
 
 
 class CodePerception:
@@ -40,6 +30,9 @@ class CodePerception:
 
     Where it is not ``factored``, the encoder's whole code is one factor.
     """
+
+    memory: Memory | None = None
+    """A code is what one frame shows; nothing is remembered."""
 
     def __init__(self, encoder: Encoder, *, factored: bool) -> None:
         self._encoder = encoder
@@ -58,40 +51,23 @@ class CodePerception:
     def codes(self, frames: Frame) -> list[Code]:
         """The codes of frames (N, 64, 64, 3)."""
         hot = self._encoder.encode(frames)[0]  # [N, sum of the sizes]
-        rows = torch.stack([values.argmax(dim=1) for values in hot.split(self._encoded, dim=1)], dim=1).tolist()
-        return [tuple(row) if self._factored else (int(np.ravel_multi_index(row, self._encoded)),) for row in rows]
+        codes = torch.stack([values.argmax(dim=1) for values in hot.split(self._encoded, dim=1)], dim=1).numpy()
+        return _rows(codes, self._encoded, factored=self._factored)
 
-    def _latents(self, codes: Sequence[Code]) -> torch.Tensor:
+    def latents(self, codes: Sequence[Code]) -> torch.Tensor:
         """N codes as the encoder decodes them: one-hot. Shape (N, sum of the encoder's sizes)."""
-        if self._factored:
-            values = list(np.array(codes, dtype=np.int64).reshape(-1, len(self._encoded)).T)
-        else:
-            values = list(np.unravel_index(np.array(codes, dtype=np.int64).ravel(), self._encoded))
+        rows = np.array(codes, dtype=np.int64).reshape(-1, len(self.sizes))
+        values = rows.T if self._factored else np.unravel_index(rows[:, 0], self._encoded)
         pairs = zip(values, self._encoded, strict=True)
-        return torch.cat([functional.one_hot(torch.as_tensor(value), size) for value, size in pairs], dim=1).float()
+        return torch.cat([functional.one_hot(torch.tensor(value), size) for value, size in pairs], dim=1).float()
 
-    def macrostates(self, codes: Sequence[Code]) -> NDArray[np.int64]:
+    def macrostates(self, codes: Sequence[Code]) -> Codes:
         """What the evaluation's probe reads from N codes; the agent must not use it. Shape (N, M)."""
-        return self._encoder.read_macrostate(self._latents(codes))
+        return self._encoder.read_macrostate(self.latents(codes))
 
-    def rollout(self, start: Code, steps: Sequence[ImaginedCode]) -> ImaginedRollout:
-        """The rollout that bench and recordings show: codes decoded to images, and read by the evaluation's probe."""
-        codes = [start, *(step.code for step in steps)]
-        frames = self._encoder.decode(self._latents(codes))
-        unknown = np.array([step.unknown for step in steps], dtype=np.float32)
-        return ImaginedRollout(
-            actions=np.array([step.action for step in steps], dtype=np.int64),
-            frames=frames[1:],
-            start_frame=frames[0],
-            rewards=np.array([step.reward for step in steps], dtype=np.float32),
-            p_terminated=np.array([step.p_terminated for step in steps], dtype=np.float32),
-            q_values=np.array([step.values for step in steps], dtype=np.float32),
-            epistemic=unknown,
-            aleatoric=np.zeros_like(unknown),
-            modal=np.array([step.p_other for step in steps], dtype=np.float32),
-            accepted=np.logical_and.accumulate(unknown <= ACCEPTED),
-            macrostates=self.macrostates(codes[1:]),
-        )
+    def images(self, codes: Sequence[Code]) -> appearance.Images:
+        """N codes as the encoder decodes them to images, for people."""
+        return self._encoder.decode(self.latents(codes))
 
 
 def load_code_perception(context: AgentContext, *, factored: bool) -> CodePerception:
@@ -103,3 +79,158 @@ def load_code_perception(context: AgentContext, *, factored: bool) -> CodePercep
             "give one made with `imagine-bench encoder --recipe codes`."
         )
     return CodePerception(encoder, factored=factored)
+
+
+def _rows(codes: Codes, sizes: Sequence[int], *, factored: bool) -> list[Code]:
+    """Codes (N, P) as tuples; where they are not ``factored``, as the numbers of whole codes."""
+    rows = codes if factored else np.ravel_multi_index(tuple(codes.T), sizes)[:, None]
+    return [tuple(row) for row in rows.tolist()]
+
+
+class LearnedPerception:
+    """Frames seen so far, and the codes that they have by what was found in the first ``looked_at`` of them."""
+
+    def __init__(self, settings: LearnedPerceptionSettings, *, factored: bool) -> None:
+        self._settings = settings
+        self._factored = factored
+        self.frames: list[Frame] = []
+        self.transitions: list[tuple[int, int]] = []
+        """Frames before and after of each transition, as long as all are remembered."""
+        self.begins: list[bool] = []
+        """Whether each of these is the first of an episode."""
+        self.actions: list[int] = []
+        """The macro-action of each."""
+        self.looked_at = 0
+        """In how many of the first frames factors were looked for; ``found_in``: and found."""
+        self.history: list[int] = []
+        """The first ``found_in`` whenever it changed."""
+        self.unknown = False
+        """Whether anything seen since has no known value."""
+        self._remembered = 0
+        self.take([], 0)
+
+    @property
+    def seen_sizes(self) -> tuple[int, ...]:
+        """Numbers of values of the factors; before any is found, of one factor of one value."""
+        sizes = tuple(len(factor.joint) for factor in self.found) or (1,)
+        return sizes if self._factored else (int(np.prod(sizes)),)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The same, and last of what is remembered, if anything is."""
+        sizes = self.seen_sizes
+        return sizes if self.memory is None else (*sizes, sizes[self.memory.factor])
+
+    @property
+    def full(self) -> bool:
+        """Whether as many frames are remembered as may be, so that nothing is found anew."""
+        return len(self.frames) >= self._settings.frames
+
+    def begin_episode(self) -> None:
+        """Forget the episode so far."""
+        self.recall(self.memory.hidden if self.memory else 0)
+
+    def recall(self, remembered: int) -> None:
+        """Remember this of the episode so far."""
+        self._remembered = remembered
+
+    def code(self, frame: Frame) -> Code:
+        """The code of the newest frame (64, 64, 3) of an episode, with what is remembered of those before."""
+        code = self._read(frame)[0]
+        if self.memory is None:
+            return code
+        self._remembered = self.memory.after(self._remembered, code)
+        return (*code, self._remembered)
+
+    def _read(self, frame: Frame) -> tuple[Code, bool]:
+        """The code of a frame, and whether all of its values are known; the last ones are kept."""
+        key = frame.tobytes()
+        if key not in self._recent:
+            codes, known = self.codes(frame[None])
+            self._recent[key] = (codes[0], bool(known.all()))
+            if len(self._recent) > _RECENT:
+                self._recent.pop(next(iter(self._recent)))
+        return self._recent[key]
+
+    def codes(self, frames: Frame) -> tuple[list[Code], Mask]:
+        """The codes of frames (N, 64, 64, 3), and which values are known, (N, P)."""
+        if not self.found:
+            return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=np.bool_)
+        codes, known = appearance.read(self.found, frames)
+        return _rows(codes, [len(factor.joint) for factor in self.found], factored=self._factored), known
+
+    def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
+        """Remember a transition; one that begins where the last one ended costs one frame."""
+        new = [after] if self.frames and np.array_equal(self.frames[-1], before) else [before, after]
+        self.frames += [frame.copy() for frame in new]
+        self.unknown |= not all(self._read(frame)[1] for frame in new)
+        self.transitions.append((len(self.frames) - 2, len(self.frames) - 1))
+        self.begins.append(begins)
+        self.actions.append(action)
+
+    def renew(self) -> bool:
+        """Look for factors anew if it is time; whether codes may now be others."""
+        growth = self._settings.growth if self.unknown else self._settings.growth_if_known
+        due = len(self.frames) >= max(_FIRST, growth * self.looked_at)
+        if due:
+            self.look(len(self.frames))
+        return due
+
+    def look(self, count: int) -> None:
+        """Find factors in the first ``count`` frames remembered."""
+        self.take(appearance.find(*self.first(count)) if count else [], count)
+        self.looked_at = count
+        self.unknown = False
+
+    def first(self, count: int) -> tuple[Frame, Mask, Ints]:
+        """The first ``count`` frames remembered, which begin an episode, and what was done then: as ``find`` asks."""
+        begins = np.isin(np.arange(count), [before for before, _ in compress(self.transitions, self.begins)])
+        actions = np.full(count, -1)
+        for (before, after), action in zip(self.transitions, self.actions, strict=True):
+            if after < count:
+                actions[before] = action
+        return np.stack(self.frames[:count]), begins, actions
+
+    def take(self, found: list[appearance.SeenFactor], found_in: int) -> None:
+        """See these factors from now on."""
+        self.found = found
+        self.found_in = found_in
+        self.memory: Memory | None = None
+        self._recent: dict[bytes, tuple[Code, bool]] = {}
+
+    def arrays(self) -> Arrays:
+        """The frames that it remembers, and which are those of each transition."""
+        return {
+            "replay/frames": np.array(self.frames, dtype=np.uint8).reshape(-1, 64, 64, 3),
+            "replay/frame_pairs": np.array(self.transitions, dtype=np.int64).reshape(-1, 2),
+            "replay/begins": np.array(self.begins, dtype=np.bool_),
+        }
+
+    def values(self) -> dict[str, Json]:
+        """What belongs to :meth:`arrays` in a snapshot."""
+        return {
+            "looked_at": self.looked_at,
+            "found_in": self.found_in,
+            "history": list(self.history),
+            "unknown": self.unknown,
+            "memory": list(self.memory) if self.memory else None,
+        }
+
+    def load(self, state: AgentState) -> None:
+        """Take up what :meth:`arrays` and :meth:`values` gave, and the agent's ``replay/action``: find the same."""
+        values = state.values
+        self.frames = list(state.arrays["replay/frames"])
+        self.transitions = [(before, after) for before, after in state.arrays["replay/frame_pairs"].tolist()]
+        self.begins = state.arrays["replay/begins"].tolist()
+        self.actions = state.arrays["replay/action"][: len(self.transitions)].tolist()
+        self.look(values["found_in"])
+        self.looked_at = values["looked_at"]
+        self.unknown = values["unknown"]
+        self.history = list(values["history"])
+        self.memory = Memory(*values["memory"]) if values["memory"] else None
+
+    def diagnostics(self) -> dict[str, float]:
+        """How many factors and values it sees, in how many frames it found them, and how many it remembers."""
+        sizes = self.sizes
+        found = {"factors": len(sizes), "values": sum(sizes), "looked_at": self.looked_at, "frames": len(self.frames)}
+        return {f"perception/{name}": float(value) for name, value in found.items()}

@@ -9,16 +9,15 @@ R-max (Brafman & Tennenholtz 2002). A search for the unknown ends as soon as not
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Literal
 
 import numpy as np
 
 from imagine_bench.interfaces import Floats
 
-from .factors import Code
-from .model import FactoredModel
-from .predictions import PredictedTransitions, Rows
+from .dynamics import EVERY
+from .factors import Code, Codes, Ints
+from .model import FactoredModel, Moves
 from .settings import PlanningSettings
 
 _KEPT = 20
@@ -26,7 +25,106 @@ _KEPT = 20
 TIE = 1e-9
 """Actions whose values differ by less are worth the same."""
 
+_HAPPENS = 1e-3
+"""Branches in which the episode goes on less probably than this are not followed."""
+
 Objective = Literal["value", "optimistic", "novelty"]
+
+
+class PredictedTransitions:
+    """Codes that were met, numbered in rows, and what every action would lead to from those that were asked about.
+
+    What an action does is predicted anew where the model's dynamics of it changed; what it brings whenever anything
+    was learned.
+
+    Attributes:
+        reward: Expected reward. Shape (rows, A), as of ``unknown`` and ``ends``.
+        unknown: Probability that something untested decides.
+        ends: Probability that the episode ends.
+        continues: Probability that each of B branches comes about and the episode goes on. Shape (rows, A, B).
+        next: Rows where these lead, as far as they are followed; shape as of ``continues``.
+        known: Whether these are what the model predicts now. Shape (rows,).
+    """
+
+    def __init__(self, model: FactoredModel, branches: int) -> None:
+        self._model = model
+        self._rows: dict[int, int] = {}
+        self._numbers: list[int] = []
+        pairs = (0, model.n_actions)
+        triples = (*pairs, branches)
+        self.reward = np.zeros(pairs)
+        self.unknown = np.zeros(pairs)
+        self.ends = np.zeros(pairs)
+        self.continues = np.zeros(triples)
+        self.next = np.zeros(triples, dtype=np.int64)
+        self.known = np.zeros(0, dtype=np.bool_)
+        self._chance = np.zeros(triples)
+        self._following = np.zeros(triples, dtype=np.int64)
+        self._certain = np.zeros(pairs)
+        self._moved_at = np.zeros(pairs, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def row(self, number: int) -> int:
+        """The row of a code, by its number; a new one if it is met for the first time."""
+        row = self._rows.setdefault(number, len(self._rows))
+        if row == len(self._numbers):
+            self._numbers.append(number)
+        return row
+
+    def expand(self, rows: Ints) -> None:
+        """Predict what follows from those of ``rows`` of which it is not known."""
+        self._grow()
+        rows = rows[~self.known[rows]]
+        if not len(rows):
+            return
+        self._move(rows)
+        moves = Moves(self._codes(self._following[rows]), self._chance[rows], self._certain[rows])
+        found = self._model.results(self._codes_of(rows), moves)
+        follows = found.p_continues > _HAPPENS
+        numbers, which = np.unique(self._following[rows][follows], return_inverse=True)
+        following = np.zeros(follows.shape, dtype=np.int64)
+        following[follows] = np.array([self.row(number) for number in numbers.tolist()], dtype=np.int64)[which]
+        self._grow()
+        self.reward[rows] = found.reward
+        self.unknown[rows] = found.unknown
+        self.ends[rows] = found.p_terminated
+        self.next[rows] = following
+        self.continues[rows] = np.where(follows, found.p_continues, 0.0)
+        self.known[rows] = True
+
+    def _move(self, rows: Ints) -> None:
+        """Predict where actions lead from ``rows``, whose dynamics changed since."""
+        changed_at = self._model.dynamics.changed_at
+        stale = self._moved_at[rows] != changed_at
+        new = stale.all(axis=1)
+        every = [(slice(action, action + 1), stale[:, action] & ~new) for action in range(len(changed_at))]
+        for actions, among in [(EVERY, new), *every]:
+            if among.any():
+                some = rows[among]
+                moves = self._model.moves(self._codes_of(some), actions)
+                following = np.ravel_multi_index(tuple(np.moveaxis(moves.following, -1, 0)), self._model.sizes)
+                self._following[some, actions] = following
+                self._chance[some, actions] = moves.chance
+                self._certain[some, actions] = moves.known
+        self._moved_at[rows] = changed_at
+
+    def _codes_of(self, rows: Ints) -> Codes:
+        return self._codes(np.array([self._numbers[row] for row in rows.tolist()]))
+
+    def _codes(self, numbers: Ints) -> Codes:
+        """Codes (..., P) of their numbers (...)."""
+        return np.stack(np.unravel_index(numbers, self._model.sizes), axis=-1)
+
+    def _grow(self) -> None:
+        """Room for every row, at least twice as much as before."""
+        more = len(self) - len(self.known)
+        if more > 0:
+            more = max(more, len(self.known))
+            for name, array in vars(self).items():
+                if isinstance(array, np.ndarray):
+                    setattr(self, name, np.concatenate([array, np.zeros((more, *array.shape[1:]), dtype=array.dtype)]))
 
 
 class Planner:
@@ -40,18 +138,14 @@ class Planner:
     def __init__(self, model: FactoredModel, settings: PlanningSettings) -> None:
         self._model = model
         self._settings = settings
+        self._predictions = PredictedTransitions(model, settings.branches)
+        self.learned()
         self.expanded = 0
         """Codes of the newest plan whose successors are predicted."""
-        self._forget()
 
-    def _forget(self) -> None:
-        """Drop every prediction."""
-        self._predictions = PredictedTransitions(self._model, self._settings.branches)
-        self.learned(())
-
-    def learned(self, actions: Iterable[int]) -> None:
-        """The model has learned something, and of the dynamics of these actions: plan anew."""
-        self._predictions.learned(actions)
+    def learned(self) -> None:
+        """The model has learned something: plan anew."""
+        self._predictions.known[:] = False
         self._known: dict[tuple[Objective, int], dict[int, Floats]] = {}
 
     def values(self, code: Code, objective: Objective = "value", left: int | None = None) -> Floats:
@@ -61,10 +155,12 @@ class Planner:
         largest reward seen; ``"novelty"`` the largest discounted chance of meeting something unknown, of which only the
         largest need be exact.
         """
-        if len(self._predictions) > _KEPT * self._settings.states:
-            self._forget()
-        depth = self._settings.depth if left is None else max(1, min(left, self._settings.depth))
-        root = self._predictions.row(code)
+        settings = self._settings
+        if len(self._predictions) > _KEPT * settings.states:
+            self._predictions = PredictedTransitions(self._model, settings.branches)
+            self.learned()
+        depth = settings.depth if left is None else max(1, min(left, settings.depth))
+        root = self._row(code)
         known = self._known.setdefault((objective, depth), {})
         if root not in known:
             known.update(self._plan(root, objective, depth))
@@ -72,33 +168,37 @@ class Planner:
 
     def outcome(self, code: Code) -> tuple[Floats, Floats, Floats]:
         """Expected reward of each action, P(it ends the episode), and how much it does is unknown: three (A,)."""
-        row = self._predictions.row(code)
+        row = self._row(code)
         predictions = self._predictions
         predictions.expand(np.array([row]))
         return predictions.reward[row], predictions.ends[row], predictions.unknown[row]
 
+    def _row(self, code: Code) -> int:
+        return self._predictions.row(int(np.ravel_multi_index(code, self._model.sizes)))
+
     def _plan(self, root: int, objective: Objective, depth: int) -> dict[int, Floats]:
         """Action values (A,) of every row within reach of ``root``, or of it alone where that is too much."""
+        predictions = self._predictions
         rows = front = np.array([root])
         self.expanded = steps = 0
         while len(front) and len(rows) <= self._settings.states and steps < depth:
-            self._predictions.expand(front)
+            predictions.expand(front)
             self.expanded = len(rows)
             steps = steps + 1
-            front = np.setdiff1d(self._predictions.following(front), rows)
+            front = np.setdiff1d(predictions.next[front][predictions.continues[front] > 0.0], rows)
             rows = np.concatenate([rows, front])
             if objective == "novelty" and len(front) and (found := self._discovery(rows, depth)) is not None:
                 return {root: found}
         values = self._back_up(rows, objective, depth)
         return {root: values[0].copy()} if len(front) else dict(zip(rows.tolist(), values, strict=True))
 
-    def _discovery(self, rows: Rows, depth: int) -> Floats | None:
+    def _discovery(self, rows: Ints, depth: int) -> Floats | None:
         """Novelty (A,) of the first of ``rows``; None where what lies beyond them may change the best actions."""
         near = self._back_up(rows, "novelty", depth)[0]
         far = self._back_up(rows, "novelty", depth, beyond=1.0)[0]
         return None if ((far > near) & (far >= near.max() - TIE)).any() else near
 
-    def _back_up(self, rows: Rows, objective: Objective, depth: int, beyond: float = 0.0) -> Floats:
+    def _back_up(self, rows: Ints, objective: Objective, depth: int, beyond: float = 0.0) -> Floats:
         """Action values of the expanded rows, which come first, (expanded, A); all others are worth ``beyond``."""
         settings = self._settings
         predictions = self._predictions

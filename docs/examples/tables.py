@@ -15,7 +15,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from imagine_bench.agents.factored.given import GivenPerceptionAgent, make
+from imagine_bench.agents.factored.agent import FactoredAgent, make
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate
@@ -29,7 +29,7 @@ from imagine_bench.store import encoders
 FLOORS = (0.5, 1.0, 2.0, 4.0)
 
 
-def away(agent: GivenPerceptionAgent, spec: TaskSpec, frames: Frame) -> float:
+def away(agent: FactoredAgent, spec: TaskSpec, frames: Frame) -> float:
     """Mean total variation of where actions lead that surely end nothing, asked with ``frames`` (S, 64, 64, 3)."""
     codes = np.array(agent.perception.codes(frames))
     moves = agent.model.moves(codes)

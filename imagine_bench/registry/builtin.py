@@ -90,7 +90,7 @@ AGENTS: dict[str, AgentEntry] = {
         "changes and what is rewarded; it explores where it is uncertain and plans in its model.",
     ),
     "factored:given": AgentEntry(
-        make="imagine_bench.agents.factored.given:make",
+        make="imagine_bench.agents.factored.agent:make",
         encoder_kind="codes",
         settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
         description="Like factored, but it is given an encoder of discrete factors and learns no perception; it can "

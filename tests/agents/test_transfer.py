@@ -13,10 +13,9 @@ from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts
 from fake_latents import built
 from fake_latents import live as live_on_latents
+from imagine_bench.agents.factored.agent import FactoredAgent
 from imagine_bench.agents.factored.dynamics import Dynamics
-from imagine_bench.agents.factored.exploration import last_step, likeliest
 from imagine_bench.agents.factored.factors import CodeTransition
-from imagine_bench.agents.factored.given import GivenPerceptionAgent
 from imagine_bench.agents.factored.outcomes import OutcomeModel
 from imagine_bench.agents.factored.settings import OutcomeSettings
 from imagine_bench.agents.imagination import agent as imagination_agents
@@ -26,26 +25,26 @@ from imagine_bench.interfaces import Observation
 from imagine_bench.interfaces.capabilities import Label, QueryingAgent, TransferLearner
 
 
-def dynamics_of(learner: GivenPerceptionAgent) -> list[np.ndarray]:
+def dynamics_of(learner: FactoredAgent) -> list[np.ndarray]:
     return [part.evidence for part in learner.model.dynamics.factors]
 
 
 @pytest.fixture(scope="module")
-def experienced() -> GivenPerceptionAgent:
+def experienced() -> FactoredAgent:
     """Has learned the first task; tests change copies of it."""
     learner = agent(3)
     live(learner, range(40), np.random.default_rng(3))
     return learner
 
 
-def test_the_dynamics_stay_and_the_outcomes_begin_anew(experienced: GivenPerceptionAgent) -> None:
+def test_the_dynamics_stay_and_the_outcomes_begin_anew(experienced: FactoredAgent) -> None:
     learner = copy.deepcopy(experienced)
     assert isinstance(learner, TransferLearner)
     assert learner.diagnostics()["real_transitions"] == len(learner.replay)
     live(learner, range(40, 41), np.random.default_rng(0))
     learner.reset_for_new_task()
     known = Dynamics(learner.perception.sizes, ACTIONS, learner.settings.dynamics)
-    for row in learner.replay.rows():
+    for row in learner.replay:
         known.add(np.array(row.code), row.action, np.array(row.following))
     for mine, all_of_it in zip(dynamics_of(learner), known.factors, strict=True):
         assert np.array_equal(mine, all_of_it.evidence)
@@ -78,7 +77,7 @@ def test_earlier_causes_are_priors_that_one_test_refutes(carried: float) -> None
     assert (before > -4.0) == (carried > 0.0), "that a move may cost one and go on is expected by the prior alone, too"
 
 
-def watch(learner: GivenPerceptionAgent, code: tuple[int, ...], action: int) -> None:
+def watch(learner: FactoredAgent, code: tuple[int, ...], action: int) -> None:
     learner.observe(fake_codes.transition(code, action), episode=0)
 
 
@@ -135,7 +134,7 @@ def test_resumed_on_a_second_task_equals_uninterrupted() -> None:
 # --- queries -----------------------------------------------------------------------------------------------------
 
 
-def ask(learner: GivenPerceptionAgent, queries: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
+def ask(learner: FactoredAgent, queries: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
     """Let it query, and label truly; the macro-actions asked about."""
     asked = []
     for _ in range(queries):
@@ -156,14 +155,14 @@ def test_it_queries_what_is_uncertain_and_learns_no_dynamics() -> None:
     assert learner.query(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
     live(learner, range(12), np.random.default_rng(0))
     learner.learn()  # what was expected too
-    known, real = [evidence.copy() for evidence in dynamics_of(learner)], learner.replay.count_real()
+    known, real = [evidence.copy() for evidence in dynamics_of(learner)], len(learner.replay)
     before = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
     asked = ask(learner, 200)
     assert 0 < len(asked) < 200
     assert max(map(len, asked)) > 1, "what is not one action away can be asked about too"
     assert all(np.array_equal(*pair) for pair in zip(known, dynamics_of(learner), strict=True))
-    assert (learner.replay.count_real(), learner.replay.count_labels()) == (real, len(asked))
-    assert learner.diagnostics()["oracle/labels"] == len(asked)
+    counted = learner.diagnostics()
+    assert (counted["real_transitions"], counted["oracle/labels"]) == (real, len(asked))
     after = learner.imagine(frame((0, 1, 1)), actions=np.array([0]), depth=1, rng=np.random.default_rng(0)).epistemic
     assert after <= before
 
@@ -175,21 +174,19 @@ def test_what_has_no_label_is_not_asked_again() -> None:
     for _ in range(5):
         actions = learner.query(seen)
         assert actions is not None
-        code, action, _ = last_step(learner.model, (0, 1, 1), actions)
-        asked.append((code, action))
         learner.learn_label(seen, actions, None)
+        asked.append(learner.replay[-1][:2])
+        assert not learner.replay[-1].has_reward
     assert len(set(asked)) == 5
-    assert learner.replay.count_labels() == 0
-    assert learner.replay.without_label == set(asked)
+    assert learner.diagnostics()["oracle/labels"] == 0
 
 
-def test_queries_lead_where_the_dynamics_do(experienced: GivenPerceptionAgent) -> None:
+def test_queries_lead_where_the_dynamics_do(experienced: FactoredAgent) -> None:
     learner = copy.deepcopy(experienced)
     learner.learn()
-    code, action, following = last_step(learner.model, (0, 1, 1), np.array([0, 2, 1]))
-    assert code == (1, 2, 1)
-    assert (action, following) == (1, (0, 2, 1))
-    reached, sure = likeliest(learner.model, np.array(starts()))
+    learner.learn_label(Observation(frame=frame((0, 1, 1))), np.array([0, 2, 1]), Label(-1.0, False))
+    assert learner.replay[-1][:3] == ((1, 2, 1), 1, (0, 2, 1))
+    reached, sure = learner.model.likeliest(np.array(starts()))
     assert sure.shape == (len(starts()), ACTIONS)
     truth = [[fake_codes.step(code, action)[0] for action in range(ACTIONS)] for code in starts()]
     assert np.array_equal(reached, truth)
@@ -199,10 +196,10 @@ def test_a_prior_for_staying_is_no_knowledge() -> None:
     """Of one factor that holds all, it alone would call more than half sure."""
     learner = agent(dynamics__factored=False)
     codes = np.array([learner.perception.code(frame(code)) for code in starts()])
-    assert not likeliest(learner.model, codes)[1].any()
+    assert not learner.model.likeliest(codes)[1].any()
     live(learner, range(20), np.random.default_rng(0))
     learner.learn()
-    assert (likeliest(learner.model, codes)[1] > 0.5).any()
+    assert (learner.model.likeliest(codes)[1] > 0.5).any()
 
 
 # --- the thesis' agents ------------------------------------------------------------------------------------------

@@ -27,8 +27,6 @@ NAMES: Mapping[str, list[str]] = {
 OLD = {
     *MOVED,
     *MOVED_NAMES,
-    "imagine_bench.agents.factored.agent:FactoredAgent",
-    "imagine_bench.agents.factored.agent:make",
 }
 
 

@@ -145,17 +145,19 @@ def test_dynamics_average_over_what_a_factor_may_depend_on(model: FactoredModel,
 def test_each_conjunction_has_a_number_of_its_own() -> None:
     """Single values and whole codes, of the code after, or of the one before together with the action."""
     conjunctions = Conjunctions(SIZES, ACTIONS, OutcomeSettings(order=1, prior=0.1, order_decay=0.3))
-    numbers: dict[tuple[object, ...], int] = {}
-    for code, action, following in itertools.product(CODES, range(ACTIONS), CODES):
-        (active,) = conjunctions.active(np.array([code]), np.array([action]), np.array([following])).tolist()
-        keys = [*enumerate(following), following, (action,), *((*pair, action) for pair in enumerate(code)),
-                (*code, action)]  # fmt: skip
-        keys = [(name, *key) for name, key in zip("abcdefg", keys, strict=True)]
-        assert [numbers.setdefault(key, number) for key, number in zip(keys, active, strict=True)] == active
-    assert sorted(numbers.values()) == list(range(2 + 3 + 6 + 2 + 4 + 6 + 12)) == list(range(len(conjunctions.group)))
+    every = list(itertools.product(CODES, range(ACTIONS), CODES))
+    active = conjunctions.active(*(np.array([row[part] for row in every]) for part in range(3)))
+    told = [
+        [(following[0],), (following[1],), following, (action,), (code[0], action), (code[1], action), (*code, action)]
+        for code, action, following in every
+    ]
+    named = set()
+    for keys, row in zip(told, active.tolist(), strict=True):
+        named |= set(zip(range(7), keys, row, strict=True))
+    assert sorted(number for *_, number in named) == list(range(2 + 3 + 6 + 2 + 4 + 6 + 12)), "one a conjunction"
     prior = conjunctions.prior[conjunctions.group]
-    for key, number in numbers.items():
-        assert prior[number] == pytest.approx(0.03 if key[0] == "g" else 0.1), "two values and the action are three"
+    for place, _, number in named:
+        assert prior[number] == pytest.approx(0.03 if place == 6 else 0.1), "two values and the action are three"
 
 
 def brought(model: FactoredModel, code: Code, action: int, following: Code) -> tuple[dict[int, float], float]:
@@ -169,21 +171,15 @@ def brought(model: FactoredModel, code: Code, action: int, following: Code) -> t
 
 def by_noisy_or(model: FactoredModel, code: Code, action: int, following: Code) -> tuple[dict[int, float], float]:
     """The same by causes alone."""
-    causes, settings = model.outcomes.causes, SETTINGS.outcomes
+    causes, pseudo = model.outcomes.causes, SETTINGS.outcomes.pseudo_tests
     assert causes is not None
-    (active,) = model.outcomes.conjunctions.active(np.array([code]), np.array([action]), np.array([following])).tolist()
-    chance, none, tested = {}, 1.0, 1.0
-    for outcome in range(len(causes.outcomes)):
-        silent = 1.0
-        for number in active:
-            silent *= 1.0 - causes.strength[outcome, number]
-        if outcome != causes.default:
-            chance[outcome], none = 1.0 - silent, none * silent
-    for number in active:
-        rate = causes.cause_rate[model.outcomes.conjunctions.group[number]]
-        tested *= 1.0 - rate * settings.pseudo_tests / (settings.pseudo_tests + causes.tests[number])
-    chance[causes.default] = none
-    return {outcome: share / sum(chance.values()) for outcome, share in chance.items()}, (1.0 - tested) * none
+    (active,) = model.outcomes.conjunctions.active(np.array([code]), np.array([action]), np.array([following]))
+    silent = np.prod(1.0 - causes.strength[:, active], axis=1)
+    chance = {outcome: 1.0 - float(none) for outcome, none in enumerate(silent)}
+    chance[causes.default] = none = float(np.prod(np.delete(silent, causes.default)))
+    rate = causes.cause_rate[model.outcomes.conjunctions.group[active]]
+    tested = np.prod(1.0 - rate * pseudo / (pseudo + causes.tests[active]))
+    return {outcome: share / sum(chance.values()) for outcome, share in chance.items()}, float(1.0 - tested) * none
 
 
 def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
@@ -222,23 +218,6 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
         assert unknown == pytest.approx(1.0 - known * (1.0 - untested))
 
 
-def test_what_a_transition_brought_outweighs_a_cause_of_something_else() -> None:
-    """Where two causes are active and one of them always wins, only the transition itself can tell which."""
-    learned = OutcomeModel(SIZES, ACTIONS, OutcomeSettings(order=1))
-    both = CodeTransition((0, 0), 1, (1, 1), 3.0, True)
-    neither, other = both._replace(following=(0, 0), reward=0.0, terminated=False), both._replace(reward=-1.0)
-    for row in [neither, both._replace(following=(1, 0)), other._replace(following=(0, 1))] * 5 + [both]:
-        learned.add(row)
-    learned.fit()
-
-    def loses(code: Code) -> float:
-        (chance,), _ = learned.predict(np.array([code]), np.array([1]), np.array([(1, 1)]))
-        return float(chance[learned.outcomes.index((-1.0, True))])
-
-    assert loses((0, 0)) < 0.02, "it was seen"
-    assert loses((1, 2)) > 0.1, "of what was not seen causes alone tell"
-
-
 def test_a_goal_of_all_values_but_one_is_expected_whatever_that_one_is() -> None:
     """Four values of five are the goal; it was met with one value of the fifth alone, and each smaller part in vain."""
     goal = (1, 1, 1, 1)
@@ -254,76 +233,53 @@ def test_a_goal_of_all_values_but_one_is_expected_whatever_that_one_is() -> None
     assert met > 0.5 and missed < 0.05
 
 
-class ByLoops:
-    """Expectation maximisation over three outcomes; of conjunctions that were met alone."""
-
-    def __init__(self, learned: OutcomeModel, rows: list[CodeTransition]) -> None:
-        self.settings, self.prior = learned.settings, learned.conjunctions.prior
-        active = [learned.conjunctions.active(*(np.array([part]) for part in row[:3]))[0].tolist() for row in rows]
-        self.rows = list(
-            zip(active, [learned.outcomes.index((row.reward, row.terminated)) for row in rows], strict=True)
-        )
-        self.met = sorted({number for active, _ in self.rows for number in active})
-        self.group = {number: int(learned.conjunctions.group[number]) for number in self.met}
-        self.tried = Counter(self.group.values())
-
-    def silent(self, strength: dict[int, float], active: list[int]) -> float:
-        return float((1.0 - self.settings.leak) * np.prod([1.0 - strength[number] for number in active]))
-
-    def decided(self, strength: dict[int, float], outcome: int) -> dict[int, float]:
-        share = dict.fromkeys(self.met, 0.0)
-        for active, what in self.rows:
-            for number in active if what == outcome else ():
-                share[number] += min(strength[number] / (1.0 - self.silent(strength, active)), 1.0)
-        return share
-
-    def strengths(self, outcome: int, default: int) -> tuple[dict[int, float], list[float]]:
-        """Of each conjunction, and how likely those of each group are causes."""
-        pseudo, few, own = self.settings.pseudo_tests, self.settings.pseudo_conjunctions, list(self.prior / 2)
-        strength = {number: own[self.group[number]] for number in self.met}
-        weight = dict.fromkeys(self.met, 0.0)
-        for active, what in self.rows:
-            for number in active:
-                weight[number] += 1.0 if what in (outcome, default) else self.settings.masked_weight
-        for _ in range(self.settings.sweeps):
-            share = self.decided(strength, outcome)
-            strength = {n: (pseudo * own[self.group[n]] + share[n]) / (pseudo + weight[n]) for n in self.met}
-            found = [sum(strength[n] for n in self.met if self.group[n] == group) for group in range(len(own))]
-            own = [(few * self.prior[g] / 2 + found[g]) / (few + self.tried[g]) for g in range(len(own))]
-        return strength, own
-
-    def explain(self, default: int) -> tuple[dict[int, dict[int, float]], list[float], list[float], float]:
-        """Strengths by outcome, tests, rates, and the posterior's logarithm."""
-        few, strengths, posterior = self.settings.pseudo_conjunctions, {}, 0.0
-        rate = [0.5 * few * p / (few + self.tried[group]) for group, p in enumerate(self.prior)]
-        tests = [float(sum(n in active and what == default for active, what in self.rows)) for n in self.met]
-        for outcome in {0, 1, 2} - {default}:
-            strength, own = self.strengths(outcome, default)
-            strengths[outcome], rate = strength, [a + b for a, b in zip(rate, own, strict=True)]
-            tests = [a + b for a, b in zip(tests, self.decided(strength, outcome).values(), strict=True)]
-            before = {number: own[self.group[number]] for number in self.met}
-            posterior += sum(max(strength[n] - before[n], 0.0) * np.log(before[n]) for n in self.met)
-        for active, what in self.rows:
-            silent = {outcome: self.silent(strength, active) for outcome, strength in strengths.items()}
-            chance = {outcome: 1.0 - none for outcome, none in silent.items()}
-            chance[default] = float(np.prod(list(silent.values())))
-            posterior += np.log(chance[what] / sum(chance.values()))
-        return strengths, tests, rate, posterior
-
-
 def test_causes_are_found_by_expectation_maximisation() -> None:
+    """The same with dense matrices over three outcomes: which conjunctions hold in which transitions, (N, M)."""
     learned = OutcomeModel(SIZES, ACTIONS, OutcomeSettings(order=1, sweeps=6, masked_weight=0.3))
     rows = [row._replace(reward=2.0) if row.following == (0, 1) else row for row in lived()]
     for row in rows:
         learned.add(row)
     learned.fit()
-    assert learned.causes is not None and len(learned.outcomes) == 3
-    slow = ByLoops(learned, rows)
-    posteriors = [slow.explain(default)[3] for default in range(3)]
-    assert learned.causes.default == int(np.argmax(posteriors)), "whichever explains it best"
-    strengths, tests, rate, posterior = slow.explain(learned.causes.default)
+    settings, groups, causes = learned.settings, learned.conjunctions.group, learned.causes
+    assert causes is not None and len(learned.outcomes) == 3
+    active = learned.conjunctions.active(*(np.array([row[part] for row in rows]) for part in range(3)))
+    brought = np.array([learned.outcomes.index((row.reward, row.terminated)) for row in rows])
+    met = np.unique(active)
+    holds = (active[:, :, None] == met).any(axis=1).astype(float)
+    belongs = np.eye(len(learned.conjunctions.prior))[groups[met]]  # [M, G]
+    few, pseudo = settings.pseudo_conjunctions, settings.pseudo_tests
+
+    def silent(strength: Floats) -> Floats:
+        return (1.0 - settings.leak) * np.prod(1.0 - holds * strength, axis=1)
+
+    def decided(strength: Floats, outcome: int) -> Floats:
+        return strength * ((brought == outcome) / (1.0 - silent(strength)) @ holds)
+
+    def explain(default: int) -> tuple[dict[int, Floats], Floats, Floats, float]:
+        """Strengths by outcome, tests, rates, and the posterior's logarithm."""
+        strengths, chance = {}, np.ones((3, len(rows)))
+        rate = 0.5 * few * learned.conjunctions.prior / (few + belongs.sum(axis=0))
+        tests = (brought == default) @ holds
+        cost = 0.0
+        for outcome in {0, 1, 2} - {default}:
+            own = learned.conjunctions.prior / 2
+            strength = belongs @ own
+            weight = np.where((brought == outcome) | (brought == default), 1.0, settings.masked_weight) @ holds
+            for _ in range(settings.sweeps):
+                strength = (pseudo * belongs @ own + decided(strength, outcome)) / (pseudo + weight)
+                own = (few * learned.conjunctions.prior / 2 + strength @ belongs) / (few + belongs.sum(axis=0))
+            strengths[outcome], rate = strength, rate + own
+            tests = tests + decided(strength, outcome)
+            cost += float(np.maximum(strength - belongs @ own, 0.0) @ np.log(belongs @ own))
+            chance[outcome] = 1.0 - silent(strength)
+            chance[default] *= silent(strength)
+        likelihood = chance[brought, np.arange(len(rows))] / chance.sum(axis=0)
+        return strengths, tests, rate, float(np.log(likelihood).sum()) + cost
+
+    assert causes.default == int(np.argmax([explain(default)[3] for default in range(3)])), "what explains it best"
+    strengths, tests, rate, posterior = explain(causes.default)
     for outcome, strength in strengths.items():
-        assert learned.causes.strength[outcome, slow.met] == pytest.approx(list(strength.values()))
-    assert learned.causes.tests[slow.met] == pytest.approx(tests)
-    assert learned.causes.cause_rate == pytest.approx(rate)
-    assert learned.causes.log_posterior == pytest.approx(posterior)
+        assert causes.strength[outcome, met] == pytest.approx(strength)
+    assert causes.tests[met] == pytest.approx(tests)
+    assert causes.cause_rate == pytest.approx(rate)
+    assert causes.log_posterior == pytest.approx(posterior)

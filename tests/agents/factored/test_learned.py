@@ -12,7 +12,6 @@ from imagine_bench.agents.factored import appearance
 from imagine_bench.agents.factored.learned import LearnedPerceptionAgent
 from numpy.typing import NDArray
 
-from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import Frame
 
 
@@ -78,18 +77,6 @@ def test_where_nothing_happens_nothing_is_found() -> None:
     assert appearance.find(still) == [] and appearance.find(still[:1]) == []
     tinted = (still * rng.uniform(0.5, 1.0, size=(20, 1, 1, 3))).astype(np.uint8)
     assert appearance.find(tinted) == [], "light is no factor"
-
-
-def test_noise_in_view_is_no_factor_and_hides_none() -> None:
-    """A screen of noise behind one wheel's edge, and no frame twice: the factors are the same."""
-    rng = np.random.default_rng(0)
-    truth, frames = walk(120, rng)
-    frames[:, 24:40, 2:30] = rng.integers(256, size=(120, 16, 28, 3))
-    found = appearance.find(frames)
-    assert sorted(len(factor.joint) for factor in found) == [2, 3, 3]
-    codes, known = appearance.read(found, frames)
-    assert known.mean() > 0.98
-    assert len({(tuple(code), true) for code, true in zip(codes.tolist(), truth, strict=True)}) == len(set(truth))
 
 
 def test_what_stands_in_front_of_noise_is_seen() -> None:
@@ -264,14 +251,6 @@ def test_neighbours_that_change_at_other_times_are_two_regions() -> None:
     assert len(regions(bits[:, 0], later)) == 2, "unless it did so for a while only"
 
 
-def test_what_falls_into_crumbs_stays_whole() -> None:
-    """Every pixel changes at times of its own: no part covers the square, so that it is one region, and is not lost."""
-    change = np.zeros((400, 64, 64), dtype=np.bool_)
-    change[:, 20:30, 20:30] = np.random.default_rng(0).random((400, 10, 10)) < 0.2
-    (found,) = appearance.regions(change, change.any(axis=0))
-    assert found.sum() == 100 and found[20:30, 20:30].all()
-
-
 def test_a_small_thing_that_a_large_one_touches_is_not_lost() -> None:
     """It falls into crumbs, and most of what hangs together with it does not; beside it are a crumb and a thin rim."""
     change, rng = np.zeros((400, 64, 64), dtype=np.bool_), np.random.default_rng(0)
@@ -309,22 +288,18 @@ def test_remembered_transitions_get_the_codes_that_their_frames_have_now(trained
     learner, _ = trained
     eyes = learner.perception
     codes, _ = eyes.codes(np.stack(eyes.frames))
-    looked = [row for row in zip(learner.replay.rows(), eyes.transitions, strict=True) if row[1][1] < eyes.looked_at]
+    looked = [row for row in zip(learner.replay, eyes.transitions, strict=True) if row[1][1] < eyes.looked_at]
     assert looked
     assert all(row.code == codes[before] and row.following == codes[after] for row, (before, after) in looked)
 
 
-def test_with_as_many_frames_as_it_may_remember_it_sees_as_before_and_resumes() -> None:
-    whole, first, resumed = (agent(seed=seed, perception__frames=20) for seed in (0, 0, 5))
-    assert live(whole, range(12), seed=0) == live(first, range(12), seed=0)
-    resumed.restore(first.state())
-    assert whole.perception.full and len(whole.perception.frames) <= 21
-    assert live(whole, range(12, 16), seed=0) == live(resumed, range(12, 16), seed=0)
-    assert same(whole.state(), resumed.state())
-    before = first.state()
-    with pytest.raises(ArtefactError, match="settings"):
-        first.restore(agent(perception__frames=21).state())
-    assert same(before, first.state())
+def test_with_as_many_frames_as_it_may_remember_it_sees_as_before() -> None:
+    learner = agent(perception__frames=20)
+    live(learner, range(12), seed=0)
+    eyes = learner.perception
+    found, frames = eyes.found, len(eyes.frames)
+    live(learner, range(12, 16), seed=0)
+    assert eyes.full and frames == len(eyes.frames) <= 21 and eyes.found is found
 
 
 def test_it_can_show_how_it_learned_to_see(trained: Trained) -> None:
@@ -336,7 +311,7 @@ def test_it_can_show_how_it_learned_to_see(trained: Trained) -> None:
     episodes = [each.episodes for each in shown]
     assert episodes == sorted(episodes) and len(set(each.sizes for each in shown)) > 1
     assert shown[-1].sizes == learner.perception.sizes
-    gray, mask = shown[-1].picture[:320:5, :320:5], np.zeros((64, 64), dtype=np.bool_)
+    gray, mask = shown[-1].picture[::5, ::5], np.zeros((64, 64), dtype=np.bool_)
     for factor in learner.perception.found:
         for part in factor.parts:
             mask |= part.mask

@@ -69,19 +69,6 @@ def test_an_action_that_fails_at_a_wall_alone_is_not_thought_to_slip() -> None:
     assert weight[2 + len(dynamics.factors[0].parents) :].sum() < 0.01
 
 
-def test_predictions_are_chances_and_what_slips_stays_unknown_only_where_it_goes() -> None:
-    dynamics = Dynamics(SIZES, ACTIONS, DynamicsSettings())
-    rng = np.random.default_rng(1)
-    for _ in range(300):
-        code, action = tuple(rng.integers(1, 4, size=3).tolist()), int(rng.integers(ACTIONS))
-        following = code if rng.random() < 0.2 else turned(code, action)
-        dynamics.add(np.array(code), action, np.array(following))
-    wheel = dynamics.predict(np.array([(0, 1, 1), (1, 1, 1)]))[0]
-    assert np.allclose(wheel.expected.sum(axis=2), 1.0)
-    assert wheel.expected[0, 0, 0] == pytest.approx(0.2, abs=0.06), "how often it slips is known where it never was"
-    assert wheel.unknown[0, 0] > 0.7 and wheel.unknown[1, 0] < 0.05, "where it leads is not"
-
-
 def novelty(least_unknown: float, times: int) -> float:
     """Of a lamp that is drawn anew at every step, after each action was tried so often in each code."""
     settings = FactoredSettings(dynamics=DynamicsSettings(least_unknown=least_unknown))

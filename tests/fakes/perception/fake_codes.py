@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from imagine_bench.agents.factored.given import GivenPerceptionAgent
+from imagine_bench.agents.factored.agent import FactoredAgent
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench.agents.factored.settings import HYPERPARAMETERS
 from torch.nn import functional
@@ -75,15 +75,15 @@ def starts() -> list[tuple[int, ...]]:
     return [code for code in codes if code not in ((2, 1, 1), (1, 2, 0))]
 
 
-def agent(seed: int = 0, **overrides: object) -> GivenPerceptionAgent:
+def agent(seed: int = 0, **overrides: object) -> FactoredAgent:
     settings = HYPERPARAMETERS.resolve(
         "fast", {name.replace("__", "."): value for name, value in overrides.items()}, "chapter_5"
     )
     perception = CodePerception(FakeCodes(), factored=settings.dynamics.factored)  # type: ignore[arg-type]
-    return GivenPerceptionAgent(perception, ACTIONS, settings, SeedTree(seed))
+    return FactoredAgent(perception, ACTIONS, settings, SeedTree(seed))
 
 
-def live(learner: GivenPerceptionAgent, episodes: range, rng: np.random.Generator, horizon: int = 6) -> list[int]:
+def live(learner: FactoredAgent, episodes: range, rng: np.random.Generator, horizon: int = 6) -> list[int]:
     """Train on the tiny world; the actions taken."""
     taken = []
     for episode in episodes:
@@ -98,7 +98,7 @@ def live(learner: GivenPerceptionAgent, episodes: range, rng: np.random.Generato
     return taken
 
 
-def success(learner: GivenPerceptionAgent, horizon: int = 6) -> float:
+def success(learner: FactoredAgent, horizon: int = 6) -> float:
     """Share of starts from which the greedy agent ends well."""
     solved = 0
     for start in starts():

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import fake_codes
 import numpy as np
 from fake_codes import ACTIONS, starts
-from imagine_bench.agents.factored.learned import LearnedPerception, LearnedPerceptionAgent
+from imagine_bench.agents.factored.learned import LearnedPerceptionAgent
+from imagine_bench.agents.factored.perception import LearnedPerception
 from imagine_bench.agents.factored.settings import LEARNED
 from numpy.typing import NDArray
 
