@@ -90,12 +90,12 @@ class _Cases(NamedTuple):
 
     met: Ints
     holds: csr_array
-    count: Floats  #: how often each transition was seen
+    times: Floats  #: how often each transition was seen
 
     def responsibility(self, strength: Floats, leak: float) -> Floats:
         """How many of the transitions each of them, so strong (M,), is held to have decided. Shape (M,)."""
         caused = 1.0 - (1.0 - leak) * np.exp(self.holds @ np.log1p(-strength))
-        return np.asarray(strength * (self.holds.T @ (self.count / caused)))
+        return np.asarray(strength * (self.holds.T @ (self.times / caused)))
 
 
 class _Evidence:
@@ -121,7 +121,7 @@ class _Evidence:
 
     def tests(self, weight: Floats) -> Floats:
         """Sum of the weights (U,) of the transitions in which each conjunction holds. Shape (M,)."""
-        return np.asarray(self.all.holds.T @ (weight * self.all.count))
+        return np.asarray(self.all.holds.T @ (weight * self.all.times))
 
 
 class _Explanation(NamedTuple):
@@ -249,7 +249,7 @@ class OutcomeModel:
         none = (1.0 - self.settings.leak) * np.exp(evidence.all.holds @ np.log1p(-strength).T).T
         probability = _by_causes(none, default)
         likelihood = probability[evidence.outcome, np.arange(len(evidence.outcome))] / probability.sum(axis=0)
-        fit = float((evidence.all.count * np.log(np.maximum(likelihood, _LEAST))).sum())
+        fit = float((evidence.all.times * np.log(np.maximum(likelihood, _LEAST))).sum())
         return _Explanation(default, strength, priors, fit - cost)
 
     def _causes_of(self, outcome: int, evidence: _Evidence, default: int, rivals: int) -> tuple[Floats, Floats]:

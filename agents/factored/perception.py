@@ -54,14 +54,14 @@ class CodePerception:
         codes = torch.stack([values.argmax(dim=1) for values in hot.split(self._encoded, dim=1)], dim=1).numpy()
         return _rows(codes, self._encoded, factored=self._factored)
 
-    def latents(self, codes: Sequence[Code]) -> torch.Tensor:
+    def latents(self, codes: Sequence[Code] | Codes) -> torch.Tensor:
         """N codes as the encoder decodes them: one-hot. Shape (N, sum of the encoder's sizes)."""
         rows = np.array(codes, dtype=np.int64).reshape(-1, len(self.sizes))
         values = rows.T if self._factored else np.unravel_index(rows[:, 0], self._encoded)
         pairs = zip(values, self._encoded, strict=True)
         return torch.cat([functional.one_hot(torch.tensor(value), size) for value, size in pairs], dim=1).float()
 
-    def macrostates(self, codes: Sequence[Code]) -> Codes:
+    def macrostates(self, codes: Sequence[Code] | Codes) -> Codes:
         """What the evaluation's probe reads from N codes; the agent must not use it. Shape (N, M)."""
         return self._encoder.read_macrostate(self.latents(codes))
 
