@@ -36,8 +36,8 @@ QUESTIONS = {
         "outcome_ece": "calibration error", "outcome_brier": "Brier",
     },
     "Which rewards and ends?": {
-        "reward_error": "reward error", "reward_ece": "calibration error", "reward_brier": "Brier",
-        "end_error": "end error", "end_ece": "calibration error", "end_brier": "Brier",
+        "reward_error": "reward error", "reward_ece": "reward calibration", "reward_brier": "reward Brier",
+        "end_error": "end error", "end_ece": "end calibration", "end_brier": "end Brier",
     },
     "What do mistakes cost?": {
         "value_loss": "value loss", "worst_value_loss": "from the worst start", "regret": "regret of 1 of 5",
@@ -88,7 +88,7 @@ _SHARES = {
     *(name for name in COLUMNS if name.startswith("auroc")),
 }
 _WHY_DASH = "not offered by the model, or nothing to tell apart"
-_ANSWERED = (0.25, 0.5, 0.75, 1.0)  # shares of the questions, those that a model is surest of
+_ANSWERED = {f"surest {share:.0%}": share for share in (0.25, 0.5, 0.75, 1.0)}  # of the questions
 Scores = Mapping[str, Any]
 """What is kept of a model that was fitted once."""
 
@@ -177,12 +177,13 @@ def _by_model(
         transitions = DASH if runs_of(model) else f"{size:,}"  # those of a trained agent are its bench's to say
         rows.append([_title(model), transitions])
         for column, value in columns.items():
-            rows[-1].append(over_seeds(list(map(value, cells)), _number, share=column in _SHARES))
-    return Table(name, ["world model", "transitions", *columns], rows, caption, _WHY_DASH, folded)
+            rows[-1].append(over_seeds(list(map(value, cells)), _number, share=column in (_SHARES | _ANSWERED.keys())))
+    header = ["world model", "transitions", *(COLUMNS.get(column, column) for column in columns)]
+    return Table(name, header, rows, caption, _WHY_DASH, folded)
 
 
 def _scores(found: Judged, name: str, names: Iterable[str], folded: str = "") -> Table:
-    columns = {COLUMNS[each]: functools.partial(score, name=each) for each in names}
+    columns = {each: functools.partial(score, name=each) for each in names}
     caption = "Interquartile means over seeds or runs, with 95 % intervals. 0 is best in every error; value loss is in "
     return _by_model(found, name, columns, f"{caption}units of reward.", folded)
 
@@ -210,7 +211,7 @@ def risk(found: Judged) -> Section:
     def error(share: float, cell: Scores) -> float:
         return cell["risk"][COVERAGES.index(share)] if cell["risk"] else math.nan
 
-    columns = {f"surest {share:.0%}": functools.partial(error, share) for share in _ANSWERED}
+    columns = {name: functools.partial(error, share) for name, share in _ANSWERED.items()}
     caption = "Total variation of the answers that a model is surest of: lower than of all where it knows its errors."
     return Section("The errors of the surest answers", tables=[_by_model(found, "risk", columns, caption)])
 
@@ -262,13 +263,12 @@ def where(found: Judged) -> Section:
             for kind, each in cell["where"].items():
                 for name, value in each.items():
                     groups.setdefault((kind, name), {}).setdefault(model, []).append(value)
-    rows: list[dict[str, str]] = []
-    for (kind, name), values in groups.items():
-        rows.append({"by": kind, "which": name})
-        for model in found.last:
-            rows[-1][_title(model)] = over_seeds(values.get(model, []), _number, share=True)
+    rows = []
+    for group, values in groups.items():
+        rows.append([*group, *(over_seeds(values.get(model, []), _number, share=True) for model in found.last)])
+    header = ["by", "which", *map(_title, found.last)]
     caption = f"Total variation of one step{found.after}; of a coordinate, that of it alone."
-    return Section("Where it fails", tables=[Table.of("where", rows, caption, "no such transition")])
+    return Section("Where it fails", tables=[Table("where", header, rows, caption, "no such transition")])
 
 
 def images(found: Judged) -> Section | None:

@@ -184,9 +184,11 @@ def _levels(result: SuiteResult) -> Section:
             row |= {"world": level.task, "real episodes": f"{level.episodes:,}"}
             for end in ("chance", "optimum"):
                 row[f"{end}, %"] = percent(getattr(found.scale, end, math.nan))
-            row[agent_title(agent)] = percent(float(found.values.mean()))
+            row[agent] = percent(float(found.values.mean()))
     caption = "Test episodes solved, or AUROC, in %: means over seeds."
-    table = Table.of("levels", list(rows.values()), caption, "not run")
+    header = ["experiment", "level", "world", "real episodes", "chance, %", "optimum, %"]
+    cells = [list(row.values()) for row in rows.values()]
+    table = Table("levels", [*header, *map(agent_title, result.agents)], cells, caption, "not run")
     questions = [f"{each.name}: {each.question}" for each in result.suite.experiments]
     return Section("Level by level", questions, tables=[table])
 
