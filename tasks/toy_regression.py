@@ -47,16 +47,6 @@ def noise_sigma(variant: str, x: Floats) -> Floats:
     return np.where((variant == "high_noise") & in_region(x), SIGMA_HIGH, SIGMA)
 
 
-def true_mean(x: Floats) -> Floats:
-    """E[f]: the mean of the branches."""
-    return branches(x).mean(axis=-1)
-
-
-def true_modal(x: Floats) -> Floats:
-    """V[f] (equation 4.7): the variance of the branches."""
-    return branches(x).var(axis=-1)
-
-
 def require_variant(variant: str) -> None:
     """Raise UnknownNameError unless ``variant`` is one of the three datasets."""
     require_known("variant of toy_regression", variant, VARIANTS)
@@ -111,12 +101,13 @@ def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arr
     missed = np.reshape(new, predicted.drawn.shape) - predicted.drawn
     scores = predicted.scores
     mean = predicted.mean[..., 0]
+    true_mean = branches(x).mean(axis=-1)
     return {
         "x": x,
-        "true_mean": true_mean(x),
-        "true_modal": true_modal(x),
+        "true_mean": true_mean,
+        "true_modal": branches(x).var(axis=-1),  # equation 4.7
         "true_aleatoric": noise_sigma(variant, x) ** 2,
-        "true_epistemic": (true_mean(x) - mean) ** 2 + scores["epistemic"],
+        "true_epistemic": (true_mean - mean) ** 2 + scores["epistemic"],
         "prediction": predicted.prediction[..., 0],
         "mean": mean,
         "squared_error": (missed[..., 0] ** 2).mean(axis=2),

@@ -48,20 +48,19 @@ class MixtureRegressor:
         settings = dataclasses.replace(settings, precision=settle(settings.precision, context.device))
         self.settings = settings
         self._device = prepare_torch(context.device)
-        targets = np.stack([data.targets for data in context.datasets])
-        inputs = self._tensor(np.stack([data.inputs for data in context.datasets]))
-        self._outputs = targets.shape[-1]
-        self._x = inputs.repeat_interleave(settings.members, dim=0)  # [E M, N, X]
-        self._shift = self._tensor(targets.mean(axis=1))  # [E, D]
-        self._scale = self._tensor(np.maximum(targets.std(axis=1), 1e-6))
-        standardised = (self._tensor(targets) - self._shift[:, None]) / self._scale[:, None]
-        self._y = standardised.repeat_interleave(settings.members, dim=0)
+        data = [each for each in context.datasets for _ in range(settings.members)]
         nodes = [seeds.child("member", m) for seeds in context.seeds for m in range(settings.members)]
         self._orders = [self._generator(node.child("batches").integer()) for node in nodes]  # of the rows
         self._draws = [self._generator(node.child("network").integer()) for node in nodes]  # of weights, then masks
         self._samples = [seeds.child("weight_samples").integer() for seeds in context.seeds]
+        targets = np.stack([each.targets for each in data])
+        self._x = self._tensor(np.stack([each.inputs for each in data]))  # [E M, N, X]
+        self._shift = self._tensor(targets.mean(axis=1))  # [E M, D]
+        self._scale = self._tensor(np.maximum(targets.std(axis=1), 1e-6))
+        self._y = (self._tensor(targets) - self._shift[:, None]) / self._scale[:, None]
         self._trained: list[Callable[[Tensor], Mixture]] = []
-        sizes = (inputs.shape[-1], *settings.hidden, mdn.output_size(settings.components, self._outputs))
+        n_outputs = mdn.output_size(settings.components, self._y.shape[-1])
+        sizes = (self._x.shape[-1], *settings.hidden, n_outputs)
         precision = hidden_dtype(settings.precision, context.device)
         self.network = NormedMLP(sizes, generators=self._draws, dropout=settings.dropout, precision=precision)
         hidden = [*self.network.weights[:-1], *self.network.biases[:-1]]
@@ -87,7 +86,7 @@ class MixtureRegressor:
             updates = [self.update(self._x[member, batch], self._y[member, batch]) for batch in chosen]
             losses.append(float(torch.stack(updates).mean()))
             on_epoch(epoch + 1, settings.epochs)
-        self._trained = [self._weight_samples(network) for network in range(len(self._scale))]
+        self._trained = [self._weight_samples(network) for network in range(len(self._samples))]
         return {"loss/likelihood": float(np.mean(losses))}
 
     def update(self, x: Tensor, y: Tensor) -> Tensor:
@@ -118,7 +117,7 @@ class MixtureRegressor:
         settings = self.settings
         floor = math.log(settings.sigma_floor)
         ceiling = math.log(settings.sigma_ceiling)
-        return mdn.from_outputs(outputs, settings.components, self._outputs, floor, ceiling)
+        return mdn.from_outputs(outputs, settings.components, self._y.shape[-1], floor, ceiling)
 
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
         """Predict, with uncertainties; see :class:`imagine_bench.interfaces.regression.Regressor`."""
@@ -148,8 +147,8 @@ class MixtureRegressor:
             generator = self._generator(self._samples[network])
             shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
             masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
-        shift = self._shift[network]
-        scale = self._scale[network]
+        shift = self._shift[first]
+        scale = self._scale[first]
 
         def mixtures(x: Tensor) -> Mixture:
             samples = self._mixture(sample_outputs(folded, x, masks))

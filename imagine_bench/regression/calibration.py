@@ -82,7 +82,7 @@ def calibrate(
         }
         for prefix, transform in transforms.items():
             row |= {f"{prefix}coverage_{level:g}": coverage(transform[e], level) for level in LEVELS}
-            row[f"{prefix}transform_distance"] = transform_distance(transform[e])
+            row[f"{prefix}transform_distance"] = scipy.stats.kstest(transform[e].ravel(), "uniform").statistic
         row |= {f"auroc_{name}": auroc(values[e], wrong[e]) for name, values in scores.items()}
         rows.append({name: float(value) for name, value in row.items()})
     arrays = {"transform": transforms[""], "pooled_transform": transforms["pooled_"], "error": error, **scores}
@@ -101,13 +101,6 @@ def probability_transform(mixtures: Mixtures, outcomes: Floats) -> Floats:
 def coverage(transforms: Floats, level: float) -> float:
     """Share of outcomes inside their central predictive interval of probability ``level``, in [0, 1]."""
     return float((np.abs(transforms - 0.5) <= 0.5 * level).mean())
-
-
-def transform_distance(transforms: Floats) -> float:
-    """Kolmogorov-Smirnov distance of the transforms from uniform, in [0, 1]."""
-    values = np.clip(np.sort(transforms.ravel()), 0.0, 1.0)
-    steps = np.arange(len(values) + 1) / len(values)
-    return float(max((steps[1:] - values).max(), (values - steps[:-1]).max()))
 
 
 def crps(mixtures: Mixtures, outcomes: Floats) -> Floats:

@@ -200,8 +200,9 @@ def claim(network: str, words: str, values: Floats, asked: str = "") -> Cells:
     if asked:
         sign, limit = asked.split()
         met = f"{_SIGNS[sign](values, float(limit)).sum()} of {len(values)}"
-    spread = f"{number(float(np.median(values)))} [{number(values.min())}, {number(values.max())}]"
-    return {"network": network, "claim": words, "measured": spread, "asked": asked, "networks that hold": met}
+    ends = f"[{number(values.min())}, {number(values.max())}]"
+    measured = DASH if np.isnan(values).any() else f"{number(float(np.median(values)))} {ends}"
+    return {"network": network, "claim": words, "measured": measured, "asked": asked, "networks that hold": met}
 
 
 def change(pair: PairResult, base: PairResult, kind: str) -> Floats:
@@ -315,10 +316,10 @@ def _robot(result: RegressionResult) -> list[Section]:
         Section(
             "Figures 4.2 and 4.3: the workspace",
             (
-                "Of the first network: how far the arm misses a place that it reaches for, and, as dots, where its tip "
-                "was while babbling; stationarity; the standard deviation of each joint by cause. The line is the edge "
-                "of the workspace: the arm is not sent to places outside (white in the error map), and the "
-                "uncertainties show what the network would say of them.",
+                "Of the first network: where the arm's tip was while babbling, how far it misses a place that it "
+                "reaches for, stationarity, and the standard deviation of each joint by cause. The line is the edge of "
+                "the workspace: the arm is not sent to places outside (white in the error map), and the uncertainties "
+                "show what the network would say of them.",
             ),
             [image(f"figures_4_2_4_3_{p.agent}_{p.variant}", partial(workspace, p.first), p.label) for p in pairs],
         ),
@@ -366,15 +367,16 @@ def workspace(data: Arrays) -> Figure:
     side = round(len(points) ** 0.5)
     x, y = points.T.reshape(2, side, side)
     outside_m = data["map/outside_m"]
+    density = np.histogram2d(*data["babbling"].T, bins=side, range=[(x.min(), x.max())] * 2)[0]
     fields = {
-        "error of reaching (m), training data": data["map/error"][0],
+        "training data (places)": density.T.ravel(),
+        "error of reaching (m)": data["map/error"][0],
         "stationarity (nats)": data["map/stationarity"][0],
     }
     for kind in _KINDS:
         for joint, variances in enumerate(data[f"map/{kind}"][0].T, 1):
             fields[f"{kind}, q{joint} (rad)"] = np.sqrt(variances)
     figure, panels = small_multiples(len(fields), 3, width=3.4, height=3.0)
-    panels[0].scatter(data["babbling"][:, 0], data["babbling"][:, 1], s=1, color=INK, zorder=3)
     for axes, (title, values) in zip(panels, fields.items(), strict=True):
         top = np.percentile(values[outside_m == 0], 99)
         shades = axes.pcolormesh(x, y, values.reshape(side, side), vmin=0, vmax=top)

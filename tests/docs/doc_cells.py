@@ -23,6 +23,8 @@ from imagine_bench.sweep.catalogue import STUDIES
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"
+KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json") if path.parent.name != "report")
+"""The folders of kept benches."""
 
 Runs = dict[int, list[dict[str, str]]]
 

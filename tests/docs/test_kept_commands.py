@@ -1,17 +1,31 @@
-"""Every kept bench names the command that makes it again, and that command still asks for the same comparison."""
+"""Every kept bench names the command that makes it again, and that command still asks for the same comparison.
+
+``docs/results/commands.csv`` has a row a bench: its folder, the command, and the fields of the protocol that today's
+command gives another value, separated by spaces.
+"""
 
 from __future__ import annotations
 
-import csv
+import json
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
-from kept_commands import FOLDERS, NOT_OPTIONS, RESULTS, differing, planned, read
+from doc_cells import KEPT, RESULTS, table
 
-from imagine_bench.cli import main
+from imagine_bench.cli import main, parsed
+from imagine_bench.cli.benches import Bench
+from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.protocols.data import ProtocolData, digest
+from imagine_bench.registry import TASKS
+from imagine_bench.running.bench import plan
+from imagine_bench.running.control import resolved_settings
+from imagine_bench.running.task_types import read_protocol
 
-_COMMANDS = read()
+COMMANDS = {row["folder"]: row for row in table("commands.csv")}
+NOT_OPTIONS = ("encoder", "codes", "sampled_futures", "settings_digest", "agent_names", "dataset")
+"""Fields of a protocol that no option sets: what they were is compared, and a difference is named in the file."""
 
 
 def name(folder: Path) -> str:
@@ -19,34 +33,65 @@ def name(folder: Path) -> str:
 
 
 def words(folder: Path) -> list[str]:
-    program, command, *rest = shlex.split(_COMMANDS[name(folder)].command)
+    program, command, *rest = shlex.split(COMMANDS[name(folder)]["command"])
     assert [program, command] == ["imagine-bench", "bench"]
     return rest
 
 
+def planned(words: list[str]) -> ProtocolData:
+    """The protocol that a command has today, but for its encoders, which only its runs need."""
+    command = parsed(["bench", *words])
+    assert isinstance(command, Bench)
+    task, preset, options = command.asked()
+    options.pop("encoder", None)
+    if task.partition(":")[0] not in TASKS:
+        return plan(task, preset, **options)[0]
+    return protocol(task, preset, **options)
+
+
+def differing(folder: Path, today: ProtocolData) -> list[str]:
+    """The fields of a kept protocol, in today's names, that ``today`` gives another value.
+
+    An older protocol lacks the later fields.
+    """
+    written = read_protocol(folder)
+    kept = _values(written)
+    now = _values(today)
+    if isinstance(today, Protocol):
+        settings = resolved_settings(today)
+        now["settings_digest"] = digest({written.written_name(agent): settings[agent] for agent in settings})
+    fields = json.loads((folder / "bench.json").read_text())["protocol"].keys() - {"encoder", "codes"}
+    return sorted(field for field in fields if kept[field] != now.get(field))
+
+
+def _values(one: ProtocolData) -> dict[str, Any]:
+    """The fields of a protocol as JSON has them, its agents by today's labels."""
+    return {**one.as_dict(), "agents": list(one.agents)}
+
+
 def test_each_kept_bench_has_one_command() -> None:
-    assert list(_COMMANDS) == [name(folder) for folder in FOLDERS]
+    assert list(COMMANDS) == [name(folder) for folder in KEPT]
 
 
-@pytest.mark.parametrize("folder", FOLDERS, ids=name)
+@pytest.mark.parametrize("folder", KEPT, ids=name)
 def test_the_command_asks_for_the_kept_comparison(folder: Path) -> None:
     differs = differing(folder, planned(words(folder)))
-    assert differs == _COMMANDS[name(folder)].differs.split()
+    assert differs == COMMANDS[name(folder)]["differs"].split()
     assert set(differs) <= set(NOT_OPTIONS), "an option of the command does not give what was kept"
 
 
 def test_another_command_would_be_seen() -> None:
-    (folder,) = (folder for folder in FOLDERS if name(folder) == "arrow_puzzle-sb3_imagined")
+    (folder,) = (folder for folder in KEPT if name(folder) == "arrow_puzzle-sb3_imagined")
     assert differing(folder, planned(words(folder))) == []
     assert differing(folder, planned([*words(folder), "--appearance", "mild"])) == ["appearance"]
     assert differing(folder, planned([*words(folder), "--set", "controller.discount=0.5"])) != []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("folder", FOLDERS, ids=name)
+@pytest.mark.parametrize("folder", KEPT, ids=name)
 def test_the_command_leaves_a_bench_of_the_same_shape(folder: Path, tmp_path: Path) -> None:
     """With one seed, one training episode and one test: the same agents, columns and rows a budget."""
-    kept = rows(folder / "results.csv")
+    kept = table(f"{name(folder)}/results.csv")
     small = ["--seeds", "0", "--workers", "1", "--out", str(tmp_path)]
     if "episodes" in kept[0]:
         small += ["--budgets", "1", "--evaluation-episodes", "1"]
@@ -56,18 +101,13 @@ def test_the_command_leaves_a_bench_of_the_same_shape(folder: Path, tmp_path: Pa
         small += ["--after-episodes", "1"]
     assert main(["bench", *words(folder), *small]) == 0
     (made,) = tmp_path.glob("*/results.csv")
-    new = rows(made)
+    new = table(str(made))
     assert fixed_columns(new) == fixed_columns(kept)
     assert [row["agent"] for row in new] == list(dict.fromkeys(row["agent"] for row in kept))
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def fixed_columns(table: list[dict[str, str]]) -> list[str]:
+def fixed_columns(rows: list[dict[str, str]]) -> list[str]:
     """The columns that every bench of the type has; those after them depend on what its agents measured."""
-    names = list(table[0])
+    names = list(rows[0])
     last = "solved" if "solved" in names else "auroc_nll"
     return names[: names.index(last) + 1]

@@ -8,9 +8,8 @@ import runpy
 from pathlib import Path
 
 import pytest
-from doc_cells import RESULTS, ROOT, iqm
+from doc_cells import KEPT, RESULTS, ROOT, iqm
 from doc_tables import PAGES, rewritten, tables, unmarked
-from kept_commands import FOLDERS
 from matplotlib.figure import Figure
 
 from imagine_bench.registry import TASKS
@@ -48,7 +47,7 @@ def test_an_unmarked_number_would_be_found() -> None:
     assert unmarked("| agent | success |\n|---|---|\n| dqn | 96.7 |\n") == ["| agent | success |"]
 
 
-@pytest.mark.parametrize("folder", FOLDERS, ids=name)
+@pytest.mark.parametrize("folder", KEPT, ids=name)
 def test_kept_benches_are_read(folder: Path) -> None:
     facts = json.loads((folder / "bench.json").read_text())
     assert list(facts)[:4] == ["protocol", "protocol_hash", "environment", "sessions"]

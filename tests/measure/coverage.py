@@ -11,7 +11,6 @@ import csv
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -30,17 +29,6 @@ _CHANCE = 0.16  # where these are, as a greedy policy that always chooses the sa
 _TESTS = 200  # test episodes a seed
 _SIZE = 2_000  # members of a population
 _CELLS = (3, 2)  # budgets of a table, and agents beside the base
-
-
-@dataclass(frozen=True, kw_only=True)
-class Kept:
-    """Measured rates of intervals and tests, at one number of seeds and one share of stuck ones."""
-
-    seeds: int
-    stuck: float
-    coverage: float  # share of 95 % intervals that hold the population's interquartile mean
-    false_cell: float  # share of differences that do not exist and have p < 0.05
-    false_table: float  # share of tables of six such with any that is claimed, by Holm
 
 
 def populations(results: Path) -> list[Floats]:
@@ -64,8 +52,13 @@ def populations(results: Path) -> list[Floats]:
     return many
 
 
-def measure(scores: list[Floats], draws: int, rng: np.random.Generator) -> Iterator[Kept]:
-    """Judge ``draws`` benches of every kind, each from a population of its own that ``scores`` give."""
+def measure(scores: list[Floats], draws: int, rng: np.random.Generator) -> Iterator[dict[str, float]]:
+    """Judge ``draws`` benches of every kind, each from a population of its own that ``scores`` give.
+
+    A row has the number of ``seeds``, the share of ``stuck`` ones, ``coverage``, the share of 95 % intervals that hold
+    the population's interquartile mean, ``false_cell``, the share of differences that do not exist and have p < 0.05,
+    and ``false_table``, the share of tables of six such with any that is claimed, by Holm.
+    """
     for stuck in STUCK:
         members = [_members(shares, stuck, rng) for shares in scores]
         truth = [statistics.iqm(each) for each in members]
@@ -81,10 +74,8 @@ def measure(scores: list[Floats], draws: int, rng: np.random.Generator) -> Itera
                 ]
                 cells.append(np.mean([p < 1.0 - statistics.LEVEL for p in tests]))
                 tables.append(statistics.holm(tests).min() < 1.0 - statistics.LEVEL)
-            yield Kept(
-                seeds=count, stuck=stuck, coverage=float(np.mean(held)), false_cell=float(np.mean(cells)),
-                false_table=float(np.mean(tables)),
-            )  # fmt: skip
+            rates = zip(("coverage", "false_cell", "false_table"), (held, cells, tables), strict=True)
+            yield {"seeds": count, "stuck": stuck, **{name: float(np.mean(found)) for name, found in rates}}
 
 
 def main(draws: int = 2_000, results: Path = RESULTS, out: Path = Path("runs/coverage.json")) -> None:
@@ -94,10 +85,10 @@ def main(draws: int = 2_000, results: Path = RESULTS, out: Path = Path("runs/cov
     print("| seeds | stuck, % | intervals that hold, % | false claims a cell, % | a table of six, % |")
     print("|---|---|---|---|---|")
     rows = []
-    for kept in measure(scores, draws, SeedTree(0).child("coverage").generator()):
-        rows.append(asdict(kept))
-        values = (kept.stuck, kept.coverage, kept.false_cell, kept.false_table)
-        print(f"| {kept.seeds} | " + " | ".join(f"{100.0 * value:.1f}" for value in values) + " |", flush=True)
+    for row in measure(scores, draws, SeedTree(0).child("coverage").generator()):
+        rows.append(row)
+        seeds, *shares = row.values()
+        print(f"| {seeds} | " + " | ".join(f"{100.0 * share:.1f}" for share in shares) + " |", flush=True)
     facts = {"populations": len(scores), "draws": draws, "seed": 0, "environment": describe_environment()}
     write_json(out, {**facts, "rows": rows})
 

@@ -13,8 +13,6 @@ from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, WorldModelSettings
 from imagine_bench.agents.imagination.world_model import EnvironmentModel, log_cosh
-from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
-from imagine_bench.agents.networks.weight_samples import sample_outputs
 from imagine_bench.agents.regressors.regressor import MixtureRegressor
 from imagine_bench.agents.regressors.settings import RegressorSettings
 from imagine_bench.agents.replay import Batch
@@ -26,9 +24,6 @@ from imagine_bench.seeding import SeedTree
 
 LATENTS, ACTIONS = 24, 6
 """Those of the arrow puzzle's bundled encoders."""
-_SIZES = (2, 256, 256, 256, mdn.output_size(10, 3))
-"""Those of a regressor of chapter 4."""
-_DROPOUT = 0.2
 
 
 def least_cpu_s(actions: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
@@ -47,21 +42,22 @@ class _PlainMLP(nn.Module):
 
     def __init__(self, sizes: tuple[int, ...], members: int, dropout: float, draws: torch.Generator) -> None:
         super().__init__()
-        self.dropout, self.draws = dropout, draws
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        self.dropout = dropout
+        self.draws = draws
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
         for n_in, n_out in pairwise(sizes):
             self.weights.append(torch.randn(members, n_in, n_out, generator=draws) * math.sqrt(2.0 / (n_in + n_out)))
             self.biases.append(torch.zeros(members, 1, n_out))
 
     def forward(self, x: Tensor) -> Tensor:
-        for layer, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            x = torch.baddbmm(bias, x, weight)
-            if layer < len(self.weights) - 1:
-                x = x.relu()
-                if self.dropout > 0.0:
-                    kept = torch.empty_like(x).bernoulli_(1.0 - self.dropout, generator=self.draws)
-                    x = x * kept.div_(1.0 - self.dropout)
-        return x
+        *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
+        for inner, shift in hidden:
+            x = torch.baddbmm(shift, x, inner).relu()
+            if self.dropout > 0.0:
+                kept = torch.empty_like(x).bernoulli_(1.0 - self.dropout, generator=self.draws)
+                x = x * kept.div_(1.0 - self.dropout)
+        return torch.baddbmm(bias, x, weight)
 
 
 class PlainWorldModel:
@@ -127,23 +123,6 @@ def model_update(hyperparameters: str, rounds: int = 25) -> dict[str, float]:
     plain = PlainWorldModel(LATENTS, ACTIONS, settings, draws)
     own = EnvironmentModel(LATENTS, ACTIONS, settings, draws)
     return least_cpu_s({"plain": lambda: plain.update(batch), "ours": lambda: own.update(batch, draws)}, rounds)
-
-
-def weight_samples(rows: int, samples: int, rounds: int) -> dict[str, float]:
-    """T weight samples of a regressor for N rows: in one pass, and in a loop of forward passes."""
-    prepare_torch("cpu")
-    draws = torch.Generator().manual_seed(0)
-    network = MemberMLP(_SIZES, members=1, dropout=_DROPOUT, generator=draws)
-    x = torch.randn(rows, _SIZES[0], generator=draws)
-    masks = [dropout_mask((samples, units), _DROPOUT, draws) for units in _SIZES[1:-1]]
-
-    @torch.no_grad()
-    def loop() -> None:
-        outputs = x.new_empty(samples, rows, _SIZES[-1])
-        for t in range(samples):
-            outputs[t] = network(x[None], tuple(mask[t].view(1, 1, -1) for mask in masks))[0]
-
-    return least_cpu_s({"ours": lambda: sample_outputs(network, x, masks), "plain": loop}, rounds)
 
 
 def training(networks: int, rows: int, updates: int, rounds: int) -> dict[str, float]:

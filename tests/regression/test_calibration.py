@@ -14,7 +14,6 @@ from imagine_bench.regression.calibration import (
     crps,
     log_score,
     probability_transform,
-    transform_distance,
 )
 from imagine_bench.seeding import SeedTree
 
@@ -63,9 +62,7 @@ def test_transforms_are_the_cdf_and_uniform_for_the_truth() -> None:
     outcomes = m.means[rows, chosen] + m.sigmas[rows, chosen] * rng.standard_normal((2000, 2))
     transforms = probability_transform(m, outcomes)
     assert transforms[5, 1] == pytest.approx(cdf(m, 5, 1, outcomes[5, 1]))
-    found = stats.kstest(transforms.ravel(), "uniform")
-    assert found.pvalue > 0.01
-    assert transform_distance(transforms) == pytest.approx(found.statistic)
+    assert stats.kstest(transforms.ravel(), "uniform").pvalue > 0.01
     assert coverage(transforms, 0.8) == pytest.approx(0.8, abs=0.03)
     assert coverage(np.array([0.0, 0.1, 0.25, 0.5, 0.9]), 0.5) == 2 / 5
 

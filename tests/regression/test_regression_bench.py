@@ -15,6 +15,7 @@ from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.cli.observers import observers_of
 from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces.regression import SCORES
 from imagine_bench.protocols.runs import Progress, RunSpec
 from imagine_bench.regression.results import PairResult, RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
@@ -158,42 +159,30 @@ def test_a_page_shows_every_table_and_figure(toy: RegressionRun, tmp_path: Path)
     assert ">nan" not in page.read_text()
 
 
-def robot(places: int) -> tuple[RunSpec, RegressionRun]:
-    """A run of two networks that chose once among three places, of which each score prefers another."""
+PREFERS = {"epistemic": 0, "aleatoric": 1, "modal": 2, **dict.fromkeys(SCORES[3:], 0)}
+"""Which of three places each score prefers."""
+
+
+def robot() -> RegressionRun:
+    """A run of two networks that chose four times among three places."""
     rng = np.random.default_rng(0)
-    spec = tiny("robot_ik", variants=("1000",))
-    side = np.linspace(-1.1, 1.1, places)
+    side = np.linspace(-1.1, 1.1, 9)
     points = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    arrays: dict[str, Any] = {"babbling": points, "map/points": points, "map/outside_m": np.hypot(*points.T) > 0.9}
-    for name in ("epistemic", "aleatoric", "modal"):
-        arrays[f"map/{name}"] = rng.random((2, len(points), 3))
-    arrays |= {f"map/{name}": rng.random((2, len(points))) for name in ("error", "stationarity")}
+    arrays = {"babbling": points, "map/points": points, "map/outside_m": np.hypot(*points.T) > 0.9}
+    arrays |= {f"map/{name}": rng.random((2, 81, 3)) for name in SCORES[:3]}
+    arrays |= {f"map/{name}": rng.random((2, 81)) for name in ("error", "stationarity")}
     for part in ("decision", "disc"):
-        arrays |= {f"{part}/{name}": rng.random((2, 4, 3)) for name in (*PREFERS,)}
         arrays[f"{part}/error"] = np.tile([0.1, 0.2, 0.6], (2, 4, 1))
         arrays |= {f"{part}/{name}": np.tile(np.roll([0, 1, 2], place), (2, 4, 1)) for name, place in PREFERS.items()}
     arrays["decision/known_model"] = np.zeros((2, 4))
-    rows = [{"variant": "1000", "network": index, **MEASURES} for index in (0, 1)]
-    found = RegressionRun(
-        agent="mc_dropout", seed=0, settings={}, rows=rows, evaluations={"1000": arrays}, folder=Path(), recording=None
-    )
-    return spec, found
-
-
-PREFERS = {
-    "epistemic": 0, "aleatoric": 1, "modal": 2, "epistemic_plus_aleatoric": 0,
-    "total": 0, "stationarity": 0, "sampled_component": 0, "nll": 0,
-}  # fmt: skip
-MEASURES = {
-    f"{prefix}{name}": 0.5
-    for prefix in ("", "pooled_")
-    for name in ("coverage_0.5", "coverage_0.8", "coverage_0.95", "transform_distance", "crps_shared", "wrong")
-} | {f"auroc_{name}": 0.5 for name in PREFERS}
+    measured = ("coverage_0.5", "coverage_0.8", "coverage_0.95", "transform_distance", "crps_shared")
+    names = [*measured, *(f"pooled_{name}" for name in measured), "wrong", *(f"auroc_{name}" for name in SCORES)]
+    rows = [{"variant": "1000", "network": index, **dict.fromkeys(names, 0.5)} for index in (0, 1)]
+    return RegressionRun(agent="mc_dropout", seed=0, rows=rows, evaluations={"1000": arrays}, folder=Path())
 
 
 def test_table_4_1_sums_the_errors_of_the_places_of_least_uncertainty(tmp_path: Path) -> None:
-    spec, found = robot(places=9)
-    result = result_of(spec, found, tmp_path)
+    result = result_of(tiny("robot_ik", variants=("1000",)), robot(), tmp_path)
     (pair,) = result.pairs.values()
     sums, ratios = choices(pair, "decision")
     by_hand = {
@@ -249,14 +238,11 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--task", "robot_ik", "--variants", "5"], "a number of samples in [20, 1000000], such as 2000, not '5'"),
-        (["--task", "toy_regression", "--variants", "bse"], "No variant of toy_regression 'bse'. Did you mean 'base'?"),
         (["--task", "toy_regression", "--agents", "dqn"], "No regressor 'dqn'. Known: mc_dropout, ensemble."),
         (
             ["--task", "toy_regression", "--networks", "0"],
             "networks is 0 and test_points 50; they must lie in [1, 1000",
         ),
-        (["--task", "toy_regression", "--budgets", "5"], "toy_regression takes no --budgets; leave it out."),
         (["--task", "toy_regression", "--encoder", "x"], "toy_regression takes no --encoder; leave it out."),
         (["--task", "toy_regression", "--set", "members=1"], "Settings members is 1 and dropout is 0: all weight"),
         (["--task", "toy_regression", "--set", "hidden=[64]"], "dropout acts between hidden layers, so it needs at"),

@@ -28,8 +28,8 @@ def causes(samples: Mixture, sigma: float) -> dict[str, float]:
     parts = decompose(samples)
     mean = (samples.log_weights.exp()[..., None] * samples.means).sum(dim=-2).mean()
     return {
-        "bias²": (toy.true_mean(np.array(X)) - float(mean)) ** 2, "epistemic": float(parts.epistemic),
-        "aleatoric": sigma**2, "modal": float(toy.true_modal(np.array(X))),
+        "bias²": (toy.branches(np.array(X)).mean() - float(mean)) ** 2, "epistemic": float(parts.epistemic),
+        "aleatoric": sigma**2, "modal": float(toy.branches(np.array(X)).var()),
         "spread": float(parts.aleatoric + parts.modal),
     }  # fmt: skip
 

@@ -19,14 +19,6 @@ def test_branches_by_hand() -> None:
     np.testing.assert_allclose(toy.branches(np.array(2.0)), expected)
 
 
-def test_the_truth_is_the_moments_of_the_process() -> None:
-    x = np.full(400_000, 4.2)
-    chosen = rng().integers(3, size=len(x))
-    f = toy.branches(x)[np.arange(len(x)), chosen]
-    assert toy.true_mean(x[:1])[0] == pytest.approx(f.mean(), abs=0.03)
-    assert toy.true_modal(x[:1])[0] == pytest.approx(f.var(), rel=0.01)
-
-
 @pytest.mark.parametrize("variant", toy.VARIANTS)
 def test_data_has_the_counts_and_the_noise_of_its_variant(variant: str) -> None:
     data = toy.training(variant, rng())
