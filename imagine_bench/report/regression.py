@@ -343,21 +343,16 @@ def choices(pair: PairResult, part: str) -> list[Cells]:
     for name in ("known_model", "mink_error"):  # the latter in runs of before 2026-11-28
         if f"{part}/{name}" in pair.first:
             found["known_model"] = pair.arrays(f"{part}/{name}")
-    sums = {name: each.sum(axis=1) for name, each in found.items()}
-    ratios = {name: statistics.ratio(sums[name], sums["random"], paired=True) for name in SCORES}
-    blank = dict.fromkeys(("measure", "network", *map(_words, (*sums, "known_model"))), DASH)
+    sums = {_words(name): each.sum(axis=1) for name, each in found.items()}
+    ratios = {name: statistics.ratio(sums[name], sums["random"], paired=True) for name in map(_words, SCORES)}
     prefix = "" if part == "decision" else f"{part}_"
+    blank = dict.fromkeys(("measure", "network", *sums, "known model"), DASH)
+    texts = {
+        "error_m": {name: mean_std(values) for name, values in sums.items()},
+        "ratio_to_random": {name: estimate(ratio, decimals) for name, ratio in ratios.items()},
+    }
     return [
-        {
-            **blank,
-            "measure": f"{prefix}{measure}",
-            "network": pair.label,
-            **{_words(name): cells[name] for name in cells},
-        }
-        for measure, cells in (
-            ("error_m", {name: mean_std(values) for name, values in sums.items()}),
-            ("ratio_to_random", {name: estimate(ratio, decimals) for name, ratio in ratios.items()}),
-        )
+        {**blank, "measure": f"{prefix}{measure}", "network": pair.label, **cells} for measure, cells in texts.items()
     ]
 
 
@@ -367,7 +362,9 @@ def workspace(data: Arrays) -> Figure:
     side = round(len(points) ** 0.5)
     x, y = points.T.reshape(2, side, side)
     outside_m = data["map/outside_m"]
-    density = np.histogram2d(*data["babbling"].T, bins=side, range=[(x.min(), x.max())] * 2)[0]
+    tips = data["babbling"]
+    square = [[x.min(), x.max()], [y.min(), y.max()]]
+    density = np.histogram2d(tips[:, 0], tips[:, 1], bins=side, range=square)[0]
     fields = {
         "training data (places)": density.T.ravel(),
         "error of reaching (m)": data["map/error"][0],

@@ -13,6 +13,8 @@ from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, WorldModelSettings
 from imagine_bench.agents.imagination.world_model import EnvironmentModel, log_cosh
+from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
+from imagine_bench.agents.networks.weight_samples import sample_outputs
 from imagine_bench.agents.regressors.regressor import MixtureRegressor
 from imagine_bench.agents.regressors.settings import RegressorSettings
 from imagine_bench.agents.replay import Batch
@@ -123,6 +125,24 @@ def model_update(hyperparameters: str, rounds: int = 25) -> dict[str, float]:
     plain = PlainWorldModel(LATENTS, ACTIONS, settings, draws)
     own = EnvironmentModel(LATENTS, ACTIONS, settings, draws)
     return least_cpu_s({"plain": lambda: plain.update(batch), "ours": lambda: own.update(batch, draws)}, rounds)
+
+
+def weight_samples(rows: int, samples: int, rounds: int) -> dict[str, float]:
+    """T weight samples of a regressor for N rows: in one pass, and in a loop of forward passes."""
+    prepare_torch("cpu")
+    draws = torch.Generator().manual_seed(0)
+    sizes = (2, 256, 256, 256, mdn.output_size(10, 3))
+    network = MemberMLP(sizes, members=1, dropout=0.2, generator=draws)
+    x = torch.randn(rows, 2, generator=draws)
+    masks = [dropout_mask((samples, units), 0.2, draws) for units in sizes[1:-1]]
+
+    @torch.no_grad()
+    def loop() -> None:
+        outputs = x.new_empty(samples, rows, sizes[-1])
+        for t in range(samples):
+            outputs[t] = network(x[None], tuple(mask[t].view(1, 1, -1) for mask in masks))[0]
+
+    return least_cpu_s({"ours": lambda: sample_outputs(network, x, masks), "plain": loop}, rounds)
 
 
 def training(networks: int, rows: int, updates: int, rounds: int) -> dict[str, float]:

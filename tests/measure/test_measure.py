@@ -54,8 +54,8 @@ def test_lanes_are_timed_beside_one_environment_and_threads() -> None:
 
 
 def test_a_frame_costs_little_more_than_mujocos_drawing_alone() -> None:
-    frame, step, kept = speed.drawing(registry.task("arrow_puzzle"))
-    assert frame.met and step.met and kept.met
+    frame, step = speed.drawing(registry.task("arrow_puzzle"))
+    assert frame.met and step.met
     assert " against " in frame.measured and frame.measured.endswith("CPU ms)")
 
 
