@@ -35,14 +35,15 @@ def record_toy(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, name:
     ``evaluations`` are by variant; ``name`` is the regressor's. ``path``, which is returned, ends in ``.rrd``. Timeline
     ``x_hundredths``, entities ``/<variant>/...``.
     """
-    columns = []
-    for variant in evaluations:
-        words = {"y": f"data and predictions ({name})", **{kind: f"{kind} (std of y)" for kind in _KINDS}}
-        views = [
-            rrb.TimeSeriesView(origin=f"/{variant}/{part}", name=f"{variant}: {text}, over 100 x")
-            for part, text in words.items()
-        ]
-        columns.append(rrb.Vertical(*views))
+    columns = [
+        rrb.Vertical(
+            *(
+                rrb.TimeSeriesView(origin=f"/{variant}/{part}", name=f"{name}, {variant}: {part} over 100 x")
+                for part in ("y", *_KINDS)
+            )
+        )
+        for variant in evaluations
+    ]
     layout = rrb.Blueprint(rrb.Horizontal(*columns), rrb.TimePanel(timeline=_TIMELINE), collapse_panels=True)
     with recording_file(path, task.id, layout) as recording:
         for variant, data in evaluations.items():
