@@ -183,7 +183,8 @@ def _levels(result: SuiteResult) -> Section:
             row = rows.setdefault((experiment, level.name), {"experiment": experiment, "level": level.name})
             row |= {"world": level.task, "real episodes": f"{level.episodes:,}"}
             for end in ("chance", "optimum"):
-                row[f"{end}, %"] = percent(getattr(found.scale, end, math.nan))
+                known = percent(getattr(found.scale, end, math.nan))
+                row[end] = row.get(end, DASH) if known == DASH else known
             row[agent] = percent(float(found.values.mean()))
     caption = "Test episodes solved, or AUROC, in %: means over seeds."
     header = ["experiment", "level", "world", "real episodes", "chance, %", "optimum, %"]
