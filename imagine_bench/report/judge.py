@@ -18,13 +18,25 @@ from imagine_bench import registry
 from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.change import FALSE_ALARMS, LENGTH, SLIP
-from imagine_bench.judge.judgement import Judgement, kept, shown
+from imagine_bench.judge.judgement import Judgement, kept, prepare, shown
 from imagine_bench.judge.models import model_entry, runs_of
 from imagine_bench.judge.scores import COVERAGES
+from imagine_bench.judge.truth import sampling_noise_floor, shares
 from imagine_bench.recording.filmstrips import TileRow, png, transition_sheet
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report.page import flat, write_page
-from imagine_bench.report.tables import DASH, Image, Page, Section, Table, estimate, number, over_seeds, p_value
+from imagine_bench.report.tables import (
+    DASH,
+    Image,
+    Page,
+    Section,
+    Table,
+    decimals,
+    estimate,
+    number,
+    over_seeds,
+    p_value,
+)
 from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import difference, holm, iqm
 from imagine_bench.store.files import read_json, table_text
@@ -195,8 +207,16 @@ def in_short(found: Judged) -> Section:
         "A reader that was trained apart turns imagined images into macrostates. Of real frames, it misreads some or "
         "refuses to read them; fog, noise and blends of two frames should not be read."
     )
+    samples = found.judgement.samples
+    truth = prepare(found.judgement, found.folder).rollouts.truth
+    noise = np.mean([[sampling_noise_floor(shares(each), samples) for each in steps] for steps in truth], axis=0)
+    chance = f"Drawing only {samples} futures adds at most {', '.join(map(decimals, noise))} to it, by depth."
     reader = Table.of("reader", [errors], "What the reader of images gets wrong itself.")
-    return Section("In short", [words], tables=[_scores(found, "short", SHORT), reader])
+    return Section(
+        "In short",
+        [words, f"Total variation is by imagined depth. {chance}"],
+        tables=[_scores(found, "short", SHORT), reader],
+    )
 
 
 def question(found: Judged, title: str) -> Section:
