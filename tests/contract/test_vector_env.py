@@ -16,7 +16,6 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, NormalizeReward, RecordEpisodeStatistics
 from imagine_bench.tasks.rendering import renderer as rendering
-from worlds import WORLDS
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
@@ -71,54 +70,41 @@ def walk_both(one, other, steps, n_actions, *, mask):
     return ended
 
 
+SAME_STEP = AutoresetMode.SAME_STEP
+
+
 @pytest.mark.parametrize(
-    ("name", "execution", "steps", "world"),
+    ("name", "execution", "mode", "steps", "world"),
     [
-        ("Arrows", "kinematic", 16, {"cubes": 1}),
-        ("Arrows", "kinematic", 16, {"cubes": 5, "gesture": 0.5, "lag": 2, "slip": 0.3, "fickle": 0.3}),
-        ("PickPlace", "kinematic", 16, {"gesture": "first", "distractors": 2}),
-        ("Arrows", "physics", 3, {"cubes": 5, "coupling": "neighbour", "slip": 0.3, "distractors": 3}),
-        ("PickPlace", "physics", 4, {"gesture": 0.5, "lag": 1, "slip": 0.5}),
+        ("Arrows", "kinematic", SAME_STEP, 16, {"cubes": 1}),
+        (
+            "Arrows", "kinematic", SAME_STEP, 16, {"cubes": 5, "gesture": 0.5, "lag": 2, "slip": 0.3, "fickle": 0.3}
+        ),
+        ("PickPlace", "kinematic", SAME_STEP, 16, {"gesture": "first", "distractors": 2}),
+        ("Arrows", "physics", SAME_STEP, 3, {"cubes": 5, "coupling": "neighbour", "slip": 0.3, "distractors": 3}),
+        ("PickPlace", "physics", SAME_STEP, 4, {"gesture": 0.5, "lag": 1, "slip": 0.5}),
+        ("PickPlace", "kinematic", AutoresetMode.NEXT_STEP, 8, {"observation": "frame,state,proprio", "size": 32}),
+        *(("ArrowPuzzle", "kinematic", mode, 16, {"max_episode_steps": 2}) for mode in MODES),
+        ("PickPlace", "kinematic", MODES[0], 16, {"max_episode_steps": 2}),
+        *(
+            pytest.param("PickPlace", "kinematic", mode, 16, {"max_episode_steps": 2}, marks=pytest.mark.slow)
+            for mode in MODES[1:]
+        ),
     ],
-)
-def test_lanes_of_any_world_step_as_sync(name, execution, steps, world):
+)  # fmt: skip
+def test_lanes_of_any_world_step_as_sync_in_every_mode(name, execution, mode, steps, world):
+    """Through ends by rule and by the limit, with any observation."""
     options = {"execution": execution, "appearance": "strong", "max_episode_steps": 3, **world}
     make_vec = functools.partial(gymnasium.make_vec, num_envs=2, **options)
-    mode = {"autoreset_mode": AutoresetMode.SAME_STEP}
-    sync = make_vec(f"imagine_bench/{name}-v0", vectorization_mode="sync", vector_kwargs=mode)
-    vector = make_vec(f"imagine_bench/{name}-vector-v0", threads=3, **mode)
-    ended = walk_both(sync, vector, steps, sync.single_action_space.n, mask=False)
-    assert ended.sum() > 0
+    sync = make_vec(f"imagine_bench/{name}-v0", vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode})
+    vector = make_vec(f"imagine_bench/{name}-vector-v0", threads=3, autoreset_mode=mode)
+    n_actions = int(sync.single_action_space.n)
+    ended = walk_both(sync, vector, steps, n_actions, mask=mode == AutoresetMode.DISABLED)
+    assert (ended > 0).all() if world == {"max_episode_steps": 2} else ended.sum() > 0
     for one, other in zip(sync.envs, vector.envs, strict=True):
         for field in ("qpos", "qvel", "mocap_pos"):
             assert np.array_equal(getattr(one.unwrapped.data, field), getattr(other.data, field))
-    sync.close()
-    vector.close()
-
-
-@pytest.mark.parametrize(
-    ("task", "mode"),
-    [
-        *((WORLDS[0], mode) for mode in MODES),
-        *((WORLDS[1], mode) for mode in MODES[:1]),
-        *(pytest.param(WORLDS[1], mode, marks=pytest.mark.slow) for mode in MODES[1:]),
-    ],
-)
-def test_lanes_step_as_sync_in_every_mode(task, mode):
-    """Through ends by rule and by the limit."""
-    options = {**KINEMATIC, "appearance": "strong", "max_episode_steps": 2}
-    sync, vector = make_sync(task, mode, **options), make(task, autoreset_mode=mode, **options)
-    ended = walk_both(sync, vector, 16, sync.single_action_space.n, mask=mode == AutoresetMode.DISABLED)
-    assert (ended > 0).all()
-    sync.close()
-    vector.close()
-
-
-def test_observations_of_choice_are_batched():
-    options, mode = {**KINEMATIC, "observation": "frame,state,proprio", "size": 32}, AutoresetMode.NEXT_STEP
-    sync, vector = make_sync("pick_place", mode, **options), make("pick_place", autoreset_mode=mode, **options)
-    walk_both(sync, vector, 8, 3, mask=False)
-    assert vector.observation_space.contains(vector.step(np.zeros(3, dtype=int))[0])
+    assert mode == AutoresetMode.DISABLED or vector.observation_space.contains(vector.step(np.zeros(2, dtype=int))[0])
     sync.close()
     vector.close()
 
