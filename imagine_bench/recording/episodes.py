@@ -188,7 +188,7 @@ class _EpisodeRecorder:
         if isinstance(scene, SceneReader):
             if self._env_step == 0:
                 sequences["imagined_depth"] = 0
-            log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences, only_moved=True)
+            log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences)
         return observation
 
     def _unseen_frame(self, scene: Env, info: Info) -> Frame:

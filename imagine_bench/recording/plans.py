@@ -75,14 +75,14 @@ class _PlanRecorder:
         moments: list[tuple[float, int]] = []
 
         def on_plan(*_: object) -> None:
-            self._arrive(only_moved=False)
+            self._arrive()
             moments.append((self._clock_s, self._env_step))
             self._clock_s += _LOOK_S
 
         def on_step(_: int) -> None:
             self._clock_s += macro_duration_s(self._env.unwrapped)
             self._env_step += 1
-            self._arrive(only_moved=True)
+            self._arrive()
             moments.append((self._clock_s, self._env_step))
 
         plan = carry_out(
@@ -94,13 +94,12 @@ class _PlanRecorder:
         self._clock_s += _LOOK_S
         self._env_step += 1
 
-    def _arrive(self, *, only_moved: bool) -> None:
+    def _arrive(self) -> None:
         scene = self._env.unwrapped
         self._recording.set_clocks(self._clock_s, env_step=self._env_step)
         if isinstance(scene, SceneReader):
             sequences = {"env_step": self._env_step, "plan": self._number}
-            motion = scene.motion()
-            log_motion(self._recording, motion, end_s=self._clock_s, sequences=sequences, only_moved=only_moved)
+            log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences)
 
     def _show(self, plan: PlanResult, done: int) -> None:
         """What was imagined, and what is real so far."""

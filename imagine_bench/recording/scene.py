@@ -46,19 +46,18 @@ def log_shapes(recording: Recording, shapes: Sequence[Shape3D]) -> None:
 
 
 def log_motion(
-    recording: Recording, motion: Motion, *, end_s: float, sequences: dict[str, int], only_moved: bool
+    recording: Recording, motion: Motion, *, end_s: float, sequences: dict[str, int], only_moved: bool = True
 ) -> None:
     """Log the bodies' poses over one macro-action, but for those that stood still where ``only_moved``.
 
     A motion of one sample is how the scene stands, and logged whole. It was over at ``end_s`` on the timeline
     ``sim_time``, in seconds; ``sequences`` are values of the sequence timelines, the same for all samples.
     """
-    only_moved = only_moved and len(motion.time_s) > 1
     times = [rr.TimeColumn("sim_time", duration=end_s - motion.time_s[-1] + motion.time_s)]
     times += [rr.TimeColumn(name, sequence=np.full(len(motion.time_s), value)) for name, value in sequences.items()]
     for index, body in enumerate(motion.body_names):
         poses = motion.poses_in_world[:, index]  # [K, 7]
-        if only_moved and np.abs(poses - poses[0]).max() < _STILL_M:
+        if only_moved and len(poses) > 1 and np.abs(poses - poses[0]).max() < _STILL_M:
             continue
         columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=_xyzw(poses[:, 3:]))
         recording.stream.send_columns(_body_path(body), indexes=times, columns=columns, strict=True)
