@@ -147,13 +147,6 @@ def test_a_former_command_runs_the_new_one(
     assert sentence is None or sentence in others[0]
 
 
-@pytest.mark.parametrize(("word", "line"), [("speed", "make speed"), ("coverage", "python tests/measure/coverage.py")])
-def test_a_command_that_went_names_the_line_to_type(word: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([word, "--turns", "5"]) == 2
-    assert f"In a checkout type: {line}." in capsys.readouterr().err
-    assert (Path(__file__).parents[1] / "tests/measure" / f"{word}.py").exists()
-
-
 def test_a_task_is_the_first_word_or_an_option(capsys: pytest.CaptureFixture[str]) -> None:
     for command in (["bench", "--preset", "x"], ["judge"], ["sweep"], ["encoder"], ["describe"], ["dataset"], ["play"]):
         said = set()
@@ -165,13 +158,6 @@ def test_a_task_is_the_first_word_or_an_option(capsys: pytest.CaptureFixture[str
 
 def test_there_are_fourteen_commands() -> None:
     assert len(get_args(Command)) == 14
-
-
-def test_the_program_itself_exits_without_a_traceback() -> None:
-    command = [sys.executable, "-m", "imagine_bench", "bench", "--task", "pick"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("imagine-bench: No task 'pick'.") and len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize("word", ["--help", "describe"])

@@ -47,16 +47,6 @@ def test_reached_macrostates_stand_in_for_listed_ones(name):
         assert spec.rules.is_terminal(state) or action == best[state]
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_where_the_horizon_suffices_it_changes_nothing(name):
-    spec = registry.task(name)
-    tables = tabulate(spec.rules)
-    found, known = horizon_optimum(tables, spec.horizon), spec.facts()
-    assert found.success[tables.starts].mean() == pytest.approx(known.optimum, abs=1e-12)
-    play = [row for state, row in tables.index.items() if not spec.rules.is_terminal(state)]
-    assert (found.actions[-1][play] == optimal_policy(tables)[play]).all()
-
-
 def _plainly(rules, horizon):
     """The largest success probability from each start, by recursion over outcomes."""
 

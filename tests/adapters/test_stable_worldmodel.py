@@ -30,22 +30,22 @@ def chance(task):
 def test_only_success_terminates_and_all_else_is_as_before(task):
     plain = gymnasium.make(entry(task).env_id, **KINEMATIC)
     wrapped = SuccessTerminates(gymnasium.make(entry(task).env_id, **KINEMATIC))
-    rng, ends = np.random.default_rng(0), {"success": 0, "illegal": 0, "limit": 0}
+    rng = np.random.default_rng(0)
+    ends = set()
     for seed in range(40):
         one, other = plain.reset(seed=seed), wrapped.reset(seed=seed)
-        over, steps = False, 0
+        over = False
         while not over:
             assert np.array_equal(one[0], other[0]) and one[-1].keys() == other[-1].keys()
             wrapped.unwrapped.np_random.integers(9)  # as the library does
-            action, steps = (rng.integers(plain.action_space.n) if seed % 3 else steps % 2), steps + 1
+            action = rng.integers(plain.action_space.n)
             one, other = plain.step(action), wrapped.step(action)
             _, reward, terminated, truncated, info = one
             over = terminated or truncated
-            assert other[1] == reward and (other[2] or other[3]) == over and not (other[2] and other[3])
-            assert other[2] is bool(info["success"])
-            assert all(not isinstance(value, np.bool_) for value in other[-1].values())
-        ends["success" if other[2] else "illegal" if terminated else "limit"] += 1
-    assert ends["success"] and ends["illegal"], "non-vacuous"
+            assert other[1:4] == (reward, bool(info["success"]), over and not info["success"])
+            assert all(not isinstance(value, np.bool_) for value in (*other[2:4], *other[-1].values()))
+        ends.add((terminated, other[2]))
+    assert ends >= {(True, True), (True, False)}, "non-vacuous"
     plain.close()
     wrapped.close()
 
@@ -77,17 +77,15 @@ def world(task, n=4, *, wrapped=True, **options):
 
 
 @pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
-def test_a_random_policy_scores_chance(task):
+def test_a_random_policy_scores_chance_and_without_the_wrapper_nearly_everything(task):
     made, n = world(task), 1000
     result, level = made.evaluate(episodes=n, seed=0), chance(task)
     assert result["success_rate"] / 100 == pytest.approx(level, abs=3 * np.sqrt(level * (1 - level) / n))
     made.close()
-
-
-def test_without_the_wrapper_it_scores_nearly_100_percent():
-    made = world("arrow_puzzle", wrapped=False, width=32, height=24)
-    assert made.evaluate(episodes=100, seed=0)["success_rate"] > 95
-    made.close()
+    if task == "arrow_puzzle":
+        bare = world(task, wrapped=False, width=32, height=24)
+        assert bare.evaluate(episodes=100, seed=0)["success_rate"] > 95
+        bare.close()
 
 
 def test_what_is_collected_is_evaluated_from(tmp_path):
