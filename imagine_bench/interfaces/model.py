@@ -69,14 +69,6 @@ def require_imagined(imagined: object, *, name: str, rows: int, depth: int, samp
         raise InvalidValueError(f"{said} gave {type(imagined).__name__}; give an Imagined.")
     given = {field.name: getattr(imagined, field.name) for field in fields(Imagined)}
     offered = {each: array for each, array in given.items() if array is not None}
-    _require_numbers(offered, said)
-    _require_shapes(offered, said, (rows, samples, depth))
-    _require_ranges(offered, said)
-    return imagined
-
-
-def _require_numbers(offered: Arrays, said: str) -> None:
-    """Raise InvalidValueError for what is no array of finite numbers."""
     for each, array in offered.items():
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
             raise InvalidValueError(f"{said} gave {each} of {type(array).__name__}; give an array of numbers.")
@@ -84,6 +76,9 @@ def _require_numbers(offered: Arrays, said: str) -> None:
             raise InvalidValueError(f"{said} gave {each} of {array.dtype}; give an array of bool.")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise InvalidValueError(f"{said} gave {each} with NaN or infinity; give finite numbers.")
+    _require_shapes(offered, said, (rows, samples, depth))
+    _require_ranges(offered, said)
+    return imagined
 
 
 def _require_shapes(offered: Arrays, said: str, asked: tuple[int, int, int]) -> None:

@@ -7,6 +7,7 @@ frame), ``episode``, ``imagined_depth``. Entities: ``/scene/...``, ``/real/...``
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,9 @@ def record_run(
         explores=_novelty(agent, first, SeedTree(seed)) is not None,
     )
     with recording_file(path, task, layout) as recording:
-        recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged=entry.privileged, seed=seed)
+        recorder = _EpisodeRecorder(
+            recording=recording, spec=spec, agent=agent, appearance=appearance, privileged=entry.privileged, seed=seed
+        )
         if isinstance(scene, SceneReader):
             log_shapes(recording, scene.shapes())
         for episode in range(1, episodes + 1):
@@ -113,82 +116,80 @@ def _novelty(agent: Agent, observation: Observation, seeds: SeedTree) -> NDArray
     return agent.novelty(observation, seeds.generator()) if isinstance(agent, NoveltyReader) else None
 
 
+@dataclass(kw_only=True)
 class _EpisodeRecorder:
     """Records one episode after the other on a common clock; ``privileged`` agents are shown the macrostate."""
 
-    def __init__(
-        self, recording: Recording, spec: TaskSpec, agent: Agent, appearance: str, *, privileged: bool, seed: int
-    ) -> None:
-        self._recording = recording
-        self._spec = spec
-        self._agent = agent
-        self._appearance = appearance
-        self._privileged = privileged
-        self._seed = seed
-        self._clock_s = 0.0
-        self._env_step = -1
-        self._episode = list[State]()
+    recording: Recording
+    spec: TaskSpec
+    agent: Agent
+    appearance: str
+    privileged: bool
+    seed: int
+    clock_s: float = 0.0
+    env_step: int = -1
+    states: list[State] = field(default_factory=list)  #: of the episode so far
 
     def record(self, env: Env, episode: int) -> None:
         """One greedy real episode, numbered from 1."""
-        seen, info = env.reset(seed=episode_seed("recording", self._seed, episode))
-        begin_episode(self._agent)
+        seen, info = env.reset(seed=episode_seed("recording", self.seed, episode))
+        begin_episode(self.agent)
         if episode == 1:  # the timeline imagined_depth begins there and needs a scene to stand in
-            self._recording.stream.set_time("imagined_depth", sequence=0)
+            self.recording.stream.set_time("imagined_depth", sequence=0)
         observation = self._log_frame(env.unwrapped, episode, seen, info)
         if episode == 1:
             self._log_learning_to_see()
-        self._episode = []
+        self.states = []
         done = False
         step = 0
         heading = f"### Episode {episode}: a new start"
         while not done:
             macrostate = np.asarray(info["macrostate"])
-            action = int(self._agent.act(observation, explore=False))
-            self._describe(heading, info, f"Next: {self._spec.action_names[action]}.", observation.frame)
+            action = int(self.agent.act(observation, explore=False))
+            self._describe(heading, info, f"Next: {self.spec.action_names[action]}.", observation.frame)
             self._log_values(observation, action)
             self._log_novelty(observation, episode, step)
-            self._recording.stream.disable_timeline("imagined_depth")
+            self.recording.stream.disable_timeline("imagined_depth")
             self._log_imagination(observation.frame, macrostate, episode, step)
-            self._episode.append(tuple(macrostate.tolist()))
+            self.states.append(tuple(macrostate.tolist()))
             seen, reward, terminated, truncated, info = env.step(np.int64(action))
-            self._clock_s += macro_duration_s(env.unwrapped)
+            self.clock_s += macro_duration_s(env.unwrapped)
             observation = self._log_frame(env.unwrapped, episode, seen, info)
-            self._recording.scalar("/real/reward", float(reward))
+            self.recording.scalar("/real/reward", float(reward))
             done = terminated or truncated
             step = step + 1
             fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
-            outcome = f"Done: {self._spec.action_names[action]}. Reward {float(reward):+.0f}.{fault}"
+            outcome = f"Done: {self.spec.action_names[action]}. Reward {float(reward):+.0f}.{fault}"
             heading = f"### Episode {episode}, after macro-action {step}\n\n{outcome}"
         self._describe(heading, info, "Solved." if info["is_success"] else "Not solved.", observation.frame)
         self._clear_predictions()
-        self._clock_s += _STILL_S
+        self.clock_s += _STILL_S
 
     def _log_learning_to_see(self) -> None:
         """What it saw whenever that changed in training, a moment each, while the scene stands still."""
-        if not isinstance(self._agent, SeeingLearner):
+        if not isinstance(self.agent, SeeingLearner):
             return
-        for seen in self._agent.perceived():
+        for seen in self.agent.perceived():
             count = len(seen.sizes)
             values = f"{count} thing{'s' * (count != 1)}, of {', '.join(map(str, seen.sizes))} values"
             told = f"In training episode {seen.episodes} it tells apart {values if seen.sizes else 'nothing yet'}."
-            self._recording.text("/real/text", told)
-            self._recording.sheet("/seen/factors", seen.picture)
-            self._clock_s += _STILL_S
-            self._recording.set_clocks(self._clock_s, env_step=self._env_step, episode=1)
+            self.recording.text("/real/text", told)
+            self.recording.sheet("/seen/factors", seen.picture)
+            self.clock_s += _STILL_S
+            self.recording.set_clocks(self.clock_s, env_step=self.env_step, episode=1)
 
     def _log_frame(self, scene: Env, episode: int, seen: Observed, info: Info) -> Observation:
         """A new real frame: set the clocks, show it and how the scene stands. Returns what the agent sees."""
-        observation = Observation.of(seen, info, privileged=self._privileged)
+        observation = Observation.of(seen, info, privileged=self.privileged)
         frame = observation.frame if observation.frame.size else self._unseen_frame(scene, info)
-        self._env_step += 1
-        sequences = {"env_step": self._env_step, "episode": episode}
-        self._recording.set_clocks(self._clock_s, **sequences)
-        self._recording.log("/real/frame", rr.Image(frame))
+        self.env_step += 1
+        sequences = {"env_step": self.env_step, "episode": episode}
+        self.recording.set_clocks(self.clock_s, **sequences)
+        self.recording.log("/real/frame", rr.Image(frame))
         if isinstance(scene, SceneReader):
-            if self._env_step == 0:
+            if self.env_step == 0:
                 sequences["imagined_depth"] = 0
-            log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences)
+            log_motion(self.recording, scene.motion(), end_s=self.clock_s, sequences=sequences)
         return observation
 
     def _unseen_frame(self, scene: Env, info: Info) -> Frame:
@@ -196,66 +197,66 @@ class _EpisodeRecorder:
         shown = np.asarray(info.get("shown", info["macrostate"]))
         if isinstance(scene, SceneReader) and np.array_equal(shown, info["macrostate"]):
             return scene.agent_view()
-        return self._spec.render_macrostates(shown[None], self._appearance, np.random.default_rng(self._env_step))[0]
+        return self.spec.render_macrostates(shown[None], self.appearance, np.random.default_rng(self.env_step))[0]
 
     def _describe(self, heading: str, info: Info, last: str, frame: Frame) -> None:
         """What has happened, what is true, and what the frame shows where that is something else; what comes next.
 
         Of an agent with memory also what a read-out finds in it.
         """
-        spec = self._spec
+        spec = self.spec
         truth: Macrostate = info["macrostate"]
         remembered = truth
-        if isinstance(self._agent, MemoryReader):
-            remembered = self._agent.read_memory(frame, [len(values) for values in spec.macrostate_values])
+        if isinstance(self.agent, MemoryReader):
+            remembered = self.agent.read_memory(frame, [len(values) for values in spec.macrostate_values])
         names = map(spec.value_names, (truth, info.get("shown", truth), remembered))
         seen = ""
         for name, now, shown, recalled in zip(spec.macrostate_names, *names, strict=True):
-            recall = f"; memory: {recalled}" if isinstance(self._agent, MemoryReader) else ""
+            recall = f"; memory: {recalled}" if isinstance(self.agent, MemoryReader) else ""
             seen += f"- {name}: {now}" + f" (frame: {shown}{recall})" * (now != shown) + "\n"
-        self._recording.text("/real/text", f"*{self._spec.description}*\n\n{heading}\n\n{seen}\n\n**{last}**")
+        self.recording.text("/real/text", f"*{self.spec.description}*\n\n{heading}\n\n{seen}\n\n**{last}**")
 
     def _log_values(self, observation: Observation, action: int) -> None:
         """The Q-values: a curve each, and a table with bars, the chosen one marked."""
-        if not isinstance(self._agent, ValueReader):
+        if not isinstance(self.agent, ValueReader):
             return
-        names = self._spec.action_names
-        values = self._agent.q_values(observation)
-        self._recording.curves("/real/q_values", names, values)
-        self._recording.text("/real/q_table", q_table(names, values, action))
+        names = self.spec.action_names
+        values = self.agent.q_values(observation)
+        self.recording.curves("/real/q_values", names, values)
+        self.recording.text("/real/q_table", q_table(names, values, action))
 
     def _log_novelty(self, observation: Observation, episode: int, step: int) -> None:
         """How unknown each macro-action is to the agent, a curve each."""
-        novelty = _novelty(self._agent, observation, SeedTree(self._seed).child("novelty", episode, step))
+        novelty = _novelty(self.agent, observation, SeedTree(self.seed).child("novelty", episode, step))
         if novelty is not None:
-            self._recording.curves("/real/novelty", self._spec.action_names, novelty)
+            self.recording.curves("/real/novelty", self.spec.action_names, novelty)
 
     def _clear_predictions(self) -> None:
         """Remove what was predicted from the frame before: at an episode's end nothing more is carried out."""
-        stale = ["/real/q_table"] if isinstance(self._agent, ValueReader) else []
-        if isinstance(self._agent, Imaginer):
+        stale = ["/real/q_table"] if isinstance(self.agent, ValueReader) else []
+        if isinstance(self.agent, Imaginer):
             stale += ["/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in _KINDS)]
-            stale += ["/imagined/sampled_rollouts"] if is_random(self._spec.rules) else []
+            stale += ["/imagined/sampled_rollouts"] if is_random(self.spec.rules) else []
         for path in stale:
-            self._recording.clear(path)
+            self.recording.clear(path)
 
     def _log_imagination(self, frame: Frame, macrostate: NDArray[np.int64], episode: int, step: int) -> None:
         """The agent's greedy plan, imagined from here and set beside what would really happen."""
-        if not isinstance(self._agent, Imaginer):
+        if not isinstance(self.agent, Imaginer):
             return
-        spec = self._spec
-        seeds = SeedTree(self._seed)
+        spec = self.spec
+        seeds = SeedTree(self.seed)
         rng = seeds.child("recording", episode, step).generator()
-        rollout = self._agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng)
-        seen: dict[str, Any] = {"frame": frame, "macrostate": macrostate, "before": self._episode}
-        seen["appearance"] = self._appearance
+        rollout = self.agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng)
+        seen: dict[str, Any] = {"frame": frame, "macrostate": macrostate, "before": self.states}
+        seen["appearance"] = self.appearance
         compared = compare_rollout(spec, **seen, rollout=rollout, rng=rng)
-        self._recording.sheet("/imagined/filmstrip", filmstrip(compared, spec.action_names, columns=IMAGINED_DEPTH))
+        self.recording.sheet("/imagined/filmstrip", filmstrip(compared, spec.action_names, columns=IMAGINED_DEPTH))
         self._uncertainty_bars(compared)
         if is_random(spec.rules):  # several rollouts, since what happens next is partly chance
             branch = seeds.child("sampled_rollouts", episode, step)
-            sampled = sampled_rollouts_from(self._agent, spec, **seen, seeds=branch)
-            self._recording.sheet("/imagined/sampled_rollouts", sampled_filmstrips(sampled, spec))
+            sampled = sampled_rollouts_from(self.agent, spec, **seen, seeds=branch)
+            self.recording.sheet("/imagined/sampled_rollouts", sampled_filmstrips(sampled, spec))
         if step == 0:
             self._by_depth(compared, f"/imagined/episode_{episode}")
 
@@ -267,12 +268,12 @@ class _EpisodeRecorder:
             places = 1.0 + np.arange(len(values)) + 0.27 * (index - 1)
             widths = np.full(len(values), 0.25)
             bars = rr.BarChart(values, abscissa=places, widths=widths, color=color)
-            self._recording.log(f"/imagined/uncertainty/{kind}", bars)
+            self.recording.log(f"/imagined/uncertainty/{kind}", bars)
 
     def _by_depth(self, compared: ComparedRollout, root: str) -> None:
         """The same rollout along ``imagined_depth``; depth 0 is the real start."""
         rollout = compared.rollout
-        recording = self._recording
+        recording = self.recording
         curves: Arrays = {
             **{f"uncertainty/{kind}": getattr(rollout, kind) for kind in _KINDS},
             "prediction/reward": rollout.rewards,

@@ -42,82 +42,69 @@ def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic:
         with recording_file(path, trained.task.id, _layout(scene, trained)) as recording:
             if isinstance(scene, SceneReader):
                 log_shapes(recording, scene.shapes())
-            recorder = _PlanRecorder(recording, trained, env, count, max_epistemic)
+            recorder = _PlanRecorder(
+                recording=recording, trained=trained, env=env, count=count, max_epistemic=max_epistemic
+            )
             for number in range(count):
                 recorder.record(number)
     return path
 
 
+@dataclasses.dataclass(kw_only=True)
 class _PlanRecorder:
     """Records one plan after the other on a common clock."""
 
-    def __init__(
-        self,
-        recording: Recording,
-        trained: Trained,
-        env: Env,
-        count: int,
-        max_epistemic: float | None,
-    ) -> None:
-        self._recording = recording
-        self._trained = trained
-        self._env = env
-        self._count = count
-        self._max_epistemic = max_epistemic
-        self._clock_s = 0.0
-        self._env_step = 0
-        self._number = 0
+    recording: Recording
+    trained: Trained
+    env: Env
+    count: int
+    max_epistemic: float | None
+    clock_s: float = 0.0
+    env_step: int = 0
 
     def record(self, number: int) -> None:
         """One plan: the scene stands, the plan appears, the arm does it, and its outcome is shown."""
-        self._number = number
-        self._recording.stream.set_time("plan", sequence=number)
+        scene = self.env.unwrapped
+        self.recording.stream.set_time("plan", sequence=number)
         moments: list[tuple[float, int]] = []
 
-        def on_plan(*_: object) -> None:
-            self._arrive()
-            moments.append((self._clock_s, self._env_step))
-            self._clock_s += _LOOK_S
-
-        def on_step(_: int) -> None:
-            self._clock_s += macro_duration_s(self._env.unwrapped)
-            self._env_step += 1
-            self._arrive()
-            moments.append((self._clock_s, self._env_step))
+        def arrive(*_: object) -> None:
+            if moments:
+                self.clock_s += macro_duration_s(scene)
+                self.env_step += 1
+            self.recording.set_clocks(self.clock_s, env_step=self.env_step)
+            if isinstance(scene, SceneReader):
+                sequences = {"env_step": self.env_step, "plan": number}
+                log_motion(self.recording, scene.motion(), end_s=self.clock_s, sequences=sequences)
+            moments.append((self.clock_s, self.env_step))
+            self.clock_s += _LOOK_S * (len(moments) == 1)
 
         plan = carry_out(
-            self._env, self._trained, number, max_epistemic=self._max_epistemic, on_step=on_step, on_plan=on_plan
+            self.env, self.trained, number, max_epistemic=self.max_epistemic, on_step=arrive, on_plan=arrive
         )
         for done, (clock_s, env_step) in enumerate(moments):
-            self._recording.set_clocks(clock_s, env_step=env_step)
+            self.recording.set_clocks(clock_s, env_step=env_step)
             self._show(plan, done)
-        self._clock_s += _LOOK_S
-        self._env_step += 1
-
-    def _arrive(self) -> None:
-        scene = self._env.unwrapped
-        self._recording.set_clocks(self._clock_s, env_step=self._env_step)
-        if isinstance(scene, SceneReader):
-            sequences = {"env_step": self._env_step, "plan": self._number}
-            log_motion(self._recording, scene.motion(), end_s=self._clock_s, sequences=sequences)
+        self.clock_s += _LOOK_S
+        self.env_step += 1
 
     def _show(self, plan: PlanResult, done: int) -> None:
         """What was imagined, and what is real so far."""
-        recording = self._recording
+        recording = self.recording
         compared = plan.compared
         rollout = plan.compared.rollout
         real = compared.start_frame if done == 0 else compared.real_frames[done - 1]
         imagined = rollout.start_frame if done == 0 else rollout.frames[done - 1]
         recording.log("/real/frame", rr.Image(real))
         recording.log("/imagined/frame", rr.Image(rgb(imagined)))
-        task = self._trained.task  # room for the longest plan: the viewer takes no images of different sizes
+        task = self.trained.task  # room for the longest plan: the viewer takes no images of different sizes
         strip = filmstrip(_so_far(compared, done), task.action_names, columns=task.horizon)
         recording.sheet("/imagined/filmstrip", strip)
         recording.text("/real/text", self._words(plan, done))
 
     def _words(self, plan: PlanResult, done: int) -> str:
-        names = self._trained.task.action_names
-        lines = [f"### Plan {plan.number} (of {self._count}, from 0), imagined from one frame", ""]
+        names = self.trained.task.action_names
+        lines = [f"### Plan {plan.number} (of {self.count}, from 0), imagined from one frame", ""]
         for step, action in enumerate(plan.compared.rollout.actions, start=1):
             mark = "done" if step <= done else ("**now**" if step == done + 1 and done < plan.done else "")
             lines.append(f"{step}. {names[int(action)]} {mark}")
