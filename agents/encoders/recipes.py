@@ -39,12 +39,13 @@ class Recipe:
 
     def __post_init__(self) -> None:
         require_known("encoder architecture", self.architecture, ARCHITECTURES)
-        if min(self.latents, self.frames, self.held_out_frames, self.steps, self.batch, self.probe_steps) < 1:
-            counts = "latents, frames, held_out_frames, steps, batch and probe_steps"
-            raise InvalidValueError(f"Encoder recipe {self.name!r} has a count below 1; {counts} must be at least 1.")
-        if not (self.beta >= 0 and self.pixel_std > 0 and self.learning_rate > 0 and 0 <= self.kl_warmup < 1):
-            ranges = "beta >= 0, pixel_std > 0, learning_rate > 0 and kl_warmup in [0, 1)"
-            raise InvalidValueError(f"Encoder recipe {self.name!r} needs {ranges}.")
+        least = min(self.latents, self.frames, self.held_out_frames, self.steps, self.batch, self.probe_steps)
+        positive = min(self.pixel_std, self.learning_rate)
+        if not (least >= 1 and positive > 0 and self.beta >= 0 and 0 <= self.kl_warmup < 1):
+            raise InvalidValueError(
+                f"Encoder recipe {self.name!r} needs latents, frames, held_out_frames, steps, batch and probe_steps of "
+                "at least 1, beta >= 0, pixel_std > 0, learning_rate > 0 and kl_warmup in [0, 1)."
+            )
 
 
 _STRIPS = Recipe(

@@ -10,10 +10,10 @@ import io
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -50,8 +50,7 @@ OFFERED = Recipe(name="offered", architecture="offered", frames=4000, held_out_f
 """Frames that scale and probe of another package's encoder are made of, and the probe's steps."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameSet:
+class FrameSet(NamedTuple):
     """Labelled frames: images (N, C, H, W), preprocessed, uint8 to quarter the memory; macrostates (N, M)."""
 
     images: Tensor
@@ -100,7 +99,7 @@ def frame_set(
         images.append(torch.from_numpy(np.rint(prepare(frames) * 255.0).astype(np.uint8)))
         labels.append(macrostates)
         progress("frames", min(start + _CHUNK, n) / n)
-    return FrameSet(images=torch.cat(images), macrostates=np.concatenate(labels))
+    return FrameSet(torch.cat(images), np.concatenate(labels))
 
 
 def beta_at(recipe: Recipe, step: int) -> float:
@@ -180,7 +179,7 @@ def train_vae(
     order = kept["order"]
     begun_s = time.process_time() - kept["cpu_s"]
     device = next(vae.parameters()).device
-    data = replace(data, images=data.images.to(device))
+    data = data._replace(images=data.images.to(device))
     at_once = _PART if device.type == "cpu" else recipe.batch
     for step in range(kept["step"], recipe.steps):
         while len(order) < recipe.batch:

@@ -8,8 +8,9 @@ them all. The dynamics may be an ensemble of E networks, which a leading member 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -50,7 +51,7 @@ class RewardTerminationHead(nn.Module):
     """
 
     def __init__(
-        self, latent_size: int, n_actions: int, settings: WorldModelSettings, generator: torch.Generator
+        self, latent_size: int, n_actions: int, settings: WorldModelSettings, network: Callable[..., MemberMLP]
     ) -> None:
         super().__init__()
         self._reads_transition = settings.head_input == "transition"
@@ -58,8 +59,8 @@ class RewardTerminationHead(nn.Module):
         outputs = [(settings.reward_hidden, 1), (settings.termination_hidden, 1)]
         if settings.shared_hidden:
             outputs = [(settings.shared_hidden, 2)]
-        self.networks = nn.ModuleList(_member_mlp((n_in, *hidden, n), 1, settings, generator) for hidden, n in outputs)
-        self._one_hot = torch.eye(n_actions, device=generator.device)
+        self.networks = nn.ModuleList(network((n_in, *hidden, n), members=1) for hidden, n in outputs)
+        self._one_hot = torch.eye(n_actions, device=self.reward_network.weights[0].device)
 
     @property
     def reward_network(self) -> MemberMLP:
@@ -105,8 +106,10 @@ class EnvironmentModel(nn.Module):
         self.predicted = latent_size if predicted is None else predicted
         outputs = mdn.output_size(settings.components, self.predicted)
         sizes = (latent_size + n_actions, *settings.dynamics_hidden, outputs)
-        self.dynamics = _member_mlp(sizes, self.members, settings, generator)
-        self.head = RewardTerminationHead(latent_size, n_actions, settings, generator)
+        dtype = hidden_dtype(settings.precision, generator.device.type)
+        network = partial(MemberMLP, dropout=settings.dropout, generator=generator, hidden_dtype=dtype)
+        self.dynamics = network(sizes, members=self.members)
+        self.head = RewardTerminationHead(latent_size, n_actions, settings, network)
         self.networks: tuple[MemberMLP, ...] = (self.dynamics, *self.head.networks)
         self.clipped: tuple[nn.Module, ...] = self.networks
         self.optimiser = Adam([(self.parameters(), 0.0)], settings.learning_rate)
@@ -198,10 +201,3 @@ class EnvironmentModel(nn.Module):
         masks = [mask.squeeze(0) for mask in weights]
         rewards = sample_outputs(self.head.reward_network, inputs, masks)[..., 0]  # [T, N]
         return rewards.std(dim=0, correction=0) * self.settings.reward_scale
-
-
-def _member_mlp(
-    sizes: Sequence[int], members: int, settings: WorldModelSettings, generator: torch.Generator
-) -> MemberMLP:
-    dtype = hidden_dtype(settings.precision, generator.device.type)
-    return MemberMLP(sizes, members=members, dropout=settings.dropout, generator=generator, hidden_dtype=dtype)

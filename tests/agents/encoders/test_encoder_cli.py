@@ -46,7 +46,7 @@ def test_retrain_leaves_three_files_and_never_overwrites(tmp_path: Path, monkeyp
     [
         ({"recipe": "defualt"}, UnknownNameError, r"No encoder recipe 'defualt'. Did you mean 'default'"),
         ({"appearance": "x"}, UnknownNameError, "Known: clean, mild, strong"),
-        ({"latents": 0}, InvalidValueError, "has a count below 1"),
+        ({"latents": 0}, InvalidValueError, "needs latents, frames"),
         (
             {"recipe": "codes", "steps": 1, "latents": 11},
             InvalidValueError,

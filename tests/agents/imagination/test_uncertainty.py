@@ -69,17 +69,6 @@ def test_a_sampled_value_is_as_uncertain_as_its_component() -> None:
 VALUES = torch.linspace(-2.0, 2.0, N * Z, dtype=torch.float64).view(N, Z)
 
 
-def test_components_count_by_their_posterior() -> None:
-    mixtures = samples(torch.float64)
-    averaged = mdn.average(mixtures)
-    log_joint = averaged.log_weights + torch.distributions.Normal(averaged.means, averaged.log_sigmas.exp()).log_prob(
-        VALUES[:, None]
-    ).sum(-1)  # [N, K]
-    own = (2.0 * mixtures.log_sigmas).exp().mean(0) + mixtures.means.var(0, correction=0)  # [N, K, Z]
-    expected = (log_joint.softmax(-1) * own.sum(-1)).sum(-1)
-    torch.testing.assert_close(sampled_component_variance(mixtures, averaged, VALUES), expected)
-
-
 def test_nll_is_that_of_all_weight_samples_together() -> None:
     mixtures = samples(torch.float64)
     densities = [mdn.log_likelihood(mixtures.map(lambda part, t=t: part[t]), VALUES).exp() for t in range(T)]

@@ -111,17 +111,16 @@ def test_one_backward_pass_trains_three_independent_networks(clip: float | None)
 def test_weight_samples_are_drawn_once_and_shared_by_every_state() -> None:
     model = make()
     weights = model.draw_weights(6, draws(1))
-    z = CODES[:4]
-    action = torch.tensor([0, 1, 0, 1])
-    together = model.predict(z, action, weights)
+    batch = chain_batch(4, draws(2))
+    together = model.predict(batch.z, batch.action, weights)
     assert together.means.shape == (6, 4, 2, Z)
     for row in range(4):
-        alone = model.predict(z[row : row + 1], action[row : row + 1], weights)
+        alone = model.predict(batch.z[row : row + 1], batch.action[row : row + 1], weights)
         torch.testing.assert_close(together.means[:, row], alone.means[:, 0])
         torch.testing.assert_close(together.log_weights[:, row], alone.log_weights[:, 0])
     assert together.means.std(dim=0).min() > 0.0, "weight samples must disagree"
-    repeated = model.predict(z, action, model.draw_weights(6, draws(1)))
-    assert torch.equal(repeated.means, together.means)
+    again = model.predict(batch.z, batch.action, model.draw_weights(6, draws(1)))
+    assert torch.equal(again.means, together.means)
 
 
 @pytest.mark.parametrize("changes", [{}, {"shared_hidden": (16, 8)}, {"head_input": "transition"}])

@@ -11,11 +11,6 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def gradients(network: MemberMLP, output: torch.Tensor, x: torch.Tensor) -> list[torch.Tensor]:
-    weighted = output * torch.linspace(-1.0, 2.0, output.numel(), dtype=output.dtype).view_as(output)
-    return list(torch.autograd.grad(weighted.square().sum(), [x, *network.parameters()]))
-
-
 @pytest.mark.parametrize("dropout", [0.5, 0.0625, 0.2, 0.9])
 def test_masks_drop_the_right_share(dropout: float) -> None:
     mask = dropout_mask((200, 1001), dropout, generator())
@@ -55,28 +50,6 @@ def test_members_are_independent_networks() -> None:
         torch.testing.assert_close(together[member], alone)
 
 
-def test_hidden_layers_in_bfloat16_point_the_same_way() -> None:
-    """Eight bits open or close a few of the gates: the gradient turns by less than 6 degrees and keeps its length.
-
-    Another mini-batch turns it by 60 and more.
-    """
-    sizes, bfloat16 = (24, 256, 256, 5), torch.bfloat16
-    network = MemberMLP(sizes, members=1, dropout=0.5, generator=generator(), hidden_dtype=bfloat16)
-    exact = MemberMLP(sizes, members=1, dropout=0.5, generator=generator())
-    x = torch.randn(1, 512, 24, generator=generator(1)).requires_grad_()
-    masks = exact.draw_masks(512, generator(2))
-    assert masks is not None
-    ours, theirs = network(x, [mask.to(bfloat16) for mask in masks]), exact(x, masks)
-    assert ours.dtype == torch.float32
-    assert not torch.equal(ours, theirs), "these layers must compute in bfloat16"
-    for mine, other in zip(gradients(network, ours, x), gradients(exact, theirs, x), strict=True):
-        cosine = torch.cosine_similarity(mine.reshape(-1).double(), other.reshape(-1).double(), dim=0)
-        assert cosine > 0.9945
-        assert abs(mine.norm() / other.norm() - 1.0) < 0.01
-    with torch.no_grad():
-        torch.testing.assert_close(network(x, masks), theirs, msg="predictions are float32")
-
-
 def test_max_norm_limits_each_unit_and_leaves_the_others() -> None:
     network = MemberMLP((4, 3, 2), members=1, dropout=0.0, generator=generator())
     with torch.no_grad():
@@ -112,7 +85,6 @@ def test_a_single_network_begins_glorot_uniform() -> None:
     assert torch.equal(before, torch.get_rng_state()), "the global generator was used"
     for one, other in zip(network.parameters(), again.parameters(), strict=True):
         assert torch.equal(one, other)
-    weight, bias = network[0].weight, network[0].bias
     bound = (6.0 / 300.0) ** 0.5
-    assert 0.98 * bound < weight.abs().max() <= bound and not bias.any()
-    assert network(torch.randn(7, 200)).shape == (7, 2)
+    assert 0.98 * bound < network[0].weight.abs().max() <= bound
+    assert not network[0].bias.any()
