@@ -176,7 +176,7 @@ def test_beta_warms_up_and_the_thesis_has_no_schedule() -> None:
     ("change", "error", "message"),
     [
         ({"steps": 0}, InvalidValueError, "'tiny' needs latents, .* steps, .* of at least 1"),
-        ({"kl_warmup": 1.0}, InvalidValueError, r"'tiny' needs beta >= 0, .* kl_warmup in \[0, 1\)"),
+        ({"kl_warmup": 1.0}, InvalidValueError, r"'tiny' needs .*, beta >= 0, .* kl_warmup in \[0, 1\)"),
         ({"architecture": "stripes"}, UnknownNameError, r"No encoder architecture 'stripes'\. Did you mean 'strips'\?"),
     ],
 )
