@@ -22,7 +22,7 @@ from imagine_bench.interfaces.regression import Mixtures, Prediction, RegressorC
 from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn
 from ..imagination.mixture import Mixture
-from ..imagination.uncertainty import decompose, nll, sampled_component_variance
+from ..imagination.uncertainty import decompose, jensen_shannon, nll, sampled_component_variance
 from ..networks.adam import Adam
 from ..networks.mlp import clip_member_gradients, dropout_mask
 from ..networks.normed_mlp import NormedMLP
@@ -34,8 +34,6 @@ _ROWS = 256
 """Rows predicted at a time: T mixtures of each are in memory."""
 _DRAWN = 16
 """Values of equation 4.8 drawn for each row."""
-_CHUNK = 2_000_000
-"""Component densities computed at a time."""
 
 
 class MixtureRegressor:
@@ -186,37 +184,6 @@ class MixtureRegressor:
 def _parts(mixture: Mixture) -> dict[str, Tensor]:
     """The fields of :class:`Mixtures`."""
     return {"weights": mixture.log_weights.exp(), "means": mixture.means, "sigmas": mixture.log_sigmas.exp()}
-
-
-@torch.no_grad()
-def jensen_shannon(samples: Mixture, draws: int, generator: torch.Generator) -> Tensor:
-    """How much the predictive distribution itself changes with the weights: an epistemic score for any mixture.
-
-    The thesis (4.3) leaves as future work a measure of the variability of the distributions {p(y | x; w_t)}. Here it
-    is their Jensen-Shannon divergence with equal weights (Lin 1991, equation 5.1), which is the mutual information of
-    prediction and weights (Depeweg et al. 2018, equation 4):
-
-        J = (1/T) sum_t KL(p_t || p_mean) = H[p_mean] - (1/T) sum_t H[p_t]   in nats, 0 <= J <= log T.
-
-    Unlike the variance of the means it sees samples that put the same mean together from other branches, it does not
-    depend on the unit of y, and it treats all dimensions of y together. Estimated by Monte Carlo: every mixture is
-    drawn from equally often (stratified over t), so that only the value within it is chance: the standard error falls
-    as 1 / sqrt(T S) with ``draws`` S from each. Mixtures (T, N) give shape (N,), cut to [0, log T].
-    """
-    count, _, components, size = samples.means.shape
-    piece = max(1, _CHUNK // (draws * count * count * components * size))
-    parts = (samples.log_weights, samples.means, samples.log_sigmas)
-    found = []
-    for rows in zip(*(part.split(piece, dim=1) for part in parts), strict=True):
-        some = Mixture(*rows)
-        flat = some.map(lambda part: part.flatten(0, 1).repeat_interleave(draws, dim=0))
-        values = mdn.sample(flat, 1.0, generator).view(count, -1, draws, size).transpose(1, 2)  # [T, S, N, D]
-        every = some.map(lambda part: part[:, None, None])
-        log_p = mdn.log_likelihood(every, values.unsqueeze(0))  # every value under every mixture: [T', T, S, N]
-        log_mean = torch.logsumexp(log_p, dim=0) - math.log(count)
-        own = log_p.diagonal(dim1=0, dim2=1).movedim(-1, 0)
-        found.append((own - log_mean).mean(dim=(0, 1)).clamp(0.0, math.log(count)))
-    return torch.cat(found)
 
 
 def make_mc_dropout(context: RegressorContext) -> MixtureRegressor:

@@ -1,12 +1,16 @@
-"""The split of the predictive variance against brute force."""
+"""The split of the predictive variance against brute force, and divergences that are known."""
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 import torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.uncertainty import decompose, nll, sampled_component_variance
+from imagine_bench.agents.imagination.uncertainty import decompose, jensen_shannon, nll, sampled_component_variance
+from scipy import integrate, stats
 
 T, N, K, Z = 6, 5, 3, 2
 
@@ -73,3 +77,40 @@ def test_nll_is_that_of_all_weight_samples_together() -> None:
     mixtures = samples(torch.float64)
     densities = [mdn.log_likelihood(mixtures.map(lambda part, t=t: part[t]), VALUES).exp() for t in range(T)]
     torch.testing.assert_close(nll(mixtures, VALUES), -torch.stack(densities).mean(dim=0).log())
+
+
+def gaussians(means: list[float], sigma: float) -> Mixture:
+    """T mixtures of one component for one row of one dimension."""
+    count = len(means)
+    values = torch.tensor(means).view(count, 1, 1, 1)
+    return Mixture(torch.zeros(count, 1, 1), values, torch.full_like(values, math.log(sigma)))
+
+
+def divergence(mixtures: Mixture, draws: int) -> float:
+    return jensen_shannon(mixtures, draws, torch.Generator().manual_seed(0))[0].item()
+
+
+def test_equal_distributions_diverge_by_0_disjoint_ones_by_log_t() -> None:
+    assert divergence(gaussians([1.0] * 5, 1.0), 50) == pytest.approx(0.0, abs=1e-5)
+    apart = gaussians([100.0 * t for t in range(5)], 1.0)
+    assert divergence(apart, 4) == pytest.approx(math.log(5), abs=1e-5)
+
+
+def test_divergence_of_two_gaussians_is_the_integral() -> None:
+    def integrand(y: float) -> float:
+        p, q = stats.norm.pdf(y, 0, 1), stats.norm.pdf(y, 1.5, 1)
+        m = (p + q) / 2
+        return 0.5 * (p * np.log(p / m) + q * np.log(q / m))
+
+    exact = integrate.quad(integrand, -10, 12)[0]
+    estimate = divergence(gaussians([0.0, 1.5], 1.0), 40_000)
+    assert estimate == pytest.approx(exact, abs=0.005)
+
+
+def test_divergence_sees_what_the_variance_of_means_does_not() -> None:
+    """Two samples with the same mean, one of two branches and one between them."""
+    weights = torch.tensor([[[0.5, 0.5]], [[0.5, 0.5]]]).log()
+    means = torch.tensor([[[[-3.0], [3.0]]], [[[0.0], [0.0]]]])
+    two = Mixture(weights, means, torch.full((2, 1, 2, 1), -1.0))
+    assert decompose(two).epistemic.item() == 0.0
+    assert divergence(two, 100) > 0.6

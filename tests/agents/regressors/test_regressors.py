@@ -1,4 +1,4 @@
-"""Networks among others and alone, weight samples against a loop, what is predicted, and divergences that are known."""
+"""Networks among others and alone, weight samples against a loop, and what is predicted."""
 
 from __future__ import annotations
 
@@ -8,13 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.uncertainty import decompose
 from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
 from imagine_bench.agents.networks.normed_mlp import NormedMLP
 from imagine_bench.agents.networks.weight_samples import sample_outputs
-from imagine_bench.agents.regressors.regressor import MixtureRegressor, jensen_shannon, make_ensemble, make_mc_dropout
-from scipy import integrate, stats
+from imagine_bench.agents.regressors.regressor import MixtureRegressor, make_ensemble, make_mc_dropout
 
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces.regression import RegressionData, RegressorContext
@@ -173,39 +170,6 @@ def test_first_units_bend_all_over_the_data() -> None:
     for low, high in ((-1.5, -0.5), (-0.5, 0.5), (0.5, 1.5)):
         assert ((bends > low) & (bends < high)).float().mean() > 0.1
     assert all(not bias.detach().any() for bias in list(network.biases)[1:])
-
-
-def gaussians(means: list[float], sigma: float) -> Mixture:
-    """T mixtures of one component for one row of one dimension."""
-    count = len(means)
-    values = torch.tensor(means).view(count, 1, 1, 1)
-    return Mixture(torch.zeros(count, 1, 1), values, torch.full_like(values, math.log(sigma)))
-
-
-def test_equal_distributions_diverge_by_0_disjoint_ones_by_log_t() -> None:
-    assert jensen_shannon(gaussians([1.0] * 5, 1.0), 50, generator())[0].item() == pytest.approx(0.0, abs=1e-5)
-    apart = gaussians([100.0 * t for t in range(5)], 1.0)
-    assert jensen_shannon(apart, 4, generator())[0].item() == pytest.approx(math.log(5), abs=1e-5)
-
-
-def test_divergence_of_two_gaussians_is_the_integral() -> None:
-    def integrand(y: float) -> float:
-        p, q = stats.norm.pdf(y, 0, 1), stats.norm.pdf(y, 1.5, 1)
-        m = (p + q) / 2
-        return 0.5 * (p * np.log(p / m) + q * np.log(q / m))
-
-    exact = integrate.quad(integrand, -10, 12)[0]
-    estimate = jensen_shannon(gaussians([0.0, 1.5], 1.0), 40_000, generator())[0].item()
-    assert estimate == pytest.approx(exact, abs=0.005)
-
-
-def test_divergence_sees_what_the_variance_of_means_does_not() -> None:
-    """Two samples with the same mean, one of two branches and one between them."""
-    weights = torch.tensor([[[0.5, 0.5]], [[0.5, 0.5]]]).log()
-    means = torch.tensor([[[[-3.0], [3.0]]], [[[0.0], [0.0]]]])
-    samples = Mixture(weights, means, torch.full((2, 1, 2, 1), -1.0))
-    assert decompose(samples).epistemic.item() == 0.0
-    assert jensen_shannon(samples, 100, generator())[0].item() > 0.6
 
 
 def test_a_likelihood_that_is_not_finite_changes_nothing() -> None:
