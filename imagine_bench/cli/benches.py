@@ -47,7 +47,7 @@ from imagine_bench.sweep.grid import SUITE_AGENTS, Study, Suite
 from imagine_bench.sweep.run import run_study, run_suite
 
 if TYPE_CHECKING:
-    from imagine_bench.report.tables import Page
+    from imagine_bench.report.page import Page
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,14 +32,14 @@ from imagine_bench.report.data import (
     open_loop_csv,
     summary_csv,
 )
-from imagine_bench.report.page import made
-from imagine_bench.report.tables import (
+from imagine_bench.report.page import (
     DASH,
     Page,
     Section,
     Table,
     count,
     decimals,
+    made,
     p_value,
     percent,
     seconds,

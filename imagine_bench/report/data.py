@@ -16,7 +16,7 @@ from imagine_bench import reference, registry, statistics
 from imagine_bench.arrays import Arrays
 from imagine_bench.errors import SetupError, UnknownNameError
 from imagine_bench.interfaces import RenderMacrostates, RuleFacts, Rules, State, TaskSpec
-from imagine_bench.report.tables import Table, estimate, percent
+from imagine_bench.report.page import Table, estimate, percent
 from imagine_bench.rules import facts as rule_facts
 from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import Estimate

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench import registry
 from imagine_bench.report.data import agent_title
-from imagine_bench.report.tables import Image
+from imagine_bench.report.page import Image
 from imagine_bench.statistics import Estimate
 
 INK = "#2b2b2f"

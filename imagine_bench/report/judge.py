@@ -24,8 +24,7 @@ from imagine_bench.judge.scores import COVERAGES
 from imagine_bench.judge.truth import sampling_noise_floor, shares
 from imagine_bench.recording.filmstrips import TileRow, png, transition_sheet
 from imagine_bench.registry.entries import file_name
-from imagine_bench.report.page import flat, write_page
-from imagine_bench.report.tables import (
+from imagine_bench.report.page import (
     DASH,
     Image,
     Page,
@@ -33,9 +32,11 @@ from imagine_bench.report.tables import (
     Table,
     decimals,
     estimate,
+    flat,
     number,
     over_seeds,
     p_value,
+    write_page,
 )
 from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import difference, holm, iqm

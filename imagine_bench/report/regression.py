@@ -19,8 +19,7 @@ from imagine_bench.interfaces.regression import SCORES
 from imagine_bench.regression.calibration import CRPS_POINTS
 from imagine_bench.regression.results import PairResult, RegressionResult
 from imagine_bench.report.figures import INK, image, small_multiples
-from imagine_bench.report.page import made
-from imagine_bench.report.tables import DASH, Page, Section, Table, decimals, estimate, mean_std, number
+from imagine_bench.report.page import DASH, Page, Section, Table, decimals, estimate, made, mean_std, number
 from imagine_bench.store.files import table_text
 
 Cells = dict[str, str]

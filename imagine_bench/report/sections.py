@@ -20,8 +20,7 @@ from imagine_bench.recording.filmstrips import filmstrip, png, sampled_filmstrip
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
 from imagine_bench.report.data import ReportData, agent_title, by_budget, known_agent, open_loop_means
-from imagine_bench.report.page import flat
-from imagine_bench.report.tables import DASH, Image, Section, Table, decimals, over_seeds, percent, printed
+from imagine_bench.report.page import DASH, Image, Section, Table, decimals, flat, over_seeds, percent, printed
 from imagine_bench.rules import greedy
 from imagine_bench.store import encoders
 from imagine_bench.store.files import reading

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 
 from imagine_bench.report import figures
 from imagine_bench.report.data import agent_title
-from imagine_bench.report.page import flat
-from imagine_bench.report.tables import (
+from imagine_bench.report.page import (
     DASH,
     Page,
     Section,
@@ -18,6 +17,7 @@ from imagine_bench.report.tables import (
     count,
     decimals,
     estimate,
+    flat,
     percent,
     seconds,
     signed_percent,

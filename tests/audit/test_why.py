@@ -16,9 +16,8 @@ from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
 from imagine_bench.report import audits
 from imagine_bench.report.audits import verify, why_report
-from imagine_bench.report.page import texts
+from imagine_bench.report.page import Page, texts
 from imagine_bench.report.sections import read_causes
-from imagine_bench.report.tables import Page
 from imagine_bench.rules import states_of
 from imagine_bench.running.bench import bench
 from imagine_bench.running.task_types import load_bench

@@ -18,8 +18,8 @@ from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.judge.values import Terminations, optimal_length, terminations
 from imagine_bench.protocols.control import protocol
 from imagine_bench.report.data import collect
+from imagine_bench.report.page import Table
 from imagine_bench.report.sections import policies
-from imagine_bench.report.tables import Table
 from imagine_bench.rules import fewest_actions, greedy, states_of
 from imagine_bench.running import bench as benches
 from imagine_bench.store.files import lock

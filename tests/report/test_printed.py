@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from imagine_bench.report.page import flat
-from imagine_bench.report.tables import number
+from imagine_bench.report.page import flat, number
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,8 @@ from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import bench_page, write_report
 from imagine_bench.report.bench import shown, verdict
 from imagine_bench.report.data import agent_title, collect
-from imagine_bench.report.page import texts
+from imagine_bench.report.page import DASH, Page, Table, estimate, markdown_text, percent, signed_percent, texts
 from imagine_bench.report.sections import encoder_readers
-from imagine_bench.report.tables import DASH, Page, Table, estimate, markdown_text, percent, signed_percent
 from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 

@@ -17,7 +17,7 @@ from imagine_bench import reference, registry, statistics
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report.bench import cost, success
 from imagine_bench.report.data import DIFFERENCE, SCORE, agent_title, collect, frames_before, open_loop_means
-from imagine_bench.report.tables import DASH, count, seconds
+from imagine_bench.report.page import DASH, count, seconds
 from imagine_bench.store import encoders
 from imagine_bench.store.results import BenchResult, Checkpoint, KeptEpisodes, RunResult
 

@@ -6,7 +6,7 @@ import dataclasses
 import re
 from html import unescape
 
-from imagine_bench.report.tables import Page
+from imagine_bench.report.page import Page
 
 PAGE_PX = 1200 - 2 * 24  # the page's own margin
 CHARACTER_PX, PADDING_PX = 8.0, 19.2
