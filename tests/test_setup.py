@@ -119,6 +119,13 @@ def test_without_a_usable_interpreter_each_is_named(checkout: Checkout) -> None:
     ]
 
 
+def test_one_version_is_not_tried_under_two_names(checkout: Checkout) -> None:
+    for name in ("python3", "python3.12"):
+        checkout.python(name, "3.12.1", install=FAILS)
+    assert checkout.setup()[0] == 1
+    assert [line for line in checkout.log() if line.startswith("made")] == ["made by python3"]
+
+
 def test_an_interpreter_that_was_named_is_the_only_one(ready: Checkout) -> None:
     ready.python("python3.11", "3.11.7")
     code, out = ready.setup(PYTHON="python3.10")
