@@ -257,8 +257,7 @@ class Plan(OfBench):
 
     def __call__(self) -> None:
         """Find, plan, report."""
-        from imagine_bench.recording.plans import record_plans  # noqa: PLC0415 - Rerun, fonts and pillow load slowly
-        from imagine_bench.report.audits import plan_report  # noqa: PLC0415 - as below
+        from imagine_bench.report.audits import plan_report  # noqa: PLC0415 - fonts and pillow load slowly
 
         run, task = self.meant()
         print(
@@ -268,7 +267,6 @@ class Plan(OfBench):
                 task=task,
                 count=self.count,
                 recorded=self.recorded,
-                record=record_plans,
                 execution=self.execution,
                 max_epistemic=self.max_epistemic,
                 encoder=self.encoder,

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 
@@ -63,7 +63,6 @@ _COUNTS = {
 }
 _CELLS = {"report.md": r"^\|.*$", "index.html": r"<t[dh][^>]*>(.*?)</t[dh]>"}
 """What is compared of a report's pages: the cells of their tables; of other files it is every line."""
-Record = Callable[..., Path]  # records plans: :func:`imagine_bench.recording.plans.record_plans`
 
 
 def chosen(given: Path | None, root: Path, task: str | None) -> Path:
@@ -90,13 +89,13 @@ def provenance(protocol_hash: str) -> dict[str, object]:
 
 def plan_report(
     run: Path | None, *, root: Path, task: str | None, count: int, execution: str | None, max_epistemic: float | None,
-    encoder: str | None, recorded: int = 0, record: Record | None = None,
+    encoder: str | None, recorded: int = 0,
 ) -> str:  # fmt: skip
     """Plan, carry out, and leave a table, filmstrips and a recording in the run's folder, below ``plans``.
 
     ``run`` is a run's folder, or a bench's, whose best imagining run is taken; None is the newest bench of ``task``,
     or of any. ``max_epistemic`` is as in :func:`imagine_bench.judge.plans.make_plans`, ``encoder`` as in
-    :func:`imagine_bench.running.trained.load_trained`. The first ``recorded`` plans go to ``record``.
+    :func:`imagine_bench.running.trained.load_trained`. The first ``recorded`` plans are recorded.
     Returns the text to print.
 
     Raises:
@@ -121,9 +120,13 @@ def plan_report(
         made = make_plans(trained, count=count, execution=execution, max_epistemic=max_epistemic)
         plans = list(counted(made, "plans", total=count))
         text = write_plans(folder, plans, trained.task, {**provenance(spec.protocol.hash), **whose, **how})
-        if record is not None and recorded:
+        if recorded:
+            from imagine_bench.recording.plans import record_plans  # noqa: PLC0415 - Rerun loads slowly
+
             path = folder / RECORDING
-            record(trained, count=min(recorded, count), execution=execution, max_epistemic=max_epistemic, path=path)
+            record_plans(
+                trained, count=min(recorded, count), execution=execution, max_epistemic=max_epistemic, path=path
+            )
             text += f"\nRecording:  {path} (imagine-bench view opens it)"
     return text
 

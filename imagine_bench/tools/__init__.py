@@ -1,1 +1,1 @@
-"""Commands beside the bench: doctor, speed, film."""
+"""Commands beside the bench: describe, doctor, new, play, and the sets of ``make data``."""
