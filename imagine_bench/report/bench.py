@@ -155,11 +155,14 @@ def success(data: ReportData) -> Section:
     )
     image = figures.image("success", lambda: success_figure(data), caption)
     excess = by_budget(
-        data, "excess", "macro-actions beyond the shortest plan, after", "excess_macro_actions",
+        data,
+        "excess",
+        "macro-actions beyond the shortest plan, after",
+        "excess_macro_actions",
         lambda record: decimals(record.get("excess_macro_actions", math.nan)),
         "Means over the solved tests; the shortest plan from each start is exact, from the rules.",
         "nothing was solved",
-    )  # fmt: skip
+    )
     tables = [table for table in (_scores(data), excess, _seeds(data)) if table.rows]
     return Section("Success against real experience", images=[image], tables=tables)
 
@@ -233,10 +236,15 @@ def gain(data: ReportData) -> Section | None:
         by_budget(data, "differences", "difference (points) after", "gain", difference, detectable),
         by_budget(data, "gains", "gain (%) after", "gain", _gain, "", "DQN solved nothing to compare with"),
         by_budget(
-            data, "paired", "solved alone : by DQN alone, after", "gain", _alone, "",
+            data,
+            "paired",
+            "solved alone : by DQN alone, after",
+            "gain",
+            _alone,
+            "",
             "which tests were solved was not kept",
         ),
-    ]  # fmt: skip
+    ]
     return Section("Gain over DQN", [words], tables=tables)
 
 
@@ -261,15 +269,17 @@ def cost(data: ReportData) -> Section:
         tested = None if known_agent(agent).learns else 1  # the one test of others stands at every budget
         tests = [row for run in runs for row in run.checkpoints[:tested]]
         played = round(sum(row.mean_length * row.test_episodes for row in tests))
-        rows.append({
-            "one run, mean over seeds": agent_title(agent),
-            "real macro-actions": count(last["env_steps"]),
-            "frames its encoder saw before": count(frames_before(data, agent)),
-            "gradient updates": count(last["gradient_updates"]),
-            "training (CPU s)": seconds(last["train_cpu_s"]),
-            "all tests (CPU s)": seconds(sum(row.eval_cpu_s for row in tests) / len(runs)),
-            "faults in all tests": f"{sum(row.faults for row in tests)} of {played:,}",
-        })  # fmt: skip
+        rows.append(
+            {
+                "one run, mean over seeds": agent_title(agent),
+                "real macro-actions": count(last["env_steps"]),
+                "frames its encoder saw before": count(frames_before(data, agent)),
+                "gradient updates": count(last["gradient_updates"]),
+                "training (CPU s)": seconds(last["train_cpu_s"]),
+                "all tests (CPU s)": seconds(sum(row.eval_cpu_s for row in tests) / len(runs)),
+                "faults in all tests": f"{sum(row.faults for row in tests)} of {played:,}",
+            }
+        )
     caption = (
         "Frames before training are drawn from all macrostates alike. A fault is a macro-action whose physical outcome "
         f"was not what the rules say. The whole bench took {data.result.wall_s:,.0f} s of wall time."

@@ -63,23 +63,27 @@ def _variants(study: Study, lines: Sequence[Line]) -> tuple[Table, str]:
             solved = iqm(line.success[:, place])
             moved = line.difference[place] if line.difference else None
             named = {"factor": one.factor, "variant": one.name, "agent": one.agent}
-            records.append({
-                **named,
-                "episodes": budget,
-                "success_iqm": f"{solved:.6g}",
-                "against": one.against or "",
-                **dict(zip(("difference", "low_95", "high_95"), moved or [""] * 3, strict=False)),
-                "cpu_s": f"{line.train_cpu_s:.1f}",
-            })  # fmt: skip
-            rows.append({
-                **named,
-                "episodes": f"{budget:,}",
-                "solved (%)": percent(solved),
-                "against": one.against or DASH,
-                "difference": DASH if moved is None else estimate(moved, signed_percent),
-                "imagined right": percent(float(line.imagined_right[:, place].mean())),
-                "CPU s": count(line.train_cpu_s),
-            })  # fmt: skip
+            records.append(
+                {
+                    **named,
+                    "episodes": budget,
+                    "success_iqm": f"{solved:.6g}",
+                    "against": one.against or "",
+                    **dict(zip(("difference", "low_95", "high_95"), moved or [""] * 3, strict=False)),
+                    "cpu_s": f"{line.train_cpu_s:.1f}",
+                }
+            )
+            rows.append(
+                {
+                    **named,
+                    "episodes": f"{budget:,}",
+                    "solved (%)": percent(solved),
+                    "against": one.against or DASH,
+                    "difference": DASH if moved is None else estimate(moved, signed_percent),
+                    "imagined right": percent(float(line.imagined_right[:, place].mean())),
+                    "CPU s": count(line.train_cpu_s),
+                }
+            )
     caption = "Difference in points; imagined right: outcomes of one macro-action that are expected rightly (%)."
     return Table.of("variants", rows, caption, "not compared, or no model to ask"), table_text(records)
 
@@ -98,18 +102,20 @@ def _seeds_csv(study: Study, lines: Sequence[Line]) -> str:
         one = line.variant
         cells = itertools.product(study.seeds, study.budgets)
         for (seed, budget), success, right in zip(cells, line.success.flat, line.imagined_right.flat, strict=True):
-            rows.append({
-                "factor": one.factor,
-                "variant": one.name,
-                "agent": one.agent,
-                "against": one.against or "",
-                "protocol": line.folder.name.rpartition("-")[2],
-                "seed": seed,
-                "episodes": budget,
-                "success": f"{success:.6g}",
-                "imagined_right": "" if math.isnan(right) else f"{right:.4f}",
-                "cpu_s": f"{line.train_cpu_s:.1f}",
-            })  # fmt: skip
+            rows.append(
+                {
+                    "factor": one.factor,
+                    "variant": one.name,
+                    "agent": one.agent,
+                    "against": one.against or "",
+                    "protocol": line.folder.name.rpartition("-")[2],
+                    "seed": seed,
+                    "episodes": budget,
+                    "success": f"{success:.6g}",
+                    "imagined_right": "" if math.isnan(right) else f"{right:.4f}",
+                    "cpu_s": f"{line.train_cpu_s:.1f}",
+                }
+            )
     return table_text(rows)
 
 
@@ -208,18 +214,20 @@ def levels_csv(result: SuiteResult) -> str:
         for found in levels:
             for seed, value, bench in zip(result.suite.seeds, found.values.tolist(), found.benches, strict=True):
                 if found.scale is not None:
-                    rows.append({
-                        "experiment": experiment,
-                        "level": found.level.name,
-                        "task": found.level.task,
-                        "episodes": found.level.episodes,
-                        "agent": agent,
-                        "seed": seed,
-                        "value": "" if math.isnan(value) else value,
-                        **dataclasses.asdict(found.scale),
-                        "cpu_s": round(found.train_cpu_s, 1),
-                        "bench": bench,
-                    })  # fmt: skip
+                    rows.append(
+                        {
+                            "experiment": experiment,
+                            "level": found.level.name,
+                            "task": found.level.task,
+                            "episodes": found.level.episodes,
+                            "agent": agent,
+                            "seed": seed,
+                            "value": "" if math.isnan(value) else value,
+                            **dataclasses.asdict(found.scale),
+                            "cpu_s": round(found.train_cpu_s, 1),
+                            "bench": bench,
+                        }
+                    )
     return table_text(rows)
 
 
