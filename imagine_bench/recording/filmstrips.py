@@ -104,14 +104,12 @@ def filmstrip(
         cut = not kept and bool(rollout.accepted[:index].all())
         right = None
         truth = ""
-        verdict = "episode over" if over else ""
         if index < done:
             truth = f" ({_signed(compared.real_rewards[index])})"
-        if index < done and not over:
             right = np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
-            verdict = _verdict(right)
+        right = None if over else right
         lines = (
-            verdict,
+            "episode over" if over else _verdict(right),
             f"reward {_signed(rollout.rewards[index])}{truth}",
             f"P(end) {rollout.p_terminated[index]:.2f}",
             f"epistemic {rollout.epistemic[index]:.2g}",
@@ -147,19 +145,18 @@ def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: Task
 
 
 def transition_sheet(titles: Sequence[str], rows: Sequence[TileRow]) -> NDArray[np.uint8]:
-    """Draw single transitions side by side (thesis' figure 5.9): a title each, above the first row of
-    as many images, and an image of each named row.
+    """Draw single transitions side by side (thesis' figure 5.9): a title each, below it an image of
+    each named row.
 
     Images are square, RGB or gray bytes. A row that is judged has a border around each image, blue where it is right
     and orange where not, and says it below. The image has shape (height, width, 3), uint8.
     """
     drawn: list[tuple[str, list[Tile]]] = []
-    titled = [len(images) for _, images, _ in rows].index(len(titles))
     for name, images, judged in rows:
         tiles = []
         for place, image in enumerate(images):
             right = None if judged is None else judged[place]
-            tiles.append(Tile(image, titles[place] if len(drawn) == titled else "", _verdict(right), right))
+            tiles.append(Tile(image, "" if drawn else titles[place], _verdict(right), right))
         drawn.append((name, tiles))
     return sheet(drawn)
 
@@ -180,7 +177,7 @@ def png(image: NDArray[np.uint8]) -> bytes:
 def rgb(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     """An image in [0, 1], gray (H, W) or RGB (H, W, 3), as RGB bytes (H, W, 3)."""
     pixels = (np.clip(image, 0.0, 1.0) * 255.0).round().astype(np.uint8)
-    return pixels if pixels.ndim == 3 else np.repeat(pixels[:, :, None], 3, axis=2)
+    return np.asarray(Image.fromarray(pixels).convert("RGB"))
 
 
 def changes(before: Macrostate, now: Macrostate, spec: TaskSpec) -> str:

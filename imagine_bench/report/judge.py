@@ -312,7 +312,9 @@ def _sheet(found: Judged, name: str, caption: str, kind: str, models: Mapping[st
         return None
     (one, *_) = models.values()
     titles = [found.spec.action_names[action] for action in one[f"{kind}_actions"].flat]
-    rows: list[TileRow] = [("before", one[f"{kind}_before"], None), ("real", _joined(one[f"{kind}_real"]), None)]
+    real = _joined(one[f"{kind}_real"])
+    before = np.concatenate([one[f"{kind}_before"], real])[: len(real)]  # a rollout goes on from what was real
+    rows: list[TileRow] = [("before", before, None), ("real", real, None)]
     for model, arrays in models.items():
         rows.append((_title(model), _joined(arrays[f"{kind}_imagined"]), arrays[f"{kind}_right"].ravel().tolist()))
     return Image(name, png(transition_sheet(titles, rows)), caption)
