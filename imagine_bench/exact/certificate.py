@@ -11,7 +11,7 @@ import numpy as np
 
 from imagine_bench.exact.beliefs import BeliefRules, TooManyBeliefsError
 from imagine_bench.exact.factors import FactorGraph, Scope, factor_graph
-from imagine_bench.exact.floor import Lesson, learn
+from imagine_bench.exact.learner import LearnerRun, learn
 from imagine_bench.exact.machine import Machine, machine
 from imagine_bench.exact.memoryless import best_without_memory
 from imagine_bench.interfaces import Floats, Rules, TaskSpec
@@ -21,12 +21,12 @@ _PROVED = 1e-6  # of a success probability
 _LEARNERS = 10
 _FEWEST = 2
 _PAIRS = 20_000
-"""Learners behind an information floor: the most, the fewest, and (macrostate, action) pairs that they share."""
+"""Learners behind a cost: the most, the fewest, and (macrostate, action) pairs that they share."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class InformationFloor:
-    """Means over learners that know the factor graph and nothing else (:mod:`.floor`)."""
+class LearningCost:
+    """Means over cautious learners that know the factor graph and nothing else (:mod:`.learner`)."""
 
     transitions: float
     standard_error: float  #: of ``transitions``
@@ -54,7 +54,7 @@ class Certificate:
     outcomes: tuple[tuple[str, str], ...]  #: (reward and end, coordinates of the conditions that force it), in order
     width: int  #: the most coordinates that decide one factor or condition
     facts: int  #: local entries and conditions that there are to know
-    floor: InformationFloor | None  #: None where no start can be solved, or a learner is not done after floor.MOST
+    floor: LearningCost | None  #: None where no start can be solved, or a learner is not done after learner.MOST
 
 
 def certificate(spec: TaskSpec) -> Certificate:
@@ -102,7 +102,7 @@ def certificate(spec: TaskSpec) -> Certificate:
 def from_json(values: Mapping[str, Any]) -> Certificate:
     """Undo ``dataclasses.asdict`` and JSON. Raises TypeError or KeyError: fields are missing or unknown."""
     lists = {name: tuple(map(tuple, values[name])) for name in ("plan_lengths", "dynamics", "outcomes")}
-    floor = values["floor"] and InformationFloor(**values["floor"])
+    floor = values["floor"] and LearningCost(**values["floor"])
     return Certificate(**{**values, **lists, "floor": floor})
 
 
@@ -181,17 +181,17 @@ def _class(full: Machine, index: int) -> str:
     return f"{reward:+g}{', success' if success else ', end' if ended else ''}"
 
 
-def _floor(full: Machine, graph: FactorGraph, horizon: int) -> InformationFloor | None:
+def _floor(full: Machine, graph: FactorGraph, horizon: int) -> LearningCost | None:
     learners = min(_LEARNERS, max(_FEWEST, _PAIRS // (full.n_play * full.n_actions)))
-    lessons = list[Lesson]()
+    runs = list[LearnerRun]()
     for seed in range(learners):
-        lessons.append(learn(full, graph, horizon, np.random.default_rng(seed)))
-        if not lessons[-1].done:
+        runs.append(learn(full, graph, horizon, np.random.default_rng(seed)))
+        if not runs[-1].done:
             return None
-    needed = np.array([lesson.transitions for lesson in lessons], dtype=np.float64)
-    return InformationFloor(
+    needed = np.array([run.transitions for run in runs], dtype=np.float64)
+    return LearningCost(
         transitions=float(needed.mean()),
         standard_error=float(needed.std(ddof=1) / np.sqrt(learners)),
-        episodes=float(np.mean([lesson.episodes for lesson in lessons])),
+        episodes=float(np.mean([run.episodes for run in runs])),
         learners=learners,
     )

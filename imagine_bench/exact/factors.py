@@ -77,6 +77,11 @@ def keys(values: NDArray[np.int64], scope: Iterable[int]) -> NDArray[np.int64]:
     return found
 
 
+def numbered(values: NDArray[np.generic]) -> NDArray[np.int64]:
+    """The number of each value among the distinct ones, ascending from 0. Shape (N,)."""
+    return np.unique(values, return_inverse=True)[1].reshape(-1)
+
+
 def factor_graph(machine: Machine) -> FactorGraph:
     """Compute it."""
     factors = tuple(each for action in range(machine.n_actions) for each in _factors(machine, action))
@@ -97,7 +102,7 @@ def _factors(machine: Machine, action: int) -> Iterator[Factor]:
     for children in _drawn_together(moved, before, after, weight):
         law = _laws(before, keys(after, children), weight, machine.n_play)
         parents = _smallest(now, law, children)
-        entry = np.unique(keys(now, parents), return_inverse=True)[1].reshape(-1)
+        entry = numbered(keys(now, parents))
         yield Factor(action=action, children=children, parents=parents, entry=entry)
 
 
@@ -106,8 +111,8 @@ def _laws(before: NDArray[np.int64], value: NDArray[np.int64], weight: Floats, n
     law = np.zeros(n, dtype=np.int64)
     for each in np.unique(value):
         share = np.bincount(before, weights=weight * (value == each), minlength=n).round(_DIGITS)
-        share_id = np.unique(share, return_inverse=True)[1].reshape(-1)
-        law = np.unique(law * (share_id.max() + 1) + share_id, return_inverse=True)[1].reshape(-1)
+        share_id = numbered(share)
+        law = numbered(law * (share_id.max() + 1) + share_id)
     return law
 
 
@@ -176,7 +181,7 @@ def _next_claim(points: NDArray[np.int64], label: NDArray[np.int64], left: NDArr
         for class_, so_far in forced.items():
             is_it = label == class_
             for scope in scopes:
-                key = np.unique(keys(points, scope), return_inverse=True)[1].reshape(-1)
+                key = numbered(keys(points, scope))
                 total = np.bincount(key)
                 of_it = np.bincount(key, weights=is_it)
                 forces = (total == of_it)[key]

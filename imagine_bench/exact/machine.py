@@ -1,4 +1,4 @@
-"""A macrostate machine with its ends, as arrays: what factor graphs and the information floor are computed from."""
+"""A macrostate machine with its ends, as arrays: what factor graphs and the cost of learning are computed from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The factor graph against the structure that machines were built with, and the floor against what can be counted."""
+"""The factor graph against the structure that machines were built with, and the cautious learner against counts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from machines import Wheels, spec_of
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.exact.factors import factor_graph
-from imagine_bench.exact.floor import learn
+from imagine_bench.exact.learner import learn
 from imagine_bench.exact.machine import machine
 
 
@@ -76,12 +76,12 @@ def test_a_learner_that_is_done_has_seen_what_it_needs(dials):
     rules = Wheels(**dials)
     full = machine(rules)
     graph = factor_graph(full)
-    lessons = [learn(full, graph, 12, np.random.default_rng(seed)) for seed in range(3)]
-    assert all(lesson.done and lesson.facts <= graph.facts for lesson in lessons)
-    assert all(lesson.episodes <= lesson.transitions for lesson in lessons)
-    assert min(lesson.transitions for lesson in lessons) >= 24 * 0.7
+    runs = [learn(full, graph, 12, np.random.default_rng(seed)) for seed in range(3)]
+    assert all(run.done and run.facts <= graph.facts for run in runs)
+    assert all(run.episodes <= run.transitions for run in runs)
+    assert min(run.transitions for run in runs) >= 24 * 0.7
     again = learn(full, graph, 12, np.random.default_rng(0))
-    assert again == lessons[0]
+    assert again == runs[0]
 
 
 def test_a_world_without_a_plan_says_so():
