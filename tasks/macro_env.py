@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from imagine_bench.arrays import Info, Observed
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
-from imagine_bench.interfaces import EXECUTIONS, Floats, Frame, Outcome, PhysicsSettings, State, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, State, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.values import Json
 
-from .motion.executor import MacroResult
 from .observations import Observer
 from .parameters.observation import delivered, hides
 from .rendering.cameras import FRAME_PX, human_camera_view
@@ -40,12 +39,11 @@ class EnvState:
     world: WorldState
     generator: Mapping[str, Json]  #: state of the generator that everything random is drawn from
     macrostate: State
-    begun: bool
-    latest: MacroResult | None = field(repr=False)
-    people: tuple[Floats, Floats] = field(repr=False)
-    steps: int = 0
-    #: what lag keeps back: observations, and what they show
-    under_way: tuple[tuple[Observed, ...], tuple[State, ...]] = field(default=((), ()), repr=False)
+    episode: Mapping[str, object] = field(repr=False)  #: what else it has of :data:`_EPISODE`
+
+
+_EPISODE = ("begun", "_latest", "_people", "_steps", "_observations", "_observed")
+"""Attributes that say where an episode stands: latest macro-action, and what lag keeps back."""
 
 
 class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
@@ -268,11 +266,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             world=self.world.get_state(),
             generator=copy.deepcopy(self.np_random.bit_generator.state),
             macrostate=self._macrostate,
-            begun=self.begun,
-            latest=self._latest,
-            people=self._people,
-            steps=self._steps,
-            under_way=(self._observations, self._observed),
+            episode={name: getattr(self, name) for name in _EPISODE},
         )
 
     def set_state(self, state: EnvState) -> None:
@@ -288,11 +282,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
         self._macrostate = state.macrostate
-        self.begun = state.begun
-        self._latest = state.latest
-        self._people = state.people
-        self._steps = state.steps
-        self._observations, self._observed = state.under_way
+        for name, value in state.episode.items():
+            setattr(self, name, value)
 
     # --- details -------------------------------------------------------------------------------------------------
 

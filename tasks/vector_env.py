@@ -7,6 +7,7 @@ One camera draws all lanes, in the thread that calls.
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -260,9 +261,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         return stacked
 
     def _named(self, ids: Sequence[int] | None) -> list[int]:
-        given = np.arange(self.num_envs) if ids is None else np.asarray(ids)
-        known = given.ndim == 1 and len(given) and np.issubdtype(given.dtype, np.integer)
-        lanes: list[int] = given.tolist() if known else []
+        lanes = list(range(self.num_envs)) if ids is None else [operator.index(each) for each in ids]
         if not lanes or len(set(lanes)) < len(lanes) or not 0 <= min(lanes) <= max(lanes) < self.num_envs:
             raise InvalidValueError(f"Lanes {brief(ids)}: give different integers from 0 to {self.num_envs - 1}.")
         return lanes

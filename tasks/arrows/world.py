@@ -44,7 +44,7 @@ class ArrowWorld(World):
         """What carries macro-actions out in contact physics, made when it is first needed."""
         from ..motion.turn import TurnExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
-        return TurnExecutor(self.model, self._layout.slots_xy_m, self.sensing)
+        return TurnExecutor(self.model, self.data, self._layout.slots_xy_m, self.sensing)
 
     def set_outcome(self, action: int, intended: State) -> None:
         """Kinematic execution: a turned cube stands where a good turn leaves it."""
@@ -64,7 +64,6 @@ class ArrowWorld(World):
         slipping = [turn.cube for turn in turns if self._slipped(turn.cube, intended)]
         results = [
             self.executor.turn(
-                self.data,
                 cube=turn.cube,
                 clockwise=turn.clockwise,
                 slips=turn.cube in slipping,
@@ -72,7 +71,7 @@ class ArrowWorld(World):
             )
             for turn in turns
         ]
-        self.executor.rest(self.data)
+        self.executor.rest()
         self._gesture(intended[-1])
         self.update()
         result = functools.reduce(MacroResult.then, results)

@@ -42,8 +42,8 @@ def back_to_rest(opening_m: float, settle_s: float) -> list[Waypoint]:
     """Back to the observation pose, and a moment of calm there."""
     observe = np.array(OBSERVATION_QPOS_RAD)
     return [
-        Waypoint(name="return", qpos_rad=observe, opening_m=opening_m),
-        Waypoint(name="settle", qpos_rad=observe, opening_m=opening_m, min_duration_s=settle_s),
+        Waypoint("return", observe, opening_m),
+        Waypoint("settle", observe, opening_m, min_duration_s=settle_s),
     ]
 
 
@@ -95,10 +95,11 @@ class MacroExecutor:
     :class:`.orientation.Sensing` says else.
     """
 
-    def __init__(self, model: mujoco.MjModel, sensing: Sensing | None = None) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, sensing: Sensing) -> None:
         self.model = model
+        self.data = data
         self.arm = ArmModel()
-        self.sensing = sensing or Sensing()
+        self.sensing = sensing
         self.capture_motion_hz = 0.0  # samples of a motion a second for a recording; 0 takes none
         columns = arm_columns(model)
         self._arm_qpos, self._finger_qpos = np.split(columns.qpos, [len(ARM_JOINTS)])
@@ -108,7 +109,7 @@ class MacroExecutor:
         self._states = np.empty((0, mujoco.mj_stateSize(model, _STATE.mjSTATE_FULLPHYSICS.value)))
         self._control = np.empty((0, mujoco.mj_stateSize(model, _INPUTS)))
 
-    def rest(self, data: mujoco.MjData, *, squeeze_m: float | None = None) -> None:
+    def rest(self, *, squeeze_m: float | None = None) -> None:
         """Bring ``data`` to the canonical start, in place: the arm at its observation pose, everything still.
 
         Only the positions of loose objects and of mocap bodies survive, and those of fingers that hold something;
@@ -117,18 +118,17 @@ class MacroExecutor:
         the fingers to where they rest. Derived quantities are not updated.
         """
         kept = np.empty(mujoco.mj_stateSize(self.model, _KEPT))
-        mujoco.mj_getState(self.model, data, kept, _KEPT)
-        mujoco.mj_resetData(self.model, data)
-        mujoco.mj_setState(self.model, data, kept, _KEPT)
-        data.qpos[self._arm_qpos] = OBSERVATION_QPOS_RAD
+        mujoco.mj_getState(self.model, self.data, kept, _KEPT)
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_setState(self.model, self.data, kept, _KEPT)
+        self.data.qpos[self._arm_qpos] = OBSERVATION_QPOS_RAD
         if squeeze_m is None:
-            data.qpos[self._finger_qpos] = REST_OPENING_M
-        data.ctrl[self._arm_ctrl] = OBSERVATION_QPOS_RAD
-        data.ctrl[self._finger_ctrl] = REST_OPENING_M if squeeze_m is None else squeeze_m
+            self.data.qpos[self._finger_qpos] = REST_OPENING_M
+        self.data.ctrl[self._arm_ctrl] = OBSERVATION_QPOS_RAD
+        self.data.ctrl[self._finger_ctrl] = REST_OPENING_M if squeeze_m is None else squeeze_m
 
     def perform(
         self,
-        data: mujoco.MjData,
         waypoints: Sequence[Waypoint],
         *,
         ik_error_m: float,
@@ -149,7 +149,7 @@ class MacroExecutor:
             waypoints=waypoints,
             timestep_s=timestep_s,
         )
-        qpos = self.run(data, trajectory, squeeze_m=squeeze_m)
+        qpos = self.run(trajectory, squeeze_m=squeeze_m)
         steps = len(qpos) - 1
         off_rad = float(np.abs(qpos[-1, self._arm_qpos] - OBSERVATION_QPOS_RAD).max())
         result = MacroResult(
@@ -161,10 +161,11 @@ class MacroExecutor:
         return result, qpos, trajectory
 
     def refused(self, reason: str) -> MacroResult:
-        """The result of a macro-action for which the arm does not move."""
-        return MacroResult(fault=reason, motion=self._no_samples())
+        """The result of a macro-action for which the arm, which holds nothing, does not move."""
+        self.rest()
+        return MacroResult(fault=reason, motion=self.no_samples())
 
-    def run(self, data: mujoco.MjData, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
+    def run(self, trajectory: Trajectory, *, squeeze_m: float | None = None) -> Floats:
         """Execute ``trajectory``, planned at the model's timestep, from the canonical start.
 
         The derived quantities of ``data`` (such as ``xpos``) are then those of the last step.
@@ -176,20 +177,21 @@ class MacroExecutor:
         Raises:
             DivergedError: NaN, infinity or runaway speed; the message names the saved start.
         """
-        self.rest(data, squeeze_m=squeeze_m)
+        self.rest(squeeze_m=squeeze_m)
         steps = len(trajectory.opening_m)
         if len(self._control) < steps:
             self._states = np.empty((steps + 1, self._states.shape[1]))
             self._control = np.empty((steps, self._control.shape[1]))
         states = self._states[: steps + 1]
         control = self._control[:steps]
-        mujoco.mj_getState(self.model, data, states[0], _STATE.mjSTATE_FULLPHYSICS.value)
-        mujoco.mj_getState(self.model, data, control[0], _INPUTS)
+        mujoco.mj_getState(self.model, self.data, states[0], _STATE.mjSTATE_FULLPHYSICS.value)
+        mujoco.mj_getState(self.model, self.data, control[0], _INPUTS)
         control[1:] = control[0]
         control[:, self._arm_ctrl] = trajectory.arm_command_rad
         control[:, self._finger_ctrl] = trajectory.opening_m[:, None]
-        mujoco.rollout.rollout(self.model, data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
-        if _diverged(data, states[-1]):
+        mujoco.rollout.rollout(self.model, self.data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
+        exploded = any(self.data.warning[int(kind)].number for kind in _BAD_STATE)
+        if exploded or not (np.isfinite(states[-1]).all() and np.abs(self.data.qvel).max() < _RUNAWAY_RAD_S):
             raise self._divergence(states[0], control)
         return states[:, self._qpos_column : self._qpos_column + self.model.nq]
 
@@ -207,7 +209,8 @@ class MacroExecutor:
         """Each finger's distance from the grip's middle in positions of the scene: (..., nq) to (..., 2)."""
         return qpos[..., self._finger_qpos]
 
-    def _no_samples(self) -> Samples:
+    def no_samples(self) -> Samples:
+        """The samples of a motion that is not captured, or of none."""
         model = self.model
         return Samples(np.empty(0), np.empty((0, model.nq)), np.empty((0, model.nv)), np.empty((0, model.nu)))
 
@@ -221,7 +224,7 @@ class MacroExecutor:
             The samples, with the first and the last step whenever any are taken.
         """
         if self.capture_motion_hz <= 0:
-            return self._no_samples()
+            return self.no_samples()
         timestep_s = self.model.opt.timestep
         nq = self.model.nq
         stride = 1.0 / (self.capture_motion_hz * timestep_s)
@@ -234,10 +237,3 @@ class MacroExecutor:
         for row in np.flatnonzero(share % 1.0):
             mujoco.mj_normalizeQuat(self.model, samples[row, :nq])
         return Samples(at * timestep_s, samples[:, :nq], samples[:, nq:], self._control[before, : self.model.nu])
-
-
-def _diverged(data: mujoco.MjData, state: Floats) -> bool:
-    """Whether the simulation that ends in ``state`` has exploded."""
-    if any(data.warning[int(kind)].number for kind in _BAD_STATE):
-        return True
-    return not (np.isfinite(state).all() and np.abs(data.qvel).max() < _RUNAWAY_RAD_S)

@@ -20,7 +20,7 @@ from ..scenes.constants import HOME_QPOS_RAD
 
 POSITION_TOLERANCE_M = 2e-4
 ANGLE_TOLERANCE_RAD = 2e-3
-MAX_ITERATIONS = 40
+_MAX_STEPS = 40
 
 _ORIENTATION_COST = 0.3
 _POSTURE_COST = 1e-3  # ten times more leaves 0.3 mm and never converges
@@ -78,12 +78,10 @@ class UnreachableTargetError(ImagineBenchError):
 
 @dataclass(frozen=True, kw_only=True)
 class IKSolution:
-    """A configuration (7,) that reaches its target, the errors that are left, and the Newton steps taken."""
+    """A configuration (7,) that reaches its target, and its distance from it."""
 
     qpos_rad: Floats
-    position_error_m: float
-    angle_error_rad: float  # tilt and yaw together
-    iterations: int
+    error_m: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,41 +118,31 @@ class ArmIK:
         self._unbounded = np.full(2 * n_joints, -1e30)
         self._kind = np.zeros(2 * n_joints, dtype=c_int)
 
-    def solve(
-        self,
-        *,
-        position_in_base_m: Floats,
-        yaw_rad: float,
-        start_qpos_rad: Floats | None = None,
-        max_iterations: int = MAX_ITERATIONS,
-    ) -> IKSolution:
+    def solve(self, place_m: Floats, yaw_rad: float, start_qpos_rad: Floats) -> IKSolution:
         """Find the configuration nearest the home posture that points straight down at a place.
 
         Args:
-            position_in_base_m: Where the tool centre point shall be. Shape (3,).
+            place_m: Where the tool centre point shall be, the base at the origin. Shape (3,).
             yaw_rad: Heading of the tool's x axis about the vertical.
-            start_qpos_rad: Where the search starts, such as a known solution nearby; home if None. Shape (7,).
-            max_iterations: Newton steps before giving up.
+            start_qpos_rad: Where the search starts, such as a known solution nearby. Shape (7,).
 
         Raises:
-            UnreachableTargetError: No convergence; the message gives target, residual and tolerance.
+            UnreachableTargetError: No convergence; the message gives target and residual.
         """
-        self._reach.set_target(mink.SE3.from_rotation_and_translation(pointing_down(yaw_rad), position_in_base_m))
-        self._configuration.update(np.array(HOME_QPOS_RAD if start_qpos_rad is None else start_qpos_rad))
-        for iteration in range(max_iterations + 1):
+        self._reach.set_target(mink.SE3.from_rotation_and_translation(pointing_down(yaw_rad), place_m))
+        self._configuration.update(start_qpos_rad)
+        for step in range(_MAX_STEPS + 1):
             error = self._reach.compute_error(self._configuration)  # [6], position then rotation vector
-            position_error_m = math.hypot(*error[:3])
-            angle_error_rad = math.hypot(*error[3:])
-            if position_error_m < POSITION_TOLERANCE_M and angle_error_rad < ANGLE_TOLERANCE_RAD:
-                errors = {"position_error_m": position_error_m, "angle_error_rad": angle_error_rad}
-                return IKSolution(qpos_rad=self._configuration.q.copy(), iterations=iteration, **errors)
-            if iteration < max_iterations:
+            error_m = math.hypot(*error[:3])
+            angle_rad = math.hypot(*error[3:])
+            if error_m < POSITION_TOLERANCE_M and angle_rad < ANGLE_TOLERANCE_RAD:
+                return IKSolution(qpos_rad=self._configuration.q.copy(), error_m=error_m)
+            if step < _MAX_STEPS:
                 self._configuration.integrate_inplace(self._step(), 1.0)
         raise UnreachableTargetError(
-            f"The gripper cannot reach {np.round(position_in_base_m, 4).tolist()} m at yaw "
-            f"{math.degrees(yaw_rad):.0f} deg: after {max_iterations} steps {1000 * position_error_m:.1f} mm and "
-            f"{math.degrees(angle_error_rad):.1f} deg are missing, allowed are {1000 * POSITION_TOLERANCE_M:g} mm and "
-            f"{math.degrees(ANGLE_TOLERANCE_RAD):.2f} deg; choose a target nearer to the middle of the table."
+            f"The gripper cannot reach {np.round(place_m, 4).tolist()} m at yaw {math.degrees(yaw_rad):.0f} deg: after "
+            f"{_MAX_STEPS} steps {1000 * error_m:.1f} mm and {math.degrees(angle_rad):.1f} deg are missing; choose a "
+            "target nearer to the middle of the table."
         )
 
     def _step(self) -> Floats:
@@ -176,20 +164,15 @@ class ArmIK:
         step: Floats = solved
         return step
 
-    def reach(self, place_m: Floats, *, yaw_rad: float, lift_m: float, start: Reach | Floats | None = None) -> Reach:
+    def reach(self, place_m: Floats, yaw_rad: float, lift_m: float, near: Reach) -> Reach:
         """Find the configurations with the tool centre point at ``place_m`` (3,) and ``lift_m`` above it.
 
-        The searches start from a solution nearby, from one configuration (7,) for both, or from home if None.
+        The searches start from a solution nearby.
 
         Raises:
             UnreachableTargetError: As :meth:`solve`.
         """
-        starts = (start.at_qpos_rad, start.above_qpos_rad) if isinstance(start, Reach) else (start, start)
-        at, above = (
-            self.solve(
-                position_in_base_m=place_m + np.array([0.0, 0.0, height_m]), yaw_rad=yaw_rad, start_qpos_rad=qpos_rad
-            )
-            for height_m, qpos_rad in zip((0.0, lift_m), starts, strict=True)
-        )
-        error_m = max(at.position_error_m, above.position_error_m)
+        at = self.solve(place_m, yaw_rad, near.at_qpos_rad)
+        above = self.solve(place_m + np.array([0.0, 0.0, lift_m]), yaw_rad, near.above_qpos_rad)
+        error_m = max(at.error_m, above.error_m)
         return Reach(at_qpos_rad=at.qpos_rad, above_qpos_rad=above.qpos_rad, error_m=error_m)

@@ -27,7 +27,7 @@ EFFORT_SHARE = 0.5
 """Share of the effort limits that accelerating may take; the rest is left to damping, load and the servos."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Waypoint:
     """Where arm (7,) and fingers shall be next, at rest; the name, such as ``"close"``, is unique in its trajectory."""
 

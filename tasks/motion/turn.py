@@ -11,7 +11,7 @@ import numpy as np
 
 from imagine_bench.interfaces import Floats
 
-from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M
+from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M, HOME_QPOS_RAD
 from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest
 from .ik import ArmIK, Reach, UnreachableTargetError
 from .orientation import ObjectPose, Sensing
@@ -48,17 +48,22 @@ class TurnExecutor(MacroExecutor):
     """
 
     def __init__(
-        self, model: mujoco.MjModel, slots_xy_m: Sequence[tuple[float, float]], sensing: Sensing | None = None
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        slots_xy_m: Sequence[tuple[float, float]],
+        sensing: Sensing,
     ) -> None:
-        super().__init__(model, sensing)
+        super().__init__(model, data, sensing)
         self._ik = ArmIK(self.arm)
         self._cube_qpos = [int(model.joint(f"cube_{cube}_joint").qposadr[0]) for cube in range(len(slots_xy_m))]
         self._slots_xy_m = slots_xy_m
-        self._slots = [self._reach(np.array(slot), None) for slot in slots_xy_m]
+        home = np.array(HOME_QPOS_RAD)
+        near = Reach(at_qpos_rad=home, above_qpos_rad=home, error_m=0.0)
+        self._slots = [self._reach(np.array(slot), near) for slot in slots_xy_m]
 
     def turn(
         self,
-        data: mujoco.MjData,
         *,
         cube: int,
         clockwise: bool,
@@ -72,7 +77,7 @@ class TurnExecutor(MacroExecutor):
         positions and the arguments, bit for bit.
         """
         poses = [
-            self.sensing.pose(data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
+            self.sensing.pose(self.data.qpos[start : start + 7], np.array([*place_m, CUBE_REST_Z_M]))
             for start, place_m in zip(self._cube_qpos, self._slots_xy_m, strict=True)
         ]
         true = poses[cube]
@@ -80,14 +85,14 @@ class TurnExecutor(MacroExecutor):
         right_m, up_m, turned_rad = noise
         pose = self.sensing.erring(true)
         if pose.tilt_rad > _MAX_TILT_RAD:
-            return self._refuse(data, f"cube {cube} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
+            return self.refused(f"cube {cube} is tipped by {math.degrees(pose.tilt_rad):.0f} degrees")
         place_m = np.add(self._slots_xy_m[cube], (right_m, up_m))
         try:
             grip = self._reach(pose.position_m[:2], slot)
             if any(noise):
                 slot = self._reach(place_m, slot)
         except UnreachableTargetError as error:
-            return self._refuse(data, f"cube {cube} is out of reach: {error}")
+            return self.refused(f"cube {cube} is out of reach: {error}")
         others = [each for each in poses if each is not true]
         along_x_m, along_y_m = _rooms_m(others, pose)
         skewed = abs(_skew_rad(pose)) > _MAX_SKEW_RAD
@@ -102,20 +107,16 @@ class TurnExecutor(MacroExecutor):
         openings_m = (opening_m, leaves_m)
         waypoints = _waypoints(grip, slot, skews_rad, clockwise, begins_along_x != clockwise, slips, openings_m)
         error_m = max(grip.error_m, slot.error_m)
-        result, qpos, trajectory = self.perform(data, waypoints, ik_error_m=error_m)
+        result, qpos, trajectory = self.perform(waypoints, ik_error_m=error_m)
         holding = qpos[trajectory.last_step["close" if slips else "turn"] + 1]
         if self.opening_m(holding).mean() < _SQUEEZED_M + _MISSED_M:
             return replace(result, fault=f"the fingers closed past cube {cube}")
         return result
 
-    def _reach(self, place_xy_m: Floats, start: Reach | None) -> Reach:
+    def _reach(self, place_xy_m: Floats, near: Reach) -> Reach:
         """Configurations that grip, and hover over, a cube standing at ``place_xy_m`` (2,), at the middle yaw."""
         place_m = np.array([*place_xy_m, CUBE_REST_Z_M])
-        return self._ik.reach(place_m, yaw_rad=_MIDDLE_YAW_RAD, lift_m=_LIFT_M, start=start)
-
-    def _refuse(self, data: mujoco.MjData, reason: str) -> MacroResult:
-        self.rest(data)
-        return self.refused(reason)
+        return self._ik.reach(place_m, _MIDDLE_YAW_RAD, _LIFT_M, near)
 
 
 def _skew_rad(pose: ObjectPose) -> float:
@@ -168,20 +169,20 @@ def _waypoints(
     after[-1] = extra_rad + sense * _QUARTER_RAD / 2 - skews_rad[1]
     if slips:
         turn = [
-            Waypoint(name="open", qpos_rad=grip.at_qpos_rad + before, opening_m=opening_m, min_duration_s=_OPEN_S),
-            Waypoint(name="lift", qpos_rad=grip.above_qpos_rad + before, opening_m=opening_m),
-            Waypoint(name="turn", qpos_rad=slot.above_qpos_rad + after, opening_m=REST_OPENING_M, blend_s=BLEND_S),
+            Waypoint("open", grip.at_qpos_rad + before, opening_m, min_duration_s=_OPEN_S),
+            Waypoint("lift", grip.above_qpos_rad + before, opening_m),
+            Waypoint("turn", slot.above_qpos_rad + after, REST_OPENING_M, blend_s=BLEND_S),
         ]
     else:
         turn = [
-            Waypoint(name="turn", qpos_rad=slot.at_qpos_rad + after, opening_m=_SQUEEZED_M),
-            Waypoint(name="open", qpos_rad=slot.at_qpos_rad + after, opening_m=leaves_m, min_duration_s=_OPEN_S),
-            Waypoint(name="up", qpos_rad=slot.above_qpos_rad + after, opening_m=leaves_m, blend_s=BLEND_S),
+            Waypoint("turn", slot.at_qpos_rad + after, _SQUEEZED_M),
+            Waypoint("open", slot.at_qpos_rad + after, leaves_m, min_duration_s=_OPEN_S),
+            Waypoint("up", slot.above_qpos_rad + after, leaves_m, blend_s=BLEND_S),
         ]
     return [
-        Waypoint(name="reach", qpos_rad=grip.above_qpos_rad + before, opening_m=opening_m, blend_s=BLEND_S),
-        Waypoint(name="down", qpos_rad=grip.at_qpos_rad + before, opening_m=opening_m),
-        Waypoint(name="close", qpos_rad=grip.at_qpos_rad + before, opening_m=_SQUEEZED_M, min_duration_s=_CLOSE_S),
+        Waypoint("reach", grip.above_qpos_rad + before, opening_m, blend_s=BLEND_S),
+        Waypoint("down", grip.at_qpos_rad + before, opening_m),
+        Waypoint("close", grip.at_qpos_rad + before, _SQUEEZED_M, min_duration_s=_CLOSE_S),
         *turn,
         *back_to_rest(REST_OPENING_M, _SETTLE_S),
     ]

@@ -15,7 +15,7 @@ from imagine_bench.interfaces import State
 from ..motion import orientation
 from ..motion.executor import REST_OPENING_M, MacroResult
 from ..scenes.appearance import Appearance
-from ..scenes.arm import FINGER_JOINTS, TCP_SITE
+from ..scenes.arm import TCP_SITE, arm_columns
 from ..scenes.constants import TABLE_HEIGHT_M
 from ..scenes.hand import PALM_REACH_M, fingertip_m
 from ..scenes.objects import MATERIALS, OBJECTS, SLOTS_XY_M, standing_m
@@ -50,20 +50,20 @@ class PickWorld(World):
         model = compile_pick_scene(parameters.distractors)
         materials = ("table_top", "skin", *MATERIALS)
         super().__init__(model, level, objects=objects, materials=materials, distractors=parameters.distractors)
-        self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in FINGER_JOINTS]
-        self._finger_ctrl = [self.model.actuator(name.replace("_slide", "_servo")).id for name in FINGER_JOINTS]
-        self._tcp = self.model.site(TCP_SITE).id
+        columns = arm_columns(model)
+        self._finger_qpos = columns.qpos[-2:]
+        self._finger_ctrl = columns.ctrl[-2:]
         self._hand, self._palm = (int(self.model.body(name).mocapid[0]) for name in ("hand", "palm"))
-        self._tcp_m = self.data.site_xpos[self._tcp]
+        self._tcp_m = self.data.site_xpos[model.site(TCP_SITE).id]
         self._palm_m = self.data.mocap_pos[self._palm]
-        self._tcp_at_rest_m = tuple(self.data.site_xpos[self._tcp].tolist())
+        self._tcp_at_rest_m = tuple(self._tcp_m.tolist())
 
     @functools.cached_property
     def executor(self) -> CarryExecutor:
         """What carries macro-actions out in contact physics, made when it is first needed."""
         from ..motion.carry import CarryExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
-        return CarryExecutor(self.model, self.sensing)
+        return CarryExecutor(self.model, self.data, self.sensing)
 
     # --- putting -------------------------------------------------------------------------------------------------
 
@@ -71,25 +71,19 @@ class PickWorld(World):
         """Put an object on its place, into the gripper or into the palm."""
         spec = OBJECTS[index]
         right_m, up_m, turned_rad = self._scaled(offset)
+        share = 1.0
         if value == PLACED:
             base_m = standing_m(index)
-            share_x = 1.0
-            share_y = 1.0
         elif value == PICKED:
             base_m = self._tcp_at_rest_m
-            share_x = _GRIP_SHARE
-            share_y = 0.0
+            share = _GRIP_SHARE
+            up_m = 0.0
             self._fingers(spec.grip_opening_m, spec.squeeze_m)
         else:
             base_m = (*PALM_M[:2], PALM_M[2] + spec.grip_height_m)
-            share_x = 1.0
-            share_y = 1.0
-        self.data.qpos[self.object_qpos[index]] = (
-            base_m[0] + share_x * right_m,
-            base_m[1] + share_y * up_m,
-            base_m[2],
-            *orientation.about_vertical(turned_rad * share_x),
-        )
+        x_m, y_m, z_m = base_m
+        turned = orientation.about_vertical(turned_rad * share)
+        self.data.qpos[self.object_qpos[index]] = (x_m + share * right_m, y_m + up_m, z_m, *turned)
 
     def _fingers(self, opening_m: float, command_m: float) -> None:
         self.data.qpos[self._finger_qpos] = opening_m
@@ -131,7 +125,7 @@ class PickWorld(World):
         stays = before == intended[:N_OBJECTS]
         result = self._act(action, before, stays)
         self.update()
-        self.executor.rest_holding(self.data, held_object(self._objects()[0]))
+        self.executor.rest_holding(held_object(self._objects()[0]))
         self.update()
         after, problem = self._objects()
         if HANDED_OVER not in after:  # a palm stays as it is under what lies in it
@@ -148,17 +142,17 @@ class PickWorld(World):
         if action == HAND_OVER:
             palm_m = self.data.mocap_pos[self._palm].copy()
             if held is not None and self._read_gesture() == OPEN_PALM and not stays:
-                return executor.hand_over(self.data, index=held, palm_m=palm_m)
+                return executor.hand_over(index=held, palm_m=palm_m)
             place_m = np.array([*PALM_M[:2], PALM_M[2] + _VAIN_M])
         elif HANDED_OVER not in objects and held == action and not stays:
             noise = self._scaled(self._placement_noise[action])
-            return executor.place(self.data, index=action, noise=noise)
+            return executor.place(index=action, noise=noise)
         elif HANDED_OVER not in objects and held is None and not stays:
-            return executor.pick(self.data, index=action)
+            return executor.pick(index=action)
         else:
             x_m, y_m, z_m = standing_m(action)
             place_m = np.array([x_m, y_m, z_m + _VAIN_M])
-        return executor.visit(self.data, place_m=place_m, held=held)
+        return executor.visit(place_m=place_m, held=held)
 
     # --- reading -------------------------------------------------------------------------------------------------
 

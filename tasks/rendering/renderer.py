@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import atexit
-import contextlib
 import copy
 import ctypes
 import functools
@@ -20,7 +19,7 @@ import hashlib
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -140,8 +139,7 @@ class _Canvas:
         self.gl = _new_gl_context(view.width, view.height)
         self._address = ctypes.cast(self.gl._context, ctypes.c_void_p).value if _is_egl() else None
         try:
-            with _quality(model, view):
-                self.mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            self.mjr = mujoco.MjrContext(_in_quality(model, view), mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except mujoco.FatalError as error:  # GLFW makes a context object without a display, but nothing can be drawn
             raise _missing_gl(error) from error
         mujoco.mjr_setBuffer(_OFFSCREEN, self.mjr)
@@ -233,24 +231,18 @@ class _Canvases:
             canvas.gl._context = None  # its destructor would free it from here
 
 
-@contextlib.contextmanager
-def _quality(model: mujoco.MjModel, view: View) -> Iterator[None]:
-    """Lend ``model`` the quality of ``view``: a context reads it once, when it is made."""
-    quality = model.vis.quality
-    size = model.vis.global_
-    before = copy.copy(quality)
-    size_before = copy.copy(size)
+def _in_quality(model: mujoco.MjModel, view: View) -> mujoco.MjModel:
+    """A copy of a model with the quality of a view: a context reads it once, when it is made."""
+    asked = copy.copy(model)
+    quality = asked.vis.quality
+    size = asked.vis.global_
     quality.shadowsize = view.shadow_px
     quality.offsamples = view.samples
     quality.numslices = view.slices
     quality.numstacks = max(view.slices // 2, 3)
     size.offwidth = view.width
     size.offheight = view.height
-    try:
-        yield
-    finally:
-        model.vis.quality = before
-        model.vis.global_ = size_before
+    return asked
 
 
 _KEPT = 12

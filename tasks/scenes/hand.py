@@ -92,7 +92,7 @@ def add_limb(
     body = spec.worldbody.add_body(name=name, mocap=True, pos=pos_m)
     materials = (("skin", c.SCENE_GROUP), ("skin", c.SETTING_GROUP), ("cloth", c.SETTING_GROUP))
     for (part, mesh), (material, group) in zip(meshes.items(), materials, strict=True):
-        add_drawn_mesh(spec, body, part, mesh, material=material, group=group, geom=f"{part}_skin")
+        add_drawn_mesh(spec, body, part, mesh, material=material, group=group, suffix="_skin")
     return body
 
 
@@ -124,7 +124,14 @@ def add_open_hand(spec: mujoco.MjSpec, palm_m: tuple[float, float, float]) -> No
 
 
 def add_drawn_mesh(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, mesh: Mesh, *, material: str, group: int, geom: str
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    name: str,
+    mesh: Mesh,
+    *,
+    material: str,
+    group: int = c.SCENE_GROUP,
+    suffix: str = "",
 ) -> None:
     """Add a geom that is drawn, weighs nothing and touches nothing.
 
@@ -137,7 +144,7 @@ def add_drawn_mesh(
         inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
     )
     body.add_geom(
-        name=geom,
+        name=name + suffix,
         type=mujoco.mjtGeom.mjGEOM_MESH,
         meshname=name,
         material=material,

@@ -41,15 +41,16 @@ def _rings_to_mesh(rings: Floats, first: Floats, last: Floats) -> Mesh:
     vertices = np.concatenate([rings.reshape(-1, 3), first[None], last[None]])
     side = np.arange(n_sides)
     following = (side + 1) % n_sides
-    faces = [np.stack([np.full(n_sides, len(vertices) - 2), following, side], axis=1)]
-    for ring in range(n_rings - 1):
-        low = ring * n_sides
-        high = (ring + 1) * n_sides
-        faces.append(np.stack([low + side, low + following, high + following], axis=1))
-        faces.append(np.stack([low + side, high + following, high + side], axis=1))
-    top = (n_rings - 1) * n_sides
-    faces.append(np.stack([top + side, top + following, np.full(n_sides, len(vertices) - 1)], axis=1))
-    return Mesh(vertices, np.concatenate(faces).astype(np.int64))
+    low = n_sides * np.arange(n_rings - 1)[:, None]
+    high = low + n_sides
+    top = n_sides * (n_rings - 1)
+    between = [[low + side, low + following, high + following], [low + side, high + following, high + side]]
+    bottom = [np.full(n_sides, len(vertices) - 2), following, side]
+    lid = [top + side, top + following, np.full(n_sides, len(vertices) - 1)]
+    rows = np.moveaxis(np.array(between), (0, 1, 2, 3), (1, 3, 0, 2)).reshape(
+        -1, 3
+    )  # ring by ring, two triangles a side
+    return Mesh(vertices, np.concatenate([np.transpose(bottom), rows, np.transpose(lid)]))
 
 
 def _frames_along(axes: Floats) -> Floats:

@@ -56,12 +56,13 @@ def _round_opening_m(radius_m: float) -> float:
     return math.sqrt((radius_m + TIP_RADIUS_M) ** 2 - TIP_OFFSET_M**2) - TIP_RADIUS_M
 
 
-BALL = ObjectSpec(
-    name="ball", grip_height_m=_BALL_RADIUS_M, grip_opening_m=_round_opening_m(_BALL_RADIUS_M), upright=False
+OBJECTS = (
+    ObjectSpec(
+        name="ball", grip_height_m=_BALL_RADIUS_M, grip_opening_m=_round_opening_m(_BALL_RADIUS_M), upright=False
+    ),
+    ObjectSpec(name="car", grip_height_m=_CAR_GRIP_Z_M, grip_opening_m=_CAR_HALF_M[1]),
+    ObjectSpec(name="cup", grip_height_m=_CUP_GRIP_Z_M, grip_opening_m=_round_opening_m(_CUP_RADIUS_M)),
 )
-CAR = ObjectSpec(name="car", grip_height_m=_CAR_GRIP_Z_M, grip_opening_m=_CAR_HALF_M[1])
-CUP = ObjectSpec(name="cup", grip_height_m=_CUP_GRIP_Z_M, grip_opening_m=_round_opening_m(_CUP_RADIUS_M))
-OBJECTS = (BALL, CAR, CUP)
 """Left to right in the agent's frame."""
 
 _RGBA = {
@@ -144,8 +145,8 @@ def add_objects(spec: mujoco.MjSpec) -> None:
         name="car_box", type=kind.mjGEOM_BOX, size=_CAR_HALF_M, pos=(0, 0, body_z), mass=0.8 * _MASS_KG, **_TOUCH
     )
     _add_supports(car, "car_wheel", _WHEEL_M, (0.021, 0.014, _WHEEL_M - _CAR_GRIP_Z_M))
-    _skin(spec, car, "car_skin", car_body(), "car")
-    _skin(spec, car, "car_trim", car_trim(), "car_dark")
+    add_drawn_mesh(spec, car, "car_skin", car_body(), material="car")
+    add_drawn_mesh(spec, car, "car_trim", car_trim(), material="car_dark")
 
     half_m = (_CUP_HEIGHT_M - _CUP_FOOT_M) / 2
     middle_z = _CUP_FOOT_M + half_m - _CUP_GRIP_Z_M
@@ -158,8 +159,8 @@ def add_objects(spec: mujoco.MjSpec) -> None:
         **_TOUCH,
     )
     _add_supports(cup, "cup_foot", _CUP_FOOT_M, (0.014, 0.014, _CUP_FOOT_M - _CUP_GRIP_Z_M))
-    _skin(spec, cup, "cup_skin", cup_body(), "cup")
-    _skin(spec, cup, "cup_hole", cup_inside(), "cup_inside")
+    add_drawn_mesh(spec, cup, "cup_skin", cup_body(), material="cup")
+    add_drawn_mesh(spec, cup, "cup_hole", cup_inside(), material="cup_inside")
 
 
 def _body(spec: mujoco.MjSpec, index: int) -> mujoco.MjsBody:
@@ -180,7 +181,3 @@ def _add_supports(body: mujoco.MjsBody, name: str, radius_m: float, corner_m: tu
             mass=0.05 * _MASS_KG,
             **_TOUCH,
         )
-
-
-def _skin(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, mesh: Mesh, material: str) -> None:
-    add_drawn_mesh(spec, body, name, mesh, material=material, group=c.SCENE_GROUP, geom=name)

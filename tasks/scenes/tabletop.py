@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mujoco
 import numpy as np
 
@@ -19,22 +21,9 @@ _DRAWN_ONLY = {"contype": 0, "conaffinity": 0, "group": c.SETTING_GROUP}
 """Of geoms that only the human's view shows."""
 
 
-def set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
-    """Solver settings in which friction alone holds what is lifted; `make speed` measures how well."""
-    option = spec.option
-    option.timestep = timestep_s
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    option.impratio = 1.0
-    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP.value  # resting cubes cost nothing: halves a macro-action
-
-
-def set_quality(spec: mujoco.MjSpec) -> None:
+def _set_visual(spec: mujoco.MjSpec) -> None:
     """Cheap frames: no shadow map, no multisampling, coarse primitives; the human's renderer asks for more itself."""
     visual = spec.visual
-    size = spec.visual.global_
     visual.quality.shadowsize = 0
     visual.quality.offsamples = 0
     visual.quality.numslices = 12
@@ -42,8 +31,8 @@ def set_quality(spec: mujoco.MjSpec) -> None:
     visual.quality.numquads = 1
     visual.map.znear = 0.01
     visual.map.zfar = 20.0
-    size.offwidth = 64
-    size.offheight = 64
+    visual.global_.offwidth = 64
+    visual.global_.offheight = 64
     spec.stat.extent = 1.0
     spec.stat.center = (c.ROW_X_M, 0.0, c.TABLE_HEIGHT_M)
     headlight = visual.headlight
@@ -52,20 +41,7 @@ def set_quality(spec: mujoco.MjSpec) -> None:
     headlight.specular = (0.0,) * 3
 
 
-def add_lights(spec: mujoco.MjSpec) -> None:
-    """One key light over the human's left shoulder; shadows fall only where a renderer draws them."""
-    spec.worldbody.add_light(
-        name="key",
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        castshadow=True,
-        pos=(1.0, 0.9, 1.6),
-        dir=(-0.28, -0.42, -1.0),
-        diffuse=(0.5, 0.49, 0.47),
-        specular=(0.06, 0.06, 0.06),
-    )
-
-
-def add_table(spec: mujoco.MjSpec, timestep_s: float) -> None:
+def _add_table(spec: mujoco.MjSpec, timestep_s: float) -> None:
     """The table top, which carries the objects, and its legs, which only the human's view shows."""
     spec.add_material(name="table_top", rgba=(0.50, 0.44, 0.38, 1.0), specular=0.1, shininess=0.1)
     spec.add_material(name="table_leg", rgba=(0.30, 0.27, 0.25, 1.0), specular=0.1)
@@ -81,14 +57,10 @@ def add_table(spec: mujoco.MjSpec, timestep_s: float) -> None:
     )
     leg_half_m = (c.TABLE_HEIGHT_M - 2 * _TABLE_HALF_M[2] - _FLOOR_Z_M) / 2
     x_m, y_m = (half_m - _LEG_INSET_M for half_m in _TABLE_HALF_M[:2])
-    for name, x_sign, y_sign in (
-        ("far_left", 1, 1),
-        ("far_right", 1, -1),
-        ("near_left", -1, 1),
-        ("near_right", -1, -1),
-    ):
+    sides = itertools.product((("far", 1), ("near", -1)), (("left", 1), ("right", -1)))
+    for (end, x_sign), (side, y_sign) in sides:
         table.add_geom(
-            name=f"table_leg_{name}",
+            name=f"table_leg_{end}_{side}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=(0.025, 0.025, leg_half_m),
             material="table_leg",
@@ -97,7 +69,7 @@ def add_table(spec: mujoco.MjSpec, timestep_s: float) -> None:
         )
 
 
-def add_floor(spec: mujoco.MjSpec) -> None:
+def _add_floor(spec: mujoco.MjSpec) -> None:
     """Floor, sky and the arm's pedestal, for the human's view only."""
     kind = mujoco.mjtTexture
     builtin = mujoco.mjtBuiltin
@@ -145,7 +117,7 @@ def add_floor(spec: mujoco.MjSpec) -> None:
         )
 
 
-def add_human_camera(spec: mujoco.MjSpec) -> None:
+def _add_human_camera(spec: mujoco.MjSpec) -> None:
     """The view a person wants: arm, cubes and pointing hand from the far left."""
     camera = np.array(_HUMAN_CAMERA_M)
     target = np.array(_HUMAN_TARGET_M)
@@ -163,9 +135,24 @@ def add_tabletop(spec: mujoco.MjSpec, timestep_s: float = c.TIMESTEP_S) -> None:
         spec: The scene.
         timestep_s: Of the simulation; contacts get a time constant of two of them.
     """
-    set_options(spec, timestep_s)
-    set_quality(spec)
-    add_lights(spec)
-    add_table(spec, timestep_s)
-    add_floor(spec)
-    add_human_camera(spec)
+    option = spec.option  # solver settings in which friction alone holds what is lifted
+    option.timestep = timestep_s
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.impratio = 1.0
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP.value  # resting cubes cost nothing: halves a macro-action
+    _set_visual(spec)
+    spec.worldbody.add_light(  # over the human's left shoulder; shadows fall only where a renderer draws them
+        name="key",
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        castshadow=True,
+        pos=(1.0, 0.9, 1.6),
+        dir=(-0.28, -0.42, -1.0),
+        diffuse=(0.5, 0.49, 0.47),
+        specular=(0.06, 0.06, 0.06),
+    )
+    _add_table(spec, timestep_s)
+    _add_floor(spec)
+    _add_human_camera(spec)

@@ -213,8 +213,8 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
     assert not env.step(0)[4]["fault"]
     turn = env.world.executor.turn
 
-    def clumsy(data, **arguments):
-        result = turn(data, **arguments)
+    def clumsy(**arguments):
+        result = turn(**arguments)
         data.joint("cube_2_joint").qpos[0] += 0.006
         return result
 

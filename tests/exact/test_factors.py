@@ -92,14 +92,3 @@ def test_a_world_without_a_plan_says_so():
     found = certificate(spec_of(Hopeless(n=2), 5))
     assert found.floor is None and found.optimum == 0.0
     assert certificate_rows(found)["shortest plans"] == "none; none from 18 starts"
-
-
-@pytest.mark.slow
-def test_a_certificate_of_24_576_macrostates_takes_seconds():
-    """30 CPU s and 1 GB are allowed."""
-    import time
-
-    start_s = time.process_time()
-    found = certificate(spec_of(Wheels(n=6, forbid=False), 20))
-    assert time.process_time() - start_s < 30.0
-    assert (found.macrostates, found.width, found.optimum) == (24_576, 2, 1.0)

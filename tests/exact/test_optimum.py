@@ -6,17 +6,14 @@ import itertools
 from collections import defaultdict
 from dataclasses import dataclass
 
-import numpy as np
 import pytest
-from episodes import EPISODES, arrays_of_rules, simulated, solved, solved_as_a_flow
 from machines import Glimpse, Wheels, spec_of
 
 from imagine_bench import registry
-from imagine_bench.exact.beliefs import OptimalPolicy
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.exact.memoryless import best_without_memory
 from imagine_bench.interfaces import Outcome
-from imagine_bench.rules import evaluate, greedy, optimal_policy, states_of, tabulate
+from imagine_bench.rules import states_of
 
 WORLDS = {
     "seen": (Wheels(n=2, slip=0.2), Glimpse(), 4),
@@ -66,68 +63,6 @@ def test_the_optimum_with_memory_is_that_of_all_histories(rules, sight, horizon)
     assert found.optimum == pytest.approx(_best_over_histories(rules, sight, horizon), abs=1e-9)
     assert found.chance_level <= found.memoryless <= found.memoryless_bound <= found.optimum + 1e-9
     assert found.optimum <= found.seen_optimum + 1e-9
-
-
-def _play(rules, sight, horizon, act, rng):
-    """One simulated episode; whether it succeeds. ``act`` is given what is shown, and how many actions were done."""
-    state = rules.start_states[rng.integers(len(rules.start_states))]
-    frames = []
-    for step in range(horizon):
-        shares, shown = zip(*sight.seen(state, step), strict=True)
-        frames.append(shown[rng.choice(len(shown), p=shares)])
-        outcomes = rules.outcomes(state, act(frames[max(0, step - sight.lag)], step))
-        outcome = outcomes[rng.choice(len(outcomes), p=[o.probability for o in outcomes])]
-        if outcome.terminated:
-            return outcome.success
-        state = outcome.macrostate
-    return False
-
-
-@ALL
-def test_the_oracle_reaches_the_optimum_from_what_it_sees(rules, sight, horizon):
-    found, oracle = certificate(spec_of(rules, horizon, sight)), OptimalPolicy(rules, sight, horizon)
-    rng, n = np.random.default_rng(0), 2_000
-    share = np.mean([_play(rules, sight, horizon, oracle, rng) for _ in range(n)])
-    p = found.optimum
-    assert abs(share - p) < 4 * np.sqrt(max(p * (1 - p), 1e-3) / n)
-
-
-SOLVED = [
-    "arrow_puzzle",
-    "arrow_puzzle_hard",
-    "arrows:cubes=2,coupling=neighbour,slip=0.3",
-    "pick_place",
-    "pick_place:slip=0.2,fickle=0.4",
-]
-
-
-@pytest.mark.parametrize("name", SOLVED)
-def test_chance_and_optimum_agree_with_100_000_episodes(name):
-    """And with another solver; worlds of arrows also by other rules, in their own tests."""
-    spec = registry.task(name)
-    found, world = spec.facts(), arrays_of_rules(spec.rules)
-    optimum, chance, policy = solved(world, spec.horizon)
-    assert (found.optimum, found.chance_level) == pytest.approx((optimum, chance), abs=1e-9)
-    for expected, how in ((found.chance_level, None), (found.optimum, policy)):
-        limit = 4 * np.sqrt(expected * (1 - expected) / EPISODES) + 1e-5
-        assert abs(simulated(world, spec.horizon, how, seed=1) - expected) < limit
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("arrow_puzzle:fickle=0.3,horizon=4", marks=pytest.mark.slow),
-        "arrows:cubes=2,fickle=0.5,slip=0.1,horizon=3",
-    ],
-)
-def test_the_optimum_is_that_of_a_linear_programme(name):
-    """Where haste pays, so that a policy must count actions: what is best for return is not best within the horizon."""
-    spec = registry.task(name)
-    flow = solved_as_a_flow(arrays_of_rules(spec.rules), spec.horizon)
-    assert spec.facts().optimum == pytest.approx(flow, abs=1e-7) == certificate(spec).optimum
-    tables = tabulate(spec.rules)
-    stationary = evaluate(tables, greedy(optimal_policy(tables), spec.n_actions), spec.horizon)
-    assert stationary.success[tables.starts].mean() < flow - 1e-3
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 from machines import Wheels
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.exact.splits import Split, StartingFrom, by_pairs, by_plan_length, by_values, split_of
+from imagine_bench.exact.splits import Split, by_pairs, by_plan_length, by_values, split_of
 from imagine_bench.rules import fewest_actions
 
 RULES = Wheels()
@@ -54,10 +54,3 @@ def test_a_text_names_a_split():
     for wrong in ("", "plan_length", "plan_length=long", "length=2", "values=99:1", "pairs=0:3"):
         with pytest.raises(InvalidValueError, match="names no split of"):
             split_of(RULES, wrong)
-
-
-def test_rules_with_other_starts_are_the_same_otherwise():
-    some = StartingFrom(RULES, RULES.start_states[:2])
-    assert some.start_states == RULES.start_states[:2] and some.n_actions == RULES.n_actions
-    state = RULES.start_states[5]
-    assert some.outcomes(state, 0) == RULES.outcomes(state, 0)

@@ -64,20 +64,6 @@ def test_frames_are_new_upright_contiguous_arrays(world):
     camera.close()
 
 
-def test_closing_one_renderer_leaves_the_others_frames_alone(world):
-    first, second = Renderer(world.model, agent_camera_view()), Renderer(world.model, agent_camera_view())
-    image = Renderer(world.model, View(camera="human", width=96, height=72))
-    before, whole = second.frame(world.data), image.frame(world.data)
-    first.frame(world.data)
-    first.close()
-    assert np.array_equal(second.frame(world.data), before)
-    assert np.array_equal(image.frame(world.data), whole)
-    first.close()  # closing twice is allowed
-    assert np.array_equal(first.frame(world.data), before)  # and a later frame makes a new context
-    for renderer in (first, second, image):
-        renderer.close()
-
-
 def test_renderers_of_one_scene_and_view_share_a_context(world, monkeypatch):
     made = []
     make = rendering._new_gl_context
@@ -186,15 +172,6 @@ def test_drawing_shows_a_model_s_changes_and_makes_none(world):
     assert not np.array_equal(image.frame(world.data), plain)
     assert plain.shape == (48, 64, 3)
     image.close()
-
-
-def test_shadows_are_drawn_only_where_asked_for(world):
-    views = [View(camera="human", width=96, height=72, shadow_px=size) for size in (0, 512)]
-    renderers = [Renderer(world.model, view) for view in views]
-    plain, shaded = (renderer.frame(world.data).astype(int) for renderer in renderers)
-    for renderer in renderers:
-        renderer.close()
-    assert (shaded < plain - 10).any()
 
 
 def test_an_unknown_camera_is_named():

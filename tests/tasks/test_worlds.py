@@ -10,8 +10,10 @@ from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.scenes.appearance import LEVELS, Appearance
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
 from imagine_bench.tasks.scenes.objects import OBJECTS
+from worlds import WORLDS
 
 from imagine_bench import registry
+from imagine_bench.testing.fidelity import measure_fidelity
 
 FIXED = Appearance(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
 NAMES = ["pick_place", *(f"arrows:cubes={cubes}" for cubes in range(1, 7))]
@@ -63,3 +65,14 @@ def test_the_gripper_passes_the_pointing_hand(name, state, action):
         mujoco.mj_kinematics(model, data)
         closest_m = min(closest_m, *(mujoco.mj_geomDistance(model, data, hand, part, 1.0, None) for part in parts))
     assert 0.0 < closest_m < 0.05  # near, so the check is not vacuous, and free
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_random_macro_actions_end_as_the_rules_say(name):
+    """Within the targets that a longer walk of ``check --physics`` holds each task to."""
+    targets = registry.task(name).targets
+    found = measure_fidelity(registry.task(name), 60)
+    assert found.as_ruled / found.actions >= targets.as_ruled, found.faults
+    assert found.other_objects_mm < targets.other_objects_mm
+    assert np.percentile(found.error_mm, 99) < (targets.error_mm or 2.0)
+    assert np.percentile(found.error_deg, 99) < (targets.error_deg or 180.0)

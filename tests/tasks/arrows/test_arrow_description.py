@@ -146,11 +146,7 @@ def test_a_world_may_lie_in_a_file(tmp_path):
         ("forbid=equal+none", "contradicts or repeats itself"),
         ("cubes=4,forbid=equal", "forbid=equal leaves no legal turn with 4 cubes, for an arrow has only 4 directions"),
         ("cubes=1,fickle=0.1", "goal_change=0.1 needs another cube"),
-        (
-            "goal=all",
-            "no start from which its goal can be reached: of 192 macrostates 72 are legal and 0 of them goals",
-        ),
-        ("goal=toward_agent,forbid=agent", "192 are legal and 0 of them goals"),
+        ("goal=all", "no start from which its goal can be reached; give another goal or forbid less"),
         ("cubez=3", "No option of task arrows 'cubez'. Did you mean 'cubes'? Known: "),
         ("cubes", "'cubes' is not of the form name=value"),
         ("cubes=2,cubes=3", "names 'cubes' twice"),
@@ -189,19 +185,8 @@ def test_turns_are_coupled_to_the_right_and_shuffled():
     assert set(spec.action_names) == set(named) and spec.action_names != named
 
 
-@pytest.mark.parametrize("world", [{"cubes": 5, "slip": 0.1}, {"horizon": 3}])
-def test_gymnasium_makes_worlds_that_end_at_their_horizon(world):
-    spec = registry.task("arrows:" + ",".join(f"{name}={value}" for name, value in world.items()))
-    one = gymnasium.make("imagine_bench/Arrows-v0", **world, execution="kinematic")
-    many = gymnasium.make_vec("imagine_bench/Arrows-vector-v0", num_envs=2, **world, execution="kinematic")
-    named = gymnasium.make(spec.env_id, execution="kinematic")
-    there, back = 0, spec.action_names.index(spec.action_names[0].replace("clockwise", "counter-clockwise"))
-    frames = [env.reset(seed=3)[0] for env in (one, named)]
-    assert np.array_equal(*frames) and np.array_equal(many.reset(seed=3)[0][0], frames[0])
-    for step in range(spec.horizon):
-        action = (there, back)[step % 2]
-        (*_, cut, _), (*_, also, _) = one.step(action), named.step(action)
-        assert cut == also == (step == spec.horizon - 1)
-    assert many.unwrapped._horizon == spec.horizon
-    for env in (one, many, named):
+def test_a_world_ends_at_its_own_horizon():
+    for options, horizon in (({"horizon": 3}, 3), ({"cubes": 1}, registry.task("arrows:cubes=1").horizon)):
+        env = gymnasium.make("imagine_bench/Arrows-v0", goal="toward_agent", execution="kinematic", **options)
+        assert env.get_wrapper_attr("_max_episode_steps") == horizon
         env.close()

@@ -5,9 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 
-import numpy as np
 import pytest
-from episodes import EPISODES, arrays_of, simulated, solved
 
 from imagine_bench import registry
 
@@ -23,7 +21,6 @@ WORLDS = [
     "arrows:cubes=4,goal=clockwise,forbid=neighbours+agent",
     "arrows:cubes=4,goal=3210,coupling=neighbour,slip=0.4",
 ]
-LARGEST = "arrows:cubes=6,coupling=neighbour,slip=0.1,fickle=0.2"
 
 
 def status(world, directions, pointed):
@@ -119,31 +116,3 @@ def test_rules_say_what_the_oracle_says(name):
     assert {state: known[state] for state in starts} == starts
     named = spec.rules.world.horizon
     assert spec.horizon == (named or max(10, 2 * max(starts.values())))
-
-
-def _facts_agree(name):
-    """Chance and optimum, by the other statement of the rules and another solver, and in episodes of both."""
-    spec = registry.task(name)
-    found, leads, depth = oracle(spec.rules.world)
-
-    def outcomes(pair, action):
-        chances = leads[pair, action].items()
-        return [(to, chance, found[to] != "going on", found[to] == "goal") for to, chance in chances]
-
-    world = arrays_of([pair for pair, length in depth.items() if length], spec.n_actions, outcomes)
-    optimum, chance, policy = solved(world, spec.horizon)
-    facts = spec.facts()
-    assert (facts.optimum, facts.chance_level) == pytest.approx((optimum, chance), abs=1e-9)
-    for expected, how in ((facts.chance_level, None), (facts.optimum, policy)):
-        limit = 4 * np.sqrt(expected * (1 - expected) / EPISODES) + 1e-5
-        assert abs(simulated(world, spec.horizon, how, seed=1) - expected) < limit
-
-
-@pytest.mark.parametrize("name", WORLDS[::2])
-def test_chance_and_optimum_agree_with_100_000_episodes(name):
-    _facts_agree(name)
-
-
-@pytest.mark.slow
-def test_the_largest_world_agrees_with_100_000_episodes():
-    _facts_agree(LARGEST)

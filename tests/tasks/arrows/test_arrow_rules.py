@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 
 import pytest
@@ -11,7 +10,7 @@ from imagine_bench.tasks.arrows.rules import LEFT, TOWARD_AGENT, TOWARD_HUMAN
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Outcome
-from imagine_bench.rules import facts, fewest_actions, is_random
+from imagine_bench.rules import facts, is_random
 
 NAMES = ["arrow_puzzle", "arrow_puzzle_hard", "arrow_puzzle_toward", "arrow_puzzle_clockwise"]
 FAMILY = EASY, HARD, TOWARD, CLOCKWISE = tuple(registry.task(name).rules for name in NAMES)
@@ -40,14 +39,6 @@ def test_goals_are_what_their_tasks_say():
     assert goals(CLOCKWISE) == {(LEFT, frozenset({1, 2, 3}))}
 
 
-def test_each_task_says_its_goal():
-    said = {name: registry.task(name) for name in NAMES}
-    assert "to point toward the human, and no two" in said["arrow_puzzle"].description
-    assert "human, with no arrow toward the agent, and no two" in said["arrow_puzzle_hard"].description
-    assert "left, with no arrow toward the human, and no two" in said["arrow_puzzle_clockwise"].description
-    assert said["arrow_puzzle_clockwise"].action_names[3] == "turn the middle cube counter-clockwise"
-
-
 @ALL
 def test_exactly_two_actions_are_legal_in_every_legal_macrostate(rules):
     for state in filter(rules.is_legal, rules.states):
@@ -70,22 +61,6 @@ def test_facts_of_the_digest(rules, chance, optimal_return, mean_length):
     assert known.optimum == pytest.approx(1.0, abs=1e-12)
     assert known.optimal_return == pytest.approx(optimal_return, abs=5e-4)
     assert known.mean_plan_length == pytest.approx(mean_length, abs=5e-4)
-
-
-@ALL
-def test_optimal_actions_make_a_shortest_plan(rules):
-    lengths = Counter()
-    shortest = dict(zip(rules.states, rules.plan_lengths.tolist(), strict=True))
-    for start in rules.start_states:
-        state, total, steps, terminated = start, 0.0, 0, False
-        while not terminated:
-            (outcome,) = rules.outcomes(state, rules.optimal_action(state))
-            state, terminated, steps, total = outcome.macrostate, outcome.terminated, steps + 1, total + outcome.reward
-        assert outcome.success
-        assert steps == shortest[start] == fewest_actions(rules, start)
-        assert total == 50.0 - (steps - 1)
-        lengths[steps] += 1
-    assert set(lengths) == set(range(1, 7 if len(rules.start_states) == 66 else 6))
 
 
 def test_rewards_and_ends():

@@ -4,7 +4,6 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.description import Arrows
-from imagine_bench.tasks.arrows.scene import layout
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.scenes.appearance import appearance
 
@@ -38,16 +37,6 @@ def test_fingers_open_no_wider_than_there_is_room(seed):
     env.close()
 
 
-def test_coupled_cubes_are_turned_in_one_macro_action():
-    world = _world(cubes=4, coupling="neighbour")
-    world.place((0, 0, 0, 0, 2), np.random.default_rng(0))
-    world.executor.capture_motion_hz = 20.0
-    result = world.execute(2, (0, 1, 1, 0, 2))
-    assert result.fault is None
-    assert world.read().macrostate == (0, 1, 1, 0, 2)
-    assert (np.diff(result.motion.time_s) >= 0).all() and result.motion.time_s[-1] == pytest.approx(result.sim_time_s)
-
-
 @pytest.mark.parametrize("action", [0, 1, 2, 3])
 def test_a_cube_that_slips_stays_though_it_was_gripped(action):
     world = _world(cubes=2, forbid="none", slip=0.2)
@@ -60,11 +49,3 @@ def test_a_cube_that_slips_stays_though_it_was_gripped(action):
     assert world.read().macrostate == state
     assert np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1).max() < 4e-3  # squared in the fingers
     assert world.executor.opening_m(result.motion.qpos).min() < 0.0275  # the fingers did close on it
-
-
-def test_columns_of_cubes_are_apart_so_a_finger_is_clear():
-    for cubes in range(2, 7):
-        places = layout(cubes)
-        columns_m = [y_m for _, y_m in places.slots_xy_m]
-        assert max(np.diff(columns_m)) < -0.044
-        assert [tip[1] for tip in places.fingertips_m] == pytest.approx(columns_m)

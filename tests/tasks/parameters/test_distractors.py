@@ -8,10 +8,7 @@ import pickle
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.scene import layout
 from imagine_bench.tasks.parameters import distractors
-from imagine_bench.tasks.scenes import constants as c
-from imagine_bench.tasks.scenes.appearance import LEVELS
 
 from imagine_bench import registry
 
@@ -103,37 +100,6 @@ def test_a_state_and_a_macrostate_bring_them_back(id_, appearance):
     render = registry.task(f"{IDS[id_]}:distractors=3").render_macrostates
     frame, again, other = (render(start, appearance, np.random.default_rng(seed)) for seed in (4, 4, 5))
     assert np.array_equal(frame, again) and not np.array_equal(frame, other)
-
-
-def test_balls_are_anywhere_at_first_and_later_and_screens_show_every_shade():
-    """Their places are uniform: within 4 standard deviations, in eight cells, at the start and after rolling."""
-    env, rng = make(ARROWS, distractors=4), np.random.default_rng(0)
-    distraction, data = env.world._distraction, env.data
-    low, high = distractors._ON_SCREEN_M
-    for rolls in (0, 25):
-        found, shades = [], []
-        for _ in range(300):
-            env.world.place((0, 1, 2, 0), rng)
-            for _ in range(rolls):
-                before = data.mocap_pos[distraction._balls].copy()
-                distraction.vary(data, rng)
-                assert (np.abs(data.mocap_pos[distraction._balls] - before) <= distractors._ROLL_M).all()
-            found.append((data.mocap_pos[distraction._balls, :2] - low) / (high - low))
-            shades.append(env.model.mat_rgba[distraction._tiles, :3].copy())
-        places = np.concatenate(found)
-        assert (places >= 0).all() and (places <= 1).all()
-        counts = np.histogramdd(places, bins=(2, 4), range=((0, 1), (0, 1)))[0]
-        assert (np.abs(counts - len(places) / 8) <= 4 * np.sqrt(len(places) * 7 / 64)).all()
-    assert abs(np.mean(shades) - 0.5) < 0.01 and np.ptp(shades) > 0.99
-
-
-def test_nothing_stands_where_distractors_are():
-    """However it is placed at the strong level."""
-    strong = LEVELS["strong"]
-    corner_m = c.CUBE_EDGE_M / 2 * (np.cos(strong.object_yaw_rad) + np.sin(strong.object_yaw_rad))
-    for cubes in range(1, 7):
-        furthest_m = max(x_m for x_m, _ in layout(cubes).slots_xy_m)
-        assert furthest_m + corner_m + strong.object_offset_m < distractors._LOW_M[0]
 
 
 def test_encoders_of_distracted_worlds_are_others():

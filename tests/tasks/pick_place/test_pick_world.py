@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.motion.ik import ArmModel
 from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, PICKED, WITHDRAWN
-from imagine_bench.tasks.pick_place.scene import PALM_M, TIMESTEP_S
+from imagine_bench.tasks.pick_place.scene import TIMESTEP_S
 from imagine_bench.tasks.pick_place.spec import SPEC
 from imagine_bench.tasks.pick_place.world import PickWorld
-from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import appearance
-from imagine_bench.tasks.scenes.objects import OBJECTS, standing_m
-
-from imagine_bench.testing.fidelity import measure_fidelity
+from imagine_bench.tasks.scenes.objects import OBJECTS
 
 FIXED = appearance("clean").__class__(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
 RULES = SPEC.rules
@@ -46,35 +43,6 @@ def world():
 
 def rng():
     return np.random.default_rng(0)
-
-
-def test_objects_stand_still_on_the_table(world):
-    world.place((0, 0, 0, WITHDRAWN), rng())
-    before = world.object_poses()
-    assert before[:, :3] == pytest.approx(np.array([standing_m(index) for index in range(3)]))
-    for _ in range(5):  # what sleeps soon touches nothing any more
-        mujoco.mj_step(world.model, world.data)
-    touching = {
-        frozenset(world.model.geom(int(geom)).name.split("_")[0] for geom in contact.geom)
-        for contact in world.data.contact[: world.data.ncon]
-    }
-    assert touching == {frozenset(("table", spec.name)) for spec in OBJECTS}
-    for _ in range(300):
-        mujoco.mj_step(world.model, world.data)
-    assert np.abs(world.object_poses()[:, :3] - before[:, :3]).max() < 5e-4
-
-
-def test_tips_hand_table_objects_and_palm_touch(world):
-    names = {world.model.geom(index).name for index in np.flatnonzero(world.model.geom_contype)}
-    tips = {f"finger_{side}_{end}" for side in ("left", "right") for end in ("tip_front", "tip_back", "back")}
-    links = {"l4_arm", "l4_wrist", "l5_housing", "l5_wrist", "l5_ring", "l6_flange", "hand_mount", "hand_rail"}
-    assert names - links == {
-        "table_top", "ball_skin", "car_box", "cup_wall", "palm_plate", *tips, *(f"car_wheel_{i}" for i in range(4)),
-        *(f"cup_foot_{i}" for i in range(4)), *(f"palm_rim_{i}" for i in range(4)),
-    }  # fmt: skip
-    assert links <= names
-    assert world.model.neq == 0  # no weld anywhere
-    assert world.model.opt.timestep == TIMESTEP_S
 
 
 # --- reading -----------------------------------------------------------------------------------------------------
@@ -113,7 +81,7 @@ def test_an_object_off_its_place_is_a_problem(world, index, moved_m, axis, angle
 def test_what_leans_too_far_is_not_picked(world, index):
     world.place((0, 0, 0, 0), rng())
     turn(world, index, 1, 14)
-    result = world.executor.pick(world.data, index=index)
+    result = world.executor.pick(index=index)
     assert result.fault == f"the {OBJECTS[index].name} is tipped by 14 degrees" and result.sim_time_s == 0.0
 
 
@@ -137,29 +105,21 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
 
-def ghost_tips(model):
-    tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
-    model.geom_contype[tips] = model.geom_conaffinity[tips] = 0
-    model.geom_contype[model.geom_contype == 2] = 0  # the fingers' backs
-
-
 def slippery_tips(model):
     tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
     model.geom_friction[tips] = (0.02, 0.001, 0.0001)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "index"), [(ghost_tips, 1), (slippery_tips, 0), (slippery_tips, 1), (slippery_tips, 2)]
-)
-def test_only_friction_lifts(spoil, index):
-    """No weld, no teleport: fingers that pass through or slip leave the object there, and the human withdraws."""
+@pytest.mark.parametrize("index", range(3))
+def test_only_friction_lifts(index):
+    """No weld, no teleport: fingers that slip leave the object there, and the human withdraws."""
     world = PickWorld(FIXED)
-    spoil(world.model)
+    slippery_tips(world.model)
     world.place((0, 0, 0, index), rng())
     result = world.execute(index, RULES.outcomes((0, 0, 0, index), index)[0].macrostate)
     assert result.fault == f"the fingers closed and do not hold the {OBJECTS[index].name}"
-    assert world.read().macrostate[index] == 0
-    assert world.read().macrostate[3] == WITHDRAWN
+    macrostate = world.read().macrostate
+    assert (macrostate[index], macrostate[3]) == (0, WITHDRAWN)
 
 
 @pytest.mark.parametrize(
@@ -182,9 +142,9 @@ def test_pushing_another_object_is_a_fault(world, monkeypatch):
     world.execute(0, (1, 0, 0, 1))
     place = world.executor.place
 
-    def clumsy(data, **arguments):
-        result = place(data, **arguments)
-        data.joint("cup_joint").qpos[0] += 0.007
+    def clumsy(**arguments):
+        result = place(**arguments)
+        world.data.joint("cup_joint").qpos[0] += 0.007
         return result
 
     monkeypatch.setattr(world.executor, "place", clumsy)
@@ -220,7 +180,7 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
     mujoco.mj_kinematics(world.model, world.data)
     world.data.qpos[row[:3]] += world.data.site_xpos[tcp] - carried
     tilted = in_gripper()
-    world.executor.rest_holding(world.data, 1)
+    world.executor.rest_holding(1)
     after = in_gripper()
     np.testing.assert_allclose(after[0], tilted[0], atol=1e-12)
     np.testing.assert_allclose(after[1], tilted[1], atol=1e-12)
@@ -247,19 +207,6 @@ def test_a_macro_action_is_a_function_of_positions_and_arguments(state, action, 
     np.testing.assert_array_equal(one.data.ctrl, other.data.ctrl)
 
 
-def test_the_handed_over_object_rests_in_the_palm(world):
-    for index, spec in enumerate(OBJECTS):
-        state = tuple(1 if each == index else 0 for each in range(3))
-        world.place((*state, OPEN_PALM), rng())
-        world.execute(HAND_OVER, (*(2 if each == index else 0 for each in range(3)), OPEN_PALM))
-        before = world.object_poses()[index, :3]
-        assert math.dist(before[:2], PALM_M[:2]) < 0.015
-        assert before[2] - PALM_M[2] == pytest.approx(spec.grip_height_m, abs=2e-3)
-        for _ in range(300):
-            mujoco.mj_step(world.model, world.data)
-        assert np.abs(world.object_poses()[index, :3] - before).max() < 2e-3
-
-
 @pytest.mark.parametrize("seed", [83393, 3046])
 def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
     """With these seeds the palm lies so far from its nominal place that going back there would leave the object."""
@@ -274,24 +221,6 @@ def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
     *_, info = env.step(0)
     assert not info["fault"] and np.abs(data.qpos - lies).max() < 1e-5, "what is done then changes nothing"
     env.close()
-
-
-def check_fidelity(actions):
-    found = measure_fidelity(SPEC, actions)
-    assert found.actions == actions
-    assert found.as_ruled / actions >= SPEC.targets.as_ruled, found.faults
-    assert found.other_objects_mm < SPEC.targets.other_objects_mm
-    assert np.percentile(found.error_mm, 99) < SPEC.targets.error_mm
-    assert len(found.error_mm) > actions / 10
-
-
-def test_random_macro_actions_end_as_the_rules_say():
-    check_fidelity(60)
-
-
-@pytest.mark.slow
-def test_a_thousand_random_macro_actions_end_as_the_rules_say():
-    check_fidelity(1000)
 
 
 # --- what the camera sees ----------------------------------------------------------------------------------------
@@ -319,23 +248,6 @@ def test_the_frame_shows_each_object_where_it_is():
                 assert rows.max() == 63
             else:
                 assert rows.max() < 20
-
-
-def test_every_macrostate_looks_different():
-    frames = SPEC.render_macrostates(np.array(RULES.states), "clean", rng()).astype(int)
-    for one in range(len(frames)):
-        for other in range(one):
-            assert (np.abs(frames[one] - frames[other]).max(axis=-1) > 40).sum() > 40
-
-
-def test_an_arm_that_holds_something_is_out_of_the_agent_s_frame(world):
-    world.place((0, 1, 0, 0), rng())
-    views = [View(camera=c.AGENT_CAMERA, groups=groups) for groups in ((0,), (0, 2))]
-    cameras = [Renderer(world.model, view) for view in views]
-    hidden, shown = (camera.frame(world.data) for camera in cameras)
-    for camera in cameras:
-        camera.close()
-    assert np.array_equal(hidden[:40], shown[:40])  # only the fingers beside what they hold would be seen
 
 
 # --- recordings --------------------------------------------------------------------------------------------------

@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance, between, looks_of
 
-from imagine_bench import registry
 from imagine_bench.appearance import FACTORS, POINTS, appearance_name, factors_of
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.judge.judgement import Judgement
 from imagine_bench.protocols.control import protocol
-from imagine_bench.running.collect import collect, policy_of
-from imagine_bench.store import encoders
 
 
 def make(task="Arrows", **options):
@@ -93,20 +90,6 @@ def test_levels_are_points_of_the_factors(level):
     )
 
 
-@pytest.mark.parametrize(("task", "level"), [("Arrows", "mild"), ("PickPlace", "strong")])
-def test_levels_and_their_factors_give_the_same_frames(task, level):
-    factors = ",".join(f"{name}={POINTS[level].get(name, 0)}" for name in FACTORS)
-    named, said, given = (make(task, appearance=each) for each in (level, factors, dict(POINTS[level])))
-    for seed in range(3):
-        frames = [env.reset(seed=seed)[0] for env in (named, said, given)]
-        for action in (0, 2, 1):
-            frames += [env.step(action)[0] for env in (named, said, given)]
-        for index in range(0, len(frames), 3):
-            np.testing.assert_array_equal(frames[index], frames[index + 1])
-            np.testing.assert_array_equal(frames[index], frames[index + 2])
-    said.set_state(named.get_state())
-
-
 SEEN = {"light": (1, 2), "colors": (3,), "camera": (4, 5)}
 """Of each factor, where in ``looks_of`` it shows; the other two show in positions."""
 
@@ -134,26 +117,3 @@ def test_a_factor_varies_what_it_says_and_by_as_much_as_it_says(factor):
         assert np.ptp(hands, axis=0) / 2 == pytest.approx(level.hand_offset_m, rel=0.1)
     if factor == "light":
         assert reach[1].max() == pytest.approx(level.light_fraction * usual[1].max(), rel=0.05)
-
-
-def test_an_own_point_has_an_encoder_of_its_own_trained_once(tmp_path, monkeypatch):
-    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path))
-    calls = []
-
-    def train(spec, *, appearance, out, **_):
-        calls.append(appearance)
-        (out / f"{spec.encoder}-{appearance}.safetensors").write_bytes(b"weights")
-
-    spec, name = registry.task("arrow_puzzle"), "light=0.5,camera=0.2"
-    monkeypatch.setattr(registry, "load", lambda code: train)
-    paths = [encoders.own(spec, name, "latents") for _ in range(2)]
-    assert calls == [name] and paths[0] == paths[1] and paths[0].is_file() and tmp_path in paths[0].parents
-    assert encoders.find(encoders.identity(paths[0])) == paths[0]
-    assert encoders.own(spec, "mild", "latents") == encoders.bundled()["arrow_puzzle-mild"] and calls == [name]
-
-
-def test_a_dataset_says_its_appearance_by_its_one_name():
-    spec = registry.task("arrow_puzzle")
-    made = {"episodes": 1, "seed": 0, "execution": "kinematic"}
-    _, _, card = collect(spec, policy_of("random", spec, 0), appearance="camera=0.5,light=0.50", **made)
-    assert card["appearance"] == "light=0.5,camera=0.5"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import arrow_outline
 from imagine_bench.tasks.scenes import hand, objects
-from imagine_bench.tasks.scenes.meshes import Mesh, arch, box, ellipsoid, limb, merge, stack, turned_profile
+from imagine_bench.tasks.scenes.meshes import Mesh, arch, box, ellipsoid, limb, stack, turned_profile
 
 
 def signed_volume_m3(mesh: Mesh) -> float:
@@ -49,8 +49,3 @@ def test_volumes_of_round_solids_are_approached():
     assert signed_volume_m3(turned_profile([(1.0, 0.0), (1.0, 2.0)], sides=96)) == pytest.approx(2 * np.pi, rel=1e-2)
     rod = arch((0, 0, 0), radius=1.0, thickness=0.05)
     assert rod.vertices[:, 0].min() == pytest.approx(-1.05, abs=1e-2)
-
-
-def test_merged_volumes_add_up():
-    small, large = box((0, 0, 0), (1, 1, 1)), box((5, 0, 0), (2, 2, 2))
-    assert signed_volume_m3(merge([small, large])) == pytest.approx(signed_volume_m3(small) + signed_volume_m3(large))
