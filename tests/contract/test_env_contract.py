@@ -215,7 +215,7 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
 
     def clumsy(**arguments):
         result = turn(**arguments)
-        data.joint("cube_2_joint").qpos[0] += 0.006
+        env.data.joint("cube_2_joint").qpos[0] += 0.006
         return result
 
     monkeypatch.setattr(env.world.executor, "turn", clumsy)

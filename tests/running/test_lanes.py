@@ -81,8 +81,8 @@ def test_a_simulation_that_blows_up_ends_the_run(
     run = MacroExecutor.run
     runs = itertools.count()
 
-    def failing(executor: MacroExecutor, data: Any, trajectory: Any, **options: Any) -> Any:
-        qpos = run(executor, data, trajectory, **options)
+    def failing(executor: MacroExecutor, trajectory: Any, **options: Any) -> Any:
+        qpos = run(executor, trajectory, **options)
         number = next(runs)
         if in_lanes and number > 25:
             raise DivergedError("The simulation diverged.")

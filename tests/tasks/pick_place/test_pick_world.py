@@ -137,20 +137,6 @@ def test_what_is_dropped_is_a_fault_and_ends_the_episode(macrostate, action):
     assert info["macrostate"][3] == WITHDRAWN
 
 
-def test_pushing_another_object_is_a_fault(world, monkeypatch):
-    world.place((0, 0, 0, 0), rng())
-    world.execute(0, (1, 0, 0, 1))
-    place = world.executor.place
-
-    def clumsy(**arguments):
-        result = place(**arguments)
-        world.data.joint("cup_joint").qpos[0] += 0.007
-        return result
-
-    monkeypatch.setattr(world.executor, "place", clumsy)
-    assert world.execute(0, (0, 0, 0, 1)).fault == "the cup was pushed 7 mm by the way"
-
-
 def test_what_is_out_of_reach_is_a_fault(world):
     world.place((0, 0, 0, 0), rng())
     world.data.qpos[world.object_qpos[0][0]] = 1.4
