@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.exact.machine import Machine
+from imagine_bench.exact.machine import Ints, Machine
 from imagine_bench.interfaces import Floats
 
 Scope = tuple[int, ...]
@@ -31,7 +31,7 @@ class Factor:
     action: int
     children: Scope
     parents: Scope
-    entry: NDArray[np.int64]  #: which local entry decides in each macrostate of play, from 0. Shape (P,).
+    entry: Ints  #: which local entry decides in each macrostate of play, from 0. Shape (P,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +51,8 @@ class FactorGraph:
     #: what reward and end are a function of: ``"next"``, the macrostate reached, ``"choice"``, the macrostate and the
     #: action, or ``"both"``
     read: str
-    point: NDArray[np.int64]  #: the distinct point that each outcome's class is read from. Shape (N,).
-    points: NDArray[np.int64]  #: the points' values. Shape (Q, F).
+    point: Ints  #: the distinct point that each outcome's class is read from. Shape (N,).
+    points: Ints  #: the points' values. Shape (Q, F).
     claims: tuple[LocalClass, ...]  #: in order
     usual: int  #: the class of everything that none claims
 
@@ -69,7 +69,7 @@ class FactorGraph:
         return entries + sum(claim.conditions for claim in self.claims)
 
 
-def keys(values: NDArray[np.int64], scope: Iterable[int]) -> NDArray[np.int64]:
+def keys(values: Ints, scope: Iterable[int]) -> Ints:
     """One number for the values of some columns in each row, equal where they are. Shape (N,)."""
     found = np.zeros(len(values), dtype=np.int64)
     for column in scope:
@@ -77,7 +77,7 @@ def keys(values: NDArray[np.int64], scope: Iterable[int]) -> NDArray[np.int64]:
     return found
 
 
-def numbered(values: NDArray[np.generic]) -> NDArray[np.int64]:
+def numbered(values: NDArray[np.generic]) -> Ints:
     """The number of each value among the distinct ones, ascending from 0. Shape (N,)."""
     return np.unique(values, return_inverse=True)[1].reshape(-1)
 
@@ -100,25 +100,20 @@ def _factors(machine: Machine, action: int) -> Iterator[Factor]:
     weight = machine.probability[first:last]
     moved = [i for i in range(now.shape[1]) if (after[:, i] != now[before, i]).any()]
     for children in _drawn_together(moved, before, after, weight):
-        law = _laws(before, keys(after, children), weight, machine.n_play)
+        law = _laws(before, numbered(keys(after, children)), weight, machine.n_play)
         parents = _smallest(now, law, children)
         entry = numbered(keys(now, parents))
         yield Factor(action=action, children=children, parents=parents, entry=entry)
 
 
-def _laws(before: NDArray[np.int64], value: NDArray[np.int64], weight: Floats, n: int) -> NDArray[np.int64]:
+def _laws(before: Ints, value: Ints, weight: Floats, n: int) -> Ints:
     """A number for the distribution of a value after each macrostate, equal where they are. Shape (P,)."""
-    law = np.zeros(n, dtype=np.int64)
-    for each in np.unique(value):
-        share = np.bincount(before, weights=weight * (value == each), minlength=n).round(_DIGITS)
-        share_id = numbered(share)
-        law = numbered(law * (share_id.max() + 1) + share_id)
-    return law
+    share = np.zeros((n, int(value.max()) + 1))
+    np.add.at(share, (before, value), weight)
+    return np.unique(share.round(_DIGITS), axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def _drawn_together(
-    moved: list[int], before: NDArray[np.int64], after: NDArray[np.int64], weight: Floats
-) -> list[Scope]:
+def _drawn_together(moved: list[int], before: Ints, after: Ints, weight: Floats) -> list[Scope]:
     """Partition of the coordinates that an action moves: two are together if their joint law is no product."""
     groups = {each: {each} for each in moved}
     if (np.bincount(before) > 1).any():
@@ -129,7 +124,7 @@ def _drawn_together(
     return sorted({tuple(sorted(group)) for group in groups.values()})
 
 
-def _independent(before: NDArray[np.int64], after: NDArray[np.int64], weight: Floats) -> bool:
+def _independent(before: Ints, after: Ints, weight: Floats) -> bool:
     shape = (int(before.max()) + 1, *(after.max(axis=0) + 1))
     joint = np.zeros(shape)
     np.add.at(joint, (before, after[:, 0], after[:, 1]), weight)
@@ -137,7 +132,7 @@ def _independent(before: NDArray[np.int64], after: NDArray[np.int64], weight: Fl
     return bool(np.abs(joint - product).max() < 10.0**-_DIGITS)
 
 
-def _smallest(now: NDArray[np.int64], law: NDArray[np.int64], children: Scope) -> Scope:
+def _smallest(now: Ints, law: Ints, children: Scope) -> Scope:
     columns = range(now.shape[1])
     for size in range(now.shape[1] + 1):
         for scope in sorted(combinations(columns, size), key=lambda each: (-len({*each} & {*children}), each)):
@@ -149,7 +144,7 @@ def _smallest(now: NDArray[np.int64], law: NDArray[np.int64], children: Scope) -
     raise AssertionError("the whole macrostate decides")
 
 
-def _points(machine: Machine) -> tuple[str, NDArray[np.int64], NDArray[np.int64]]:
+def _points(machine: Machine) -> tuple[str, Ints, Ints]:
     now = machine.coordinates[machine.before]
     then = machine.coordinates[machine.after]
     choice = np.hstack([now, machine.action[:, None]])
@@ -162,7 +157,7 @@ def _points(machine: Machine) -> tuple[str, NDArray[np.int64], NDArray[np.int64]
     raise AssertionError("everything together decides")
 
 
-def _claims(points: NDArray[np.int64], label: NDArray[np.int64]) -> tuple[tuple[LocalClass, ...], int]:
+def _claims(points: Ints, label: Ints) -> tuple[tuple[LocalClass, ...], int]:
     claims: list[LocalClass] = []
     while len(left := np.unique(label)) > 1:
         claim = _next_claim(points, label, left)
@@ -172,9 +167,9 @@ def _claims(points: NDArray[np.int64], label: NDArray[np.int64]) -> tuple[tuple[
     return tuple(claims), int(left[0])
 
 
-def _next_claim(points: NDArray[np.int64], label: NDArray[np.int64], left: NDArray[np.int64]) -> LocalClass:
+def _next_claim(points: Ints, label: Ints, left: Ints) -> LocalClass:
     """The class that the smallest conditions force everywhere; of those, the one with the fewest."""
-    forced: dict[int, list[tuple[Scope, NDArray[np.int64]]]] = {int(each): [] for each in left}
+    forced: dict[int, list[tuple[Scope, Ints]]] = {int(each): [] for each in left}
     for size in range(points.shape[1] + 1):
         scopes = list(combinations(range(points.shape[1]), size))
         found = []
@@ -194,7 +189,7 @@ def _next_claim(points: NDArray[np.int64], label: NDArray[np.int64], left: NDArr
     raise AssertionError("the whole point decides")
 
 
-def _cover(class_: int, forced: list[tuple[Scope, NDArray[np.int64]]]) -> LocalClass:
+def _cover(class_: int, forced: list[tuple[Scope, Ints]]) -> LocalClass:
     """A small set of scopes: again and again the one that covers the most of what is left."""
     covered = np.zeros(len(forced[0][1]), dtype=np.bool_)
     scopes = []

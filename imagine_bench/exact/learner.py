@@ -15,10 +15,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench.exact.factors import FactorGraph, keys, numbered
-from imagine_bench.exact.machine import Machine
+from imagine_bench.exact.machine import Ints, Machine, Mask
 from imagine_bench.interfaces import Floats
 
 _SUCCESS = 10_000.0  # of return: success comes first
@@ -50,7 +49,7 @@ class _Learner:
         self.sweeps = _SWEEPS * horizon
         self.shape = (machine.n_actions, machine.n_play)
         self.moved: list[list[int]] = [[] for _ in range(machine.n_actions)]
-        entries: list[list[NDArray[np.int64]]] = [[] for _ in range(machine.n_actions)]
+        entries: list[list[Ints]] = [[] for _ in range(machine.n_actions)]
         count = 1
         for factor in graph.factors:
             self.moved[factor.action] += factor.children
@@ -60,7 +59,7 @@ class _Learner:
         self.entries = np.zeros((*self.shape, max(map(len, entries))), dtype=np.int64)
         for action, columns in enumerate(entries):
             self.entries[action, :, : len(columns)] = np.transpose(columns) if columns else 0
-        self.conditions: list[NDArray[np.int64]] = []  # of each claim: condition of each point and scope. (Q, scopes)
+        self.conditions: list[Ints] = []  # of each claim: condition of each point and scope. (Q, scopes)
         count = 0
         for claim in graph.claims:
             numbers = []
@@ -70,7 +69,7 @@ class _Learner:
             self.conditions.append(np.stack(numbers, axis=1))
         self.true = np.zeros(count, dtype=np.bool_)
         self.false = np.zeros(count, dtype=np.bool_)
-        self.clauses: list[NDArray[np.int64]] = []  # conditions of which one at least is true
+        self.clauses: list[Ints] = []  # conditions of which one at least is true
         read = sorted({i for claim in graph.claims for scope in claim.scopes for i in scope})
         self.alike = numbered(keys(graph.points, read))  # points that are one
         self.class_of = np.full(int(self.alike.max()) + 1, -1)  # what was observed
@@ -110,7 +109,7 @@ class _Learner:
         self.clauses = open_
         return learned
 
-    def possible(self) -> NDArray[np.bool_]:
+    def possible(self) -> Mask:
         """Which classes each point may have. Shape (C, Q)."""
         found = np.zeros((len(self.machine.classes), len(self.alike)), dtype=np.bool_)
         free = np.ones(len(self.alike), dtype=np.bool_)  # of every claim above
@@ -154,7 +153,7 @@ class _Learner:
         self._want(np.unique(open_starts), known, settled, sure, sure & alive)
         return not len(open_starts)
 
-    def _imagined(self, worth: Floats, known: NDArray[np.bool_]) -> Floats:
+    def _imagined(self, worth: Floats, known: Mask) -> Floats:
         """The best that an unknown entry may lead to: any values of all the coordinates that the action moves."""
         machine = self.machine
         if self.graph.read != "next" or math.prod(self.box) > _CELLS:
@@ -171,11 +170,11 @@ class _Learner:
 
     def _want(
         self,
-        front: NDArray[np.int64],
-        known: NDArray[np.bool_],
-        settled: NDArray[np.bool_],
-        sure: NDArray[np.bool_],
-        goes_on: NDArray[np.bool_],
+        front: Ints,
+        known: Mask,
+        settled: Mask,
+        sure: Mask,
+        goes_on: Mask,
     ) -> None:
         """Find the unknown facts that the plans from some rows touch."""
         self.wanted = np.zeros(len(self.known), dtype=np.bool_)
@@ -194,13 +193,13 @@ class _Learner:
             front = np.unique(self.machine.after[outcomes[goes_on[outcomes]]])
             front = front[~met[front]]
 
-    def _open_conditions(self, points: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _open_conditions(self, points: Ints) -> Ints:
         """The conditions that the class of some points still rests on."""
         every = [np.empty(0, dtype=np.int64), *(conditions[points].ravel() for conditions in self.conditions)]
         found = np.unique(np.concatenate(every))
         return found[~(self.true | self.false)[found]]
 
-    def _outcomes_of(self, actions: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _outcomes_of(self, actions: Ints, rows: Ints) -> Ints:
         pairs = actions * self.machine.n_play + rows
         ranges = [np.arange(self.first[pair], self.first[pair + 1]) for pair in pairs]
         return np.concatenate([np.empty(0, dtype=np.int64), *ranges])

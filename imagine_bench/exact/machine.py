@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Floats, Rules, State
 
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 Class = tuple[float, bool, bool]
 """What a macro-action gave: the reward, whether the episode ended, whether as a success."""
 
@@ -20,23 +22,23 @@ class Machine:
     Shapes: ``S`` macrostates, those of play first, ``P`` of play, ``A`` actions, ``N`` outcomes, ``M`` coordinates.
     """
 
-    coordinates: NDArray[np.int64]  #: Shape (S, M).
+    coordinates: Ints  #: Shape (S, M).
     n_play: int  #: P
     n_actions: int  #: A
-    starts: NDArray[np.int64]  #: Rows an episode may start in.
+    starts: Ints  #: Rows an episode may start in.
     classes: tuple[Class, ...]
-    pair: NDArray[np.int64]  #: ``action * P + row`` of each outcome, ascending. Shape (N,).
-    after: NDArray[np.int64]  #: Row of its macrostate. Shape (N,).
+    pair: Ints  #: ``action * P + row`` of each outcome, ascending. Shape (N,).
+    after: Ints  #: Row of its macrostate. Shape (N,).
     probability: Floats  #: Shape (N,).
-    class_: NDArray[np.int64]  #: Index in ``classes``. Shape (N,).
+    class_: Ints  #: Index in ``classes``. Shape (N,).
 
     @property
-    def action(self) -> NDArray[np.int64]:
+    def action(self) -> Ints:
         """The action of each outcome. Shape (N,)."""
         return self.pair // self.n_play
 
     @property
-    def before(self) -> NDArray[np.int64]:
+    def before(self) -> Ints:
         """The row that each outcome comes from. Shape (N,)."""
         return self.pair % self.n_play
 

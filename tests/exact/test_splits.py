@@ -2,55 +2,48 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from machines import Wheels
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.exact.splits import Split, by_pairs, by_plan_length, by_values, split_of
+from imagine_bench.exact.splits import Split, split_of
 from imagine_bench.rules import fewest_actions
 
 RULES = Wheels()
 
 
 def test_a_split_by_plan_length_has_longer_plans_in_tests():
-    split = by_plan_length(RULES, 2)
+    split = split_of(RULES, "plan_length=2")
     assert max(fewest_actions(RULES, state) for state in split.train) == 2
     assert min(fewest_actions(RULES, state) for state in split.test) == 3
     assert sorted(split.train + split.test) == sorted(RULES.start_states)
 
 
 def test_held_out_pairs_are_never_trained_on_but_their_values_are():
-    split = by_pairs(RULES, 0, 3, 3, np.random.default_rng(0))
+    split = split_of(RULES, "pairs=0:3:3")
     trained, tested = ({(s[0], s[3]) for s in starts} for starts in (split.train, split.test))
     assert len(tested) == 3 and not trained & tested
     for i in (0, 1):
         assert {pair[i] for pair in tested} <= {pair[i] for pair in trained}
-    with pytest.raises(InvalidValueError, match=r"pairs can be held out, not 99"):
-        by_pairs(RULES, 0, 3, 99, np.random.default_rng(0))
 
 
 def test_a_split_is_known_by_its_content():
-    split = by_values(RULES, 3, {2})
+    split = split_of(RULES, "values=3:2")
     assert {state[3] for state in split.test} == {2} and {state[3] for state in split.train} == {0, 1}
     again = Split(name="another", train=split.train[::-1], test=split.test)
-    assert split.hash == again.hash != by_values(RULES, 3, {1}).hash
+    assert split.hash == again.hash != split_of(RULES, "values=3:1").hash
     with pytest.raises(InvalidValueError, match="leaves no start for test"):
-        by_values(RULES, 3, {9})
+        split_of(RULES, "values=3:9")
 
 
 def test_a_text_names_a_split():
-    for text, split in (
-        ("plan_length=2", by_plan_length(RULES, 2)),
-        ("values=3:2:0", by_values(RULES, 3, {0, 2})),
-        ("pairs=0:3:2", by_pairs(RULES, 0, 3, 2, np.random.default_rng(0))),
-    ):
+    for text in ("plan_length=2", "values=3:2:0", "pairs=0:3:2"):
         found = split_of(RULES, text)
-        assert (found.train, found.test, found.identity) == (split.train, split.test, f"{text}@{split.hash}")
+        assert found.identity == f"{text}@{found.hash}"
         assert split_of(RULES, found.identity) == found
         assert split_of(RULES, text.replace("=", "=+")).identity == found.identity  # however a number is written
     with pytest.raises(InvalidValueError, match=r"is .{12} here, not 000000000000"):
         split_of(RULES, "plan_length=2@000000000000")
-    for wrong in ("", "plan_length", "plan_length=long", "length=2", "values=99:1", "pairs=0:3"):
+    for wrong in ("", "plan_length", "plan_length=long", "length=2", "values=99:1", "pairs=0:3", "pairs=0:3:99"):
         with pytest.raises(InvalidValueError, match="names no split of"):
             split_of(RULES, wrong)
