@@ -104,7 +104,8 @@ def _by_values(rules: Rules, coordinate: int, *values: int) -> _IsTest:
 def _by_pairs(rules: Rules, first: int, second: int, held_out: int) -> _IsTest:
     found = sorted({(state[first], state[second]) for state in rules.start_states})
     trained = list(found)
-    for index in np.random.default_rng(0).permutation(len(found)).tolist():
+    rng = np.random.default_rng(0)
+    for index in rng.permutation(len(found)).tolist():
         left = [pair for pair in trained if pair != found[index]]
         if len(found) - len(left) <= held_out and all(
             {pair[i] for pair in left} == {pair[i] for pair in found} for i in (0, 1)
