@@ -181,9 +181,7 @@ def _title(model: str) -> str:
     return model_entry(model).title
 
 
-def _by_model(
-    found: Judged, name: str, columns: Mapping[str, Callable[[Scores], float]], caption: str, folded: str = ""
-) -> Table:
+def _by_model(found: Judged, name: str, columns: Mapping[str, Callable[[Scores], float]], caption: str) -> Table:
     """A row a model and number of transitions, a column a number over seeds; NaN where a model has none."""
     rows: list[list[str]] = []
     for (model, size), cells in found.cells.items():
@@ -192,13 +190,13 @@ def _by_model(
         for column, value in columns.items():
             rows[-1].append(over_seeds(list(map(value, cells)), _number, share=column in (_SHARES | _ANSWERED.keys())))
     header = ["world model", "transitions", *(COLUMNS.get(column, column) for column in columns)]
-    return Table(name, header, rows, caption, _WHY_DASH, folded)
+    return Table(name, header, rows, caption, _WHY_DASH)
 
 
-def _scores(found: Judged, name: str, names: Iterable[str], folded: str = "") -> Table:
+def _scores(found: Judged, name: str, names: Iterable[str]) -> Table:
     columns = {each: functools.partial(score, name=each) for each in names}
     caption = "Interquartile means over seeds or runs, with 95 % intervals. 0 is best in every error; value loss is in "
-    return _by_model(found, name, columns, f"{caption}units of reward.", folded)
+    return _by_model(found, name, columns, f"{caption}units of reward.")
 
 
 def in_short(found: Judged) -> Section:

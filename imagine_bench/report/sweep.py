@@ -24,7 +24,7 @@ from imagine_bench.report.page import (
 )
 from imagine_bench.statistics import Estimate, iqm
 from imagine_bench.store.files import json_text, table_text, with_null
-from imagine_bench.sweep.grid import Experiment, Study
+from imagine_bench.sweep.grid import Study
 from imagine_bench.sweep.run import Line, SuiteResult
 
 Row = dict[str, float | str]
@@ -147,24 +147,20 @@ def suite_page(result: SuiteResult) -> Page:
     )
 
 
-def _score(result: SuiteResult, experiment: Experiment) -> list[Estimate]:
-    return [result.score(experiment, agent) for agent in result.agents]
-
-
 def _scores(result: SuiteResult) -> Section:
-    experiments = result.suite.experiments
-    found = [_score(result, each) for each in experiments]
-    by_agent = dict(zip(result.agents, zip(*found, strict=True), strict=True))
-    spokes = [each.name for each in experiments]
+    by_agent: dict[str, list[Estimate]] = {agent: [] for agent in result.agents}
+    rows = []
+    for each in result.suite.experiments:
+        for agent, found in by_agent.items():
+            found.append(result.score(each, agent))
+        rows.append([f"{each.name}: {each.dial}", *(estimate(found[-1], decimals) for found in by_agent.values())])
+    rows.append(["training of all levels and seeds (CPU s)", *(_cpu_s(result, agent) for agent in result.agents)])
+    spokes = [each.name for each in result.suite.experiments]
     caption = (
         "(success − chance) / (optimum − chance), mean over the levels of each experiment. The middle is blind choice, "
-        "the rim is perfect play. Bands: 95 % intervals."
+        "the rim is perfect play. Lines across: 95 % intervals."
     )
     image = figures.image("radar", lambda: figures.radar_figure(spokes, by_agent), caption)
-    rows = []
-    for each, scores in zip(experiments, found, strict=True):
-        rows.append([f"{each.name}: {each.dial}", *(estimate(score, decimals) for score in scores)])
-    rows.append(["training of all levels and seeds (CPU s)", *(_cpu_s(result, agent) for agent in result.agents)])
     words = (
         "Scores with 95 % intervals: Student's over seeds, and at least that of the tests. 0 is chance, 1 the exact "
         "optimum, with memory where frames hide something or are late. Uncertainty is scored by the AUROC with which "
@@ -235,7 +231,7 @@ def scores_csv(result: SuiteResult) -> str:
     """One row an experiment and agent."""
     rows: list[Row] = []
     for each in result.suite.experiments:
-        for agent, score in zip(result.agents, _score(result, each), strict=True):
-            ends = dict(zip(("score", "low_95", "high_95"), score, strict=False))
+        for agent in result.agents:
+            ends = dict(zip(("score", "low_95", "high_95"), result.score(each, agent), strict=False))
             rows.append({"experiment": each.name, "agent": agent, **with_null(ends)})
     return table_text(rows)
