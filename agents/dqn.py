@@ -20,7 +20,7 @@ from . import snapshot
 from .dqn_settings import HYPERPARAMETERS, MORE_UPDATES, ControllerSettings, DQNSettings, GreedySettings
 from .encoders.perception import Perception, load_perception, prepare_torch
 from .meters import Meters
-from .networks.adam import Adam
+from .networks.adam import Adam, TrainedModule
 from .networks.mlp import mlp
 from .replay import Batch, RealMemory, Transitions
 from .settings import Hyperparameters, flatten
@@ -40,7 +40,7 @@ def td_target(reward: Tensor, terminated: Tensor, q_next: Tensor, discount: floa
     return reward + discount * (1.0 - terminated) * q_next.amax(dim=-1)
 
 
-class Controller(nn.Module):
+class Controller(TrainedModule):
     """Action values of latents: a network, a slowly updated target network, and Adam.
 
     The generator draws the initial weights of the dense network that it has where none is given; its device is the
@@ -201,11 +201,12 @@ class DQN:
         counters = {"real_transitions": float(self.real.added), "gradient_updates": float(self.updates)}
         return {**self.meters.read(), "epsilon": epsilon(self.steps, self.settings.controller), **counters}
 
+    def parts(self) -> dict[str, snapshot.Part]:
+        """What a snapshot holds arrays of, by name."""
+        return {"controller": self.controller, "real": self.real, "generator/replay": self._replay}
+
     def state(self) -> AgentState:
         """A snapshot: weights, moments, memories, generators, counters, measurements."""
-        arrays = snapshot.prefixed("controller", snapshot.training_arrays(self.controller, self.controller.optimiser))
-        arrays |= snapshot.prefixed("real", self.real.arrays())
-        arrays["generator/replay"] = snapshot.generator_array(self._replay)
         values = {
             "steps": self.steps,
             "updates": self.updates,
@@ -214,16 +215,14 @@ class DQN:
             "meters": self.meters.state(),
             "settings": snapshot.jsonable(flatten(self.settings)),
         }
-        return AgentState(arrays=arrays, values=values)
+        return AgentState(arrays=snapshot.arrays_of(self.parts()), values=values)
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         snapshot.require_fit(state, self.state())
-        arrays = state.arrays
+        snapshot.load_parts(self.parts(), state.arrays)
         values = state.values
-        snapshot.load_training(self.controller, self.controller.optimiser, snapshot.below("controller", arrays))
-        snapshot.load_generator(self._replay, arrays["generator/replay"])
-        self.real.load(snapshot.below("real", arrays), values["real_added"])
+        self.real.added = values["real_added"]
         self.meters.restore(values["meters"])
         self.rng.bit_generator.state = values["exploration"]
         self.steps = values["steps"]

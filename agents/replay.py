@@ -49,7 +49,7 @@ class Batch:
         return self.z, self.action, self.reward, self.next_z, self.terminated
 
 
-class _Ring:
+class Ring:
     """Named columns of a fixed number of rows, the capacity; a full ring overwrites its oldest ones."""
 
     _latents: tuple[str, ...]
@@ -96,7 +96,7 @@ class _Ring:
         self.added = added
 
 
-class RealMemory(_Ring):
+class RealMemory(Ring):
     """Transitions that happened, as posteriors of their latents; with ``prioritised``, each with its latest error."""
 
     _latents = ("mu", "sigma", "next_mu", "next_sigma")
@@ -159,7 +159,7 @@ class RealMemory(_Ring):
         return weights
 
 
-class StartMemory(_Ring):
+class StartMemory(Ring):
     """Posteriors of the latents that real episodes began with."""
 
     _latents = ("mu", "sigma")
@@ -177,7 +177,7 @@ class StartMemory(_Ring):
         return torch.addcmul(rows["mu"], rows["sigma"], noise)
 
 
-class ImaginedMemory(_Ring):
+class ImaginedMemory(Ring):
     """Transitions that were imagined; with ``weighted``, each with what its error counts."""
 
     _latents = ("z", "next_z")

@@ -16,7 +16,11 @@ from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.values import Json
 
-from .networks.adam import MOMENTS, Adam
+from .networks.adam import MOMENTS, Adam, TrainedModule
+from .replay import Ring
+
+Part = TrainedModule | torch.Generator | Ring
+"""What an agent's arrays belong to."""
 
 
 def prefixed(prefix: str, arrays: Mapping[str, Array]) -> Arrays:
@@ -64,6 +68,30 @@ def load_generator(generator: torch.Generator, array: NDArray[np.uint8]) -> None
 def jsonable(values: Mapping[str, Any]) -> dict[str, Json]:
     """The values as JSON would give them back."""
     return json.loads(json.dumps(values))
+
+
+def arrays_of(parts: Mapping[str, Part]) -> Arrays:
+    """Copies of weights, moments, rows and generators, below the name of each part."""
+    found: Arrays = {}
+    for name, part in parts.items():
+        if isinstance(part, torch.Generator):
+            found[name] = generator_array(part)
+        elif isinstance(part, TrainedModule):
+            found |= prefixed(name, training_arrays(part, part.optimiser))
+        else:
+            found |= prefixed(name, part.arrays())
+    return found
+
+
+def load_parts(parts: Mapping[str, Part], arrays: Arrays) -> None:
+    """Take up the result of :func:`arrays_of`; how many rows memories ever held is the caller's to say."""
+    for name, part in parts.items():
+        if isinstance(part, torch.Generator):
+            load_generator(part, arrays[name])
+        elif isinstance(part, TrainedModule):
+            load_training(part, part.optimiser, below(name, arrays))
+        else:
+            part.load(below(name, arrays), part.added)
 
 
 _ROWS_VARY = ("real/", "imagination/memory/", "model_only/memory/", "starts/", "replay/", "table/")

@@ -113,18 +113,24 @@ class ImaginingAgent(DQN):
         """Return the DQN's diagnostics and the number of transitions imagined so far."""
         return {**super().diagnostics(), "imagined_transitions": float(self.imagination.memory.added)}
 
+    def parts(self) -> dict[str, snapshot.Part]:
+        """What a snapshot holds arrays of: world model and imagined memory, too."""
+        own = {f"imagination/{name}": part for name, part in self.imagination.parts().items()}
+        return {**super().parts(), **own}
+
     def state(self) -> AgentState:
         """Return a snapshot that includes the world model and the imagined memory."""
         state = super().state()
         own = self.imagination
-        state.arrays.update(snapshot.prefixed("imagination", own.arrays()))
+        state.arrays["imagination/threshold"] = np.array(own.filter.threshold)
         state.values.update(filtered=own.filter.active, imagined_added=own.memory.added)
         return state
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         super().restore(state)
-        self.imagination.load(snapshot.below("imagination", state.arrays), state.values["imagined_added"])
+        self.imagination.memory.added = state.values["imagined_added"]
+        self.imagination.filter.threshold = float(state.arrays["imagination/threshold"])
 
     def reset_for_new_task(self) -> None:
         """Keep the network of the dynamics; see :class:`.capabilities.TransferLearner`.

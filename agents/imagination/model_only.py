@@ -144,14 +144,19 @@ class ModelOnlyAgent(ImaginingAgent):
         """Return the diagnostics of an imagining agent, with the transitions of the training in the model."""
         return {**super().diagnostics(), "imagined_transitions": float(self.imagined_steps)}
 
+    def parts(self) -> dict[str, snapshot.Part]:
+        """What a snapshot holds arrays of: the training in the model and the starts of episodes, too."""
+        return {
+            **super().parts(),
+            "model_only/controller": self.trained,
+            "model_only/memory": self.imagined,
+            "model_only/generator": self._draws,
+            "starts": self.starts,
+        }
+
     def state(self) -> AgentState:
         """Return a snapshot that includes the training in the model and the starts of episodes."""
         state = super().state()
-        trained = snapshot.training_arrays(self.trained, self.trained.optimiser)
-        state.arrays.update(snapshot.prefixed("model_only/controller", trained))
-        state.arrays.update(snapshot.prefixed("model_only/memory", self.imagined.arrays()))
-        state.arrays["model_only/generator"] = snapshot.generator_array(self._draws)
-        state.arrays.update(snapshot.prefixed("starts", self.starts.arrays()))
         training = {
             "real_step": self.real_step,
             "episodes": self.imagined_episodes,
@@ -164,16 +169,12 @@ class ModelOnlyAgent(ImaginingAgent):
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         super().restore(state)
-        arrays = state.arrays
         training = state.values["model_only"]
-        self.begin_training(training["real_step"])
+        self.real_step = training["real_step"]
         self.imagined_episodes = training["episodes"]
         self.imagined_steps = training["steps"]
-        trained = snapshot.below("model_only/controller", arrays)
-        snapshot.load_training(self.trained, self.trained.optimiser, trained)
-        self.imagined.load(snapshot.below("model_only/memory", arrays), training["imagined"])
-        snapshot.load_generator(self._draws, arrays["model_only/generator"])
-        self.starts.load(snapshot.below("starts", arrays), state.values["starts_added"])
+        self.imagined.added = training["imagined"]
+        self.starts.added = state.values["starts_added"]
         self._episode = state.values["episode"]
 
 

@@ -10,19 +10,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from imagine_bench.arrays import Arrays
 from imagine_bench.errors import DivergedError, InvalidValueError
 from imagine_bench.interfaces.model import UNCERTAINTIES
 from imagine_bench.seeding import SeedTree
 
-from .. import snapshot
 from ..dqn import Controller
 from ..networks.mlp import Masks
 from ..replay import Batch, ImaginedMemory, RealMemory
+from ..snapshot import Part
 from . import mixture as mdn
 from .filter import EpistemicFilter
 from .mixture import Mixture
@@ -303,23 +301,10 @@ class Imagination:
         explores = torch.rand(greedy.shape, generator=generator, device=generator.device) < epsilon
         return torch.where(explores, random, greedy)
 
-    def arrays(self) -> Arrays:
-        """Copies of weights, moments, memory and generators."""
-        generators = {name: snapshot.generator_array(generator) for name, generator in self.generators.items()}
-        return {
-            **snapshot.prefixed("model", snapshot.training_arrays(self.model, self.model.optimiser)),
-            **snapshot.prefixed("memory", self.memory.arrays()),
-            **snapshot.prefixed("generator", generators),
-            "threshold": np.array(self.filter.threshold),
-        }
-
-    def load(self, arrays: Arrays, added: int) -> None:
-        """Take up the result of :meth:`arrays` and the number of transitions ever imagined."""
-        snapshot.load_training(self.model, self.model.optimiser, snapshot.below("model", arrays))
-        self.memory.load(snapshot.below("memory", arrays), added)
-        self.filter.threshold = float(arrays["threshold"])
-        for name, generator in self.generators.items():
-            snapshot.load_generator(generator, arrays[f"generator/{name}"])
+    def parts(self) -> dict[str, Part]:
+        """What snapshots hold arrays of, by name; the filter's threshold is not among it."""
+        generators = {f"generator/{name}": generator for name, generator in self.generators.items()}
+        return {"model": self.model, "memory": self.memory, **generators}
 
 
 def _require_numbers(imagined: Tensor) -> None:

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from imagine_bench.errors import DivergedError
 
-from ..networks.adam import Adam
+from ..networks.adam import Adam, TrainedModule
 from ..networks.mlp import Masks, MemberMLP, clip_unit_norms
 from ..networks.precision import hidden_dtype
 from ..networks.weight_samples import sample_outputs
@@ -82,7 +82,7 @@ class RewardTerminationHead(nn.Module):
         return reward, logit
 
 
-class EnvironmentModel(nn.Module):
+class EnvironmentModel(TrainedModule):
     """Dynamics, reward and termination, trained together from batches of transitions.
 
     The generator draws the initial weights; its device is the model's. ``predicted`` says how many of the numbers of a

@@ -66,3 +66,9 @@ class Adam:
                 amsgrad=False,
                 maximize=False,
             )
+
+
+class TrainedModule(nn.Module):
+    """A network with its optimiser, as snapshots hold it."""
+
+    optimiser: Adam

@@ -166,7 +166,7 @@ def graded(sound: Mixture, z: torch.Tensor) -> Mixture:
 
 
 @pytest.mark.parametrize(("quantile", "threshold", "kept"), [(1.0, 49.0, [3, 0]), (0.0, 0.0, [0, 0])])
-def test_a_moving_threshold_is_a_quantile_of_real_transitions_and_comes_back(
+def test_a_moving_threshold_is_a_quantile_of_real_transitions(
     quantile: float, threshold: float, kept: list[int]
 ) -> None:
     moving = {"reduction": "max", "threshold_quantile": quantile, "threshold": 99.0}
@@ -177,8 +177,3 @@ def test_a_moving_threshold_is_a_quantile_of_real_transitions_and_comes_back(
     ]
     assert imagination.filter.threshold == threshold
     assert accepted == kept
-    settings = Settings(imagination=imagination.settings)
-    other, resumed = (Imagination(2, 2, settings, filtered=True, seeds=SeedTree(0), device=CPU) for _ in range(2))
-    other.filter.threshold = threshold
-    resumed.load(other.arrays(), 0)
-    assert resumed.filter.threshold == threshold
