@@ -122,7 +122,7 @@ def compared_rollout(rng: np.random.Generator, depth: int = 5, cut: int | None =
     if cut is not None:
         accepted[cut:] = False
     rollout = ImaginedRollout(
-        actions=rng.integers(0, 6, depth),
+        actions=rng.integers(0, 4, depth),
         frames=rng.uniform(size=(depth, 64, 64)).astype(np.float32),
         start_frame=rng.uniform(size=(64, 64)).astype(np.float32),
         rewards=rng.normal(size=depth).astype(np.float32),
