@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
@@ -30,24 +29,12 @@ _REASONS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Examination:
-    """What was found."""
+def examine() -> tuple[str, bool]:
+    """Look at versions, GL, threads, GPU and disk; draws a frame of the first task.
 
-    facts: tuple[tuple[str, str], ...]  #: names and values, in order
-    complaints: tuple[str, ...]  #: sentences about what will not work, each with what to do
-    notes: tuple[str, ...]  #: sentences about what works, but could be better
-
-    def __str__(self) -> str:
-        width = max((len(name) for name, _ in self.facts), default=0) + 2
-        lines = [f"{name:{width}}{value}" for name, value in self.facts]
-        lines += [f"Note: {note}" for note in self.notes]
-        lines += [f"Wrong: {complaint}" for complaint in self.complaints] or ["Everything works."]
-        return "\n".join(lines)
-
-
-def examine() -> Examination:
-    """Look at versions, GL, threads, GPU and disk; draws a frame of the first task."""
+    Returns:
+        What was found, as text, and whether everything works.
+    """
     here = machine()
     complaints = unmet_requirements()
     try:
@@ -79,7 +66,11 @@ def examine() -> Examination:
         "free disk": f"{free_gib:.1f} GiB",
     }
     notes = _notes(here["gpu"], gl) + unlocked_versions() + missing_extras()
-    return Examination(facts=tuple(facts.items()), complaints=tuple(complaints), notes=tuple(notes))
+    width = max(map(len, facts)) + 2
+    lines = [f"{name:{width}}{value}" for name, value in facts.items()]
+    lines += [f"Note: {note}" for note in notes]
+    lines += [f"Wrong: {complaint}" for complaint in complaints] or ["Everything works."]
+    return "\n".join(lines), not complaints
 
 
 def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str]:
