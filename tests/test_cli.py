@@ -28,62 +28,40 @@ from imagine_bench.sweep.catalogue import GRIDS
 
 
 def bench_words(out: Path, *more: str) -> list[str]:
-    return [
-        "bench",
-        "--task",
-        "arrow_puzzle",
-        "--preset",
-        "smoke",
-        "--execution",
-        "kinematic",
-        "--out",
-        str(out),
-        *more,
-    ]
+    words = "bench --task arrow_puzzle --preset smoke --execution kinematic --out"
+    return [*words.split(), str(out), *more]
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--task=pick"], "Both arrow_puzzle and --task pick were given; leave one of them out."),
+        ("--task=pick", "Both arrow_puzzle and --task pick were given; leave one of them out."),
+        ("--preset quik", "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full, "),
+        ("--agents dqnn", "No agent 'dqnn'. Did you mean 'dqn'? Known: random, oracle, dqn, imagination"),
+        ("--appearance strng", "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, photo, "),
+        ("--execution physic", "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic."),
+        ("--device gpu", "No device 'gpu'. Did you mean 'cpu'? Known: cpu, cuda."),
+        ("--encoder arrow_puzzle-mid", "No encoder 'arrow_puzzle-mid'. Did you mean 'arrow_puzzle-mild'? Known: "),
+        ("--budgets 10 5", "budgets (10, 5) must be one or more different integers of at least 1, ascending."),
+        ("--seeds -1", "seeds (-1,) must be one or more different integers from 0 to 16777215."),
         (
-            ["--preset", "quik"],
-            "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full, ",
-        ),
-        (["--agents", "dqnn"], "No agent 'dqnn'. Did you mean 'dqn'? Known: random, oracle, dqn, imagination"),
-        (
-            ["--appearance", "strng"],
-            "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, photo, ",
-        ),
-        (
-            ["--execution", "physic"],
-            "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic.",
-        ),
-        (["--device", "gpu"], "No device 'gpu'. Did you mean 'cpu'? Known: cpu, cuda."),
-        (["--encoder", "arrow_puzzle-mid"], "No encoder 'arrow_puzzle-mid'. Did you mean 'arrow_puzzle-mild'? Known: "),
-        (["--budgets", "10", "5"], "budgets (10, 5) must be one or more different integers of at least 1, ascending."),
-        (["--seeds", "-1"], "seeds (-1,) must be one or more different integers from 0 to 16777215."),
-        (
-            ["--encoder", "pick_place-clean"],
+            "--encoder pick_place-clean",
             "Encoder 'pick_place-clean.safetensors' reads frames as 'small_rgb', the task declares",
         ),
-        (["--variants", "base"], "arrow_puzzle takes no --variants; leave it out."),
-        (["--evaluation-episodes", "0"], "evaluation_episodes is 0; give at least 1."),
-        (
-            ["--set", "controller.discnt=0.9"],
-            "No setting 'controller.discnt'. Did you mean 'controller.discount'? Known: ",
-        ),
-        (["--set", "controller.discount"], "--set 'controller.discount' is not of the form name=value"),
-        (["--set", "controller.discount=0.9", "--set=b=2"], "No setting 'b'. Known: "),
-        (["--set", "--workers", "1"], "--set has no value; give at least one behind it, or leave it out."),
-        (["--agents="], "--agents has no value; give at least one behind it, or leave it out."),
-        (["--workers", "0"], "0 workers cannot run anything; give at least 1."),
+        ("--variants base", "arrow_puzzle takes no --variants; leave it out."),
+        ("--evaluation-episodes 0", "evaluation_episodes is 0; give at least 1."),
+        ("--set controller.discnt=0.9", "No setting 'controller.discnt'. Did you mean 'controller.discount'? Known: "),
+        ("--set controller.discount", "--set 'controller.discount' is not of the form name=value"),
+        ("--set controller.discount=0.9 --set=b=2", "No setting 'b'. Known: "),
+        ("--set --workers 1", "--set has no value; give at least one behind it, or leave it out."),
+        ("--agents=", "--agents has no value; give at least one behind it, or leave it out."),
+        ("--workers 0", "0 workers cannot run anything; give at least 1."),
     ],
 )
 def test_wrong_words_get_one_line_and_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, sentence: str
 ) -> None:
-    given = bench_words(tmp_path / "runs", *words)
+    given = bench_words(tmp_path / "runs", *words.split())
     assert main(given) == 2
     said = capsys.readouterr()
     assert said.out == ""
@@ -92,39 +70,41 @@ def test_wrong_words_get_one_line_and_exit_code_2(
     assert not (tmp_path / "runs").exists()
 
 
-def test_wrong_words_of_other_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for words, sentence in (
-        (["report", "a", "--merge"], "--merge has no value; give at least one behind it, or leave it out."),
-        (["plan", str(tmp_path), "--max-epistemic=-1"], "more epistemic uncertainty than -1.0: give at least 0."),
-        (["sweep", "toy_regression"], "toy_regression is learned from data; a study compares agents that act"),
-        (["sweep", "arrow_puzzle", "--name", "factor"], "No study 'factor'. Did you mean 'factors'?"),
-        (["sweep", "arrow_puzzle", "--name", "suite"], "ladder takes no --task; leave it out."),
-        (["sweep", "arrow_puzzle", "--experiment", "memory"], "factors takes no --experiment; leave it out."),
-        (["sweep", "--name", "smoke"], "smoke is a study of one task; give a task as the first word."),
-        (["sweep", "--experiment", "memry"], "No experiment 'memry'. Did you mean 'memory'?"),
-        *(
-            ([command, "a", "--task", "arrow_puzzle"], "Both a and --task arrow_puzzle were given; leave one of them")
-            for command in ("report", "plan", "verify", "view")
-        ),
-        (["report", "--task", "pick", "--out", str(tmp_path)], "No task 'pick'. Did you mean 'pick_place'?"),
-        (["report", "robot_ik", "--out", str(tmp_path)], "There is no bench of robot_ik below"),
-        (["verify", "--causes", "--out", str(tmp_path)], "There is no bench of arrow_puzzle or"),
-        (["verify", "--encoder", "x"], "--encoder goes with --causes"),
-        (["report", str(tmp_path)], "protocol.json, a bench's protocol."),
-        (["view", "--out", str(tmp_path)], "There is no recording below"),
-        (["view", str(tmp_path / "x.rrd")], "No recording"),
-        (["play", "arrow_puzzle", "--film", "--out", str(tmp_path / "film.mp4")], "does not end in .gif"),
-        (["play", "--film"], "A film is of the oracle in a task"),
-        (["check", "--physics"], "Physics is measured of a task; give one."),
-        (["encoder", "--task", "arow_puzzle"], "No task 'arow_puzzle'. Did you mean 'arrow_puzzle'?"),
-        (
-            ["encoder", "--task", "arrow_puzzle", "--out", "/dev/null/x"],
-            "Cannot write /dev/null/x: a part of that path",
-        ),
-    ):
-        assert main(words) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("imagine-bench: ") and sentence in line
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("report a --merge", "--merge has no value; give at least one behind it, or leave it out."),
+        ("plan HERE --max-epistemic=-1", "more epistemic uncertainty than -1.0: give at least 0."),
+        ("sweep toy_regression", "toy_regression is learned from data; a study compares agents that act"),
+        ("sweep arrow_puzzle --name factor", "No study 'factor'. Did you mean 'factors'?"),
+        ("sweep arrow_puzzle --name suite", "ladder takes no --task; leave it out."),
+        ("sweep arrow_puzzle --experiment memory", "factors takes no --experiment; leave it out."),
+        ("sweep --name smoke", "smoke is a study of one task; give a task as the first word."),
+        ("sweep --experiment memry", "No experiment 'memry'. Did you mean 'memory'?"),
+        ("report a --task arrow_puzzle", "Both a and --task arrow_puzzle were given; leave one of them"),
+        ("plan a --task arrow_puzzle", "Both a and --task arrow_puzzle were given; leave one of them"),
+        ("verify a --task arrow_puzzle", "Both a and --task arrow_puzzle were given; leave one of them"),
+        ("view a --task arrow_puzzle", "Both a and --task arrow_puzzle were given; leave one of them"),
+        ("report --task pick --out HERE", "No task 'pick'. Did you mean 'pick_place'?"),
+        ("report robot_ik --out HERE", "There is no bench of robot_ik below"),
+        ("verify --causes --out HERE", "There is no bench of arrow_puzzle or"),
+        ("verify --encoder x", "--encoder goes with --causes"),
+        ("report HERE", "protocol.json, a bench's protocol."),
+        ("view --out HERE", "There is no recording below"),
+        ("view HERE/x.rrd", "No recording"),
+        ("play arrow_puzzle --film --out HERE/film.mp4", "does not end in .gif"),
+        ("play --film", "A film is of the oracle in a task"),
+        ("check --physics", "Physics is measured of a task; give one."),
+        ("encoder --task arow_puzzle", "No task 'arow_puzzle'. Did you mean 'arrow_puzzle'?"),
+        ("encoder --task arrow_puzzle --out /dev/null/x", "Cannot write /dev/null/x: a part of that path"),
+    ],
+)
+def test_wrong_words_of_other_commands(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, sentence: str
+) -> None:
+    assert main([word.replace("HERE", str(tmp_path)) for word in words.split()]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("imagine-bench: ") and sentence in line
 
 
 @pytest.mark.parametrize(
