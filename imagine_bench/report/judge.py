@@ -38,7 +38,6 @@ from imagine_bench.report.page import (
     p_value,
     write_page,
 )
-from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import difference, holm, iqm
 from imagine_bench.store.files import read_json, table_text
 
@@ -235,20 +234,6 @@ def risk(found: Judged) -> Section:
     return Section("The errors of the surest answers", tables=[_by_model(found, "risk", columns, caption)])
 
 
-def by_start(found: Judged) -> Section:
-    """Value loss by the fewest macro-actions that a start needs."""
-    rules = found.spec.rules
-    needs = np.array([fewest_actions(rules, state) for state in rules.start_states])
-
-    def loss(need: int, cell: Scores) -> float:
-        losses = np.array(cell["value_loss_by_start"])
-        return float(losses[needs == need].mean()) if losses.size else math.nan
-
-    columns = {f"{need} ({(needs == need).sum()} starts)": functools.partial(loss, need) for need in np.unique(needs)}
-    caption = "Mean value loss from starts by the fewest macro-actions to a success."
-    return Section("Value loss by start", tables=[_by_model(found, "value_loss_by_start", columns, caption)])
-
-
 def compared(found: Judged) -> Section:
     """Each pair's difference in total variation at the most transitions, and a line on the two best that learned."""
     values = {model: [score(cell, "total_variation") for cell in cells] for model, cells in found.last.items()}
@@ -328,7 +313,6 @@ SECTIONS: tuple[Callable[[Judged], Section | None], ...] = (
     images,
     risk,
     *(functools.partial(question, title=title) for title in QUESTIONS),
-    by_start,
     where,
     compared,
 )
