@@ -35,11 +35,11 @@ MOVED = {
     "imagine_bench.report.plots": "imagine_bench.report.figures",
     "imagine_bench.report.radar": "imagine_bench.report.figures",
     "imagine_bench.store.archive": "imagine_bench.store.loading",
-    "imagine_bench.studies": "imagine_bench.sweep.catalogue",
-    "imagine_bench.studies.catalogue": "imagine_bench.sweep.catalogue",
+    "imagine_bench.studies": "imagine_bench.sweep.grid",
+    "imagine_bench.studies.catalogue": "imagine_bench.sweep.grid",
     "imagine_bench.studies.study": "imagine_bench.sweep.grid",
-    "imagine_bench.suite": "imagine_bench.sweep.catalogue",
-    "imagine_bench.suite.experiments": "imagine_bench.sweep.catalogue",
+    "imagine_bench.suite": "imagine_bench.sweep.grid",
+    "imagine_bench.suite.experiments": "imagine_bench.sweep.grid",
     "imagine_bench.suite.run": "imagine_bench.sweep.run",
     "imagine_bench.suite.score": "imagine_bench.sweep.score",
     "imagine_bench.world_models": "imagine_bench.interfaces.model",
@@ -50,7 +50,7 @@ MOVED_NAMES = {
         "imagine_bench.agents.factored.learned:LearnedPerceptionAgent"
     ),
     "imagine_bench.registry:OBSERVERS": "imagine_bench.cli.observers:OBSERVERS",
-    "imagine_bench.registry:TASK_TYPES": "imagine_bench.running.task_types:TASK_TYPES",
+    "imagine_bench.registry:TASK_TYPES": "imagine_bench.running.bench:TASK_TYPES",
     "imagine_bench.store.archive:load_archive": "imagine_bench.store.loading:load_so_far",
 }
 """Where each name lies now, by the place that it had: names of moved modules, and of those loaded here."""

@@ -20,11 +20,11 @@ from imagine_bench import errors
 from imagine_bench.cli import Command, main
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.running.bench import task_types
 from imagine_bench.running.launchers.jobs import LAUNCHERS
-from imagine_bench.running.task_types import task_types
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.encoders import bundled
-from imagine_bench.sweep.catalogue import GRIDS
+from imagine_bench.sweep.grid import GRIDS
 
 
 def bench_words(out: Path, *more: str) -> list[str]:
@@ -42,14 +42,14 @@ def bench_words(out: Path, *more: str) -> list[str]:
         ("--execution physic", "No execution 'physic'. Did you mean 'physics'? Known: physics, kinematic."),
         ("--device gpu", "No device 'gpu'. Did you mean 'cpu'? Known: cpu, cuda."),
         ("--encoder arrow_puzzle-mid", "No encoder 'arrow_puzzle-mid'. Did you mean 'arrow_puzzle-mild'? Known: "),
-        ("--budgets 10 5", "budgets (10, 5) must be one or more different integers of at least 1, ascending."),
+        ("--budgets 10 5", "budgets (10, 5) must be one or more different integers from 1 to 10,000,000"),
         ("--seeds -1", "seeds (-1,) must be one or more different integers from 0 to 16777215."),
         (
             "--encoder pick_place-clean",
             "Encoder 'pick_place-clean.safetensors' reads frames as 'small_rgb', the task declares",
         ),
         ("--variants base", "arrow_puzzle takes no --variants; leave it out."),
-        ("--evaluation-episodes 0", "evaluation_episodes is 0; give at least 1."),
+        ("--evaluation-episodes 0", "evaluation_episodes is 0; give 1 to 10,000,000."),
         ("--set controller.discnt=0.9", "No setting 'controller.discnt'. Did you mean 'controller.discount'? Known: "),
         ("--set controller.discount", "--set 'controller.discount' is not of the form name=value"),
         ("--set controller.discount=0.9 --set=b=2", "No setting 'b'. Known: "),
@@ -75,7 +75,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
     [
         ("report a --merge", "--merge has no value; give at least one behind it, or leave it out."),
         ("plan HERE --max-epistemic=-1", "more epistemic uncertainty than -1.0: give at least 0."),
-        ("sweep toy_regression", "toy_regression is learned from data; a study compares agents that act"),
+        ("sweep toy_regression", "toy_regression is of a regression task, in which no agent acts"),
         ("sweep arrow_puzzle --name factor", "No study 'factor'. Did you mean 'factors'?"),
         ("sweep arrow_puzzle --name suite", "ladder takes no --task; leave it out."),
         ("sweep arrow_puzzle --experiment memory", "factors takes no --experiment; leave it out."),
@@ -87,7 +87,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
         ("view a --task arrow_puzzle", "Both a and --task arrow_puzzle were given; leave one of them"),
         ("report --task pick --out HERE", "No task 'pick'. Did you mean 'pick_place'?"),
         ("report robot_ik --out HERE", "There is no bench of robot_ik below"),
-        ("verify --causes --out HERE", "There is no bench of arrow_puzzle or"),
+        ("verify --causes --out HERE", "There is no bench below"),
         ("verify --encoder x", "--encoder goes with --causes"),
         ("report HERE", "protocol.json, a bench's protocol."),
         ("view --out HERE", "There is no recording below"),
@@ -169,7 +169,7 @@ def test_a_failing_seed_fails_the_command_and_names_its_log(
     folder = newest_bench(tmp_path)
     assert capsys.readouterr().err.splitlines()[-2:] == [
         "imagine-bench: 1 of 2 runs failed; the same command tries them again and keeps the others.",
-        f"  failing seed 1: this agent breaks on purpose Log: {folder}/failing/seed_1/log.txt",
+        f"  failing seed 1 in arrow_puzzle: this agent breaks on purpose Log: {folder}/failing/seed_1/log.txt",
     ]
     assert len(inline.order) == 2
     assert (folder / "failing/seed_0/DONE").exists() and not (folder / "failing/seed_1/DONE").exists()

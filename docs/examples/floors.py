@@ -19,7 +19,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.launchers.jobs import launcher
 from imagine_bench.store.results import BenchResult, RunResult
-from imagine_bench.sweep.catalogue import LADDER
+from imagine_bench.sweep.grid import LADDER
 
 BUDGETS = (10, 20, 30, 40, 50, 60, 70, 80, 100, 120, 150)
 SHARE = 0.95

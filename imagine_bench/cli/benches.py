@@ -34,16 +34,13 @@ from imagine_bench.errors import InvalidValueError, RunFailedError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.judge.judgement import Judgement, judge
 from imagine_bench.judge.verify import cost
-from imagine_bench.protocols.data import ProtocolData, digest
-from imagine_bench.protocols.runs import Encoders, Result
+from imagine_bench.protocols.data import Encoders, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
-from imagine_bench.running.bench import bench, plan
-from imagine_bench.running.task_types import load_so_far
+from imagine_bench.running.bench import bench, load_so_far, plan
 from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.results import BenchResult
-from imagine_bench.sweep.catalogue import SUITE, grid_named
-from imagine_bench.sweep.grid import SUITE_AGENTS, Study, Suite
+from imagine_bench.sweep.grid import SUITE, SUITE_AGENTS, Study, Suite, grid_named
 from imagine_bench.sweep.run import run_study, run_suite
 
 if TYPE_CHECKING:
@@ -230,7 +227,7 @@ class Sweep:
     def _suite(self, suite: Suite) -> None:
         launcher = self.launch.chosen()
         agents = self.agents or SUITE_AGENTS
-        result = run_suite(suite, agents, root=self.launch.out, launcher=launcher, planners=self.launch.workers)
+        result = run_suite(suite, agents, root=self.launch.out, launcher=launcher)
         page = registry.load(_PAGES["suite"])(result)
         _write(page, self.launch.out / "suite" / f"{suite.name}-{suite.hash}" / "report")
         if result.failures:

@@ -19,8 +19,7 @@ from imagine_bench.judge.open_loop import (
 )
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.runs import Failure, Job, Launcher, OnProgress
+from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, ProtocolData
 from imagine_bench.rules import states_of
 from imagine_bench.running.run_state import Run, make_env
 from imagine_bench.running.runner import AtBudget, AtEnd, RunObserver

@@ -13,9 +13,9 @@ import tyro
 from imagine_bench import registry
 from imagine_bench.cli.observers import Observed
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.protocols.runs import Launcher
+from imagine_bench.protocols.data import Launcher
+from imagine_bench.running.bench import task_type
 from imagine_bench.running.launchers.jobs import launcher
-from imagine_bench.running.task_types import task_type
 from imagine_bench.store.bench_folder import require_either
 
 T = TypeVar("T")

@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from imagine_bench import registry
 from imagine_bench.arrays import Array, Arrays
 from imagine_bench.errors import ArtefactError, InvalidValueError, require_known
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.episodes import Episodes, content_hash
-from imagine_bench.store.files import make_folder, read_sealed, reading, sealed, write_arrays, write_json, writing
+from imagine_bench.store.files import make_folder, read_arrays, read_sealed, sealed, write_arrays, write_json, writing
 from imagine_bench.values import Json
 
 FORMATS = {name: f"imagine_bench.data.{name}" for name in ("npz", "lerobot", "minari")}
@@ -116,10 +114,9 @@ def read_apart(dataset: Dataset) -> dict[str, Arrays]:
     found = {}
     for name, digest in (dataset.card or {}).get("apart", {}).items():
         path = dataset.folder / f"{name}.npz"
-        with reading(path, "a part of a dataset"), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            found[name] = dict(arrays)
-            if content_hash(found[name]) != digest:
-                raise InvalidValueError("it is not what the card says")
+        found[name] = read_arrays(path, "a part of a dataset")
+        if content_hash(found[name]) != digest:
+            raise ArtefactError(f"{path} is not what the card says. It was left untouched.")
     return found
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import gymnasium
 import minari
@@ -24,33 +25,20 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.store.files import reading
 
-_ROOT = "MINARI_DATASETS_PATH"
-
 
 def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
     """Write the dataset ``<task>-<policy>-v0``; the card says which environment it is of."""
     name = re.sub(r"[^\w-]+", "_", f"{card['task']}-{card['policy']}")
     env_id = registry.task_entry(card["task"]).env_id
     made = {name: card[name] for name in ("execution", "appearance")}
-    with _below(folder), warnings.catch_warnings(), closing(gymnasium.make(env_id, **made)) as env:
+    written_below = mock.patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder))
+    with written_below, warnings.catch_warnings(), closing(gymnasium.make(env_id, **made)) as env:
         warnings.simplefilter("ignore")  # about what we do not know, such as whom to write to
         minari.create_dataset_from_buffers(
             f"{name}-v0", [_buffer(episodes, index) for index in range(len(episodes))], env=env,
             algorithm_name=str(card["policy"]), description=str(card["description"]), data_format="parquet",
             jpeg_encoding=False,
         )  # fmt: skip
-
-
-@contextmanager
-def _below(folder: Path) -> Iterator[None]:
-    """Have Minari write below a folder."""
-    before = dict(os.environ)
-    os.environ[_ROOT] = str(folder)
-    try:
-        yield
-    finally:
-        del os.environ[_ROOT]
-        os.environ.update(before)
 
 
 def _buffer(episodes: Episodes, index: int) -> EpisodeBuffer:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.store.files import reading, write_arrays
+from imagine_bench.store.files import read_arrays, reading, write_arrays
 from imagine_bench.values import Json
 
 
@@ -19,5 +17,5 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
 
 def read(path: Path) -> Episodes:
     """Read an archive. Raises ArtefactError: it is damaged, or the arrays are not those of episodes."""
-    with reading(path, "an archive of episodes"), path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-        return Episodes(**arrays)
+    with reading(path, "an archive of episodes"):
+        return Episodes(**read_arrays(path))

@@ -16,8 +16,8 @@ from imagine_bench import registry
 from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.running.bench import counted
 from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts, replay
-from imagine_bench.running.progress import counted
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import run_folder

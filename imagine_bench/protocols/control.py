@@ -8,12 +8,16 @@ from typing import Any, cast
 
 from imagine_bench.appearance import appearance_name
 from imagine_bench.errors import InvalidValueError, brief, require_known
+from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.exact.splits import StartingFrom, split_of
 from imagine_bench.interfaces import (
     EXECUTIONS,
     FRAME_PX,
     OBSERVATION_SIZES_PX,
     OBSERVATIONS,
+    PROPRIO_SIZE,
+    AgentContext,
+    ExactWorld,
     PhysicsSettings,
     Rules,
     TaskSpec,
@@ -23,12 +27,12 @@ from imagine_bench.protocols.data import (
     LATER,
     MOST,
     ProtocolData,
-    require_ascending,
-    require_between,
+    RunSpec,
     require_different,
 )
-from imagine_bench.registry import agent_entry, task, task_entry
+from imagine_bench.registry import agent_entry, own_settings, task, task_entry
 from imagine_bench.registry import task_name as canonical
+from imagine_bench.seeding import SeedTree
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
@@ -37,6 +41,15 @@ _THESIS_BUDGETS = (250, 500, 1000, 1500, 2000, 3000, 4000, 5000, 6000)
 _AFTER_EPISODES = 100
 _FIRST_STAGE = 2000
 """Real episodes to which all runs are taken first: the thesis' smallest budget, and below it waiting would not pay."""
+_AT_LEAST = {
+    "after_episodes": 1,
+    "demonstrations": 0,
+    "queries": 0,
+    "evaluation_episodes": 1,
+    "open_loop_starts": 0,
+    "sampled_futures": 0,
+    "recorded_episodes": 0,
+}
 
 
 def _set(section: object, name: str, value: object) -> None:
@@ -64,10 +77,8 @@ class WorldSection:
         require_known("execution", self.execution, EXECUTIONS)
         _set(self, "appearance", appearance_name(self.appearance))
         settings = dataclasses.asdict(PhysicsSettings.of(dict(self.physics)))
-        usual = dataclasses.asdict(PhysicsSettings())
-        changed = tuple(sorted((name, value) for name, value in settings.items() if value != usual[name]))
-        _set(self, "physics", changed)
-        if changed and self.execution == "kinematic":
+        _set(self, "physics", tuple(sorted(settings.items() - dataclasses.asdict(PhysicsSettings()).items())))
+        if self.physics and self.execution == "kinematic":
             raise InvalidValueError("Physics settings change nothing in kinematic execution; leave one of them out.")
         parts = tuple(self.observation.split(","))
         for part in parts:
@@ -137,10 +148,11 @@ class BudgetSection:
 
     def _check_budget(self) -> None:
         """Raise InvalidValueError for a value out of range, and for two that exclude each other."""
-        require_ascending("budgets", self.budgets, at_least=1)
-        require_between("after_episodes", self.after_episodes, at_least=1)
-        require_between("demonstrations", self.demonstrations, at_least=0)
-        require_between("queries", self.queries, at_least=0)
+        in_range = all(1 <= budget <= MOST for budget in self.budgets)
+        if not self.budgets or not in_range or list(self.budgets) != sorted({*self.budgets}):
+            raise InvalidValueError(
+                f"budgets {brief(self.budgets)} must be one or more different integers from 1 to {MOST:,}, ascending."
+            )
         if not 0.0 <= self.feedback <= MOST or not 0.0 <= self.feedback_error <= (0.5 if self.feedback else 0.0):
             raise InvalidValueError(
                 f"feedback is {brief(self.feedback)} and feedback_error {brief(self.feedback_error)}; give a reward of "
@@ -172,15 +184,6 @@ class EvaluationSection:
     sampled_futures: int = 0
     recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
 
-    def _check_tests(self) -> None:
-        """Write the appearance in one way. Raises InvalidValueError for a value out of range."""
-        if self.test_appearance is not None:
-            _set(self, "test_appearance", appearance_name(self.test_appearance))
-        require_between("evaluation_episodes", self.evaluation_episodes, at_least=1)
-        require_between("open_loop_starts", self.open_loop_starts, at_least=0)
-        require_between("sampled_futures", self.sampled_futures, at_least=0)
-        require_between("recorded_episodes", self.recorded_episodes, at_least=0)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, ProtocolData):
@@ -194,9 +197,14 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name, at_least in _AT_LEAST.items():
+            value = getattr(self, name)
+            if not at_least <= value <= MOST:
+                raise InvalidValueError(f"{name} is {brief(value)}; give {at_least:,} to {MOST:,}.")
         self._check_world()
         self._check_budget()
-        self._check_tests()
+        if self.test_appearance is not None:
+            _set(self, "test_appearance", appearance_name(self.test_appearance))
         if self.dataset is not None and not self.shows_frames_alone:
             raise InvalidValueError("A dataset holds 64 x 64 frames alone; leave the observation as it is by default.")
 
@@ -309,13 +317,12 @@ def _require_learner(wanted: Protocol) -> None:
 def _require_takes(agent: str, wanted: Protocol) -> None:
     """Raise InvalidValueError for an agent that cannot take what is observed, or UnknownNameError."""
     takes = agent_entry(agent).observes
-    if not wanted.shows_frames_alone and not takes:
+    able = set(wanted.observation.split(",")) <= set(takes) if takes else wanted.shows_frames_alone
+    if not able:
         raise InvalidValueError(
-            f"Agent {agent!r} takes 64 x 64 frames alone; leave it out, or leave the observation as it is by default."
+            f"Agent {agent!r} takes {', '.join(takes) or '64 x 64 frames'} alone; leave it out, or the observation "
+            "as it is by default."
         )
-    for part in wanted.observation.split(",") if takes else ():
-        if part not in takes:
-            raise InvalidValueError(f"Agent {agent!r} takes {', '.join(takes)}, but not {part}; leave one of them out.")
 
 
 def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
@@ -334,3 +341,25 @@ def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
                     f"{there!r} there and {here!r} here). Give tasks of one family, such as arrow_puzzle and "
                     "arrow_puzzle_hard."
                 )
+
+
+def context_of(spec: RunSpec[Protocol]) -> AgentContext:
+    """What a run's agent is built from."""
+    protocol = spec.protocol
+    entry = agent_entry(spec.agent)
+    world = task(protocol.task)
+    size = (protocol.observation_size, protocol.observation_size, 3)
+    shapes = {"state": (sum(map(len, world.macrostate_values)),), "proprio": (PROPRIO_SIZE,)}
+    return AgentContext(
+        n_actions=world.n_actions,
+        preprocessing=world.preprocessing,
+        encoder=spec.encoder if entry.needs_encoder else None,
+        seeds=SeedTree(spec.seed).child("agent"),  # the same for every agent: runs of one seed are pairs
+        config_group=protocol.config_group,
+        hyperparameters=protocol.hyperparameters,
+        overrides=own_settings(spec.agent, dict(protocol.overrides)),
+        device=protocol.device,
+        optimal_policy=optimal_policy_of(world) if entry.privileged else None,
+        exact_world=ExactWorld.of(world, protocol.appearance) if entry.privileged else None,
+        observation={part: shapes.get(part, size) for part in protocol.observation.split(",")},
+    )

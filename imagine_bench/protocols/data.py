@@ -1,15 +1,19 @@
-"""What protocols of every task type have in common: they are data, and a hash stands for everything in them."""
+"""What protocols of every task type have in common, what their runs are, and what a type of task brings along.
+
+A protocol is data, and a hash stands for everything in it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import itertools
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self, get_type_hints
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, get_type_hints
+from typing import Protocol as Interface
 
 from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
@@ -118,23 +122,6 @@ def require_types(one: DataclassInstance) -> None:
             raise InvalidValueError(f"{name} was given {brief(value)}; it takes {wanted}.") from None
 
 
-def require_ascending(name: str, values: tuple[int, ...], *, at_least: int) -> None:
-    """Raise InvalidValueError unless values are different integers, ascending, of at least ``at_least``."""
-    ascending = all(a < b for a, b in itertools.pairwise(values))
-    if not values or not ascending or values[0] < at_least or values[-1] > MOST:
-        most = f" and at most {MOST:,}" if values and values[-1] > MOST else ""
-        raise InvalidValueError(
-            f"{name} {brief(values)} must be one or more different integers of at least {at_least}{most}, ascending."
-        )
-
-
-def require_between(name: str, value: int, *, at_least: int) -> None:
-    """Raise InvalidValueError unless a number is at least ``at_least`` and at most :data:`MOST`."""
-    if not at_least <= value <= MOST:
-        allowed = f"at least {at_least}" if value < at_least else f"at most {MOST:,}"
-        raise InvalidValueError(f"{name} is {brief(value)}; give {allowed}.")
-
-
 def require_different(name: str, values: tuple[str, ...]) -> None:
     """Raise InvalidValueError for names that are none or given twice."""
     if not values or len(set(values)) != len(values):
@@ -150,3 +137,134 @@ def require_seeds(seeds: tuple[int, ...]) -> None:
             f"seeds {seeds} mix tuning seeds (from {TUNING_SEEDS} on, tested on starts of their own) with "
             "reported ones; give them to separate benches."
         )
+
+
+P = TypeVar("P", bound=ProtocolData)
+P_co = TypeVar("P_co", bound=ProtocolData, covariant=True)
+Phase = Literal["training", "training in the model", "testing", "imagining", "recording", "done", "failed"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSpec(Generic[P_co]):
+    """What one run is."""
+
+    protocol: P_co  #: The comparison it belongs to
+    agent: str  #: Registered agent or regressor
+    seed: int  #: One of the protocol's seeds
+    encoder: Path | None = None  #: The encoder artefact, or None if the agent needs none
+    dataset: Path | None = None  #: The folder of the dataset that comes first, or None
+    until: int | None = None  #: Budget after which it pauses, or None to the end
+    checkpoint_every_s: float = 20.0  #: Seconds of work that a kill may cost
+    observers: tuple[str, ...] = ()  #: What looks at it, each the ``"module:attr"`` of a :class:`.runner.RunObserver`
+
+    @property
+    def work(self) -> int:
+        """Parts of work to do, of whatever the protocol counts."""
+        return self.protocol.work(self.agent, self.until)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a run is."""
+
+    agent: str  #: Registered agent
+    seed: int  #: The run's seed
+    bench: str = ""  #: Hash of the run's protocol
+    phase: Phase  #: What it is doing
+    done: int  #: Episodes played, for training and for tests
+    work: int  #: Episodes to play
+    episode: int = 0  #: Training episodes done
+    #: Share of successes among recent training episodes, or in the running test; None before the first.
+    success: float | None = None
+    #: What a run without episodes is doing, or why one failed, in words; None where episodes say it.
+    detail: str | None = None
+
+
+OnProgress = Callable[[Progress], None]
+
+Encoders = Mapping[str, Path]
+"""The encoder artefacts of a bench, by kind, none where nothing needs one, and its ``"dataset"``, a folder."""
+
+
+class FinishedRun(Interface):
+    """What runs of every type leave."""
+
+    @property
+    def recording(self) -> Path | None:
+        """Its Rerun recording, or None."""
+
+
+class Result(Interface):
+    """What benches of every type measured: one run an agent and seed, in a folder."""
+
+    @property
+    def runs(self) -> Sequence[FinishedRun]:
+        """One an agent and seed, each with its recording if it has one."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the bench's files lie."""
+
+    @property
+    def missing(self) -> Sequence[str]:
+        """What an unfinished bench lacks, one sentence a run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskType(Generic[P]):
+    """What a type of task brings along."""
+
+    tasks: Callable[[], Mapping[str, object]]  #: Gives its tasks, by name
+    learners: Callable[[], Mapping[str, object]]  #: Gives its agents or regressors, by name
+    draws: bool  #: Whether its runs need OpenGL
+    protocol: type[P]  #: The class of its protocols
+    presets: Mapping[str, Mapping[str, Setting]]  #: What each protocol preset changes, by name
+    #: Makes a protocol from a task, a preset and changes to single fields, all checked, and finds its encoders.
+    plan: Callable[..., tuple[P, Encoders]]
+    run: Callable[[RunSpec[P], Path, OnProgress], object]  #: Carries out a run in a folder
+    load_so_far: Callable[[Path], Result]  #: Reads a bench folder, as far as it can be reported
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A run and where its files go."""
+
+    spec: RunSpec[ProtocolData]
+    folder: Path
+
+    @property
+    def log(self) -> Path:
+        """Everything the run printed."""
+        return self.folder / "log.txt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """A job that did not finish, and why in one sentence."""
+
+    job: Job
+    reason: str
+
+    def __str__(self) -> str:
+        spec = self.job.spec
+        return f"{spec.agent} seed {spec.seed} in {spec.protocol.task}: {self.reason} Log: {self.job.log}"
+
+    @property
+    def progress(self) -> Progress:
+        """What an observer is told of it."""
+        spec = self.job.spec
+        return Progress(
+            agent=spec.agent, seed=spec.seed, bench=spec.protocol.hash, phase="failed", done=0, work=spec.work,
+            detail=self.reason,
+        )  # fmt: skip
+
+
+class Launcher(Interface):
+    """Carries out jobs, somewhere."""
+
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+        """Carry out every job, whatever becomes of the others, and return those that failed.
+
+        Jobs are independent of one another, and each resumes by itself. ``on_progress`` is told now and then, from this
+        process, how far each is, and at once of one that failed.
+        """

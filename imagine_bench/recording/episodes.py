@@ -28,9 +28,8 @@ from imagine_bench.interfaces.capabilities import (
     begin_episode,
 )
 from imagine_bench.judge.open_loop import compare_rollout, sampled_rollouts_from
-from imagine_bench.recording.blueprint import blueprint
 from imagine_bench.recording.filmstrips import filmstrip, rgb, sampled_filmstrips
-from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
+from imagine_bench.recording.scene import blueprint, log_motion, log_shapes, look_target_m, macro_duration_s
 from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.rules import is_random
 from imagine_bench.seeding import SeedTree, episode_seed

@@ -16,10 +16,17 @@ import rerun.blueprint as rrb
 from imagine_bench.environments import Env
 from imagine_bench.interfaces import SceneReader
 from imagine_bench.judge.plans import PlanResult, carry_out, make_env
-from imagine_bench.recording.blueprint import playing, scene_view, sheet_view
 from imagine_bench.recording.episodes import MOTION_HZ
 from imagine_bench.recording.filmstrips import filmstrip, rgb
-from imagine_bench.recording.scene import log_motion, log_shapes, look_target_m, macro_duration_s
+from imagine_bench.recording.scene import (
+    log_motion,
+    log_shapes,
+    look_target_m,
+    macro_duration_s,
+    playing,
+    scene_view,
+    sheet_view,
+)
 from imagine_bench.recording.stream import Recording, recording_file
 from imagine_bench.running.trained import Trained
 from imagine_bench.store.files import make_folder

@@ -12,8 +12,7 @@ import rerun.blueprint as rrb
 from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import RegressionSpec
-from imagine_bench.recording.blueprint import playing
-from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
+from imagine_bench.recording.scene import ROOT, log_motion, log_shapes, playing
 from imagine_bench.recording.stream import Recording, recording_file
 
 _KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86, 180, 233)}

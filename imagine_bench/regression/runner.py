@@ -14,7 +14,7 @@ from imagine_bench import registry
 from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import Prediction, RegressorContext
-from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec, TaskType
+from imagine_bench.protocols.data import OnProgress, Phase, Progress, RunSpec, TaskType
 from imagine_bench.regression.calibration import calibrate
 from imagine_bench.regression.protocol import PRESETS, RegressionProtocol, plan
 from imagine_bench.regression.results import (

@@ -24,8 +24,7 @@ from imagine_bench.registry.machine import describe_environment
 from imagine_bench.report.bench import bench_page
 from imagine_bench.report.page import DASH, Table, percent, texts, write_page
 from imagine_bench.report.sections import HEAD, causes_table
-from imagine_bench.running.progress import counted
-from imagine_bench.running.task_types import load_bench, task_type
+from imagine_bench.running.bench import counted, load_bench, task_type
 from imagine_bench.running.trained import (
     best_run,
     learners,

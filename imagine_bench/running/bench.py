@@ -1,27 +1,205 @@
-"""From a task to its results: plan a protocol, run what is still missing, and read everything back from the files."""
+"""From a task to its results: plan a protocol, run what is still missing, and read everything back from the files.
+
+A *control* task is acted in, by agents that learn from episodes; a *regression* task is learned from data, by
+regressors. Launchers, locks, run folders, progress, store and command line are the same for both types.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import itertools
+import sys
 import time
-from collections.abc import Collection, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from tqdm import tqdm
 
 from imagine_bench import registry
-from imagine_bench.errors import RunFailedError, SetupError, plain, require_modules
+from imagine_bench.errors import (
+    ArtefactError,
+    InvalidValueError,
+    RunFailedError,
+    SetupError,
+    UnknownNameError,
+    plain,
+    require_modules,
+)
 from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.protocols.control import spec_of
-from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.runs import Encoders, Failure, Job, Launcher, OnProgress, Progress, Result, RunSpec
+from imagine_bench.protocols.data import (
+    Encoders,
+    Failure,
+    Job,
+    Launcher,
+    Progress,
+    ProtocolData,
+    Result,
+    RunSpec,
+    TaskType,
+)
 from imagine_bench.registry.machine import describe_environment, gl_renderer
-from imagine_bench.running.progress import ProgressBar
-from imagine_bench.running.task_types import load_bench, require_options, task_type
-from imagine_bench.store.bench_folder import BenchStore, bench_folder
+from imagine_bench.store import loading
+from imagine_bench.store.bench_folder import (
+    BenchStore,
+    bench_folder,
+    is_archive,
+    read_protocol_as,
+    read_protocol_values,
+)
 
-_SAVE_EVERY_S = 10.0
+Item = TypeVar("Item")
+RunKey = tuple[str, str, int]
+"""Hash of its protocol, agent and seed of a run."""
+
+_LINE_EVERY_S = 15.0
+"""Between two lines where nobody watches a terminal."""
+
+
+class ProgressBar(AbstractContextManager["ProgressBar"]):
+    """Shows :class:`~imagine_bench.protocols.data.Progress` on a terminal as a bar, elsewhere as a line now and then.
+
+    ``specs`` are the runs to come, to their ends even where they pause on the way.
+    """
+
+    def __init__(self, specs: Sequence[RunSpec[ProtocolData]]) -> None:
+        self._works = {(spec.protocol.hash, spec.agent, spec.seed): spec.work for spec in specs}
+        self._done = dict.fromkeys(self._works, 0)
+        self._before = dict[RunKey, int]()
+        self._finished = set[RunKey]()
+        self._began_s = time.monotonic()
+        self._shown_s = self._began_s
+        form = "{percentage:3.0f} % |{bar:20}| {desc}"
+        total = sum(self._works.values())
+        self._bar = tqdm(total=total, bar_format=form, leave=False, disable=not sys.stderr.isatty())
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+
+    def __call__(self, progress: Progress) -> None:
+        """Show how far a run is."""
+        with suppress(OSError):  # nobody reads the screen any more; the runs go on
+            self._show(progress)
+
+    def _show(self, progress: Progress) -> None:
+        run = (progress.bench, progress.agent, progress.seed)
+        if progress.phase == "failed":  # what it lacks will not be done
+            self._works[run] = self._done[run]
+            tqdm.write(f"{progress.agent} seed {progress.seed} failed: {progress.detail}", file=sys.stderr)
+            return
+        self._before.setdefault(run, progress.done)  # what an earlier session did took no time now
+        self._done[run] = progress.done
+        pauses = progress.phase == "done"
+        if pauses and progress.done >= self._works[run]:
+            self._finished.add(run)
+        shown = f"{len(self._finished)} of {len(self._works)} runs done, {self._times()}"
+        sentence = f"{shown}; {_sentence(progress, self._works[run])}"
+        if not self._bar.disable:
+            self._bar.total = sum(self._works.values())
+            self._bar.n = sum(self._done.values())
+            self._bar.set_description_str(sentence)
+        elif pauses or time.monotonic() - self._shown_s > _LINE_EVERY_S:
+            self._shown_s = time.monotonic()
+            print(sentence, file=sys.stderr, flush=True)
+
+    def _times(self) -> str:
+        """Time gone and, once there is something to judge by, time left."""
+        gone_s = time.monotonic() - self._began_s
+        done = sum(self._done.values())
+        played = done - sum(self._before.values())
+        missing = sum(self._works.values()) - done
+        left = f", {tqdm.format_interval(gone_s * missing / played)} left" if played else ""
+        return f"{tqdm.format_interval(gone_s)} gone{left}"
+
+
+def counted(items: Iterable[Item], what: str, *, total: int) -> Iterable[Item]:
+    """The items; on a terminal a bar shows how many of ``total`` are done. ``what`` is what they are called."""
+    counting: Iterable[Item] = tqdm(items, desc=what, total=total, leave=False, disable=None)
+    return counting
+
+
+def _sentence(progress: Progress, work: int) -> str:
+    """What a run is doing, and how far it is of all its ``work``; what is done as far as a budget waits for others."""
+    if progress.detail is not None:
+        return f"{progress.agent} seed {progress.seed}: {progress.detail}, {100 * progress.done / work:.0f} %"
+    phase = "waiting" if progress.phase == "done" and progress.done < work else progress.phase
+    success = "" if progress.success is None else f", success {100 * progress.success:.0f} %"
+    return (
+        f"{progress.agent} seed {progress.seed}: {phase}, training episode {progress.episode}, "
+        f"{100 * progress.done / work:.0f} % of its episodes{success}"
+    )
+
+
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
+
+
+TASK_TYPES = {
+    "control": "imagine_bench.running.control:CONTROL",
+    "regression": "imagine_bench.regression.runner:REGRESSION",
+}
+"""The types of task, each the ``"module:attr"`` of a :class:`.TaskType`."""
+
+
+@functools.cache
+def task_types() -> dict[str, TaskType[ProtocolData]]:
+    """Return the types by name."""
+    return {name: registry.load(target) for name, target in TASK_TYPES.items()}
+
+
+def task_type(task: str) -> TaskType[ProtocolData]:
+    """Return the type of a task, be it with options or without.
+
+    Raises UnknownNameError, or SetupError: as :func:`.registry.task_entry`.
+    """
+    for kind in task_types().values():
+        if task in kind.tasks() or task.partition(":")[0] in kind.tasks():
+            return kind
+    for group in (registry.TASK_GROUP, registry.REGRESSION_GROUP):
+        if isinstance(error := registry.offers(group).get(task), SetupError):
+            raise error
+    raise UnknownNameError("task", task, [name for kind in task_types().values() for name in kind.tasks()])
+
+
+def _fields(kind: TaskType[ProtocolData]) -> set[str]:
+    """The names of the values that protocols of a type have."""
+    return {field.name for field in dataclasses.fields(kind.protocol)}
+
+
+def _type_of_bench(folder: Path) -> TaskType[ProtocolData]:
+    """The type of a bench folder's task, be the package of its task here or not."""
+    values = read_protocol_values(folder)
+    for kind in task_types().values():
+        if values.keys() <= _fields(kind):
+            return kind
+    raise ArtefactError(f"{folder} is no bench of this version: no type of task has its values. It was left untouched.")
+
+
+def read_protocol(folder: Path) -> ProtocolData:
+    """Return the protocol of a bench folder. Raises ArtefactError: it is missing or damaged."""
+    return read_protocol_as(folder, _type_of_bench(folder).protocol)
+
+
+def load_so_far(folder: Path) -> Result:
+    """Read a bench as far as it can be reported, finished or not, or in the form in which it is kept for good.
+
+    Raises:
+        ArtefactError: It is no bench, there is nothing to report yet, a file is damaged, or it is kept for good and of
+            a regression task, whose tables are files of their own.
+    """
+    return loading.load_so_far(folder) if is_archive(folder) else _type_of_bench(folder).load_so_far(folder)
+
+
+def load_bench(folder: Path) -> Result:
+    """Read a finished bench. Raises ArtefactError: it is no bench, runs are missing, or a file is damaged."""
+    result = load_so_far(folder)
+    if result.missing:
+        raise ArtefactError(
+            f"{folder} lacks {'; '.join(result.missing)}. Run the same bench command again to complete it."
+        )
+    return result
 
 
 def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders]:
@@ -36,8 +214,11 @@ def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders
         ArtefactError: The task has no bundled encoder at this appearance level.
         SetupError: The device does not exist here.
     """
-    require_options(task, options)
-    wanted, paths = task_type(task).plan(task, preset, **options)
+    kind = task_type(task)
+    for name in options:
+        if name not in {*_fields(kind), "encoder"}:
+            raise InvalidValueError(f"{task} takes no --{name.replace('_', '-')}; leave it out.")
+    wanted, paths = kind.plan(task, preset, **options)
     if wanted.device != "cpu":
         registry.load(_CHECK_DEVICE)(wanted.device)  # loads torch, which the common case need not wait for
     return wanted, paths
@@ -54,12 +235,18 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
     """
     folder = bench_folder(root, wanted)
     failures, missing = carry_out([(wanted, paths)], root=root, launcher=launcher)
-    if failures:
-        _raise(failures, missing)
+    require_done(failures, missing)
     if not missing:
         print(f"All runs lie in {folder} already; nothing was run.")
         _warn(BenchStore(folder, wanted).changed(describe_environment()), folder)
     return load_bench(folder)
+
+
+def require_done(failures: Sequence[Failure], jobs: int) -> None:
+    """Raise RunFailedError if some of so many runs failed."""
+    if failures:
+        line = f"{len(failures)} of {jobs} runs failed; the same command tries them again and keeps the others."
+        raise RunFailedError("\n  ".join([line, *map(str, failures)]))
 
 
 def carry_out(
@@ -74,7 +261,7 @@ def carry_out(
     with ExitStack() as held:
         work = list[_Bench]()
         missing = 0
-        for wanted, paths in planned:
+        for wanted, paths in {each.hash: (each, paths) for each, paths in planned}.values():  # each bench once
             store = BenchStore(bench_folder(root, wanted), wanted)
             held.enter_context(store.held())
             if store.missing():
@@ -85,6 +272,7 @@ def carry_out(
         environment = describe_environment() if work else {}
         for store, _ in work:
             _warn(store.begin_session(environment, certificate_of), store.folder)
+            held.callback(store.save_time)
         return _in_stages(work, launcher), missing
 
 
@@ -107,53 +295,28 @@ def _in_stages(work: Sequence[_Bench], launcher: Launcher) -> list[Failure]:
     """Take all runs as far as their protocol's next stage, again and again; one that failed goes no further."""
     failures: list[Failure] = []
     specs = [_job(store, paths, *pair, None).spec for store, paths in work for pair in store.missing()]
+    stages = itertools.zip_longest(*(store.protocol.stages for store, _ in work), fillvalue=0)
     with ProgressBar(specs) as show:
-        for index in range(max((len(store.protocol.stages) for store, _ in work), default=0)):
-            jobs: list[Job] = []
-            for store, paths in work:
-                jobs += _next_jobs(store, paths, index, {failure.job.folder for failure in failures})
-            if jobs:
-                failures += launcher.launch(jobs, _saving_time([store for store, _ in work], show))
-    for store, _ in work:
-        store.save_time()
+        for stage in stages:
+            failed = {failure.job.folder for failure in failures}
+            jobs = []
+            for (store, paths), until in zip(work, stage, strict=True):
+                order = store.protocol.agents  # those listed last cost most and come first of each seed
+                pairs = sorted(store.missing(until), key=lambda pair: (pair[1], -order.index(pair[0])))
+                jobs += [_job(store, paths, *pair, until) for pair in pairs]
+            left = [job for job in jobs if job.folder not in failed]
+            if left:
+                failures += launcher.launch(left, show)
     return failures
 
 
-def _next_jobs(store: BenchStore, paths: Encoders, index: int, failed: Collection[Path]) -> list[Job]:
-    order = store.protocol.agents  # those listed last cost most and come first of each seed, so no worker idles
-    if index >= len(store.protocol.stages):
-        return []
-    until = store.protocol.stages[index]
-    pairs = sorted(store.missing(until), key=lambda pair: (pair[1], -order.index(pair[0])))
-    jobs = [_job(store, paths, *pair, until) for pair in pairs]
-    return [job for job in jobs if job.folder not in failed]
-
-
 def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int | None) -> Job:
-    acts = registry.has_task(store.protocol.task)
-    entry = registry.agent_entry(agent) if acts else None  # regressors have no encoder and pause nowhere
-    needed = paths[entry.encoder_kind] if entry is not None and entry.needs_encoder else None
-    pauses = until if entry is not None and not entry.external_training_loop else None
-    spec = RunSpec(
-        protocol=store.protocol, agent=agent, seed=seed, encoder=needed, dataset=paths.get("dataset"), until=pauses
-    )
+    spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, dataset=paths.get("dataset"))
+    if registry.has_task(store.protocol.task):  # regressors have no encoder and pause nowhere
+        entry = registry.agent_entry(agent)
+        encoder = paths[entry.encoder_kind] if entry.needs_encoder else None
+        spec = dataclasses.replace(spec, encoder=encoder, until=None if entry.external_training_loop else until)
     return Job(spec=spec, folder=store.run_folder(agent, seed))
-
-
-def _saving_time(stores: Sequence[BenchStore], show: OnProgress) -> OnProgress:
-    saved_s = time.monotonic()
-
-    def observe(progress: Progress) -> None:
-        nonlocal saved_s
-        with suppress(OSError):  # nobody reads the screen any more; the runs go on
-            show(progress)
-        if time.monotonic() - saved_s > _SAVE_EVERY_S:
-            with suppress(SetupError):  # a count of seconds stops no run; what they cannot write they say themselves
-                for store in stores:
-                    store.save_time()
-            saved_s = time.monotonic()
-
-    return observe
 
 
 def _warn(changed: Sequence[str], folder: Path) -> None:
@@ -163,11 +326,3 @@ def _warn(changed: Sequence[str], folder: Path) -> None:
             "others go on from their checkpoints with what is here now; give another folder with --out to run all of "
             "them anew."
         )
-
-
-def _raise(failures: Sequence[Failure], jobs: int) -> None:
-    lines = [f"{len(failures)} of {jobs} runs failed; the same command tries them again and keeps the others."]
-    for failure in failures:
-        spec = failure.job.spec
-        lines.append(f"  {spec.agent} seed {spec.seed}: {failure.reason} Log: {failure.job.log}")
-    raise RunFailedError("\n".join(lines))

@@ -15,16 +15,16 @@ from tqdm import tqdm
 
 from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Array, Arrays, State
+from imagine_bench.arrays import Arrays, Info, State
 from imagine_bench.data.folder import Apart, Dataset, read_apart
 from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.exact.beliefs import optimal_policy_of
-from imagine_bench.interfaces import Agent, AgentContext, ArmMotion, ArmReader, Observation, TaskSpec
-from imagine_bench.interfaces.capabilities import begin_episode
+from imagine_bench.interfaces import Agent, AgentContext, ArmMotion, ArmReader, TaskSpec, Transition
 from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.rules import states_of
+from imagine_bench.running.evaluation import play
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SEEDS, SeedTree, episode_seed
 from imagine_bench.values import Json
@@ -135,28 +135,37 @@ def _episode(
     watch: Callable[[], None],
 ) -> dict[str, Any]:
     """One episode, its arrays as lists; with ``options`` of a start, one macro-action and then a truncation."""
-    frame, info = env.reset(seed=seed, options=options)
-    begin_episode(player[0])
+    agent, privileged = player
     mask = np.ones(int(env.action_space.n), dtype=np.int8)  # type: ignore[attr-defined]
-    faults = 0
-    ended = False
-    kept: dict[str, list[Array]] = {name: [] for name in ("frames", "action_masks", "macrostates")}
-    seen: dict[str, list[float]] = {name: [] for name in ("actions", "rewards", "terminated", "truncated")}
-    while True:
-        for each, value in zip(kept.values(), (frame, info.get("action_mask", mask), info["macrostate"]), strict=True):
-            each.append(np.asarray(value))
-        if ended:
-            return {**seen, **kept, "success": bool(info["is_success"]), "faults": faults}
-        action = player[0].act(Observation.of(frame, info, privileged=player[1]), explore=False)
-        frame, reward, terminated, truncated, info = env.step(action)
+    infos = list[Info]()
+    lived = list[Transition]()
+    episode = play(
+        env,
+        agent,
+        seed=seed,
+        explore=False,
+        privileged=privileged,
+        before_acting=lambda _, info: None if infos else infos.append(info),
+        options=options,
+    )
+    for transition, info in episode:
         watch()
-        truncated = truncated or (options is not None and not terminated)
-        seen["actions"].append(action)
-        seen["rewards"].append(float(reward))
-        seen["terminated"].append(bool(terminated))
-        seen["truncated"].append(bool(truncated))
-        faults = faults + bool(info["fault"])
-        ended = terminated or truncated
+        infos.append(info)
+        lived.append(transition)
+        if options is not None:
+            lived[0] = dataclasses.replace(transition, truncated=not transition.terminated)
+            break
+    return {
+        "frames": [lived[0].observation.frame, *(each.next_observation.frame for each in lived)],
+        "action_masks": [np.asarray(info.get("action_mask", mask)) for info in infos],
+        "macrostates": [np.asarray(info["macrostate"]) for info in infos],
+        "actions": [each.action for each in lived],
+        "rewards": [each.reward for each in lived],
+        "terminated": [each.terminated for each in lived],
+        "truncated": [each.truncated for each in lived],
+        "success": bool(infos[-1]["is_success"]),
+        "faults": sum(bool(info["fault"]) for info in infos[1:]),
+    }
 
 
 def _card(spec: TaskSpec, policy: Policy, played: Episodes) -> dict[str, Json]:
@@ -180,20 +189,21 @@ def describe(dataset: Dataset) -> str:
         "episodes": f"{len(episodes):,} of {len(episodes.actions):,} transitions, as {dataset.format}",
         "success": f"{episodes.success.mean():.1%} of episodes [{low:.1%}, {high:.1%}]",
         "return": f"{episodes.rewards.sum() / len(episodes):.2f} an episode",
-        "card": "none: it is not of this suite, and nothing says whether it is whole",
+        "content": episodes.hash,
+        "in a protocol": dataset.identity,
     }
-    if card is not None:
+    if card is None:
+        lines["card"] = "none: it is not of this suite, and nothing says whether it is whole"
+    else:
         apart = [f"{name}.npz ({', '.join(arrays)})" for name, arrays in read_apart(dataset).items()]
-        lines = {
+        lines |= {
             "task": f"{card['task']}, {card['execution']} execution, appearance {card['appearance']}",
             "policy": f"{card['policy']} ({card['played']}), seed {card['seed']}",
-            "episodes": lines["episodes"],
-            "success": f"{lines['success']}; chance {card['chance_level']:.1%}, optimum {card['optimum']:.1%}",
-            "return": f"{lines['return']}; optimum {card['optimal_return']:.2f}",
+            "exact": f"chance {card['chance_level']:.1%}, optimum {card['optimum']:.1%}, "
+            f"optimal return {card['optimal_return']:.2f}",
             "faults": f"{card['faults']} macro-actions whose physics disagreed with the rules",
             "apart": f"{', '.join(apart)}: never given to a learner",
             "commit": str(card["commit"]),
             "command": str(card["command"]),
         }
-    lines |= {"content": episodes.hash, "in a protocol": dataset.identity}
     return "\n".join(f"{name:<14}{value}" for name, value in lines.items())

@@ -12,14 +12,12 @@ import numpy as np
 from imagine_bench import registry
 from imagine_bench.data.folder import read_dataset, require_fits
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, plain
-from imagine_bench.protocols.control import PRESETS, Protocol, protocol
-from imagine_bench.protocols.data import digest
-from imagine_bench.protocols.runs import Encoders, OnProgress, RunSpec, TaskType
+from imagine_bench.protocols.control import PRESETS, Protocol, context_of, protocol
+from imagine_bench.protocols.data import Encoders, RunSpec, TaskType, digest
 from imagine_bench.registry.entries import entrant
 from imagine_bench.rules import states_of
 from imagine_bench.running import runner
-from imagine_bench.running.queries import require_able
-from imagine_bench.running.run_state import make_env
+from imagine_bench.running.run_state import make_env, require_able
 from imagine_bench.store import encoders
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.values import Json
@@ -58,21 +56,19 @@ def plan_control(
 def _require_sound(wanted: Protocol) -> None:
     """Raise InvalidValueError for a package's task whose rules, frames or environment would end every run or report."""
     spec = registry.task(wanted.task)
+    some = np.array(states_of(spec.rules)[:1])
     try:
         spec.facts()
-        frame = spec.render_macrostates(
-            np.array(states_of(spec.rules)[:1]), wanted.appearance, np.random.default_rng(0)
-        )
-        seen = [("render_macrostates", frame[0])]
+        frames = {"render_macrostates": spec.render_macrostates(some, wanted.appearance, np.random.default_rng(0))[0]}
         with closing(make_env(wanted, wanted.task)) as env:
             first = env.reset(seed=0)[0]
         if wanted.shows_frames_alone:
-            seen.append(("its environment", first))
+            frames["its environment"] = first
         elif set(first) != set(wanted.observation.split(",")):
             raise InvalidValueError(f"its environment shows {brief(first)}, not {wanted.observation}")
-        for what, each in seen:
-            if (each.shape, each.dtype) != ((64, 64, 3), np.uint8):
-                raise InvalidValueError(f"{what} gives frames of {each.dtype} and shape {each.shape}")
+        for what, frame in frames.items():
+            if (frame.shape, frame.dtype) != ((64, 64, 3), np.uint8):
+                raise InvalidValueError(f"{what} gives frames of {frame.dtype} and shape {frame.shape}")
     except Exception as error:  # whatever a guest does wrong is one sentence
         why = " ".join(plain(error).split()).rstrip(".")
         more = f"'imagine-bench check --task {wanted.task}' says more"
@@ -91,7 +87,7 @@ def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
         if entry.learns:
             encoder = paths[entry.encoder_kind] if entry.needs_encoder else None
             spec = RunSpec(protocol=wanted, agent=agent, seed=wanted.seeds[0], encoder=encoder)
-            require_able(registry.make_agent(agent, spec.context()), agent, wanted)
+            require_able(registry.make_agent(agent, context_of(spec)), agent, wanted)
 
 
 def resolved_settings(wanted: Protocol) -> dict[str, Json]:
@@ -132,12 +128,7 @@ def _encoders(wanted: Protocol, given: str | None) -> Encoders:
     return {**own, **dict.fromkeys(sorted(replaced), path)}
 
 
-def run_control(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> None:
-    """Do a run, looked at by its observers; see :func:`.runner.run`."""
-    runner.run(spec, folder, on_progress, [registry.load(name)() for name in spec.observers])
-
-
 CONTROL = TaskType(
     tasks=registry.tasks, learners=registry.agents, draws=True, protocol=Protocol, presets=PRESETS, plan=plan_control,
-    run=run_control, load_so_far=load_so_far,
+    run=runner.run, load_so_far=load_so_far,
 )  # fmt: skip

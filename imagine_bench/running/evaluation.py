@@ -1,24 +1,39 @@
-"""Episodes, and greedy test episodes: the same starts for every agent and seed, none of them ever a training start."""
+"""How episodes are played, in training and in tests, and what a learner is given beside its own.
+
+Test episodes are greedy: the same starts for every agent and seed, none of them ever a training start. A demonstration
+is seen as frames, a label is a reward and whether the episode would end, and feedback is reward: none shows a
+macrostate.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
-import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, SupportsFloat, TypedDict
+from typing import SupportsFloat, TypedDict
 
-import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
-from imagine_bench.arrays import Action, Info, Observed
+from imagine_bench import registry
+from imagine_bench.arrays import Info, Observed
 from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Agent, Observation, State, Transition
-from imagine_bench.interfaces.capabilities import begin_episode
-from imagine_bench.seeding import Purpose, episode_seed
+from imagine_bench.interfaces import Agent, Observation, Rules, State, Transition
+from imagine_bench.interfaces.capabilities import Label, QueryingAgent, begin_episode
+from imagine_bench.protocols.control import Protocol, context_of
+from imagine_bench.protocols.data import RunSpec
+from imagine_bench.rules import optimal_actions, tabulate
+from imagine_bench.seeding import episode_seed
 from imagine_bench.store.results import KeptEpisodes
+
+Options = dict[str, State] | None
+"""Of ``reset``: the macrostate where an episode begins, if it is given."""
+_INTEGERS = ("starts", "lengths", "actions", "faults", "fingerprints")
+"""Fields of :class:`EvaluationCounts` that are integers of :class:`.KeptEpisodes`."""
 
 
 @dataclass
@@ -106,28 +121,9 @@ class EvaluationCounts:
 
     def kept(self) -> KeptEpisodes:
         """All of them as arrays."""
-        return KeptEpisodes(
-            starts=np.array(self.starts, dtype=np.int64),
-            lengths=np.array(self.lengths, dtype=np.int64),
-            actions=np.array(self.actions, dtype=np.int64),
-            returns=np.array(self.returns, dtype=np.float64),
-            success=np.array([each == "1" for each in self.solved]),
-            faults=np.array(self.faults, dtype=np.int64),
-            fingerprints=np.array(self.fingerprints, dtype=np.int64),
-        )
-
-
-class AsDict(gymnasium.ObservationWrapper[Any, Action, Observed]):
-    """An observation of one part, as a dict of that part."""
-
-    def __init__(self, env: Env, name: str) -> None:
-        super().__init__(env)
-        self._name = name
-        self.observation_space = gymnasium.spaces.Dict({name: env.observation_space})
-
-    def observation(self, observation: Observed) -> dict[str, Observed]:
-        """See above."""
-        return {self._name: observation}
+        counts = {name: np.array(getattr(self, name), dtype=np.int64) for name in _INTEGERS}
+        success = np.array([each == "1" for each in self.solved])
+        return KeptEpisodes(**counts, returns=np.array(self.returns, dtype=np.float64), success=success)
 
 
 def play(
@@ -138,13 +134,15 @@ def play(
     explore: bool,
     privileged: bool,
     before_acting: Callable[[Observation, Info], None] | None = None,
+    options: Options = None,
 ) -> Iterator[tuple[Transition, Info]]:
     """One episode, a real transition at a time, each with the ``info`` that followed it; the agent learns nothing here.
 
     ``seed`` decides the whole episode but for the agent: the environment carries nothing over from the one before.
     Before each macro-action, ``before_acting`` is called with what the agent sees and the ``info`` that it does not.
+    ``options`` are those of the environment's ``reset``.
     """
-    frame, info = env.reset(seed=seed)
+    frame, info = env.reset(seed=seed, options=options)
     _require_sound(env, frame, 0.0)
     begin_episode(agent)
     before = Observation.of(frame, info, privileged=privileged)
@@ -171,42 +169,26 @@ def play(
 
 def _require_sound(env: Env, seen: Observed, reward: SupportsFloat) -> None:
     """Raise InvalidValueError for what no agent should be shown: a package's environment can give anything."""
-    space = env.observation_space
-    spaces = {"frame": space}
-    parts = {"frame": seen}
-    if isinstance(space, gymnasium.spaces.Dict) and isinstance(seen, dict):
-        spaces = space.spaces
-        parts = seen
-    for name, wanted in spaces.items():
-        part = parts.get(name)
-        more = "'imagine-bench check --task' finds such faults."
-        if isinstance(wanted, gymnasium.spaces.Box):
-            given = (getattr(part, "shape", None), getattr(part, "dtype", type(part)))
-            if given != (wanted.shape, wanted.dtype):
-                raise InvalidValueError(
-                    f"{env} gave a {name} of {given[1]} and shape {given[0]}; it declares {wanted.dtype} of shape "
-                    f"{wanted.shape}. {more}"
-                )
-            if isinstance(part, np.ndarray) and part.dtype.kind == "f" and not np.isfinite(part).all():
-                raise InvalidValueError(f"{env} gave a {name} with NaN or infinity. {more}")
-    if not math.isfinite(float(reward)):
+    if not env.observation_space.contains(seen):
+        raise InvalidValueError(
+            f"{env} gave an observation that is not in its space {env.observation_space}; 'imagine-bench check --task' "
+            "finds such faults."
+        )
+    if not math.isfinite(reward):
         raise InvalidValueError(f"{env} gave the reward {reward}; rewards are finite.")
 
 
-def play_test_episode(counts: EvaluationCounts, env: Env, agent: Agent, *, privileged: bool, purpose: Purpose) -> None:
-    """Play the next test episode of ``purpose`` greedily and count it; the count says which start it has."""
-    start_s = time.process_time()
+def play_test_episode(env: Env, agent: Agent, *, seed: int, privileged: bool) -> EpisodeRecord:
+    """Play a test episode greedily."""
     begun = list[EpisodeRecord]()
 
     def begin(observation: Observation, info: Info) -> None:
         if not begun:
             begun.append(EpisodeRecord.begun(env, info))
 
-    seed = episode_seed(purpose, 0, counts.episodes)
     for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged, before_acting=begin):
         begun[0].add(transition.action, transition.reward, info)
-    counts.add(begun[0])
-    counts.cpu_s += time.process_time() - start_s
+    return begun[0]
 
 
 def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[EpisodeRecord, bool]:
@@ -223,31 +205,125 @@ def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[EpisodeRecord, 
     return played, bool(over)
 
 
-class StartFrom(Wrapper):
-    """Starts every episode in one of some macrostates, equally likely, that its seed decides."""
+class ResetBy(Wrapper):
+    """Begins episodes as ``begin`` has them: it makes another seed and other options of those that are asked for."""
 
-    def __init__(self, env: Env, starts: Sequence[State]) -> None:
+    def __init__(self, env: Env, begin: Callable[[int | None, Options], tuple[int | None, Options]]) -> None:
         super().__init__(env)
-        self._starts = tuple(starts)
+        self._begin = begin
 
-    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
-        """Start an episode, where ``options`` say so if they do."""
-        if options is None:
-            rng = np.random.default_rng(seed)
-            options = {"macrostate": self._starts[int(rng.integers(len(self._starts)))]}
+    def reset(self, *, seed: int | None = None, options: Options = None) -> tuple[Observed, Info]:
+        """Begin an episode."""
+        seed, options = self._begin(seed, options)
         return self.env.reset(seed=seed, options=options)
 
 
-class TrainingStarts(Wrapper):
-    """Starts each training episode of a run where every agent of that seed starts it, whatever seed a loop asks for."""
+def start_from(env: Env, starts: Sequence[State]) -> Env:
+    """An environment whose episodes begin in one of some macrostates, equally likely, that their seed decides."""
 
-    def __init__(self, env: Env, seed: int) -> None:
-        super().__init__(env)
-        self._seed = seed
-        self._episode = 0
+    def begin(seed: int | None, options: Options) -> tuple[int | None, Options]:
+        rng = np.random.default_rng(seed)
+        drawn = starts[int(rng.integers(len(starts)))]
+        return seed, {"macrostate": drawn} if options is None else options
 
-    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
-        """Start the next training episode; ``seed`` changes nothing."""
-        start = episode_seed("training", self._seed, self._episode)
-        self._episode += 1
-        return self.env.reset(seed=start, options=options)
+    return ResetBy(env, begin)
+
+
+def training_starts(env: Env, seed: int) -> Env:
+    """An environment that begins each training episode where every agent of a seed begins it, whatever a loop asks."""
+    episodes = itertools.count()
+    return ResetBy(env, lambda _, options: (episode_seed("training", seed, next(episodes)), options))
+
+
+def demonstrator(spec: RunSpec[Protocol]) -> Agent:
+    """The reference agent that plays the demonstrated episodes of a run; it has to be shown macrostates."""
+    of_demonstrator = dataclasses.replace(spec, agent=registry.DEMONSTRATOR)
+    return registry.make_agent(registry.DEMONSTRATOR, context_of(of_demonstrator))
+
+
+def as_seen(transition: Transition) -> Transition:
+    """A demonstrated transition as a learner may see it: without macrostates."""
+    before, after = (
+        dataclasses.replace(seen, macrostate=None, shown=None)
+        for seen in (transition.observation, transition.next_observation)
+    )
+    return dataclasses.replace(transition, observation=before, next_observation=after)
+
+
+class LabelOracle:
+    """Labels what actions would bring, from the rules and the true macrostate, where these allow one outcome."""
+
+    def __init__(self, rules: Rules) -> None:
+        self._rules = rules
+
+    def label(self, macrostate: tuple[int, ...], actions: NDArray[np.int64]) -> Label | None:
+        """What the last of ``actions`` (D,) from ``macrostate`` would bring.
+
+        The scene goes on obeying its dynamics through the ends of episodes. Where chance decides on the way, all that
+        may happen is looked at; None where that differs in reward or end: a matter of chance has no label. Raises
+        InvalidValueError: no action, or one that does not exist.
+        """
+        planned = [int(action) for action in actions]
+        if not planned or not all(0 <= action < self._rules.n_actions for action in planned):
+            raise InvalidValueError(
+                f"Asked about the actions {planned}; give at least one, each from 0 to {self._rules.n_actions - 1}."
+            )
+        possible = {macrostate}
+        for action in planned[:-1]:
+            possible = {each.macrostate for state in possible for each in self._rules.outcomes(state, action)}
+        labels = {
+            Label(outcome.reward, outcome.terminated)
+            for state in possible
+            for outcome in self._rules.outcomes(state, planned[-1])
+        }
+        return labels.pop() if len(labels) == 1 else None
+
+
+class Teacher:
+    """Watches a learner, and tells after each macro-action whether it was optimal (thesis 6: teacher feedback).
+
+    The learner sees that as reward on top of the world's own: ``feedback`` where an optimal agent could have chosen the
+    action, else minus that. With probability ``error`` the teacher says the opposite.
+    """
+
+    def __init__(self, rules: Rules, feedback: float, error: float) -> None:
+        tables = tabulate(rules)
+        self._rows = tables.index
+        self._optimal = optimal_actions(tables)
+        self._feedback = feedback
+        self._error = error
+
+    def begin(self, seed: int) -> None:
+        """A new episode, of which ``seed`` decides the errors."""
+        self._rng = np.random.default_rng(seed)
+
+    def __call__(self, observation: Observation, info: Info) -> None:
+        """See where the learner is about to act."""
+        self._row = self._rows[tuple(int(value) for value in info["macrostate"])]
+
+    def told(self, transition: Transition) -> Transition:
+        """The transition that followed, with what the teacher says of it in its reward."""
+        right = bool(self._optimal[transition.action, self._row]) != bool(self._rng.random() < self._error)
+        return dataclasses.replace(
+            transition, reward=transition.reward + (self._feedback if right else -self._feedback)
+        )
+
+
+class QueryBudget:
+    """The ``queries`` that ``learner`` may ask in one episode, before each of its macro-actions."""
+
+    def __init__(self, learner: Agent, oracle: LabelOracle, queries: int) -> None:
+        self._learner = learner
+        self._oracle = oracle
+        self._queries = queries
+        self.asked = 0
+
+    def __call__(self, observation: Observation, info: Info) -> None:
+        """Let the learner ask at a real frame until it has nothing to ask or may not any more."""
+        while self.asked < self._queries and isinstance(self._learner, QueryingAgent):
+            actions = self._learner.query(observation)
+            if actions is None:
+                return
+            macrostate = tuple(int(value) for value in info["macrostate"])
+            self._learner.learn_label(observation, actions, self._oracle.label(macrostate, actions))
+            self.asked = self.asked + 1

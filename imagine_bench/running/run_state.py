@@ -17,17 +17,17 @@ from imagine_bench import registry
 from imagine_bench.arrays import Action, Info, Observed, State
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.environments import Env, Wrapper
-from imagine_bench.errors import ArtefactError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import OBSERVATIONS, Agent, AgentState
+from imagine_bench.interfaces.capabilities import ExternalTrainer, QueryingAgent, TransferLearner
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.runs import OnProgress, Phase, Progress, RunSpec
-from imagine_bench.running.evaluation import AsDict, EvaluationCounts, StartFrom
-from imagine_bench.running.queries import Teacher, demonstrator, require_able
+from imagine_bench.protocols.control import Protocol, context_of
+from imagine_bench.protocols.data import OnProgress, Phase, Progress, RunSpec
+from imagine_bench.running.evaluation import EvaluationCounts, Teacher, demonstrator, start_from
 from imagine_bench.store import encoders, run_folder
-from imagine_bench.store.checkpoints import Snapshot, load_newest, pack, save_snapshot, unpack
 from imagine_bench.store.files import reading
 from imagine_bench.store.results import Checkpoint
+from imagine_bench.store.run_folder import Snapshot, load_newest, pack, save_snapshot, unpack
 
 _RECENT = 100
 """Training episodes whose success is shown while running."""
@@ -106,10 +106,11 @@ def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options:
         disable_env_checker=True,  # the tests run it; here it would only cost time
     )
     if protocol.observation in OBSERVATIONS[1:]:
-        env = AsDict(env, protocol.observation)
+        parts = gymnasium.spaces.Dict({protocol.observation: env.observation_space})
+        env = gymnasium.wrappers.TransformObservation(env, lambda seen: {protocol.observation: seen}, parts)
     if protocol.split is None or task != protocol.task:
         return env
-    return StartFrom(env, protocol.spec(testing=testing).rules.start_states)
+    return start_from(env, protocol.spec(testing=testing).rules.start_states)
 
 
 @contextmanager
@@ -121,6 +122,23 @@ def environments(protocol: Protocol, **options: Any) -> Iterator[tuple[Env, Env]
             return
         with closing(make_env(protocol, protocol.task, testing=True, **options)) as test_env:
             yield env, test_env
+
+
+def require_able(agent: object, name: str, protocol: Protocol) -> None:
+    """Raise InvalidValueError where a learner cannot carry over to the next task, watch or ask, as a protocol wants."""
+    external = isinstance(agent, ExternalTrainer)
+    privileged = registry.agent_entry(name).privileged
+    own_loop = "trains in a loop of its own"
+    reasons = {
+        "demonstrations": own_loop if external else "",
+        "dataset": own_loop if external else "is shown true macrostates" if privileged else "",
+        "after": "" if isinstance(agent, TransferLearner) else "has no model of the world to carry over",
+        "queries": "" if isinstance(agent, QueryingAgent) else "cannot query an oracle",
+        "feedback": own_loop if external else "",
+    }
+    for option, reason in reasons.items():
+        if getattr(protocol, option) and reason:
+            raise InvalidValueError(f"Agent {name!r} {reason}; leave --{option} out, or that agent.")
 
 
 class Run:
@@ -139,13 +157,21 @@ class Run:
         self.test_env = test_env
         self.task = registry.task(spec.protocol.task)
         self.entry = registry.agent_entry(spec.agent)
-        self._require_its_encoder()
-        self.dataset = self._its_dataset() if self.entry.learns else None
-        self.agent: Agent = registry.make_agent(spec.agent, spec.context())
+        self.dataset: Episodes | None = None
+        if self.entry.needs_encoder and spec.encoder is not None:
+            self._require(
+                spec.encoder, encoders.identity(spec.encoder), spec.protocol.encoder_of(self.entry.encoder_kind)
+            )
+        if self.entry.learns and spec.dataset is not None:
+            found = read_dataset(spec.dataset)
+            self._require(spec.dataset, found.identity, spec.protocol.dataset)
+            self.dataset = found.episodes
+        self.agent: Agent = registry.make_agent(spec.agent, context_of(spec))
         if self.entry.learns:
             require_able(self.agent, spec.agent, spec.protocol)
-        wanted = self.protocol
-        self.teacher = Teacher(self.task.rules, wanted.feedback, wanted.feedback_error) if wanted.feedback else None
+        self.teacher: Teacher | None = None
+        if spec.protocol.feedback:
+            self.teacher = Teacher(self.task.rules, spec.protocol.feedback, spec.protocol.feedback_error)
         self.counters = Counters()
         self._on_progress = on_progress
         run_folder.check_config(folder, spec, self.agent)
@@ -160,28 +186,15 @@ class Run:
                 run_folder.write_metrics(folder, self.counters.rows)
         self._saved_s = self._reported_s = time.monotonic()
 
-    def _require_its_encoder(self) -> None:
+    @staticmethod
+    def _require(path: Path, found: str, wanted: str | None) -> None:
         """Refuse another file than the protocol's, such as an older one on another node, or one changed since."""
-        wanted = self.protocol.encoder_of(self.entry.encoder_kind) if self.entry.needs_encoder else None
-        if wanted is not None and self.spec.encoder is not None:
-            found = encoders.identity(self.spec.encoder)
-            if found != wanted:
-                raise ArtefactError(f"{self.spec.encoder} is encoder {found}, and this bench is of {wanted}.")
-
-    def _its_dataset(self) -> Episodes | None:
-        """The protocol's dataset, if it has one; ArtefactError for another, such as one that changed since."""
-        if self.protocol.dataset is None or self.spec.dataset is None:
-            return None
-        found = read_dataset(self.spec.dataset)
-        if found.identity != self.protocol.dataset:
-            raise ArtefactError(
-                f"{self.spec.dataset} is dataset {found.identity}, and this bench is of {self.protocol.dataset}."
-            )
-        return found.episodes
+        if wanted not in (None, found):
+            raise ArtefactError(f"{path} is {found}, and this bench is of {wanted}.")
 
     @cached_property
     def demonstrator(self) -> Agent:
-        """See :func:`.queries.demonstrator`; it holds nothing from one episode to the next."""
+        """See :func:`.evaluation.demonstrator`; it holds nothing from one episode to the next."""
         return demonstrator(self.spec)
 
     @property
@@ -217,19 +230,17 @@ class Run:
             return
         self._reported_s = now_s
         counters = self.counters
-        test = self.counters.test
+        solved = counters.test.solved if counters.test else ""
         tested = len(counters.rows) if self.entry.learns else min(1, len(counters.rows))
-        played = counters.before + counters.episode + tested * self.protocol.evaluation_episodes
-        recent = counters.success[-_RECENT:]
-        if test is not None and test.episodes:
-            success: float | None = test.successes / test.episodes
-        else:
-            success = sum(recent) / len(recent) if recent else None
-        spec = self.spec
-        done = played + (test.episodes if test else 0)
-        episode = counters.episode
+        recent = [each == "1" for each in solved] or counters.success[-_RECENT:]
         where = Progress(
-            agent=spec.agent, seed=spec.seed, bench=self.protocol.hash, phase=phase, done=done, work=spec.work,
-            episode=episode, success=success,
-        )  # fmt: skip
+            agent=self.spec.agent,
+            seed=self.spec.seed,
+            bench=self.protocol.hash,
+            phase=phase,
+            done=counters.before + counters.episode + tested * self.protocol.evaluation_episodes + len(solved),
+            work=self.spec.work,
+            episode=counters.episode,
+            success=sum(recent) / len(recent) if recent else None,
+        )
         self._on_progress(where)

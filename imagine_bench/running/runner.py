@@ -8,16 +8,35 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TypedDict
 
+from imagine_bench import registry
+from imagine_bench.arrays import Info
 from imagine_bench.errors import DivergedError
-from imagine_bench.interfaces.capabilities import ExternalTrainer
+from imagine_bench.interfaces import Observation
+from imagine_bench.interfaces.capabilities import (
+    ExternalTrainer,
+    ModelOnlyTrainer,
+    TransferLearner,
+    begin_episode,
+)
+from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.runs import OnProgress, RunSpec
-from imagine_bench.running import phases
-from imagine_bench.running.run_state import Run, environments
+from imagine_bench.protocols.data import OnProgress, RunSpec
+from imagine_bench.running.evaluation import (
+    EvaluationCounts,
+    LabelOracle,
+    QueryBudget,
+    as_seen,
+    play,
+    play_test_episode,
+    training_starts,
+)
+from imagine_bench.running.run_state import CountVisits, Run, environments, make_env
+from imagine_bench.seeding import episode_seed, evaluation_split
 from imagine_bench.store import run_folder
 from imagine_bench.store.results import Checkpoint, ComparedRollout, OpenLoop, PolicyTable
 
@@ -48,8 +67,10 @@ class RunObserver:
         return {}
 
 
-def run(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, observers: Sequence[RunObserver] = ()) -> None:
-    """Do a run, or what is left of it, as far as the budget at which it pauses. Nothing is done of a finished run.
+def run(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> None:
+    """Do a run, or what is left of it, as far as the budget at which it pauses, looked at by its observers.
+
+    Nothing is done of a finished run.
 
     Raises:
         BusyError: Another process is at this run.
@@ -60,6 +81,7 @@ def run(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, observer
     with run_folder.unfinished(folder) as left:
         if left:
             with environments(spec.protocol) as (env, test_env):
+                observers = [registry.load(name)() for name in spec.observers]
                 _go_on(Run(spec, folder, on_progress, env, test_env), observers)
 
 
@@ -67,13 +89,13 @@ def _go_on(run: Run, observers: Sequence[RunObserver]) -> None:
     """Train and test at every budget that is wanted now; after the last one of all, finish."""
     try:
         if isinstance(run.agent, ExternalTrainer):
-            phases.train_externally(run, run.agent, lambda budget: _test(run, budget, observers))
+            train_externally(run, run.agent, lambda budget: _at_budget(run, budget, observers))
         else:
-            phases.transfer(run)
+            transfer(run)
             for budget in run.budgets_left:
                 if run.entry.learns:
-                    phases.train(run, budget)
-                _test(run, budget, observers)
+                    train(run, budget)
+                _at_budget(run, budget, observers)
     except DivergedError as error:
         raise DivergedError(f"{error} The agent's state lies in {run.save('diverged')}.") from error
     if len(run.counters.rows) == len(run.protocol.budgets):
@@ -84,7 +106,7 @@ def _go_on(run: Run, observers: Sequence[RunObserver]) -> None:
     run.tell("done", at_once=True)
 
 
-def _test(run: Run, budget: int, observers: Sequence[RunObserver]) -> None:
+def _at_budget(run: Run, budget: int, observers: Sequence[RunObserver]) -> None:
     """Test at ``budget``; an agent that does not learn is tested once, and its row stands at every budget."""
     counters = run.counters
     if counters.rows and not run.entry.learns:
@@ -98,7 +120,7 @@ def _test(run: Run, budget: int, observers: Sequence[RunObserver]) -> None:
 
 
 def _row(run: Run, budget: int, observers: Sequence[RunObserver]) -> Checkpoint:
-    test = phases.test(run)
+    tested = test(run)
     start_s = time.process_time()
     measured = AtBudget()
     for observer in observers:
@@ -106,11 +128,124 @@ def _row(run: Run, budget: int, observers: Sequence[RunObserver]) -> Checkpoint:
     return Checkpoint(
         episodes=budget,
         env_steps=run.counters.env_steps,
-        **test.figures(),
-        kept=test.kept(),
+        **tested.figures(),
+        kept=tested.kept(),
         train_cpu_s=run.counters.train_cpu_s,
-        eval_cpu_s=test.cpu_s + time.process_time() - start_s,
-        diagnostics=test.diagnostics,
-        open_loop=measured.get("open_loop"),
-        beliefs=measured.get("beliefs"),
+        eval_cpu_s=tested.cpu_s + time.process_time() - start_s,
+        diagnostics=tested.diagnostics,
+        **measured,
     )
+
+
+def transfer(run: Run) -> None:
+    """Train on the tasks that come before; after the last episode of each, the agent takes its model to the next."""
+    counters = run.counters
+    each = run.protocol.after_episodes
+    for index, task in enumerate(run.protocol.after):
+        if counters.before >= (index + 1) * each or not isinstance(run.agent, TransferLearner):
+            continue
+        with closing(make_env(run.protocol, task)) as env:
+            while counters.before < (index + 1) * each:
+                with run.training_time():
+                    seed = episode_seed("earlier_training", run.spec.seed, counters.before)
+                    for transition, _ in play(env, run.agent, seed=seed, explore=True, privileged=False):
+                        run.agent.observe(transition, episode=counters.before % each)
+                    counters.before += 1
+                    if counters.before % each == 0:
+                        run.agent.reset_for_new_task()
+                run.made_progress("training")
+
+
+def train(run: Run, budget: int) -> None:
+    """Train until the agent has had ``budget`` episodes: first those of a dataset or demonstrated, then its own."""
+    while run.counters.episode < budget:
+        with run.training_time():
+            if run.dataset is not None and run.counters.episode < len(run.dataset):
+                _episode_of_dataset(run, run.dataset)
+            else:
+                _training_episode(run, demonstrated=run.counters.episode < run.protocol.demonstrations)
+        run.made_progress("training")
+
+
+def _episode_of_dataset(run: Run, dataset: Episodes) -> None:
+    episode = run.counters.episode
+    begin_episode(run.agent)
+    for transition in dataset.transitions(episode):
+        run.agent.observe(transition, episode=episode)
+    run.counters.add_episode(bool(dataset.success[episode]), int(dataset.lengths[episode]))
+
+
+def _training_episode(run: Run, *, demonstrated: bool) -> None:
+    counters = run.counters
+    if demonstrated:
+        begin_episode(run.agent)  # an agent that acts is told by play()
+    queries = QueryBudget(run.agent, LabelOracle(run.task.rules), 0 if demonstrated else run.protocol.queries)
+    teacher = None if demonstrated else run.teacher
+    if teacher is not None:
+        teacher.begin(episode_seed("feedback", run.spec.seed, counters.episode))
+
+    def before_acting(observation: Observation, info: Info) -> None:
+        queries(observation, info)
+        if teacher is not None:
+            teacher(observation, info)
+
+    episode = play(
+        CountVisits(run.env, counters),
+        run.demonstrator if demonstrated else run.agent,
+        seed=episode_seed("training", run.spec.seed, counters.episode),
+        explore=True,
+        privileged=demonstrated or run.entry.privileged,
+        before_acting=before_acting,
+    )
+    length = 0
+    success = False
+    for lived, info in episode:
+        transition = lived if teacher is None else teacher.told(lived)
+        run.agent.observe(transition if run.entry.privileged else as_seen(transition), episode=counters.episode)
+        length = length + 1
+        success = bool(info["is_success"])
+    counters.add_episode(success, length, queries=queries.asked)
+
+
+def train_externally(run: Run, agent: ExternalTrainer, test_at: Callable[[int], None]) -> None:
+    """Let the agent train in its own loop through all budgets, and test it, in an environment apart, at each."""
+    budgets = run.protocol.budgets
+    start_s = time.process_time()
+
+    def on_episode(success: bool, length: int) -> bool:
+        nonlocal start_s
+        run.counters.add_episode(success, length)
+        run.counters.train_cpu_s += time.process_time() - start_s
+        run.tell("training")
+        if run.counters.episode in budgets:
+            test_at(run.counters.episode)
+        start_s = time.process_time()
+        return run.counters.episode < budgets[-1]
+
+    with closing(make_env(run.protocol, run.task.id)) as own:
+        starts = training_starts(CountVisits(own, run.counters), run.spec.seed)
+        agent.train(starts, episodes=budgets[-1], horizon=run.task.horizon, on_episode=on_episode)
+
+
+def test(run: Run) -> EvaluationCounts:
+    """Play the greedy test episodes of the budget that was reached, or those that a resumed run has left.
+
+    Before them, an agent that trains in its model alone does so; its time counts as training.
+    """
+    counters = run.counters
+    if counters.test is None:
+        more = isinstance(run.agent, ModelOnlyTrainer)
+        while more and isinstance(run.agent, ModelOnlyTrainer):
+            with run.training_time():
+                more = run.agent.train_in_model()
+            run.made_progress("training in the model")
+        counters.test = EvaluationCounts(diagnostics=run.agent.diagnostics())
+    purpose = evaluation_split(run.spec.seed)
+    while counters.test.episodes < run.protocol.evaluation_episodes:
+        start_s = time.process_time()
+        seed = episode_seed(purpose, 0, counters.test.episodes)
+        played = play_test_episode(run.test_env, run.agent, seed=seed, privileged=run.entry.privileged)
+        counters.test.add(played)
+        counters.test.cpu_s += time.process_time() - start_s
+        run.made_progress("testing")
+    return counters.test

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,15 +11,15 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
-from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.runs import Result, RunSpec
+from imagine_bench.protocols.control import Protocol, context_of
+from imagine_bench.protocols.data import Result, RunSpec
 from imagine_bench.registry.entries import agent_label, entrant
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
-from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.files import reading
 from imagine_bench.store.results import BenchResult, RunResult
-from imagine_bench.values import Setting
+from imagine_bench.store.run_folder import load_newest
+from imagine_bench.values import dotted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
         task = config["protocol"]["task"]
         name = agent_label(config["agent"], config["protocol"])
         seed = config["seed"]
-        settings = _flat(config["settings"])
+        settings = dotted(config["settings"])
     require_control(task, str(folder))
     with reading(folder / "config.json", "a run's configuration"):
         protocol = Protocol.from_dict(config["protocol"])
@@ -72,7 +72,7 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
     as_it_ran = registry.own_settings(entrant(name).agent, settings)  # whatever presets say by now
-    agent = registry.make_agent(name, dataclasses.replace(spec.context(), overrides=as_it_ran))
+    agent = registry.make_agent(name, dataclasses.replace(context_of(spec), overrides=as_it_ran))
     with reading(folder / run_folder.CHECKPOINTS, f"a checkpoint of {name!r}"):
         agent.restore(snapshot.agent)
     if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run
@@ -101,22 +101,20 @@ def learners(bench: Path) -> tuple[Path, ...]:
     """The run folders of a bench, finished or not, whose agents have learned and are at hand, or ArtefactError."""
     protocol = read_control(bench)
     store = BenchStore(bench, protocol)
-    entries = {agent: registry.agent_entry(agent) for agent in protocol.agents}
-    able = [agent for agent, entry in entries.items() if entry.learns and not entry.external_training_loop]
-    folders = [store.run_folder(agent, seed) for agent in able for seed in protocol.seeds]
-    found = tuple(folder for folder in folders if _has_learned(folder))
+    found = []
+    for agent, seed in itertools.product(protocol.agents, protocol.seeds):
+        entry = registry.agent_entry(agent)
+        if entry.learns and not entry.external_training_loop:
+            folder = store.run_folder(agent, seed)
+            snapshot = load_newest(folder / run_folder.CHECKPOINTS, agent=False)
+            if snapshot is not None and snapshot.episode > 0:  # none on its own task: it is at those before
+                found.append(folder)
     if not found:
         raise ArtefactError(
             f"No run below {bench} has a checkpoint of an agent that learns and can be taken up again (a library's "
             "cannot); give the folder of a bench with one, such as of dqn."
         )
-    return found
-
-
-def _has_learned(run: Path) -> bool:
-    """Whether a run has had an episode on its task; one with tasks before may have a checkpoint without."""
-    snapshot = load_newest(run / run_folder.CHECKPOINTS)
-    return snapshot is not None and snapshot.episode > 0
+    return tuple(found)
 
 
 def best_run(result: Result) -> RunResult:
@@ -128,33 +126,21 @@ def best_run(result: Result) -> RunResult:
 
 
 def _encoder(protocol: Protocol, agent: str, given: str | None) -> Path | None:
+    """The encoder that an agent saw through; ``given`` may be that of the bench's agents of the other kind."""
     entry = registry.agent_entry(agent)
     used = protocol.encoder_of(entry.encoder_kind)
     if not entry.needs_encoder or used is None:
         return None
-    task = registry.task(protocol.task)
-    if given is not None and _is_other(task, protocol, given, used):
-        given = None
-    path = encoders.find(used) if given is None else encoders.resolve(task, protocol.appearance, given)
+    here = encoders.find(used)
+    path = here
+    if given is not None:
+        path = encoders.resolve(registry.task(protocol.task), protocol.appearance, given)
+        found = encoders.identity(path)
+        if found != used:
+            path = here if found in (protocol.encoder, protocol.codes) else None
     if path is None:
-        raise ArtefactError(f"The run saw through encoder {used}, which is not here; give its file with --encoder.")
-    if encoders.identity(path) != used:
         raise ArtefactError(
-            f"The run saw through encoder {used}, and {path} is {encoders.identity(path)}; give the right "
-            "file with --encoder."
+            f"The run saw through encoder {used}, which {'is not here' if given is None else f'{given} is not'}; give "
+            "its file with --encoder."
         )
     return path
-
-
-def _is_other(task: TaskSpec, protocol: Protocol, given: str, used: str) -> bool:
-    """Whether an encoder was given for the agents of the bench that see through another kind than this one."""
-    found = encoders.identity(encoders.resolve(task, protocol.appearance, given))
-    return found != used and found in (protocol.encoder, protocol.codes)
-
-
-def _flat(settings: Mapping[str, Setting], prefix: str = "") -> dict[str, Setting]:
-    """Nested settings by dotted name."""
-    flat: dict[str, Setting] = {}
-    for name, value in settings.items():
-        flat.update(_flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value})
-    return flat

@@ -186,7 +186,7 @@ def _newest(root: Path, pattern: str, what: str, tasks: Sequence[str]) -> Path:
     wanted = [f"{name}{options}" for name in names for options in ("", "-*")] or ["*"]
     found = [path for name in wanted for path in root.glob(f"{name}/{pattern}")]
     if not found:
-        of = f" of {' or '.join(tasks)}" if tasks else ""
+        of = f" of {tasks[0]}" if len(tasks) == 1 else ""
         some = next(iter(tasks), "arrow_puzzle")
         raise ArtefactError(f"There is no {what}{of} below {root}; run 'imagine-bench bench --task {some}' first.")
     return max(found, key=lambda path: path.stat().st_mtime)
@@ -225,7 +225,5 @@ def read_control(folder: Path) -> Protocol:
     """
     values = read_protocol_values(folder)
     if "variants" in values:
-        raise ArtefactError(
-            f"{folder} is of the regression task {values.get('task')}, in which no agent acts; give one of agents."
-        )
+        raise ArtefactError(f"{folder} is of a regression task, in which no agent acts; give one of agents.")
     return read_protocol_as(folder, Protocol)

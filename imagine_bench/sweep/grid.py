@@ -1,4 +1,4 @@
-"""The two kinds of grid, and how they are read from TOML or JSON files.
+"""The two kinds of grid, how they are read from TOML or JSON files, and those that have a name.
 
 A study compares variants of agents on one task. It chooses settings, so it runs on tuning seeds, which are tested on
 starts of their own; an ordinary bench on other seeds then confirms its findings. A suite scores agents in experiments,
@@ -16,11 +16,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest, require_types
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
-from imagine_bench.values import Setting
+from imagine_bench.values import Setting, dotted
 
 BASE = "base"
 """Name of the factor of a variant that others are compared with."""
@@ -83,13 +84,9 @@ class Study:
     def only(self, names: Sequence[str]) -> Study:
         """The study with the named variants, or all, and those they are compared with. Raises UnknownNameError."""
         known = {variant.name: variant for variant in self.variants}
-        queue = [require_known("variant", name, known) for name in names] or list(known)
-        wanted = set(queue)
-        while queue:
-            against = known[queue.pop()].against
-            if against is not None and against not in wanted:
-                wanted.add(against)
-                queue.append(against)
+        wanted: set[str | None] = {require_known("variant", name, known) for name in names or known}
+        for _ in self.variants:  # what these are compared with may be compared with others
+            wanted |= {variant.against for variant in self.variants if variant.name in wanted}
         return replace(self, variants=tuple(variant for variant in self.variants if variant.name in wanted))
 
 
@@ -146,7 +143,7 @@ class Suite:
     def only(self, names: Sequence[str]) -> Suite:
         """The suite with some of its experiments, or all if none are named. Raises UnknownNameError."""
         known = {each.name: each for each in self.experiments}
-        wanted = {require_known("experiment", name, known) for name in names} or set(known)
+        wanted = {require_known("experiment", name, known) for name in names or known}
         return replace(self, experiments=tuple(each for each in self.experiments if each.name in wanted))
 
 
@@ -171,47 +168,56 @@ def read_grid(path: Path) -> Study | Suite:
     """
     try:
         text = path.read_text()
-        data = _with_tuples(json.loads(text) if path.suffix == ".json" else tomllib.loads(text))
-        named = {"name": path.stem, **data}
-        return _suite(named) if "experiments" in named else _study(named)
+        data = {"name": path.stem, **(json.loads(text) if path.suffix == ".json" else tomllib.loads(text))}
+        if "experiments" not in data:
+            variants = [Variant(**{**each, "settings": _settings(each)}) for each in data["variants"]]
+            return Study(**{**data, "variants": tuple(variants)})
+        experiments = []
+        for each in data["experiments"]:
+            levels = tuple(Level(**level) for level in each["levels"])
+            experiments.append(Experiment(**{**each, "levels": levels}))
+        return Suite(**{**data, "experiments": tuple(experiments)})
     except ImagineBenchError as error:
         raise InvalidValueError(f"{path}: {error}") from error
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise InvalidValueError(
             f"{path} is no study: {type(error).__name__}: {error}. Give {', '.join(Study.__annotations__)} and "
-            f"[[variants]] with {', '.join(Variant.__annotations__)}, as TOML or JSON; or, for a suite, "
-            f"{', '.join(Suite.__annotations__)}."
+            f"[[variants]] with {', '.join(Variant.__annotations__)}, as TOML or JSON; a suite has [[experiments]]."
         ) from error
 
 
-def _study(data: dict[str, Any]) -> Study:
-    variants = [Variant(**{**each, "settings": _dotted(each.get("settings", {}))}) for each in data["variants"]]
-    return Study(**{**data, "variants": tuple(variants)})
-
-
-def _suite(data: dict[str, Any]) -> Suite:
-    experiments = []
-    for each in data["experiments"]:
-        levels = tuple(Level(**level) for level in each["levels"])
-        experiments.append(Experiment(**{**each, "levels": levels}))
-    return Suite(**{**data, "experiments": tuple(experiments)})
-
-
-def _dotted(settings: Mapping[str, Setting], before: str = "") -> dict[str, Setting]:
-    """Settings, nested or not, by dotted name."""
+def _settings(variant: Mapping[str, Any]) -> dict[str, Setting]:
+    """The settings of a variant by dotted name; the word ``none`` is None, and a list a tuple."""
     found: dict[str, Setting] = {}
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            found |= _dotted(value, f"{before}{name}.")
-        else:
-            found[before + name] = None if value == "none" else value
+    for name, value in dotted(variant.get("settings", {})).items():
+        found[name] = tuple(value) if isinstance(value, list) else None if value == "none" else value
     return found
 
 
-def _with_tuples(value: Any) -> Any:
-    """A value of a file with tuples for its lists."""
-    if isinstance(value, list):
-        return tuple(_with_tuples(each) for each in value)
-    if isinstance(value, dict):
-        return {name: _with_tuples(each) for name, each in value.items()}
-    return value
+SUITE = "suite"
+"""Name of the benchmark suite."""
+GRIDS = {path.stem: read_grid(path) for path in sorted((Path(__file__).parent / "grids").glob("*.toml"))}
+"""The grids in ``sweep/grids``, by name."""
+(LADDER,) = (grid for grid in GRIDS.values() if isinstance(grid, Suite))
+"""The suite of ``make suite``; two cores are meant to finish it within the hour."""
+STUDIES = {name: grid for name, grid in GRIDS.items() if isinstance(grid, Study)}
+registry.describe_group(registry.STUDY_GROUP, what="study", kind=Study, own=GRIDS)
+
+
+def grid_named(name: str) -> Study | Suite:
+    """The grid of a name, or of a file if the name ends in ``.toml`` or ``.json``.
+
+    Raises:
+        UnknownNameError: No such grid.
+        InvalidValueError: The file is no grid.
+        SetupError: A package offers it, and it cannot be loaded.
+    """
+    if name.endswith((".toml", ".json")):
+        return read_grid(Path(name))
+    grid: Study | Suite = registry.offered(name, GRIDS, registry.STUDY_GROUP)
+    return grid
+
+
+def all_grids() -> dict[str, Study | Suite]:
+    """All grids by name, also those of installed packages, without those that cannot be loaded."""
+    return {**GRIDS, **registry.usable(registry.STUDY_GROUP)}

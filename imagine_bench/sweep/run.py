@@ -6,12 +6,10 @@ So another agent, seed or experiment costs none of the runs that are there, and 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-import multiprocessing
-import os
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, RunFailedError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Rules
 from imagine_bench.judge.causes import expected_rightly
-from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.data import ProtocolData
-from imagine_bench.protocols.runs import Encoders, Launcher
-from imagine_bench.running.bench import carry_out, plan
-from imagine_bench.running.launchers.jobs import processes
-from imagine_bench.running.task_types import load_bench, task_type
+from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData
+from imagine_bench.running.bench import carry_out, plan, require_done, task_type
+from imagine_bench.running.trained import require_control
 from imagine_bench.statistics import Estimate, difference
 from imagine_bench.store.bench_folder import BenchStore, bench_folder
+from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult, RunResult
 from imagine_bench.sweep.grid import Experiment, Level, Study, Suite, Variant
 from imagine_bench.sweep.score import Scale, auroc, score
@@ -38,29 +34,6 @@ from imagine_bench.values import Json
 Planned = tuple[ProtocolData, Encoders]
 """A bench, and the encoders that its agents need."""
 _FIGURES_ONLY = {"open_loop_starts": 0, "recorded_episodes": 0}
-LevelPlan = tuple[tuple[Protocol, ...], Encoders]
-"""The benches of a level and an agent, one a seed."""
-
-
-def run_benches(planned: Iterable[Planned], *, root: Path, launcher: Launcher) -> tuple[str, ...]:
-    """Run what is missing of several benches below ``root``; a run that fails costs the others nothing.
-
-    Returns:
-        A sentence for each run that failed. Raises as :func:`.bench.bench`, but for runs that fail.
-    """
-    different = {protocol.hash: (protocol, encoders) for protocol, encoders in planned}
-    failures, _ = carry_out(list(different.values()), root=root, launcher=launcher)
-    return tuple(
-        f"{each.job.spec.agent} seed {each.job.spec.seed} in {each.job.spec.protocol.task}: {each.reason} "
-        f"Log: {each.job.log}"
-        for each in failures
-    )
-
-
-def _load(root: Path, protocol: ProtocolData) -> BenchResult:
-    result = load_bench(bench_folder(root, protocol))
-    assert isinstance(result, BenchResult), "of a control task"
-    return result
 
 
 # --- studies -----------------------------------------------------------------------------------------------------
@@ -84,24 +57,21 @@ class Line:
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
     """Run what is missing of every variant and compare. Errors are those of :func:`.bench.bench`."""
-    if not registry.has_task(task):
-        task_type(task)  # knows every name
-        raise InvalidValueError(f"{task} is learned from data; a study compares agents that act. Give a control task.")
+    task_type(task)  # knows every name
+    require_control(task, task)
     planned = {variant.name: plan_variant(study, task, variant) for variant in study.variants}
-    failures = run_benches(planned.values(), root=root, launcher=launcher)
-    if failures:
-        raise RunFailedError("\n".join([f"{len(failures)} runs failed; the same command tries them again.", *failures]))
-    results = {name: _load(root, protocol) for name, (protocol, _) in planned.items()}
+    require_done(*carry_out(list(planned.values()), root=root, launcher=launcher))
+    results = {name: load_so_far(bench_folder(root, protocol)) for name, (protocol, _) in planned.items()}
     return tuple(_line(study, variant, results, registry.task(task).rules) for variant in study.variants)
 
 
 def _line(study: Study, variant: Variant, results: Mapping[str, BenchResult], rules: Rules) -> Line:
     result = results[variant.name]
     success = result.success_rates(variant.agent)
-    against = next((each for each in study.variants if each.name == variant.against), None)
     differences = None
-    if against is not None:
-        pairs = zip(success.T, results[against.name].success_rates(against.agent).T, strict=True)
+    if variant.against is not None:
+        base = results[variant.against]
+        pairs = zip(success.T, base.success_rates(base.protocol.agents[0]).T, strict=True)
         differences = tuple(difference(ours, theirs, trials=study.evaluation_episodes) for ours, theirs in pairs)
     return Line(
         variant=variant,
@@ -116,10 +86,9 @@ def _line(study: Study, variant: Variant, results: Mapping[str, BenchResult], ru
 
 def plan_variant(study: Study, task: str, variant: Variant) -> Planned:
     """The bench of a variant. Raises as :func:`.bench.plan`."""
-    world = {
-        name: tuple(sorted(value.items())) if isinstance(value, Mapping) else value
-        for name, value in variant.world.items()
-    }
+    world = dict(variant.world)
+    if "physics" in world:
+        world["physics"] = tuple(sorted(world["physics"].items()))
     return plan(
         task,
         study.preset,
@@ -137,12 +106,12 @@ def imagined_right(rules: Rules, runs: Sequence[RunResult]) -> NDArray[np.float6
 
     Shape (runs, budgets).
     """
-    rows = []
-    for run in runs:
-        rows.append([
-            math.nan if each.beliefs is None else expected_rightly(rules, each.beliefs) for each in run.checkpoints
-        ])  # fmt: skip
-    return np.array(rows)
+    shares = [
+        math.nan if row.beliefs is None else expected_rightly(rules, row.beliefs)
+        for run in runs
+        for row in run.checkpoints
+    ]
+    return np.array(shares).reshape(len(runs), -1)
 
 
 # --- the suite ---------------------------------------------------------------------------------------------------
@@ -154,10 +123,10 @@ class LevelResult:
 
     level: Level
     values: NDArray[np.float64]  #: Success share, or AUROC, of each seed; NaN if it was not run. Shape (seeds,).
-    scale: Scale | None  #: None if nothing was run
-    train_cpu_s: float  #: Mean CPU seconds of training a run; NaN likewise
     benches: tuple[str, ...]  #: Task and folder of the bench of each seed, below the folder of all benches
-    environment: Mapping[str, Json]  #: Of its first session; empty likewise
+    scale: Scale | None = None  #: None if nothing was run
+    train_cpu_s: float = math.nan  #: Mean CPU seconds of training a run; NaN likewise
+    environment: Mapping[str, Json] = field(default_factory=dict)  #: Of its first session; empty likewise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,8 +148,8 @@ class SuiteResult:
         return score(np.column_stack([each.values for each in found]), scales, trials=trials)
 
 
-def plan_level(suite: Suite, level: Level, agent: str) -> LevelPlan:
-    """The benches of a level and an agent; an agent that cannot transfer has no earlier task.
+def plan_level(suite: Suite, level: Level, agent: str) -> list[Planned]:
+    """The benches of a level and an agent, one a seed; an agent that cannot transfer has no earlier task.
 
     An encoder that does not exist yet is trained now. Raises as :func:`.bench.plan`.
     """
@@ -201,73 +170,44 @@ def plan_level(suite: Suite, level: Level, agent: str) -> LevelPlan:
             raise
         fields.pop("after_episodes", None)
         whole, encoders = plan(level.task, "quick", **fields)
-    assert isinstance(whole, Protocol), "of a control task"
-    return tuple(dataclasses.replace(whole, seeds=(seed,)) for seed in whole.seeds), encoders
+    return [(dataclasses.replace(whole, seeds=(seed,)), encoders) for seed in whole.seeds]
 
 
-def _try_to_plan(job: tuple[Suite, Level, str]) -> LevelPlan | None:
-    """The plan of a level; None if it fails, for not every error can be sent between processes."""
-    try:
-        return plan_level(*job)
-    except ImagineBenchError:
-        return None
+def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Launcher) -> SuiteResult:
+    """Run what is missing of a suite. A run that fails costs the others nothing. Raises as :func:`plan_level`."""
+    plans = {
+        (each.name, agent): [plan_level(suite, level, agent) for level in each.levels]
+        for each, agent in itertools.product(suite.experiments, agents)
+    }
+    planned = [bench for levels in plans.values() for level in levels for bench in level]
+    failures, _ = carry_out(planned, root=root, launcher=launcher)
+    results = {}
+    for each, agent in itertools.product(suite.experiments, agents):
+        pairs = zip(each.levels, plans[each.name, agent], strict=True)
+        results[each.name, agent] = tuple(_level_result(each, level, planned, root) for level, planned in pairs)
+    return SuiteResult(suite=suite, agents=tuple(agents), levels=results, failures=tuple(map(str, failures)))
 
 
-def plan_suite(suite: Suite, agents: Sequence[str], workers: int | None) -> dict[tuple[str, str, str], LevelPlan]:
-    """The plans by experiment, level and agent, made by so many processes; None is one a core.
-
-    Raises as :func:`plan_level`.
-    """
-    jobs = {
-        (each.name, level.name, agent): (suite, level, agent)
-        for each in suite.experiments for level in each.levels for agent in agents
-    }  # fmt: skip
-    found: dict[tuple[str, str, str], LevelPlan | None] = dict.fromkeys(jobs)
-    if processes(workers) > 1:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
-        with ProcessPoolExecutor(processes(workers), mp_context=multiprocessing.get_context("spawn")) as pool:
-            found = dict(zip(jobs, pool.map(_try_to_plan, jobs.values(), chunksize=len(agents)), strict=True))
-    return {key: found[key] or plan_level(*job) for key, job in jobs.items()}
-
-
-def run_suite(
-    suite: Suite, agents: Sequence[str], *, root: Path, launcher: Launcher, planners: int | None = 1
-) -> SuiteResult:
-    """Run what is missing of a suite, planned by so many processes. Raises as :func:`run_benches`."""
-    plans = plan_suite(suite, agents, planners)
-    benches = [(protocol, encoders) for protocols, encoders in plans.values() for protocol in protocols]
-    failures = run_benches(benches, root=root, launcher=launcher)
-    levels = {}
-    for each in suite.experiments:
-        for agent in agents:
-            protocols = [plans[each.name, level.name, agent][0] for level in each.levels]
-            pairs = zip(each.levels, protocols, strict=True)
-            levels[each.name, agent] = tuple(_level_result(each, *pair, root) for pair in pairs)
-    return SuiteResult(suite=suite, agents=tuple(agents), levels=levels, failures=failures)
-
-
-def _level_result(experiment: Experiment, level: Level, protocols: Sequence[Protocol], root: Path) -> LevelResult:
-    folders = [bench_folder(root, protocol) for protocol in protocols]
-    benches = tuple(f"{folder.parent.name}/{folder.name}" for folder in folders)
-    if any(BenchStore(*pair).missing() for pair in zip(folders, protocols, strict=True)):
-        nothing = np.full(len(protocols), math.nan)
-        return LevelResult(
-            level=level, values=nothing, scale=None, train_cpu_s=math.nan, benches=benches, environment={}
-        )
-    results = [_load(root, protocol) for protocol in protocols]
+def _level_result(experiment: Experiment, level: Level, planned: Sequence[Planned], root: Path) -> LevelResult:
+    stores = [BenchStore(bench_folder(root, protocol), protocol) for protocol, _ in planned]
+    benches = tuple(f"{store.folder.parent.name}/{store.folder.name}" for store in stores)
+    if any(store.missing() for store in stores):
+        return LevelResult(level=level, values=np.full(len(stores), math.nan), benches=benches)
+    results = [load_so_far(bench_folder(root, protocol)) for protocol, _ in planned]
     last = [run.checkpoints[-1] for result in results for run in result.runs]
-    by_success = experiment.measure == "success"
+    values = [auroc(each.open_loop) for each in last]
+    scale = Scale(chance=0.5, optimum=1.0)
+    if experiment.measure == "success":
+        values = [each.success_rate for each in last]
+        exact = results[0].certificate
+        if exact is None:
+            raise ArtefactError(f"{results[0].folder} has no certificate; remove the folder and run the suite again.")
+        scale = Scale(chance=exact.chance_level, optimum=exact.optimum)
     return LevelResult(
         level=level,
-        values=np.array([each.success_rate if by_success else auroc(each.open_loop) for each in last]),
-        scale=_scale(results[0]) if by_success else Scale(chance=0.5, optimum=1.0),
-        train_cpu_s=float(np.mean([each.train_cpu_s for each in last])),
+        values=np.array(values),
         benches=benches,
+        scale=scale,
+        train_cpu_s=float(np.mean([each.train_cpu_s for each in last])),
         environment=results[0].environment,
     )
-
-
-def _scale(result: BenchResult) -> Scale:
-    if result.certificate is None:
-        raise ArtefactError(f"{result.folder} has no certificate; remove the folder and run the suite again.")
-    return Scale(chance=result.certificate.chance_level, optimum=result.certificate.optimum)

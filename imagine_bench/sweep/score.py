@@ -31,10 +31,6 @@ class Scale:
                 f"Chance {self.chance} is not below the optimum {self.optimum}: nothing can be learned in this level."
             )
 
-    def normalised(self, values: Floats) -> Floats:
-        """0 at chance, 1 at the optimum; below 0 for what is worse than blind choice."""
-        return np.asarray((values - self.chance) / (self.optimum - self.chance))
-
 
 def score(values: Floats, scales: Sequence[Scale], *, trials: int | None = None) -> statistics.Estimate:
     """Mean over levels and seeds of ``values`` (S, L), each on its level's scale, with a 95 % interval.
@@ -43,16 +39,17 @@ def score(values: Floats, scales: Sequence[Scale], *, trials: int | None = None)
     of so many ``trials``; with one seed it is of the tests alone. A level without values is left out; all is NaN where
     none has any.
     """
-    scaled = np.column_stack([scale.normalised(values[:, index]) for index, scale in enumerate(scales)])
-    there = ~np.isnan(scaled).all(axis=0)
-    if not there.any() or np.isnan(scaled[:, there]).all(axis=1).any():
+    there = ~np.isnan(values).all(axis=0)
+    known = values[:, there]
+    if not there.any() or np.isnan(known).all(axis=1).any():
         return statistics.Estimate(math.nan, math.nan, math.nan)
-    seeds = np.nanmean(scaled[:, there], axis=1)
+    chance = np.array([scale.chance for scale in scales])[there]
+    span = np.array([scale.optimum for scale in scales])[there] - chance
+    seeds = np.nanmean((known - chance) / span, axis=1)
     value = float(seeds.mean())
     low, high = statistics.interval(seeds, trim=0.0)
     if trials is not None:
-        spans = np.array([scale.optimum - scale.chance for scale in scales])[there]
-        half = float(scipy.stats.norm.isf(0.025)) * _error_of_tests(values[:, there], spans, trials)
+        half = float(scipy.stats.norm.isf(0.025)) * _error_of_tests(known, span, trials)
         low, high = np.fmin(low, value - half), np.fmax(high, value + half)
     return statistics.Estimate(value, float(low), float(high))
 

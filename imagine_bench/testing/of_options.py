@@ -27,8 +27,8 @@ from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentState, Observation, Transition
 from imagine_bench.interfaces.capabilities import ExternalTrainer, begin_episode
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.runs import Progress, RunSpec
-from imagine_bench.running import phases
+from imagine_bench.protocols.data import Progress, RunSpec
+from imagine_bench.running import runner
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.control import plan_control
 from imagine_bench.running.evaluation import play
@@ -204,19 +204,19 @@ def _carried_out(run: Run) -> _Left:
     """Train, or test one whose training is a library's or none; a digest of what it did, earned and learned."""
     watched = _WatchedAgent(run.agent)
     if isinstance(run.agent, ExternalTrainer):
-        phases.train_externally(run, run.agent, lambda budget: None)
+        runner.train_externally(run, run.agent, lambda budget: None)
     if run.entry.external_training_loop:
         run.agent = watched
-        phases.test(run)
+        runner.test(run)
     elif run.entry.learns:
         run.agent = watched
-        phases.transfer(run)
-        phases.train(run, run.protocol.budgets[-1])
+        runner.transfer(run)
+        runner.train(run, run.protocol.budgets[-1])
         episodes = run.protocol.episodes_before + run.protocol.budgets[-1]
         require(watched.begun >= episodes, f"told of {watched.begun} beginnings of {episodes} training episodes")
     else:
         run.agent = watched
-        phases.test(run)
+        runner.test(run)
     return watched.left(run.counters)
 
 

@@ -11,10 +11,10 @@ from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, TaskSpec, bundled_name
 from imagine_bench.rules import evaluate, greedy, is_random, optimal_policy, states_of, tabulate
+from imagine_bench.running.bench import task_types
 from imagine_bench.running.launchers.jobs import LAUNCHERS
-from imagine_bench.running.task_types import task_types
 from imagine_bench.store.encoders import bundled
-from imagine_bench.sweep.catalogue import all_grids
+from imagine_bench.sweep.grid import all_grids
 
 _MOST = 10
 """Plan lengths that are listed one by one."""

@@ -22,10 +22,9 @@ from imagine_bench.protocols.control import protocol
 from imagine_bench.report import bench_page
 from imagine_bench.report.audits import verify, with_report
 from imagine_bench.report.page import texts
-from imagine_bench.running.bench import bench
+from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode, replay
 from imagine_bench.running.run_state import environments
-from imagine_bench.running.task_types import load_bench
 from imagine_bench.seeding import episode_seed
 
 
@@ -108,7 +107,8 @@ def test_a_policy_cannot_shift_the_starts_of_tests(env_id: str, execution: str, 
         agent, counts = Constant(context()), EvaluationCounts()
         agent.chosen = chosen
         for _ in range(6):
-            play_test_episode(counts, env, agent, privileged=False, purpose="evaluation")
+            seed = episode_seed("evaluation", 0, counts.episodes)
+            counts.add(play_test_episode(env, agent, seed=seed, privileged=False))
         starts.append(counts.starts)
         played.append(counts.fingerprints)
         seed = episode_seed("evaluation", 0, 5)

@@ -19,8 +19,7 @@ from imagine_bench.report.audits import verify, why_report
 from imagine_bench.report.page import Page, texts
 from imagine_bench.report.sections import read_causes
 from imagine_bench.rules import states_of
-from imagine_bench.running.bench import bench
-from imagine_bench.running.task_types import load_bench
+from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import make_folder, write_bytes

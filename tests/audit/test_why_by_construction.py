@@ -20,8 +20,7 @@ from imagine_bench.interfaces.capabilities import FrameReader
 from imagine_bench.judge import causes as why
 from imagine_bench.protocols.control import protocol
 from imagine_bench.rules import states_of
-from imagine_bench.running.bench import bench
-from imagine_bench.running.task_types import load_bench
+from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.results import Checkpoint, RunResult

@@ -17,7 +17,7 @@ from small_runs import Inline
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
-from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.protocols.data import RunSpec
 from imagine_bench.registry.machine import versions
 from imagine_bench.regression.runner import run
 from imagine_bench.running.bench import bench, plan

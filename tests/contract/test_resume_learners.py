@@ -10,11 +10,11 @@ import pytest
 from small_runs import final_arrays, measured, run_observed, small
 
 from imagine_bench import registry
-from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import run_state
 from imagine_bench.store import encoders
-from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import RunResult
+from imagine_bench.store.run_folder import load_newest
 
 LEARNERS = [
     name

@@ -112,51 +112,37 @@ def flipped(content: bytes) -> bytes:
 _LONG = np.ones(6, dtype=np.int64)
 DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("npz", bytes_of("episodes.npz", lambda old: old[:-1000]), "is not an archive of episodes"),
-    ("npz", bytes_of("episodes.npz", lambda old: b""), "is not an archive of episodes"),
-    ("npz", bytes_of("episodes.npz", lambda old: b"PK\x03\x04garbage"), "is not an archive of episodes"),
     ("npz", bytes_of("episodes.npz", lambda old: old[: len(old) // 2] + b"\0" + old[len(old) // 2 + 1 :]), ""),
     ("npz", archive(actions=np.array([[1], [1, 2]], dtype=object)), "pickle"),
     ("npz", archive(rewards=None), "rewards"),
     ("npz", archive(more=_LONG), "more"),
     ("npz", with_item("rewards", 2, np.nan), "reward 2 is not finite"),
-    ("npz", with_item("rewards", 0, np.inf), "reward 0 is not finite"),
     ("npz", with_item("actions", 0, 6), "actions must lie from 0 to 5"),
-    ("npz", with_item("actions", 0, -1), "actions must lie from 0 to 5"),
     ("npz", with_item("action_masks", 0, 2), "an action mask is neither 0 nor 1"),
     ("npz", with_item("terminated", 1, True), "an episode goes on after its end, or has none"),
     ("npz", archive(frames=collected()[0].frames[1:]), "frames has shape"),
     ("npz", archive(frames=collected()[0].frames.astype(np.float32)), "frames holds float32, not uint8"),
-    ("npz", archive(frames=collected()[0].frames[..., :2]), "frames has shape"),
     ("npz", archive(lengths=np.zeros(0, dtype=np.int64)), "one or more episodes"),
     ("npz", archive(lengths=-_LONG), "each of at least 1"),
     ("npz", with_item("frames", 0, 7), "is damaged: its episodes are not those of its card"),
-    ("npz", with_item("success", 0, ~collected()[0].success[0]), "is damaged: its episodes are not those of its card"),
     ("npz", bytes_of("card.json", lambda old: old.replace(b'"mixed"', b'"oracle"')), "card.json is damaged"),
-    ("npz", bytes_of("card.json", lambda old: b"[]"), "is not a dataset's card"),
     ("npz", bytes_of("privileged.npz", flipped), "privileged.npz is not a part of a dataset"),
-    ("npz", lambda folder: (folder / "privileged.npz").unlink(), "There is no"),
-    ("npz", lambda folder: np.savez(folder / "privileged.npz", seeds=np.arange(6)), "it is not what the card says"),
+    ("npz", lambda folder: np.savez(folder / "privileged.npz", seeds=np.arange(6)), "is not what the card says"),
     ("lerobot", lambda folder: (folder / "final_frames.parquet").unlink(), "the last frames of episodes"),
     ("lerobot", lambda folder: shutil.rmtree(folder / "data"), "is not a LeRobot dataset of macro-actions"),
-    ("lerobot", bytes_of(_DATA, lambda old: old[:-200]), "is not a LeRobot dataset of macro-actions"),
     ("lerobot", table(lambda old: old[:-1]), "rows are said to be in it and"),
     ("lerobot", table(lambda old: old[:-1], "final_frames.parquet"), "rows are said to be in it and"),
     ("lerobot", table(lambda old: old.take(list(range(len(old)))[::-1])), "its rows are not in order"),
     ("lerobot", table(lambda old: replaced(old, "episode_index", old["episode_index"][::-1])), "rows are not in order"),
     ("lerobot", table(lambda old: replaced(old, "action", [0.5] * len(old))), "an action is no integer"),
-    ("lerobot", table(lambda old: replaced(old, "next.reward", [np.nan] * len(old))), "reward 0 is not finite"),
     ("lerobot", table(lambda old: old.drop_columns(["next.reward"])), "next.reward"),
     ("lerobot", table(with_image(b"not a PNG")), "cannot identify image"),
-    ("lerobot", table(with_image(png((64, 64))[:60])), "image file is truncated"),
     ("lerobot", table(with_image(png((6400, 64)))), "an image is RGB of (6400, 64) pixels"),
     ("lerobot", table(with_image(png((64, 64), "L"))), "an image is L of (64, 64) pixels"),
-    ("lerobot", table(with_image(png((64, 64)))), "is damaged: its episodes are not those of its card"),
     ("lerobot", info(codebase_version="v2.1"), "it is of version v2.1"),
     ("lerobot", info(features={"action": {}, "observation.images.top": {}}), "it has no next.reward, which 'imagine"),
     ("lerobot", info(total_frames=10**9), "1000000000 rows are said to be in it"),
-    ("lerobot", bytes_of("meta/info.json", lambda old: b"{"), "is not the metadata of a LeRobot dataset"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: b"{}"), "is not a Minari dataset of macro-actions"),
-    ("minari", bytes_of("*/data/metadata.json", lambda old: old.replace(b"0.5", b"9.5")), "is not a Minari dataset"),
     ("minari", bytes_of("*/data/metadata.json", steps_less_one), "steps are not what it holds"),
     ("minari", bytes_of("*/data/2/*.parquet", lambda old: old[:-200]), "is not a Minari dataset of macro-actions"),
     ("minari", lambda folder: shutil.rmtree(next(folder.glob("*/data/5"))), "a file of it is missing"),
@@ -179,13 +165,6 @@ def test_what_is_no_dataset_is_refused(tmp_path: Path, make: Callable[[Path], No
     make(tmp_path / "set")
     with pytest.raises(ArtefactError, match="is no dataset; give a folder with episodes"):
         read_dataset(tmp_path / "set")
-
-
-def test_a_card_of_another_set_is_refused(sets: Path, tmp_path: Path) -> None:
-    shutil.copytree(sets / "npz", tmp_path / "set")
-    other = written(tmp_path / "other", episodes=3)
-    shutil.copy(other.folder / "card.json", tmp_path / "set/card.json")
-    refused(tmp_path / "set", "is damaged: its episodes are not those of its card")
 
 
 def test_a_set_that_could_not_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,8 +221,5 @@ def test_no_value_changes_with_its_type() -> None:
         joined([{**part, "actions": part["actions"] + 0.5}])
     with pytest.raises(InvalidValueError, match="there is no episode"):
         joined([])
-
-
-def test_lists_are_no_arrays() -> None:
     with pytest.raises(InvalidValueError, match="lengths holds list, not int64"):
-        dataclasses.replace(collected()[0], lengths=[1, 2])
+        dataclasses.replace(episodes, lengths=[1, 2])

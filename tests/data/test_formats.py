@@ -6,10 +6,7 @@ import dataclasses
 import hashlib
 import io
 import json
-import re
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import gymnasium
@@ -18,13 +15,12 @@ import numpy as np
 import PIL.Image
 import pyarrow.parquet as pq
 import pytest
-import rerun
 from small_runs import FORMATS, collected, written
 
 from imagine_bench import registry
 from imagine_bench.data import lerobot
 from imagine_bench.data.folder import read_apart, read_dataset, require_format
-from imagine_bench.errors import SetupError, UnknownNameError
+from imagine_bench.errors import SetupError
 from imagine_bench.interfaces.episodes import Episodes
 
 
@@ -178,28 +174,6 @@ def test_large_sets_lie_in_several_files(tmp_path: Path, monkeypatch: pytest.Mon
     assert same(read_dataset(tmp_path / "set").episodes, collected()[0])
 
 
-def test_rerun_opens_the_layout(tmp_path: Path) -> None:
-    """Its own reader of LeRobot datasets finds every image, action and reward."""
-    written(tmp_path / "set", "lerobot")
-    path, recording, size = tmp_path / "set.rrd", rerun.RecordingStream("set"), -1
-    recording.save(path)
-    recording.log_file_from_path(tmp_path / "set")
-    for _ in range(100):  # it reads in a thread of its own
-        recording.flush()
-        if size == (size := path.stat().st_size) and size > 20_000:
-            break
-        time.sleep(0.1)
-    command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    for entity, component in (
-        ("observation.image", "EncodedImage:blob"),
-        ("action", "Scalars"),
-        ("next.reward", "Scalars"),
-    ):
-        rows = re.findall(rf"with (\d+) rows .* - /{re.escape(entity)} - .*{component}", said)
-        assert sum(map(int, rows)) == len(collected()[0].actions), entity
-
-
 # --- the extra -------------------------------------------------------------------------------------------------------
 
 
@@ -212,8 +186,3 @@ def test_a_missing_library_is_one_sentence(monkeypatch: pytest.MonkeyPatch, libr
     with pytest.raises(SetupError, match=rf"^This needs {library}, which .*'imagine-bench\[data\]'\.$"):
         require_format(format)
     require_format("npz")
-
-
-def test_an_unknown_format_is_named() -> None:
-    with pytest.raises(UnknownNameError, match=r"^No format 'hdf5'\. Known: npz, lerobot, minari\.$"):
-        require_format("hdf5")

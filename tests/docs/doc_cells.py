@@ -17,9 +17,9 @@ import numpy as np
 from imagine_bench import reference, registry, rules, statistics
 from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.registry.entries import agent_label, label_today
-from imagine_bench.running.task_types import read_protocol
+from imagine_bench.running.bench import read_protocol
 from imagine_bench.store import encoders
-from imagine_bench.sweep.catalogue import STUDIES
+from imagine_bench.sweep.grid import STUDIES
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"

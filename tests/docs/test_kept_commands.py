@@ -19,9 +19,8 @@ from imagine_bench.cli.benches import Bench
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.registry import TASKS
-from imagine_bench.running.bench import plan
+from imagine_bench.running.bench import plan, read_protocol
 from imagine_bench.running.control import resolved_settings
-from imagine_bench.running.task_types import read_protocol
 
 COMMANDS = {row["folder"]: row for row in table("commands.csv")}
 NOT_OPTIONS = ("encoder", "codes", "sampled_futures", "settings_digest", "agent_names", "dataset")

@@ -13,7 +13,7 @@ from doc_tables import PAGES, rewritten, tables, unmarked
 from matplotlib.figure import Figure
 
 from imagine_bench.registry import TASKS
-from imagine_bench.running.task_types import read_protocol
+from imagine_bench.running.bench import read_protocol
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult
 

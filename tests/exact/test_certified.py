@@ -16,8 +16,7 @@ from imagine_bench.exact.certificate import certificate
 from imagine_bench.exact.splits import split_of
 from imagine_bench.report import write_report
 from imagine_bench.report.data import collect
-from imagine_bench.running.bench import bench
-from imagine_bench.running.task_types import load_bench
+from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.store.loading import archive_files, load_so_far
 
 

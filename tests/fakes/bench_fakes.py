@@ -16,7 +16,7 @@ from imagine_bench.cli import main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Label
-from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.protocols.data import RunSpec
 from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.seeding import SeedTree
 

@@ -18,13 +18,13 @@ from imagine_bench.data.folder import Apart, Dataset, write_dataset
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol, protocol
-from imagine_bench.protocols.runs import Failure, Job, OnProgress, RunSpec
+from imagine_bench.protocols.data import Failure, Job, OnProgress, RunSpec
 from imagine_bench.running.collect import collect, policy_of
-from imagine_bench.running.control import run_control
+from imagine_bench.running.runner import run
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
-from imagine_bench.store.checkpoints import load_newest
 from imagine_bench.store.results import Checkpoint, RunResult
+from imagine_bench.store.run_folder import load_newest
 
 _TIMES = {"train_cpu_s": 0.0, "eval_cpu_s": 0.0}
 
@@ -44,7 +44,7 @@ def small(**changes: Any) -> Protocol:
 
 def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> RunResult | None:
     """A run in this process, looked at as those of a command are; None if it pauses before its end."""
-    run_control(dataclasses.replace(spec, observers=OBSERVERS), folder, on_progress)
+    run(dataclasses.replace(spec, observers=OBSERVERS), folder, on_progress)
     return run_folder.load_run(folder) if run_folder.is_done(folder) else None
 
 

@@ -20,7 +20,7 @@ from imagine_bench.interfaces import Frame, PhysicsSettings, State
 from imagine_bench.interfaces.capabilities import ImaginedRollout
 from imagine_bench.judge.plans import PlanResult, carry_out, make_env, make_plans
 from imagine_bench.protocols.control import protocol
-from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.protocols.data import RunSpec
 from imagine_bench.recording.plans import record_plans
 from imagine_bench.report.audits import plan_table, summarise, write_plans
 from imagine_bench.rules import fewest_actions

@@ -16,13 +16,12 @@ from imagine_bench.cli import main
 from imagine_bench.cli.observers import observers_of
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces.regression import SCORES
-from imagine_bench.protocols.runs import Progress, RunSpec
+from imagine_bench.protocols.data import Progress, RunSpec
 from imagine_bench.regression.results import PairResult, RegressionResult, RegressionRun
 from imagine_bench.regression.runner import run
 from imagine_bench.report.page import write_page
 from imagine_bench.report.regression import choices, claim, report_page, squared_error_terms
-from imagine_bench.running.bench import plan
-from imagine_bench.running.task_types import task_types
+from imagine_bench.running.bench import plan, task_types
 from imagine_bench.running.trained import load_trained
 
 SURE = 4.5

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 from pathlib import Path
 
 import pytest
-from small_runs import Inline, small
+from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
-from imagine_bench.protocols.control import Protocol, protocol
-from imagine_bench.protocols.data import digest
+from imagine_bench.protocols.control import protocol
 from imagine_bench.registry.entries import entrant, file_name
 from imagine_bench.report import summary_table
 from imagine_bench.report.figures import color
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.control import resolved_settings
-from imagine_bench.running.task_types import read_protocol
 from imagine_bench.running.trained import load_trained
 from imagine_bench.store.loading import archive_files, load_so_far, merge
 
@@ -83,25 +80,6 @@ def test_one_agent_with_two_settings_in_one_table(tmp_path: Path) -> None:
         for agent in both.protocol.agents
     ]
     assert merge(parts, tmp_path).protocol.agents == ("dqn", SLOW)
-
-
-def test_what_is_not_said_changes_no_hash(tmp_path: Path) -> None:
-    wanted = small()
-    assert not {"test_appearance", "physics"} & wanted.as_dict().keys()
-    assert dataclasses.replace(wanted, physics=()).hash == wanted.hash
-    other = small(test_appearance="strong")
-    assert Protocol.from_dict(other.as_dict()) == other and other.hash != wanted.hash
-    store = bench(other, {}, root=tmp_path, launcher=Inline()).folder
-    assert read_protocol(store) == other
-
-
-def test_kept_hashes_are_as_they_were() -> None:
-    kept = [json.loads(path.read_text()) for path in sorted(Path("docs/results").glob("*/bench.json"))]
-    control = [each for each in kept if "evaluation_episodes" in each["protocol"]]
-    same = [each for each in control if digest(each["protocol"]) == each["protocol_hash"]]
-    assert len(same) > 3
-    for each in same:
-        assert Protocol.from_dict(each["protocol"]).hash == each["protocol_hash"]
 
 
 def test_training_and_tests_may_look_different() -> None:

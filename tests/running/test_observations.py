@@ -57,9 +57,7 @@ def witness(monkeypatch: pytest.MonkeyPatch) -> Witness:
     return agent
 
 
-@pytest.mark.parametrize(
-    ("choice", "size"), [("frame", 64), ("frame", 96), ("state", 64), ("proprio,frame", 64), ("state,proprio", 64)]
-)
+@pytest.mark.parametrize(("choice", "size"), [("frame", 64), ("frame", 96), ("state", 64), ("proprio,frame", 64)])
 def test_agents_are_shown_what_is_chosen(tmp_path: Path, witness: Witness, choice: str, size: int) -> None:
     shown = {"observation": choice, "observation_size": size}
     wanted, paths = plan("arrow_puzzle", "smoke", agents=("witness", "random", "oracle"), **_FEW, **shown)
@@ -89,19 +87,17 @@ def test_choices_in_any_order_are_one_bench() -> None:
     ("changes", "error", "words"),
     [
         ({"observation": "stat"}, UnknownNameError, "No observation 'stat'. Did you mean 'state'?"),
-        ({"observation": "state,state"}, InvalidValueError, "none of them twice"),
         ({"observation_size": 16}, InvalidValueError, "observation_size is 16; give 32 to 256 pixels"),
         (
             {"observation": "human", "agents": ("witness",)},
             InvalidValueError,
-            "takes frame, state, proprio, but not human",
+            "takes frame, state, proprio alone; leave it out",
         ),
         (
             {"observation": "state", "agents": ("dqn",)},
             InvalidValueError,
             "Agent 'dqn' takes 64 x 64 frames alone; leave",
         ),
-        ({"observation_size": 96, "agents": ("factored:given",)}, InvalidValueError, "takes 64 x 64 frames alone"),
     ],
 )
 @pytest.mark.usefixtures("witness")
@@ -119,13 +115,6 @@ def test_a_run_that_saw_something_else_is_not_asked_with_frames(tmp_path: Path) 
         load_trained(folder)
 
 
-def test_a_part_alone_comes_by_its_name() -> None:
-    wanted = Protocol(task="pick_place", preset="quick", observation="proprio", execution="kinematic")
-    with environments(wanted) as (env, _):
-        seen, _ = env.reset(seed=1)
-        assert set(seen) == {"proprio"} and env.observation_space.contains(seen)
-
-
 class _Broken(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Its third observation has a part that no agent should be shown."""
 
@@ -139,35 +128,12 @@ class _Broken(gymnasium.Wrapper[Any, Any, Any, Any]):
         return (seen if self.steps < 2 else {**seen, "proprio": self.part}, *rest)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize(
-    ("part", "words"),
-    [
-        (np.full(16, np.nan, dtype=np.float32), "gave a proprio with NaN or infinity"),
-        (np.zeros(7, dtype=np.float32), "gave a proprio of float32 and shape (7,); it declares float32 of shape (16,)"),
-        (np.zeros(16), "gave a proprio of float64"),
-        (None, "gave a proprio of <class 'NoneType'> and shape None"),
-    ],
+    "part", [np.full(16, np.nan, dtype=np.float32), np.zeros(7, dtype=np.float32), np.zeros(16), None]
 )
-def test_a_part_that_goes_wrong_ends_the_run(part: Any, words: str) -> None:
+def test_a_part_that_goes_wrong_ends_the_run(part: Any) -> None:
     wanted = Protocol(task="arrow_puzzle", preset="quick", observation="state,proprio", execution="kinematic")
-    with environments(wanted) as (env, _), pytest.raises(InvalidValueError) as caught:
+    with environments(wanted) as (env, _), pytest.raises(InvalidValueError, match="that is not in its space Dict"):
         for seed in range(9):
             list(play(_Broken(env, part), FakeAgent(), seed=seed, explore=True, privileged=False))
-    assert words in str(caught.value)
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
-@pytest.mark.parametrize(("choice", "policy"), [("state", "MultiInputPolicy"), ("frame", "CnnPolicy")])
-def test_a_librarys_agent_takes_them_as_they_are(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, choice: str, policy: str
-) -> None:
-    library = pytest.importorskip("stable_baselines3")
-    named, make_dqn = list[str](), library.DQN
-    monkeypatch.setattr(
-        library, "DQN", lambda name, *given, **more: named.append(name) or make_dqn(name, *given, **more)
-    )
-    few = (("sb3.batch_size", 8), ("sb3.buffer_size", 500), ("sb3.learning_starts", 10))
-    shown = {"observation": choice, "observation_size": 64 if choice == "state" else 48, "overrides": few}
-    wanted, paths = plan("arrow_puzzle_easy", "smoke", agents=("sb3_dqn",), **{**_FEW, "budgets": (20,)}, **shown)
-    result = bench(wanted, paths, root=tmp_path, launcher=Inline())
-    assert named == [policy] and np.isfinite(result.runs[0].checkpoints[-1].mean_return)

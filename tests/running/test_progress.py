@@ -9,8 +9,8 @@ import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
 
-from imagine_bench.protocols.runs import Phase, Progress
-from imagine_bench.running.progress import ProgressBar, counted
+from imagine_bench.protocols.data import Phase, Progress
+from imagine_bench.running.bench import ProgressBar
 
 WORK = 9 + 2 * 5
 """Of a learner: training episodes, and tests at two budgets."""
@@ -49,7 +49,7 @@ def test_time_left_counts_neither_what_was_done_before_nor_what_a_failed_run_lac
 ) -> None:
     """Of 72 parts, 9 were done before and 10 take ten hours; 34 are left, for a run that failed has 19."""
     now_s = [0.0]
-    monkeypatch.setattr("imagine_bench.running.progress.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("imagine_bench.running.bench.time.monotonic", lambda: now_s[0])
     with ProgressBar(SPECS) as show:
         show(far(0, 9))
         show(far(1, 0, "failed", "RuntimeError: it broke"))
@@ -69,12 +69,3 @@ def test_a_terminal_has_one_bar_that_leaves_nothing_behind(monkeypatch: pytest.M
         show(far(1, 0, "failed", "it broke"))
     assert "table seed 1 failed: it broke\n" in terminal.getvalue()
     assert terminal.getvalue().endswith("\r") and not terminal.getvalue().split("\r")[-2].strip()
-
-
-def test_items_are_counted_when_they_are_done(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    now_s = iter(range(0, 1000, 10))
-    monkeypatch.setattr("imagine_bench.running.progress.time.monotonic", lambda: float(next(now_s)))
-    assert list(counted(iter("abcd"), "plans", total=4)) == list("abcd")
-    assert capsys.readouterr().err.splitlines() == ["2 of 4 plans", "4 of 4 plans"]

@@ -17,12 +17,12 @@ BUNDLED = [name for name in TASKS if name != "arrow_puzzle_easy"]
 """Tasks whose encoders are bundled."""
 
 
-@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_survives_json_with_its_hash(task, preset):
-    original = protocol(task, preset)
-    copy = Protocol.from_dict(original.as_dict())
-    assert copy == original and copy.hash == original.hash
+def test_every_preset_survives_json_with_its_hash(preset):
+    for name in TASKS:
+        original = protocol(name, preset)
+        copy = Protocol.from_dict(original.as_dict())
+        assert copy == original and copy.hash == original.hash
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -113,17 +113,13 @@ def test_the_caller_overrides_the_task_overrides_the_preset(monkeypatch):
             "No preset 'fast'.* Known: smoke, quick, thesis, full, ",
         ),
         ({"agents": ("dqnn",)}, UnknownNameError, r"No agent 'dqnn'. Did you mean 'dqn'\?"),
-        ({"agents": ("dqn", "dqn")}, InvalidValueError, "none of them twice"),
         ({"appearance": "milld"}, UnknownNameError, r"No appearance 'milld'. Did you mean 'mild'\?"),
         ({"execution": "real"}, UnknownNameError, "Known: physics, kinematic"),
         ({"budgets": (100, 100)}, InvalidValueError, r"budgets \(100, 100\) must be .* ascending"),
-        ({"seeds": (1, 1)}, InvalidValueError, "seeds"),
         ({"seeds": (999, 1000)}, InvalidValueError, "mix tuning seeds .from 1000 on"),
         ({"seeds": (2**24,)}, InvalidValueError, "must be one or more different integers from 0 to 16777215"),
         ({"after_episodes": 50}, InvalidValueError, "after_episodes is 50, but no task comes before"),
         ({"evaluation_episodes": 0}, InvalidValueError, "evaluation_episodes is 0"),
-        ({"open_loop_starts": -1}, InvalidValueError, "open_loop_starts is -1; give at least 0"),
-        ({"recorded_episodes": -1}, InvalidValueError, "recorded_episodes is -1; give at least 0"),
     ],
 )
 def test_bad_fields_say_what_is_allowed(changes, error, message):

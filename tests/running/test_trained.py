@@ -17,7 +17,7 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
 from imagine_bench.judge.plans import make_plans
 from imagine_bench.protocols.control import protocol
-from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import bench as benches
 from imagine_bench.running.runner import run
 from imagine_bench.running.trained import best_run, learners, load_trained
@@ -51,10 +51,10 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
     assert np.array_equal(first.compared.rollout.q_values, again.compared.rollout.q_values)
     with pytest.raises(ArtefactError, match=r"There is no .*config\.json, a run's configuration; give a run's folder"):
         load_trained(tmp_path)
-    with pytest.raises(ArtefactError, match=r"saw through encoder arrow_puzzle-clean@.*give the right file"):
+    with pytest.raises(ArtefactError, match=r"through encoder arrow_puzzle-clean@.*, which arrow_puzzle-mild is not"):
         load_trained(folder, encoder="arrow_puzzle-mild")
     other = dataclasses.replace(spec, encoder=encoders.own(TASK, "mild"))
-    with pytest.raises(ArtefactError, match=r"is encoder arrow_puzzle-mild@.*, and this bench is of .*-clean@"):
+    with pytest.raises(ArtefactError, match=r"is arrow_puzzle-mild@.*, and this bench is of .*-clean@"):
         run(other, tmp_path / "another node", lambda progress: None)
 
 
@@ -79,7 +79,7 @@ def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> N
             load_trained(tmp_path, encoder=str(own))
     with pytest.raises(ArtefactError, match=r"own@\w+, which is not here; give its file with --encoder"):
         load_trained(tmp_path)
-    with pytest.raises(ArtefactError, match=r"own@\w+, and .*arrow_puzzle-mild.* give the right file"):
+    with pytest.raises(ArtefactError, match=r"own@\w+, which arrow_puzzle-mild is not"):
         load_trained(tmp_path, encoder="arrow_puzzle-mild")
 
 
@@ -89,17 +89,7 @@ def test_a_bench_without_learners_says_so(tmp_path: Path) -> None:
         learners(benches.bench(wanted, {}, root=tmp_path, launcher=Inline()).folder)
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "best"),
-    [
-        ((0.9, 0.9, 0.9, 1.0), (0.1, 0.1, 1.0, 1.0), 1),
-        ((0.1, 0.1, 0.1, 1.0), (0.9, 0.9, 0.9, 0.9), 0),
-        ((0.5, 0.5, 0.5, 0.5), (0.5, 0.5, 0.5, 0.5), 0),
-    ],
-)
-def test_of_runs_that_end_alike_the_earlier_one_is_taken(
-    first: tuple[float, ...], second: tuple[float, ...], best: int, tmp_path: Path
-) -> None:
+def test_of_runs_that_end_alike_the_earlier_one_is_taken(tmp_path: Path) -> None:
     wanted = protocol("arrow_puzzle", agents=("imagination",), seeds=(0, 1), budgets=(1, 2, 3, 4))
     result = bench_result(tmp_path, protocol=wanted)
 
@@ -108,5 +98,10 @@ def test_of_runs_that_end_alike_the_earlier_one_is_taken(
         tests = [dataclasses.replace(test, successes=round(share * test.test_episodes)) for test, share in pairs]
         return dataclasses.replace(run, checkpoints=tuple(tests))
 
-    runs = tuple(map(solving, result.runs, (first, second)))
-    assert best_run(dataclasses.replace(result, runs=runs)).seed == best
+    for first, second, best in (
+        ((0.9, 0.9, 0.9, 1.0), (0.1, 0.1, 1.0, 1.0), 1),
+        ((0.1, 0.1, 0.1, 1.0), (0.9, 0.9, 0.9, 0.9), 0),
+        ((0.5, 0.5, 0.5, 0.5), (0.5, 0.5, 0.5, 0.5), 0),
+    ):
+        runs = tuple(map(solving, result.runs, (first, second)))
+        assert best_run(dataclasses.replace(result, runs=runs)).seed == best

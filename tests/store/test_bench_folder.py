@@ -11,9 +11,8 @@ import pytest
 from small_runs import do, same_but_for_time, small
 
 from imagine_bench.errors import ArtefactError, BusyError
-from imagine_bench.running.bench import bench
+from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.launchers.jobs import launcher
-from imagine_bench.running.task_types import load_bench
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, newest_bench, newest_recording
 from imagine_bench.store.results import OpenLoop
 

@@ -11,7 +11,7 @@ import pytest
 from small_runs import do, same_but_for_time, small
 
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.running.task_types import load_bench
+from imagine_bench.running.bench import load_bench
 from imagine_bench.store.bench_folder import bench_folder
 from imagine_bench.store.files import lock, read_json, write_bytes
 from imagine_bench.store.run_folder import load_run, load_so_far, mark_done, recording_path

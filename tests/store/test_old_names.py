@@ -14,9 +14,7 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.registry.entries import agent_label, edition_of, label_today, name_in_edition_1
-from imagine_bench.report import figures
-from imagine_bench.running.bench import bench, plan
-from imagine_bench.running.task_types import read_protocol
+from imagine_bench.running.bench import bench, plan, read_protocol
 from imagine_bench.store.bench_folder import bench_folder
 from imagine_bench.store.results import BenchResult
 
@@ -56,10 +54,6 @@ def test_a_kept_protocol_keeps_its_text_and_hash(agents: list[str]) -> None:
 def test_an_old_name_is_refused_with_the_new_one() -> None:
     with pytest.raises(InvalidValueError, match=r"Agent 'factored_own' is now called 'factored'; give that name\."):
         registry.agent_entry("factored_own")
-
-
-def test_the_agent_that_was_factored_keeps_its_color() -> None:
-    assert figures.color("factored:given") == "#999933"
 
 
 def test_a_kept_bench_is_read_and_finished_under_todays_labels(tmp_path: Path) -> None:

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from small_runs import Inline, final_arrays, same_but_for_time, small
 
-from imagine_bench.running.bench import bench
-from imagine_bench.running.task_types import load_bench, read_protocol
+from imagine_bench.running.bench import bench, load_bench, read_protocol
 from imagine_bench.store.bench_folder import bench_folder
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult

@@ -15,12 +15,10 @@ from small_runs import Inline
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.exact.splits import split_of
-from imagine_bench.registry import AgentEntry
 from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
-from imagine_bench.sweep.catalogue import LADDER
-from imagine_bench.sweep.grid import Experiment, Level, Suite
-from imagine_bench.sweep.run import plan_level, plan_suite, run_suite
+from imagine_bench.sweep.grid import LADDER, Experiment, Level, Suite
+from imagine_bench.sweep.run import plan_level, run_suite
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 TINY = Suite(
@@ -112,24 +110,6 @@ def test_the_page_opens_with_the_radar(result):
     assert TINY.hash in texts(page)["index.html"]
 
 
-def test_an_agent_of_another_package_takes_part(tmp_path, monkeypatch):
-    """Its entry is offered by an entry point, as an installed package's; nothing of the suite names it."""
-    entry = AgentEntry(make="bench_fakes:TableAgent", needs_encoder=False, settings=registry.AGENTS["table"].settings)
-    offers = registry.offers
-    theirs = {registry.AGENT_GROUP: {"guest": entry}}
-    monkeypatch.setattr(registry, "offers", lambda group: {**offers(group), **theirs.get(group, {})})
-    suite = dataclasses.replace(TINY.only(["size"]), seeds=(0,))
-    guest, own = run_suite(suite, ("guest", "table"), root=tmp_path, launcher=Inline()).levels.values()
-    assert np.array_equal(guest[0].values, own[0].values)
-
-
-def test_planned_by_several_processes_it_is_the_same():
-    suite = TINY.only(["size", "transfer"])
-    assert plan_suite(suite, ("random", "oracle"), 2) == plan_suite(suite, ("random", "oracle"), 1)
-    with pytest.raises(UnknownNameError, match="No agent 'nobody'"):
-        plan_suite(suite, ("nobody",), 2)
-
-
 def test_the_suite_is_that_of_all_kept_scores():
     kept = json.loads((RESULTS / "suite" / "suite.json").read_text())
     assert LADDER.hash == kept["hash"] == "95bb5d4a0450" and len(LADDER.experiments) == 12
@@ -159,12 +139,14 @@ def test_every_level_is_a_world_in_which_something_can_be_learned():
 def test_names_that_do_not_exist_are_named():
     with pytest.raises(UnknownNameError, match="No experiment 'memry'"):
         LADDER.only(["memry"])
+    with pytest.raises(UnknownNameError, match="No agent 'nobody'"):
+        plan_level(TINY, TINY.experiments[1].levels[0], "nobody")
     with pytest.raises(InvalidValueError, match="each name once"):
         dataclasses.replace(TINY, experiments=TINY.experiments * 2)
 
 
 def test_who_cannot_carry_over_starts_anew():
     level = TINY.experiments[2].levels[0]
-    (alone, *_), _ = plan_level(TINY, level, "table")
-    (carried, *_), _ = plan_level(TINY, level, "factored:given")
+    (alone, _), *_ = plan_level(TINY, level, "table")
+    (carried, _), *_ = plan_level(TINY, level, "factored:given")
     assert (alone.after, carried.after) == ((), ("arrow_puzzle",))

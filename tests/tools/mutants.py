@@ -57,9 +57,9 @@ ROOMS: dict[str, dict[str, Sequence[str]]] = {
     },
     "statistics": {"imagine_bench/statistics.py": ("tests/test_statistics.py",)},
     "resume": {
-        "imagine_bench/store/checkpoints.py": _CHECKPOINTS,
+        "imagine_bench/store/run_folder.py": _CHECKPOINTS,
         "imagine_bench/running/evaluation.py": _CHECKPOINTS,
-        "imagine_bench/running/run_state.py": ("tests/running/test_run_state.py", *_CHECKPOINTS[::-1]),
+        "imagine_bench/running/run_state.py": _CHECKPOINTS[::-1],
     },
     "report": {
         "imagine_bench/report/data.py": (

@@ -20,9 +20,9 @@ from unittest import mock
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known
-from imagine_bench.protocols.runs import Failure, Job, Launcher, OnProgress, Progress
+from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, Progress
 from imagine_bench.registry.machine import usable_cores
-from imagine_bench.running.task_types import task_type
+from imagine_bench.running.bench import task_type
 from imagine_bench.store.files import make_folder, writing
 
 ONE_THREAD = dict.fromkeys(
@@ -32,12 +32,6 @@ ONE_THREAD = dict.fromkeys(
 
 _POLL_S = 0.5
 _PATIENCE_S = 5.0
-
-
-def require_workers(workers: int) -> None:
-    """Raise InvalidValueError unless there is at least one worker."""
-    if workers < 1:
-        raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
 
 
 LAUNCHERS = {
@@ -57,12 +51,10 @@ def launcher(name: str, workers: int | None = None) -> Launcher:
         SetupError: It needs something that is not installed.
     """
     make = registry.load(LAUNCHERS[require_known("launcher", name, LAUNCHERS)])
-    return make(processes(workers))
-
-
-def processes(workers: int | None) -> int:
-    """How many processes work at a time: so many, or, of None, one a core."""
-    return usable_cores() if workers is None else workers
+    at_a_time = usable_cores() if workers is None else workers
+    if at_a_time < 1:
+        raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
+    return make(at_a_time)
 
 
 def absolute(job: Job) -> Job:
@@ -113,22 +105,20 @@ def _log(job: Job, text: str) -> None:
 
 
 class LocalPool:
-    """``workers`` processes of this machine at a time, at least 1, sharing its cores; none outlives this process."""
+    """``workers`` processes of this machine at a time, at least 1; none outlives this process."""
 
     def __init__(self, workers: int) -> None:
-        require_workers(workers)
         self._workers = workers
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job, ``workers`` at a time, in order; see :class:`Launcher`."""
-        cores = max(usable_cores() // max(min(self._workers, len(jobs)), 1), 1)
         waiting = list(jobs)[::-1]
         running: list[_Child] = []
         failures: list[Failure] = []
         try:
             while waiting or running:
                 while waiting and len(running) < self._workers:
-                    running.append(_Child(waiting.pop(), cores))
+                    running.append(_Child(waiting.pop()))
                 wait([source for child in running for source in child.sources], timeout=_POLL_S)
                 for child in running:
                     child.forward(on_progress)
@@ -148,14 +138,13 @@ class LocalPool:
 class _Child:
     """A job in a process of its own."""
 
-    def __init__(self, job: Job, cores: int) -> None:
+    def __init__(self, job: Job) -> None:
         self._job = job
-        given = replace(job, spec=replace(job.spec, cores=cores))
         self._reason: str | None = None
         context = multiprocessing.get_context("spawn")  # a fork would inherit GL contexts and threads
         self._receiver, sender = context.Pipe(duplex=False)
         name = f"{job.spec.agent}/{job.folder.name}"
-        self.process: BaseProcess = context.Process(target=_work, args=(given, sender), name=name, daemon=True)
+        self.process: BaseProcess = context.Process(target=_work, args=(job, sender), name=name, daemon=True)
         with mock.patch.dict(os.environ, ONE_THREAD):
             self.process.start()
         sender.close()

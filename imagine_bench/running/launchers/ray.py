@@ -15,8 +15,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from imagine_bench.errors import BusyError, SetupError, lacking
-from imagine_bench.protocols.runs import Failure, Job, OnProgress, Progress
-from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out, require_workers, run_job
+from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
+from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out, run_job
 
 if TYPE_CHECKING:
     from ray import ObjectRef
@@ -33,13 +33,10 @@ _FREED_WITHIN_S = 60.0
 class RayCluster:
     """Tasks of the Ray cluster at ``RAY_ADDRESS``, or ``workers`` at a time of one started here for the purpose.
 
-    Raises:
-        InvalidValueError: Fewer than one worker.
-        SetupError: Ray is not installed.
+    Raises SetupError: Ray is not installed.
     """
 
     def __init__(self, workers: int) -> None:
-        require_workers(workers)
         try:
             import ray  # noqa: PLC0415 - an optional dependency
         except ImportError as error:

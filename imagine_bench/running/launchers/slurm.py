@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from imagine_bench.errors import lacking
-from imagine_bench.protocols.runs import Failure, Job, OnProgress, Progress
-from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out, require_workers
+from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
+from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out
 from imagine_bench.store.files import make_folder, write_bytes
 
 if TYPE_CHECKING:
@@ -34,13 +34,10 @@ _LOST = 1000
 class SlurmCluster:
     """``workers`` jobs in Slurm's queue at a time, at least 1.
 
-    Raises:
-        InvalidValueError: Fewer than one worker.
-        SetupError: submitit is not installed.
+    Raises SetupError: submitit is not installed.
     """
 
     def __init__(self, workers: int) -> None:
-        require_workers(workers)
         try:
             import submitit  # noqa: PLC0415 - an extra
         except ImportError as error:

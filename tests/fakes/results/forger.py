@@ -13,10 +13,9 @@ import numpy as np
 
 from imagine_bench.arrays import Arrays
 from imagine_bench.protocols.data import digest
-from imagine_bench.store.checkpoints import load_newest, pack, save_snapshot
 from imagine_bench.store.files import sealed, sha256
 from imagine_bench.store.results import Checkpoint, KeptEpisodes
-from imagine_bench.store.run_folder import load_run, write_metrics
+from imagine_bench.store.run_folder import load_newest, load_run, pack, save_snapshot, write_metrics
 
 Forge = Callable[[Path, np.random.Generator], None]
 

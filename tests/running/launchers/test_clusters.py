@@ -16,7 +16,7 @@ import pytest
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.protocols.control import protocol
-from imagine_bench.protocols.runs import Job, Progress, RunSpec
+from imagine_bench.protocols.data import Job, Progress, RunSpec
 from imagine_bench.running.launchers.jobs import LAUNCHERS, LocalPool, absolute, launcher
 from imagine_bench.running.launchers.ray import RayCluster
 from imagine_bench.running.launchers.slurm import SlurmCluster

@@ -14,8 +14,7 @@ import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
 
-from imagine_bench.errors import InvalidValueError
-from imagine_bench.protocols.runs import Job, Progress
+from imagine_bench.protocols.data import Job, Progress
 from imagine_bench.running.launchers.jobs import LocalPool
 from imagine_bench.store import run_folder
 
@@ -64,11 +63,6 @@ def test_an_observer_that_fails_is_not_taken_for_a_run_that_did(tmp_path: Path) 
 
     with pytest.raises(BrokenPipeError):
         LocalPool(1).launch([job(tmp_path, "failing", 0)], closed_screen)
-
-
-def test_no_workers_are_refused() -> None:
-    with pytest.raises(InvalidValueError, match="0 workers cannot run anything"):
-        LocalPool(0)
 
 
 @pytest.fixture

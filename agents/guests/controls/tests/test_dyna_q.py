@@ -19,7 +19,7 @@ from small_runs import run_observed, small
 from imagine_bench import registry, rules
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Observation, Transition
-from imagine_bench.protocols.runs import RunSpec
+from imagine_bench.protocols.data import RunSpec
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 

@@ -15,10 +15,11 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.interfaces.capabilities import ExternalTrainer
-from imagine_bench.protocols.runs import RunSpec
-from imagine_bench.running import phases
+from imagine_bench.protocols.control import context_of
+from imagine_bench.protocols.data import RunSpec
+from imagine_bench.running import runner
 from imagine_bench.running.bench import plan
-from imagine_bench.running.evaluation import TrainingStarts
+from imagine_bench.running.evaluation import training_starts
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.results import RunResult
@@ -98,7 +99,7 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(
         patch.setattr(run_folder, "finish", killed)
         do(tmp_path / "run", agent)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(phases, "play_test_episode", killed)
+        patch.setattr(runner, "play_test_episode", killed)
         do(tmp_path / "run", agent)
     assert run_folder.reached(tmp_path / "run") == 0, "what the attempt before left is not this one's"
     again = do(tmp_path / "run", agent)
@@ -110,14 +111,14 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(
 def test_the_registry_knows_agents_with_a_loop_of_their_own() -> None:
     for name, entry in registry.agents().items():
         if entry.settings.startswith("imagine_bench_peers.sb3_settings:"):
-            agent = registry.make_agent(name, spec(name).context())
+            agent = registry.make_agent(name, context_of(spec(name)))
             assert isinstance(agent, ExternalTrainer) and entry.external_training_loop
         else:
             assert not entry.external_training_loop
 
 
 def test_a_world_model_counts_in_steps_and_updates() -> None:
-    agent = registry.make_agent(IMAGINING[0], spec(IMAGINING[0]).context())
+    agent = registry.make_agent(IMAGINING[0], context_of(spec(IMAGINING[0])))
     assert agent._steps_an_episode(10) == 10 + 4 * 3, "four imagined episodes of depth three"  # type: ignore[attr-defined]
     agent._learner.updates = 7  # type: ignore[attr-defined]
     assert agent.diagnostics()["gradient_updates"] == 7.0
@@ -125,7 +126,7 @@ def test_a_world_model_counts_in_steps_and_updates() -> None:
 
 def test_its_episodes_start_where_all_agents_of_a_seed_start() -> None:
     entry = registry.task_entry("arrow_puzzle")
-    with_starts = TrainingStarts(gymnasium.make(entry.env_id, execution="kinematic"), 3)
+    with_starts = training_starts(gymnasium.make(entry.env_id, execution="kinematic"), 3)
     plain = gymnasium.make(entry.env_id, execution="kinematic")
     for episode in range(4):
         frame, _ = with_starts.reset(seed=99)  # a loop may ask for another
@@ -162,7 +163,7 @@ def test_latents_of_another_task_or_of_no_name_are_refused() -> None:
 
 
 def test_it_is_never_taken_up_again_half_way() -> None:
-    agent = registry.make_agent("sb3_dqn", spec("sb3_dqn").context())
+    agent = registry.make_agent("sb3_dqn", context_of(spec("sb3_dqn")))
     with pytest.raises(ArtefactError, match="cannot be taken up again; run its bench anew"):
         agent.restore(AgentState(arrays={}, values={}))
 
@@ -177,7 +178,7 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
             raise ImportError(f"No module named {name!r}")
         return present(name)
 
-    context = spec("sb3_qrdqn").context()
+    context = context_of(spec("sb3_qrdqn"))
     monkeypatch.setattr(sb3.importlib, "import_module", missing)
     sentence = r"needs the library sb3_contrib.*pip install 'imagine-bench\[peers\]'"
     with pytest.raises(SetupError, match=sentence):
