@@ -216,7 +216,7 @@ def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders
     """
     kind = task_type(task)
     for name in options:
-        if name not in {*_fields(kind), "encoder"}:
+        if name not in _fields(kind):
             raise InvalidValueError(f"{task} takes no --{name.replace('_', '-')}; leave it out.")
     wanted, paths = kind.plan(task, preset, **options)
     if wanted.device != "cpu":
