@@ -15,7 +15,6 @@ from imagine_bench.arrays import Arrays
 from imagine_bench.exact.certificate import certificate_rows
 from imagine_bench.judge.causes import CAUSES
 from imagine_bench.judge.values import optimal_length, terminations
-from imagine_bench.protocols.control import Protocol
 from imagine_bench.recording.filmstrips import filmstrip, png, sampled_filmstrips
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
@@ -243,11 +242,17 @@ def encoders_used(data: ReportData) -> Section | None:
     Raises:
         ArtefactError: A card is damaged.
     """
+    readers: dict[str, list[str]] = {}
+    for agent in data.result.protocol.agents:
+        entry = known_agent(agent)
+        identity = data.result.protocol.encoder_of(entry.encoder_kind)
+        if entry.needs_encoder and identity is not None:
+            readers.setdefault(identity, []).append(agent_title(agent))
     images = []
     tables = []
-    for identity, agents in encoder_readers(data.result.protocol).items():
+    for identity, agents in readers.items():
         name = identity.partition("@")[0]
-        heading = f"{identity}, for {', '.join(map(agent_title, agents))}"
+        heading = f"{identity}, for {', '.join(agents)}"
         path = encoders.find(identity)
         if path is not None and path.with_suffix(".png").is_file():
             with reading(path.with_suffix(".png"), "an encoder's image"):
@@ -262,14 +267,3 @@ def encoders_used(data: ReportData) -> Section | None:
         "factor. The probe's accuracy is the share of held-out images whose whole macrostate can be read from them."
     )
     return Section("What the agents see", [words], images, tables) if tables else None
-
-
-def encoder_readers(protocol: Protocol) -> dict[str, list[str]]:
-    """The agents that see through each encoder of a protocol."""
-    readers: dict[str, list[str]] = {}
-    for agent in protocol.agents:
-        entry = known_agent(agent)
-        identity = protocol.encoder_of(entry.encoder_kind)
-        if entry.needs_encoder and identity is not None:
-            readers.setdefault(identity, []).append(agent)
-    return readers

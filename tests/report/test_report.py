@@ -22,7 +22,7 @@ from imagine_bench.report import bench_page, write_report
 from imagine_bench.report.bench import shown, verdict
 from imagine_bench.report.data import agent_title, collect
 from imagine_bench.report.page import DASH, Page, Table, estimate, markdown_text, percent, signed_percent, texts
-from imagine_bench.report.sections import encoder_readers
+from imagine_bench.report.sections import encoders_used
 from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
@@ -283,8 +283,11 @@ def test_titles_are_those_of_the_registry_line(monkeypatch: pytest.MonkeyPatch) 
         assert agent_title("my_agent") == words
 
 
-def test_every_encoder_stands_with_its_readers(result: BenchResult) -> None:
-    both = dataclasses.replace(
-        result.protocol, agents=("random", "dqn", "factored:given"), encoder="a@0123456789ab", codes="b@0123456789ab"
-    )
-    assert encoder_readers(both) == {"a@0123456789ab": ["dqn"], "b@0123456789ab": ["factored:given"]}
+def test_every_encoder_stands_with_its_readers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LEVELS, "factored:given", (0.1, 0.9))
+    agents = ("random", "dqn", "factored:given")
+    both = dataclasses.replace(WIDE, agents=agents, encoder="a@0123456789ab", codes="b@0123456789ab")
+    section = encoders_used(collect(bench_result(tmp_path, protocol=both)))
+    assert section is not None and [found.header[0] for found in section.tables] == [
+        "a@0123456789ab, for DQN", f"b@0123456789ab, for {agent_title('factored:given')}",
+    ]  # fmt: skip
