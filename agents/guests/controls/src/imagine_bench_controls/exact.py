@@ -130,19 +130,20 @@ class ExactImaginationAgent(DQN):
         """As of the DQN, with how many transitions were imagined so far."""
         return {**super().diagnostics(), "imagined_transitions": float(self.imagined.added)}
 
+    def parts(self) -> dict[str, snapshot.Part]:
+        """As of the DQN; and the imagined memory."""
+        return {**super().parts(), "imagination/memory": self.imagined, "generator/rollouts": self._draws}
+
     def state(self) -> AgentState:
         """A snapshot, imagined memory and visited macrostates included."""
         state = super().state()
-        state.arrays.update(snapshot.prefixed("imagination/memory", self.imagined.arrays()))
-        state.arrays["generator/rollouts"] = snapshot.generator_array(self._draws)
         state.values.update(imagined_added=self.imagined.added, visited=[list(each) for each in self.visited])
         return state
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         super().restore(state)
-        self.imagined.load(snapshot.below("imagination/memory", state.arrays), state.values["imagined_added"])
-        snapshot.load_generator(self._draws, state.arrays["generator/rollouts"])
+        self.imagined.added = state.values["imagined_added"]
         self.visited = deque(map(tuple, state.values["visited"]), maxlen=self.settings.memory.real)
 
 
