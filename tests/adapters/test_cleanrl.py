@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import random
-
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from stable_baselines3.common.buffers import ReplayBuffer
 
 from imagine_bench import registry
 from imagine_bench.adapters.cleanrl import as_cleanrl
@@ -17,21 +14,14 @@ LANES = 3
 
 
 def collected(envs, total_timesteps, seed=1):
-    """The acting half of ``cleanrl/dqn.py``, line by line: its buffer, and the episodes that it would print."""
-    random.seed(seed)
-    assert isinstance(envs.single_action_space, gym.spaces.Discrete), "only discrete action space is supported"
-    rb = ReplayBuffer(
-        total_timesteps * envs.num_envs, envs.single_observation_space, envs.single_action_space, "cpu",
-        n_envs=envs.num_envs, handle_timeout_termination=False,
-    )  # fmt: skip
+    """The acting half of ``cleanrl/dqn.py``: what its buffer would hold, by column, and the episodes it would print."""
+    rng = np.random.default_rng(seed)
+    stored = []
     printed = []
-    envs.single_action_space.seed(seed)
     obs, _ = envs.reset(seed=seed)
     for global_step in range(total_timesteps):
-        if random.random() < 0.8:
-            actions = np.array([envs.single_action_space.sample() for _ in range(envs.num_envs)])
-        else:
-            actions = np.full(envs.num_envs, global_step % 2)
+        explores = rng.random() < 0.8
+        actions = rng.integers(6, size=envs.num_envs) if explores else np.full(envs.num_envs, global_step % 2)
         next_obs, rewards, terminations, truncations, infos = envs.step(actions)
         if "final_info" in infos:
             for info in infos["final_info"]:
@@ -41,10 +31,10 @@ def collected(envs, total_timesteps, seed=1):
         for idx, trunc in enumerate(truncations):
             if trunc:
                 real_next_obs[idx] = infos["final_observation"][idx]
-        rb.add(obs, real_next_obs, actions, rewards, terminations, infos)
+        stored.append((obs, real_next_obs, actions, rewards, terminations))
         obs = next_obs
     envs.close()
-    return rb, printed
+    return [np.stack(column) for column in zip(*stored, strict=True)], printed
 
 
 class _Numbered(gym.Wrapper):
@@ -70,8 +60,7 @@ def test_equals_single_environments_with_gymnasiums_statistics():
     own = as_cleanrl(registry.vector_id(ARROWS), num_envs=LANES, execution="kinematic")
     ours, printed = collected(own, 40)
     theirs, _ = collected(as_cleanrl(sync), 40)
-    for name in ("observations", "next_observations", "actions", "rewards", "dones"):
-        assert np.array_equal(getattr(ours, name), getattr(theirs, name)), name
+    assert all(np.array_equal(*columns) for columns in zip(ours, theirs, strict=True))
     lanes = [env.length_queue for env in sync.envs]
     assert len(printed) > 10 and sum(length for *_, length in printed) == sum(map(sum, lanes)) > 100
 
@@ -79,9 +68,9 @@ def test_equals_single_environments_with_gymnasiums_statistics():
 def test_what_a_truncated_episode_reached_is_stored_not_the_next_start():
     lanes = [lambda: _Numbered(gym.make(ARROWS, execution="kinematic"))] * 2
     sync = gym.vector.SyncVectorEnv(lanes, autoreset_mode=AutoresetMode.SAME_STEP)
-    rb, printed = collected(as_cleanrl(sync), 6)
-    assert rb.observations[:, 0].max(axis=(1, 2, 3)).tolist() == [0, 1, 2, 0, 1, 2]
-    assert rb.next_observations[:, 1].max(axis=(1, 2, 3)).tolist() == [1, 2, 3, 1, 2, 3]
+    (seen, seen_next, *_), printed = collected(as_cleanrl(sync), 6)
+    assert seen[:, 0].max(axis=(1, 2, 3)).tolist() == [0, 1, 2, 0, 1, 2]
+    assert seen_next[:, 1].max(axis=(1, 2, 3)).tolist() == [1, 2, 3, 1, 2, 3]
     assert printed == [(2, 3.0, 3), (2, 3.0, 3), (5, 3.0, 3), (5, 3.0, 3)]
 
 
