@@ -15,6 +15,10 @@ State = tuple[int, ...]
 """A macrostate that can be a key. Length M."""
 Floats = NDArray[np.float64]
 """Numbers of double precision, of any shape."""
+Ints = NDArray[np.int64]
+"""Whole numbers, of any shape."""
+Bools = NDArray[np.bool_]
+"""True or False, of any shape."""
 Images = NDArray[np.uint8] | NDArray[np.floating]
 """Images of any shape: uint8, or floats in [0, 1]."""
 Array = NDArray[np.generic]

@@ -19,26 +19,29 @@ Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizo
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
+from bisect import bisect
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from imagine_bench.arrays import Bools, Ints
 from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import Agent, Floats, Frame, Observation, Outcome, Rules, State, TaskSpec
+from imagine_bench.interfaces import Agent, Frame, Observation, Outcome, Rules, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.judge.truth import added_up, total_variation
+from imagine_bench.judge.values import Model, action_values, rows_of, true_model
 from imagine_bench.rules import states_of
 from imagine_bench.running.run_state import make_env
 from imagine_bench.running.trained import Trained
 from imagine_bench.seeding import Purpose, SeedTree, episode_seed, evaluation_split
 from imagine_bench.store import run_folder
-from imagine_bench.store.results import KeptEpisodes, PolicyTable
+from imagine_bench.store.results import PolicyTable
 
 CAUSES = {
     "misread": "a frame was misread",
@@ -55,15 +58,6 @@ MOST_STATES = 2_000
 _TRIES = 8  # frames of a macrostate, until the agent reads one right
 _NOWHERE = -1e6  # reward of what was never experienced, for an agent that has nothing but what it experienced
 _TIE = 1e-6
-_Number = TypeVar("_Number", np.int64, np.float64)
-
-
-class Model(NamedTuple):
-    """What follows in every macrostate; probabilities of less than 1 in sum end the episode."""
-
-    following: NDArray[np.int64]  # rows of macrostates, -1 for what is none. Shape (S, A, B).
-    p_continues: Floats  # shape (S, A, B)
-    reward: Floats  # expected reward. Shape (S, A).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +89,7 @@ def frames_to_ask_with(agent: Agent, spec: TaskSpec, *, appearance: str, purpose
     return frames
 
 
-def misread(agent: Agent, frames: Frame, states: NDArray[np.int64]) -> NDArray[np.bool_]:
+def misread(agent: Agent, frames: Frame, states: Ints) -> Bools:
     """Which frames (N, 64, 64, 3) of macrostates (N, M) an agent misreads; none of one that cannot say. Shape (N,)."""
     if not isinstance(agent, FrameReader):
         return np.zeros(len(frames), dtype=np.bool_)
@@ -130,27 +124,26 @@ class Attribution:
         readable: Macrostates of which it reads some frame right; those that end episodes do not matter. Shape (S,).
     """
 
-    def __init__(
-        self, spec: TaskSpec, held: PolicyTable, tried: NDArray[np.int64], readable: NDArray[np.bool_]
-    ) -> None:
+    def __init__(self, spec: TaskSpec, held: PolicyTable, tried: Ints, readable: Bools) -> None:
         self._rules = spec.rules
         self._horizon = spec.horizon
-        self._held = held
-        self._rows = {state: row for row, state in enumerate(states_of(spec.rules))}
-        truth = true_model(spec.rules)
-        known = np.zeros(truth.reward.shape, dtype=np.bool_)
-        for *state, action in tried.tolist():
-            if (row := self._rows.get(tuple(state))) is not None:  # physics can leave a scene that is no macrostate
-                known[row, action] = True
-        if held.model is None:
-            nothing = Model(truth.following, np.zeros_like(truth.p_continues), np.full_like(truth.reward, _NOWHERE))
-            own = _mixed(known, truth, nothing)
+        self._action = held.action
+        states = states_of(spec.rules)
+        self._rows = {state: row for row, state in enumerate(states)}
+        truth = true_model(spec.rules, states)
+        known = np.zeros((len(states) + 1, spec.n_actions), dtype=np.bool_)
+        known[rows_of(tried[:, :-1], states), tried[:, -1]] = True
+        known = known[:-1]  # physics can leave a scene that is no macrostate
+        model = held.model
+        if model is None:
+            own = Model(truth.following, truth.p_continues * known[..., None], np.where(known, truth.reward, _NOWHERE))
         else:
-            own = _mixed(np.broadcast_to(readable[:, None], known.shape), self._own(held.model), truth)
+            expected = Model(rows_of(model.macrostates, states), model.p_continues, model.reward)
+            own = _mixed(readable[:, None], expected, truth)
         self._best = self._plan(truth)
         self._stages = (
             ("misread", self._best | readable[:, None]),
-            ("planning" if held.model else "values", self._plan(own)),
+            ("planning" if model else "values", self._plan(own)),
             ("unexperienced", self._plan(_mixed(known, own, truth))),
             ("model", self._best),
         )  # and "fault": the best plan, without faults
@@ -171,37 +164,28 @@ class Attribution:
         drawn: list[float] = rng.random(self._horizon).tolist()
         for step, (state, action) in enumerate(zip(episode.states, episode.actions, strict=False)):
             if state in self._rows and not episode.faults[step]:
-                before, probability = _place(self._rules.outcomes(state, action), episode.states[step + 1])
+                before, probability = place(self._rules.outcomes(state, action), episode.states[step + 1])
                 drawn[step] = before + probability * drawn[step]
         return drawn
 
-    def _own(self, model: ExpectedOutcomes) -> Model:
-        flat = map(tuple, model.macrostates.reshape(-1, model.macrostates.shape[-1]).tolist())
-        following = np.array([self._rows.get(state, -1) for state in flat]).reshape(model.p_continues.shape)
-        return Model(following, model.p_continues.astype(np.float64), model.reward.astype(np.float64))
-
-    def _plan(self, model: Model) -> NDArray[np.bool_]:
+    def _plan(self, model: Model) -> Bools:
         """Which macro-actions have the largest return in those left, 1 to H of them. Shape (H, S, A)."""
-        value = np.zeros(len(model.reward) + 1)  # the last one is of what is no macrostate
-        best = []
-        for _ in range(self._horizon):
-            q = model.reward + (model.p_continues * value[model.following]).sum(axis=2)
-            value[:-1] = q.max(axis=1)
-            best.append(q >= (value[:-1] - _TIE * np.maximum(1.0, np.abs(value[:-1])))[:, None])
-        return np.array(best)
+        values = action_values(model, self._horizon)
+        best = values.max(axis=2, keepdims=True)
+        return values >= best - _TIE * np.maximum(1.0, np.abs(best))
 
-    def _solves(self, episode: FailedEpisode, drawn: Sequence[float], plan: NDArray[np.bool_], *, faults: bool) -> bool:
+    def _solves(self, episode: FailedEpisode, drawn: Sequence[float], plan: Bools, *, faults: bool) -> bool:
         """Whether the episode succeeds where frames are read right and a plan is followed.
 
         Among equals of the plan is what the agent does.
         """
         state = episode.states[0]
         for step in range(self._horizon):
-            row = self._rows.get(state, -1)
-            lived = step < len(episode.actions) and state == episode.states[step]
-            if row < 0:
+            row = self._rows.get(state)
+            if row is None:
                 return False
-            action = int(episode.actions[step] if lived and not episode.misread[step] else self._held.action[row])
+            lived = step < len(episode.actions) and state == episode.states[step]
+            action = int(episode.actions[step] if lived and not episode.misread[step] else self._action[row])
             if not plan[self._horizon - step - 1, row, action]:
                 action = int(plan[self._horizon - step - 1, row].argmax())
             if lived and action == episode.actions[step] and (faults or not episode.faults[step]):
@@ -209,21 +193,21 @@ class Attribution:
                     return False
                 state = episode.states[step + 1]
                 continue
-            outcome = _at(self._rules.outcomes(state, action), drawn[step])
+            outcome = drawn_by(drawn[step], self._rules.outcomes(state, action))
             if outcome.terminated:
                 return outcome.success
             state = outcome.macrostate
         return False
 
 
-def _at(outcomes: Sequence[Outcome], share: float) -> Outcome:
-    """The outcome at a number in [0, 1), as environments draw it."""
-    ends = np.cumsum([outcome.probability for outcome in outcomes])
-    return outcomes[min(int(np.searchsorted(ends, share, side="right")), len(outcomes) - 1)]
+def drawn_by(number: float, outcomes: Sequence[Outcome]) -> Outcome:
+    """The outcome that a number in [0, 1) draws, as environments do."""
+    ends = list(itertools.accumulate(outcome.probability for outcome in outcomes))
+    return outcomes[min(bisect(ends, number), len(outcomes) - 1)]
 
 
-def _place(outcomes: Sequence[Outcome], macrostate: State) -> tuple[float, float]:
-    """Where the outcomes that lead to a macrostate begin, and how probable the first of them is."""
+def place(outcomes: Sequence[Outcome], macrostate: State) -> tuple[float, float]:
+    """Where the numbers begin that draw the first outcome that leads to a macrostate, and how many of them do."""
     before = 0.0
     for outcome in outcomes:
         if outcome.macrostate == macrostate:
@@ -232,22 +216,14 @@ def _place(outcomes: Sequence[Outcome], macrostate: State) -> tuple[float, float
     return 0.0, 1.0  # none does
 
 
-def true_model(rules: Rules) -> Model:
-    """The rules as a model."""
-    states = states_of(rules)
-    rows = {state: row for row, state in enumerate(states)}
-    every = [[rules.outcomes(state, action) for action in range(rules.n_actions)] for state in states]
-    shape = (len(states), rules.n_actions, max(len(outcomes) for actions in every for outcomes in actions))
-    following = np.full(shape, -1)
-    p_continues = np.zeros(shape)
-    reward = np.zeros(shape[:2])
-    for row, actions in enumerate(every):
-        for action, outcomes in enumerate(actions):
-            for branch, outcome in enumerate(outcomes):
-                following[row, action, branch] = rows.get(outcome.macrostate, -1)
-                p_continues[row, action, branch] = outcome.probability * (not outcome.terminated)
-                reward[row, action] += outcome.probability * outcome.reward
-    return Model(following, p_continues, reward)
+def _mixed(where: Bools, one: Model, other: Model) -> Model:
+    """One model where (S, A) says so, and the other elsewhere."""
+    shares = [one.p_continues * where[..., None], other.p_continues * ~where[..., None]]
+    return Model(
+        following=np.concatenate([one.following, other.following], axis=2),
+        p_continues=np.concatenate(shares, axis=2),
+        reward=np.where(where, one.reward, other.reward),
+    )
 
 
 def expected_rightly(rules: Rules, held: PolicyTable) -> float:
@@ -258,34 +234,18 @@ def expected_rightly(rules: Rules, held: PolicyTable) -> float:
     """
     if held.model is None:
         return math.nan
-    states = states_of(rules)
-    own = np.moveaxis(held.model.macrostates, 2, 0)
-    shares = np.moveaxis(held.model.p_continues, 2, 0)
     found = []
-    for row, state in enumerate(states):
+    for row, state in enumerate(states_of(rules)):
         for action in range(0 if rules.is_terminal(state) else rules.n_actions):
             exact = added_up(
                 (() if outcome.terminated else outcome.macrostate, outcome.probability)
                 for outcome in rules.outcomes(state, action)
             )
-            after = zip(map(tuple, own[:, row, action].tolist()), shares[:, row, action].tolist(), strict=True)
-            expected = added_up([((), 1.0 - float(shares[:, row, action].sum())), *after])
+            shares = held.model.p_continues[row, action]
+            after = zip(map(tuple, held.model.macrostates[row, action].tolist()), shares.tolist(), strict=True)
+            expected = added_up([((), 1.0 - float(shares.sum())), *after])
             found.append(1.0 - total_variation(exact, expected))
     return float(np.mean(found))
-
-
-def _mixed(where: NDArray[np.bool_], one: Model, other: Model) -> Model:
-    """One model where (S, A) says so, and the other elsewhere."""
-    most = max(one.following.shape[2], other.following.shape[2])
-
-    def wide(values: NDArray[_Number]) -> NDArray[_Number]:
-        return np.pad(values, ((0, 0), (0, 0), (0, most - values.shape[2])))
-
-    return Model(
-        np.where(where[..., None], wide(one.following), wide(other.following)),
-        np.where(where[..., None], wide(one.p_continues), wide(other.p_continues)),
-        np.where(where, one.reward, other.reward),
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,87 +257,66 @@ class Tested:
     causes: Mapping[int, str]  # by number of the test
 
 
-class WhyAnalysis:
-    """The causes of every failure."""
+def causes_of(trained: Trained) -> tuple[Tested, ...]:
+    """The causes of every failure of an agent, which sees as at the end of training.
 
-    def __init__(self, spec: TaskSpec, *, appearance: str, purpose: Purpose = "evaluation") -> None:
-        if spec.sight is not None:
-            raise InvalidValueError(
-                f"Frames of {spec.id} hide something, or are old. What an agent should have done there depends on all "
-                "that it saw before, so its failures have no one cause; ask about a world without gesture and lag."
-            )
-        self.spec = spec
-        self._appearance = appearance
-        self._purpose = purpose
-        self._states = np.array(states_of(spec.rules), dtype=np.int64)
+    Its failed test episodes are played again.
 
-    def measure(self, trained: Trained) -> tuple[Tested, ...]:
-        """Play its failed test episodes again and find their causes; it sees as at the end of training.
-
-        Raises:
-            ArtefactError: An unfinished run, or one that keeps no test episodes.
-            InvalidValueError: What it experienced is not known, or its task has too many macrostates.
-        """
-        protocol = trained.spec.protocol
-        found = []
-        if protocol.dataset or protocol.after:
-            raise InvalidValueError("What agents saw in a dataset or an earlier task is not kept; give another bench.")
-        if not protocol.shows_frames_alone:
-            raise InvalidValueError("These agents saw more than frames; give a bench of --observation frame.")
-        if not run_folder.is_done(trained.folder):
-            raise ArtefactError(f"{trained.folder} is not finished; give the bench command again to finish it.")
-        run = run_folder.load_run(trained.folder)
-        with closing(make_env(protocol, protocol.task, testing=True)) as env:
-            agent = trained.agent
-            episodes = _FailedEpisodes(env, agent, trained.spec.seed)
-            frames = frames_to_ask_with(agent, self.spec, appearance=self._appearance, purpose=self._purpose)
-            readable = ~misread(agent, frames, self._states)
-            for row in run.checkpoints:
-                if row.kept is None or run.tried is None:
-                    raise ArtefactError(f"{trained.folder} keeps no test episodes; run its bench anew, elsewhere.")
-                if row.beliefs is None:
-                    raise InvalidValueError(f"{self.spec.id} has too many macrostates to ask an agent about each.")
-                tried = run.tried[run.tried[:, -1] < row.episodes, :-1].astype(np.int64)
-                attribution = Attribution(self.spec, row.beliefs, tried, readable)
-                failed = np.flatnonzero(~row.kept.success).tolist()
-                causes = {test: attribution.cause(episodes.of(row.kept, test)) for test in failed}
-                found.append(Tested(episodes=row.episodes, tests=row.test_episodes, causes=causes))
-        return tuple(found)
-
-
-class _FailedEpisodes:
-    """Failed test episodes, played again to see what the agent misread; each once."""
-
-    def __init__(self, env: Env, agent: Agent, seed: int) -> None:
-        self._env = env
-        self._agent = agent
-        self._purpose = evaluation_split(seed)
-        self._known: dict[tuple[int, ...], FailedEpisode] = {}
-
-    def of(self, kept: KeptEpisodes, test: int) -> FailedEpisode:
-        """One of the episodes kept."""
-        actions = kept.actions_of(test)
-        seed = episode_seed(self._purpose, 0, test)
-        if (seed, *actions) not in self._known:
-            self._known[seed, *actions] = self._play(seed, actions)
-        return self._known[seed, *actions]
-
-    def _play(self, seed: int, actions: list[int]) -> FailedEpisode:
-        frame, info = self._env.reset(seed=seed)
-        frames = [frame]
-        infos = [info]
-        terminated = False
-        for action in actions:
-            frame, _, terminated, _, info = self._env.step(action)
-            frames.append(frame)
-            infos.append(info)
-        states = np.array([info["macrostate"] for info in infos], dtype=np.int64)
-        wrong = misread(self._agent, np.array(frames[:-1]), states[:-1])
-        return FailedEpisode(
-            states=[tuple(state) for state in states.tolist()],
-            actions=actions,
-            terminated=bool(terminated),
-            faults=[bool(info["fault"]) for info in infos[1:]],
-            misread=wrong.tolist(),
-            seed=seed,
+    Raises:
+        ArtefactError: An unfinished run, or one that keeps no test episodes.
+        InvalidValueError: What it experienced is not known, or its task has too many macrostates or hides something.
+    """
+    protocol = trained.spec.protocol
+    spec = trained.task
+    if spec.sight is not None:
+        raise InvalidValueError(
+            f"Frames of {spec.id} hide something, or are old. What an agent should have done there depends on all "
+            "that it saw before, so its failures have no one cause; ask about a world without gesture and lag."
         )
+    if protocol.dataset or protocol.after:
+        raise InvalidValueError("What agents saw in a dataset or an earlier task is not kept; give another bench.")
+    if not protocol.shows_frames_alone:
+        raise InvalidValueError("These agents saw more than frames; give a bench of --observation frame.")
+    if not run_folder.is_done(trained.folder):
+        raise ArtefactError(f"{trained.folder} is not finished; give the bench command again to finish it.")
+    run = run_folder.load_run(trained.folder)
+    purpose = evaluation_split(trained.spec.seed)
+    frames = frames_to_ask_with(trained.agent, spec, appearance=protocol.appearance_in_tests, purpose=purpose)
+    readable = ~misread(trained.agent, frames, np.array(states_of(spec.rules), dtype=np.int64))
+    found = []
+    with closing(make_env(protocol, protocol.task, testing=True)) as env:
+        lived = functools.cache(functools.partial(lived_again, env, trained.agent))
+        for row in run.checkpoints:
+            if row.kept is None or run.tried is None:
+                raise ArtefactError(f"{trained.folder} keeps no test episodes; run its bench anew, elsewhere.")
+            if row.beliefs is None:
+                raise InvalidValueError(f"{spec.id} has too many macrostates to ask an agent about each.")
+            tried = run.tried[run.tried[:, -1] < row.episodes, :-1].astype(np.int64)
+            attribution = Attribution(spec, row.beliefs, tried, readable)
+            causes = {}
+            for test in np.flatnonzero(~row.kept.success).tolist():
+                actions = tuple(row.kept.actions_of(test))
+                causes[test] = attribution.cause(lived(episode_seed(purpose, 0, test), actions))
+            found.append(Tested(episodes=row.episodes, tests=row.test_episodes, causes=causes))
+    return tuple(found)
+
+
+def lived_again(env: Env, agent: Agent, seed: int, actions: Sequence[int]) -> FailedEpisode:
+    """A failed test episode, played again to see what the agent misread."""
+    frame, info = env.reset(seed=seed)
+    frames = []
+    infos = [info]
+    terminated = False
+    for action in actions:
+        frames.append(frame)
+        frame, _, terminated, _, info = env.step(action)
+        infos.append(info)
+    states = np.array([info["macrostate"] for info in infos], dtype=np.int64)
+    return FailedEpisode(
+        states=[tuple(state) for state in states.tolist()],
+        actions=actions,
+        terminated=bool(terminated),
+        faults=[bool(info["fault"]) for info in infos[1:]],
+        misread=misread(agent, np.array(frames), states[:-1]).tolist(),
+        seed=seed,
+    )

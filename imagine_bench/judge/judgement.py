@@ -12,17 +12,17 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
+from imagine_bench.arrays import Arrays
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import State, TaskSpec
@@ -30,7 +30,7 @@ from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.change import Streams, change_detection_delay, counterfactual_error, streams_of
 from imagine_bench.judge.models import TrainedModel, make, model_entry, one_name, runs_of
-from imagine_bench.judge.predictions import ImageReader, Predictions, RenderedFrameIndex, call, evaluate, read_images
+from imagine_bench.judge.predictions import ImageReader, Predictions, RenderedFrameIndex, call, evaluate
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.scores import after_the_end_scores, by_depth, one_step_scores, ranking_scores
 from imagine_bench.judge.truth import Distribution, shares
@@ -60,6 +60,7 @@ _AFTER = 6  # transitions after the end whose images are kept
 _PATIENCE_S = 1_800.0  # seconds that a process waits while another makes the data or the reader
 _READ = 1_000  # frames that the reader is measured on
 _READER = "imagine_bench.agents.world_models.reader"
+Costs = dict[str, str | float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,19 +148,16 @@ class ModelFit(NamedTuple):
         return self.file.removesuffix(".json") + ".npz"
 
 
-@dataclass(frozen=True, kw_only=True)
-class _World:
+@dataclass(frozen=True)
+class AskedWorld:
     """What every model is asked, and with what it is read: the same for all."""
 
     spec: TaskSpec
     index: RenderedFrameIndex
     reader: ImageReader
-    one_step: EvalSet
-    rollouts: EvalSet
-    ranked: EvalSet
+    asked: dict[str, EvalSet]  # "one_step", "rollouts", "ranked" and, where there is such, "after" the end
     counterfactuals: tuple[EvalSet, ...]
-    after_the_end: EvalSet | None
-    streams: dict[str, Streams] | None  #: None where not all of the world is asked about
+    streams: dict[str, Streams] | None  # None where not all of the world is asked about
 
 
 def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list[str]]:
@@ -212,69 +210,63 @@ def carry_out(judgement: Judgement, folder: Path, cell: ModelFit) -> str:
     return ""
 
 
-def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict[str, Any], Arrays]:
     """The scores of one model, fitted once, and a few of its images beside the truth.
 
     Raises:
         ImagineBenchError: It cannot be made, or fails.
     """
     world = prepare(judgement, folder)
+    asked = world.asked
     seeds = SeedTree(cell.seed).child("judge", judgement.task, cell.transitions)
     name = str(runs_of(cell.model).get(cell.seed, cell.model))
     model, cost = make(name, world.spec, world.index, judgement.appearance, seeds, judgement.encoder)
     if isinstance(model, TrainedModel):  # its data and the cost of its training are its bench's to say
         seen = model.visited
-        learned: dict[str, str | float] = {"data": "", "fit_s": math.nan, "parameters": math.nan}
+        learned: Costs = {"data": "", "fit_s": math.nan, "parameters": math.nan}
     else:
         seen, learned = _fit(model, cell, data_of(judgement, folder, cell.seed), seeds.child("fit").generator())
 
-    def ask(questions: EvalSet, generator: str) -> Predictions:
+    def ask(questions: EvalSet, name: str) -> Predictions:
+        rng = seeds.child(name).generator()
         return evaluate(
-            model,
-            cell.model,
-            questions,
-            samples=judgement.samples,
-            reader=world.reader,
-            index=world.index,
-            rng=seeds.child(generator).generator(),
+            model, cell.model, questions, samples=judgement.samples, reader=world.reader, index=world.index, rng=rng
         )
 
-    single = ask(world.one_step, "one_step")
-    deep = ask(world.rollouts, "rollouts")
-    ranked = ask(world.ranked, "ranked")
-    after = None if world.after_the_end is None else ask(world.after_the_end, "after")
+    answers = {name: ask(each, name) for name, each in asked.items()}
     again = [ask(each, "counterfactuals") for each in world.counterfactuals]
-    timed = [each for each in (single, deep, ranked, after) if each is not None]
-    scores = one_step_scores(world.spec, world.one_step, single, seen)
+    scores = one_step_scores(world.spec, asked["one_step"], answers["one_step"], seen)
+    futures = [answers["rollouts"].distribution(0, step) for step in range(questions.DEPTH)]
+    cpu_s = sum(each.cpu_s for each in answers.values())
     found = {
         **cell._asdict(),
         **learned,
         **scores,
-        **by_depth(world.rollouts, deep),
-        **ranking_scores(world.spec, world.ranked, ranked),
-        **after_the_end_scores(world.after_the_end, after, single),
-        **change_detection_delay(world.streams, single),
+        "tv_by_depth": by_depth(asked["rollouts"], answers["rollouts"]),
+        **ranking_scores(world.spec, asked["ranked"], answers["ranked"]),
+        **after_the_end_scores(asked.get("after"), answers.get("after"), answers["one_step"]),
+        **change_detection_delay(world.streams, answers["one_step"]),
         "counterfactual": counterfactual_error(world.counterfactuals, again),
         "futures": {
-            "real": [_named(world.spec, shares(outcomes)) for outcomes in world.rollouts.truth[0]],
-            "imagined": [_named(world.spec, deep.distribution(0, step)) for step in range(questions.DEPTH)],
+            "real": [_named(world.spec, shares(outcomes)) for outcomes in asked["rollouts"].truth[0]],
+            "imagined": [_named(world.spec, each) for each in futures],
         },
-        "imagine_s_per_1000": 1000.0 * sum(each.cpu_s for each in timed) / sum(each.steps for each in timed),
+        "imagine_s_per_1000": 1000.0 * cpu_s / sum(each.steps for each in answers.values()),
         **cost,
     }
-    return found, _images(model, world, scores["worst"], seeds)
+    return found, _images(model, world, scores["worst"], seeds.child("pictures").generator())
 
 
 def _fit(
     model: WorldModel, cell: ModelFit, dataset: Dataset, rng: np.random.Generator
-) -> tuple[set[tuple[State, int]], dict[str, str | float]]:
+) -> tuple[set[tuple[State, int]], Costs]:
     """Fit a model: what it has seen then, and the data's hash, CPU seconds and parameters."""
     episodes = dataset.episodes.first(cell.transitions)
     begun_s = time.process_time()
     call(cell.model, "fit", model.fit, episodes, rng)
     fit_s = time.process_time() - begun_s
     parameters = int(call(cell.model, "parameters", model.parameters))
-    learned: dict[str, str | float] = {"data": dataset.episodes.hash, "fit_s": fit_s, "parameters": parameters}
+    learned: Costs = {"data": dataset.episodes.hash, "fit_s": fit_s, "parameters": parameters}
     return visited(dataset, cell.transitions), learned
 
 
@@ -293,11 +285,9 @@ def data_of(judgement: Judgement, folder: Path, seed: int) -> Dataset:
         return read_dataset(place) if place.exists() else _collected(judgement, place, seed)
 
 
-@contextmanager
-def _making(folder: Path) -> Iterator[None]:
+def _making(folder: Path) -> AbstractContextManager[None]:
     """Let one process at a time make what all cells of a folder share; the others wait and find it made."""
-    with lock(folder / ".lock", f"The folder {folder}", patience_s=_PATIENCE_S):
-        yield
+    return lock(folder / ".lock", f"The folder {folder}", patience_s=_PATIENCE_S)
 
 
 def _collected(judgement: Judgement, place: Path, seed: int) -> Dataset:
@@ -305,13 +295,9 @@ def _collected(judgement: Judgement, place: Path, seed: int) -> Dataset:
     spec = registry.task(judgement.task)
     episodes = -(-judgement.sizes[-1] // spec.horizon)
     while True:
+        policy = policy_of(judgement.policy, spec, seed)
         played, apart, card = collect(
-            spec,
-            policy_of(judgement.policy, spec, seed),
-            episodes=episodes,
-            seed=seed,
-            execution="kinematic",
-            appearance=judgement.appearance,
+            spec, policy, episodes=episodes, seed=seed, execution="kinematic", appearance=judgement.appearance
         )
         if len(played.actions) >= judgement.sizes[-1]:
             return write_dataset(place, played, apart, card, "npz")
@@ -325,22 +311,15 @@ def visited(dataset: Dataset, transitions: int) -> set[tuple[State, int]]:
 
 
 @functools.lru_cache(maxsize=2)
-def prepare(judgement: Judgement, folder: Path) -> _World:
+def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
     """Questions and reader, made once in each process."""
     spec = registry.task(judgement.task)
     index = RenderedFrameIndex(spec, judgement.appearance)
-    one_step = questions.one_step(spec, index.render)
-    return _World(
-        spec=spec,
-        index=index,
-        reader=_reader(spec, judgement.appearance, folder),
-        one_step=one_step,
-        rollouts=questions.rollouts(spec, index.render),
-        ranked=questions.ranked(spec, index.render),
-        after_the_end=questions.after_the_end(spec, index.render),
-        counterfactuals=questions.counterfactuals(spec, index.render),
-        streams=streams_of(spec, one_step),
-    )
+    asked = {name: make(spec, index.render) for name, make in questions.SETS.items()}
+    there = {name: each for name, each in asked.items() if each is not None}
+    again = questions.counterfactuals(spec, index.render)
+    reader = _reader(spec, judgement.appearance, folder)
+    return AskedWorld(spec, index, reader, there, again, streams_of(spec, there["one_step"]))
 
 
 def _reader(spec: TaskSpec, appearance: str, folder: Path) -> ImageReader:
@@ -364,10 +343,8 @@ def reader_errors(reader: ImageReader, spec: TaskSpec, appearance: str) -> dict[
     """
     rng = SeedTree(1).child("encoder_probe", "judge", spec.id, appearance).generator()
     states = np.array(states_of(spec.rules), dtype=np.int64)
-    macrostates = states[rng.integers(len(states), size=_READ)]
-    others = states[rng.integers(len(states), size=_READ)]
-    frames = spec.render_macrostates(macrostates, appearance, rng)
-    blended = spec.render_macrostates(others, appearance, rng)
+    macrostates, others = (states[rng.integers(len(states), size=_READ)] for _ in range(2))
+    frames, blended = (spec.render_macrostates(each, appearance, rng) for each in (macrostates, others))
     differ = (macrostates != others).any(axis=1)
     of_nothing = {
         "black": np.zeros_like(frames[:1]),
@@ -377,58 +354,44 @@ def reader_errors(reader: ImageReader, spec: TaskSpec, appearance: str) -> dict[
     }
     read = reader.read(frames)
     refused = read[:, 0] < 0
-    return {
-        "misread": float(((read != macrostates).any(axis=1) & ~refused).mean()),
-        "refused": float(refused.mean()),
-        **{f"{name}_read": float((reader.read(images)[:, 0] >= 0).mean()) for name, images in of_nothing.items()},
-    }
-
-
-def _images(model: WorldModel, world: _World, worst: list[int], seeds: SeedTree) -> dict[str, NDArray[Any]]:
-    """Transitions and a rollout, imagined once more: before, likeliest real outcome, imagined of each.
-
-    ``right`` says whether what is imagined, as read, may happen.
-    """
-    rng = seeds.child("pictures").generator()
-    found = {
-        **_imagined_again("worst", model, world, world.one_step, worst, rng),
-        **_imagined_again("futures", model, world, world.rollouts, [0], rng),
-    }
-    if world.after_the_end is not None:
-        some = np.linspace(0, len(world.after_the_end.states) - 1, _AFTER).astype(int)
-        rows = sorted(set(some.tolist()))
-        found |= _imagined_again("after", model, world, world.after_the_end, rows, rng)
+    wrong = (read != macrostates).any(axis=1) & ~refused
+    found = {"misread": float(wrong.mean()), "refused": float(refused.mean())}
+    for name, images in of_nothing.items():
+        found[f"{name}_read"] = float((reader.read(images)[:, 0] >= 0).mean())
     return found
 
 
-def _imagined_again(
-    name: str, model: WorldModel, world: _World, asked: EvalSet, rows: list[int], rng: np.random.Generator
-) -> dict[str, NDArray[Any]]:
-    """Rows of an evaluation set, each imagined in one future; arrays by ``name`` and what they are."""
-    imagined = model.imagine(asked.frames[rows], asked.actions[rows], 1, rng)
-    read = read_images(imagined, world.reader, world.index, len(world.spec.macrostate_names))[:, 0]
-    images = imagined.pictures[:, 0]
-    if images.dtype != np.uint8:
-        images = (np.asarray(images) * 255.0).round().astype(np.uint8)
-    truth = [[shares(outcomes) for outcomes in asked.truth[row]] for row in rows]
-    real = [[world.index.frame(max(each, key=each.__getitem__)) for each in steps] for steps in truth]
-    right = [
-        [tuple(state) in each for state, each in zip(states, steps, strict=True)]
-        for states, steps in zip(read.tolist(), truth, strict=True)
-    ]
-    return {
-        f"{name}_before": asked.frames[rows, -1],
-        f"{name}_actions": asked.asked[rows],
-        f"{name}_imagined": images,
-        f"{name}_real": np.array(real),
-        f"{name}_right": np.array(right),
-    }
+def _images(model: WorldModel, world: AskedWorld, worst: list[int], rng: np.random.Generator) -> Arrays:
+    """Transitions and a rollout, imagined once more in one future each: before, likeliest real outcome, imagined.
+
+    ``right`` says whether what is imagined, as read, may happen.
+    """
+    chosen = {"worst": ("one_step", worst), "futures": ("rollouts", [0])}
+    if "after" in world.asked:
+        some = np.linspace(0, len(world.asked["after"].states) - 1, _AFTER).astype(int)
+        chosen["after"] = ("after", sorted(set(some.tolist())))
+    found: Arrays = {}
+    for name, (kind, rows) in chosen.items():
+        asked = world.asked[kind]
+        imagined = model.imagine(asked.frames[rows], asked.actions[rows], 1, rng).pictures
+        read = world.index.read(imagined, world.reader)[:, 0].tolist()
+        truth = [[shares(outcomes) for outcomes in asked.truth[row]] for row in rows]
+        real = [[world.index.frame(max(each, key=each.__getitem__)) for each in steps] for steps in truth]
+        right = np.zeros((len(rows), len(truth[0])), dtype=np.bool_)
+        for row, step in np.ndindex(*right.shape):
+            right[row, step] = tuple(read[row][step]) in truth[row][step]
+        images = imagined[:, 0] if imagined.dtype == np.uint8 else (np.asarray(imagined[:, 0]) * 255.0).round()
+        found[f"{name}_before"] = asked.frames[rows, -1]
+        found[f"{name}_actions"] = asked.asked[rows]
+        found[f"{name}_imagined"] = images.astype(np.uint8)
+        found[f"{name}_real"] = np.array(real)
+        found[f"{name}_right"] = right
+    return found
 
 
 def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
     """Every cell of a judgement that is kept. Raises ArtefactError: one is damaged."""
-    order = {model: place for place, model in enumerate(judgement.models)}
-    cells = sorted(judgement.cells, key=lambda cell: order[cell.model])
+    cells = sorted(judgement.cells, key=lambda cell: judgement.models.index(cell.model))
     return [read_sealed(folder / cell.file, "a judged cell") for cell in cells if (folder / cell.file).exists()]
 
 
@@ -438,9 +401,9 @@ def shown(folder: Path, judgement: Judgement) -> dict[str, dict[str, Any]]:
     Raises:
         ArtefactError: A file is damaged.
     """
-    cells = {model: judgement.shown(model) for model in judgement.models}
-    return {
-        model: {**read_arrays(folder / cell.images), **read_sealed(folder / cell.file, "a judged cell")}
-        for model, cell in cells.items()
-        if (folder / cell.file).exists()
-    }
+    found = {}
+    for model in judgement.models:
+        cell = judgement.shown(model)
+        if (folder / cell.file).exists():
+            found[model] = read_arrays(folder / cell.images) | read_sealed(folder / cell.file, "a judged cell")
+    return found

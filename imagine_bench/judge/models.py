@@ -5,16 +5,15 @@ What an agent says its own images show counts for nothing when it is judged: the
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.arrays import Ints
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, Floats, Frame, State, TaskSpec
-from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer, begin_episode
+from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel
 from imagine_bench.judge.predictions import RenderedFrameIndex
@@ -40,16 +39,15 @@ class AgentModel:
         """Learn nothing more."""
         del dataset, rng
 
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """Rollouts of the agent, one after another; see :class:`imagine_bench.interfaces.model.WorldModel`."""
-        asked = actions[:, frames.shape[1] - 1 :]
-        seeds = rng.integers(2**63, size=(len(frames), samples))
-        rollouts = self.rollouts(
-            np.repeat(frames[:, -1], samples, axis=0),
-            np.repeat(asked, samples, axis=0),
-            depth=asked.shape[1],
-            generators=(np.random.default_rng(seed) for seed in seeds.ravel()),
-        )
+        depth = actions.shape[1] - frames.shape[1] + 1
+        rollouts = []
+        begin_episode(self.agent)
+        for row, seeds in enumerate(rng.integers(2**63, size=(len(frames), samples))):
+            for seed in seeds:
+                given = {"actions": actions[row, -depth:], "depth": depth, "rng": np.random.default_rng(seed)}
+                rollouts.append(self.agent.imagine(frames[row, -1], **given))
 
         def stacked(name: str) -> Floats:  # [N, S, D, ...]
             found = np.array([getattr(rollout, name) for rollout in rollouts], dtype=np.float64)
@@ -59,7 +57,7 @@ class AgentModel:
         if not uncertain["aleatoric"].any():  # a rollout has to hold something; a model that has none says 0
             del uncertain["aleatoric"]
         survived = np.cumprod(1.0 - stacked("p_terminated"), axis=2)
-        before = np.concatenate([np.ones_like(survived[:, :, :1]), survived[:, :, :-1]], axis=2)
+        before = np.pad(survived[:, :, :-1], ((0, 0), (0, 0), (1, 0)), constant_values=1.0)
         return Imagined(
             pictures=(stacked("frames").clip(0.0, 1.0) * 255.0).round().astype(np.uint8),
             rewards=before * stacked("rewards"),
@@ -67,31 +65,6 @@ class AgentModel:
             accepted=stacked("accepted").mean(axis=1) >= _MOST,
             **uncertain,
         )
-
-    def rollouts(
-        self,
-        frames: Iterable[Frame],
-        actions: Iterable[NDArray[np.int64] | None],
-        *,
-        depth: int,
-        generators: Iterable[np.random.Generator],
-        begins: bool = True,
-    ) -> list[ImaginedRollout]:
-        """One rollout from each of N frames.
-
-        Args:
-            frames: Each of shape (64, 64, 3).
-            actions: Of each the macro-actions to imagine, (D,); None lets the agent's controller choose.
-            depth: Macro-actions of each rollout at most, D.
-            generators: Of each what it draws from.
-            begins: Whether each frame is the first of an episode; else the agent has seen the episode so far.
-        """
-        if begins:
-            begin_episode(self.agent)
-        return [
-            self.agent.imagine(frame, actions=row, depth=depth, rng=rng)
-            for frame, row, rng in zip(frames, actions, generators, strict=True)
-        ]
 
     def parameters(self) -> int:
         """Not known."""

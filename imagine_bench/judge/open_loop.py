@@ -7,14 +7,15 @@ rollouts that the greedy controller chooses stand beside what the environment sh
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Floats, Frame, Macrostate, Outcome, Sight, State, TaskSpec
-from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
-from imagine_bench.judge.models import AgentModel
+from imagine_bench.arrays import Floats, Ints
+from imagine_bench.interfaces import Frame, Sight, State, TaskSpec
+from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer, begin_episode
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.truth import added_up, expected_reward, shares
 from imagine_bench.rules import Outcomes, advance, is_random
@@ -26,8 +27,26 @@ OPEN_LOOP_DEPTH = 10  # steps of the open-loop comparison, the thesis' I_D
 EXAMPLES = 5  # greedy imagined rollouts kept with each run, with their real counterparts
 SAMPLED_ROLLOUTS = 4  # rollouts sampled from one start and kept with each run
 SAMPLED_DEPTH = 5  # macro-actions of each of them
+Real = tuple[Frame, State, float, bool]
+"""What came of a macro-action: the frame, what it shows, the reward, and whether the episode has ended."""
+T = TypeVar("T")
 
-Alive = Callable[[frozenset[State], int], bool]
+
+def imagined_from(
+    agent: Imaginer, frames: Sequence[Frame] | Frame, seeds: SeedTree, *, depth: int, actions: Ints | None = None
+) -> list[ImaginedRollout]:
+    """A rollout from each of N frames, of which the agent sees each as the next of its episode.
+
+    The controller chooses where no macro-actions (N, D) are given. ``seeds`` has a generator for each rollout.
+    """
+    found = []
+    for row, frame in enumerate(frames):
+        given = None if actions is None else actions[row]
+        found.append(agent.imagine(frame, actions=given, depth=depth, rng=seeds.child(row).generator()))
+    return found
+
+
+# Open loop ---------------------------------------------------------------------------------------------------------
 
 
 def surviving_actions(
@@ -41,32 +60,39 @@ def surviving_actions(
     None where no episode can be kept alive, or no start is wanted.
     """
     rng = SeedTree(0).child(purpose, "open_loop", spec.id).generator()
-    alive = _alive(spec)
+
+    @functools.cache
+    def safe(support: frozenset[State], steps: int) -> list[int]:
+        """The actions after which the episode surely goes on, and can surely go on for ``steps - 1`` more."""
+        found = []
+        for action in range(spec.n_actions):
+            outcomes = [outcome for state in support for outcome in spec.rules.outcomes(state, action)]
+            ended = any(outcome.terminated for outcome in outcomes)
+            reached = frozenset(outcome.macrostate for outcome in outcomes)
+            if not ended and (steps == 1 or safe(reached, steps - 1)):
+                found.append(action)
+        return found
+
     looks = {state: _clearest_look(spec.sight, state) for state in spec.rules.start_states}
     alike = {look: [state for state in looks if looks[state] == look] for look in looks.values()}
     candidates: list[State] = []
     while depth and not candidates:
-        candidates = [state for state in looks if alive(frozenset(alike[looks[state]]), depth)]
+        candidates = [state for state in looks if safe(frozenset(alike[looks[state]]), depth)]
         depth -= not candidates
     if not candidates or not starts:
         return None
     chosen = [candidates[index] for index in rng.integers(len(candidates), size=starts)]
     frames = spec.render_macrostates(np.array([looks[state] for state in chosen], dtype=np.int64), appearance, rng)
-    actions = []
+    actions = np.zeros((starts, depth), dtype=np.int64)
     truth = []
-    for state in chosen:
+    for row, state in enumerate(chosen):
         same_look = alike[looks[state]]
         reached: list[Outcomes] = [{(each, False): (1.0 / len(same_look), 0.0) for each in same_look}]
-        row: list[int] = []
         for step in range(depth):
-            safe = _safe_actions(spec, alive, shares(reached[-1]), depth - step)
-            row.append(int(rng.choice(safe)))
-            reached.append(advance(spec.rules, reached[-1], row[-1]))
-        actions.append(row)
+            actions[row, step] = rng.choice(safe(frozenset(shares(reached[-1])), depth - step))
+            reached.append(advance(spec.rules, reached[-1], int(actions[row, step])))
         truth.append(tuple(_observed(spec, reached, looks[state], step) for step in range(1, depth + 1)))
-    return EvalSet(
-        states=tuple(chosen), frames=frames[:, None], actions=np.array(actions, dtype=np.int64), truth=tuple(truth)
-    )
+    return EvalSet(states=tuple(chosen), frames=frames[:, None], actions=actions, truth=tuple(truth))
 
 
 def _clearest_look(sight: Sight | None, state: State) -> State:
@@ -83,16 +109,16 @@ def _observed(spec: TaskSpec, reached: Sequence[Outcomes], look: State, step: in
     """
     if spec.sight is None:
         return reached[step]
-    reward = expected_reward(reached[step])
     taken = step - spec.sight.lag
-    if taken <= 0:
-        return {(spec.as_observed(look), False): (1.0, reward)}
-    looks = (
-        (spec.as_observed(shown), share * probability)
-        for state, share in shares(reached[taken]).items()
-        for probability, shown in spec.sight.seen(state, taken)
-    )
-    return {(read, False): (share, reward) for read, share in added_up(looks).items()}
+    looks = {spec.as_observed(look): 1.0}
+    if taken > 0:
+        looks = added_up(
+            (spec.as_observed(shown), share * probability)
+            for state, share in shares(reached[taken]).items()
+            for probability, shown in spec.sight.seen(state, taken)
+        )
+    reward = expected_reward(reached[step])
+    return {(read, False): (share, reward) for read, share in looks.items()}
 
 
 def open_loop(agent: Imaginer, questions: EvalSet, seeds: SeedTree) -> OpenLoop:
@@ -102,49 +128,107 @@ def open_loop(agent: Imaginer, questions: EvalSet, seeds: SeedTree) -> OpenLoop:
     its expectation. The rules keep every rollout alive: any predicted termination is wrong. The agent, which draws
     from the generators of ``seeds``, is not changed.
     """
-    rollouts = AgentModel(agent).rollouts(
-        questions.frames[:, -1],
-        questions.asked,
-        depth=questions.depth,
-        generators=(seeds.child(index).generator() for index in range(len(questions.frames))),
-    )
+    begin_episode(agent)
+    shape = questions.asked.shape
+    rollouts = imagined_from(agent, questions.frames[:, -1], seeds, depth=shape[1], actions=questions.asked)
 
     def stacked(name: str) -> Floats:  # [starts, D]
         return np.array([getattr(rollout, name) for rollout in rollouts], dtype=np.float64)
 
-    correct = np.array(
-        [
-            [
-                tuple(read) in shares(outcomes)
-                for read, outcomes in zip(rollout.macrostates.tolist(), steps, strict=True)
-            ]
-            for rollout, steps in zip(rollouts, questions.truth, strict=True)
-        ]
-    )  # [starts, D]
+    correct = np.zeros(shape, dtype=np.bool_)
+    rewards = np.zeros(shape)
+    for row, step in np.ndindex(*shape):
+        outcomes = questions.truth[row][step]
+        correct[row, step] = tuple(rollouts[row].macrostates[step].tolist()) in shares(outcomes)
+        rewards[row, step] = expected_reward(outcomes)
     accepted = stacked("accepted")
     kept = accepted.sum(axis=0)
-    rewards = np.array([[expected_reward(outcomes) for outcomes in steps] for steps in questions.truth])
-    causes = {cause: stacked(cause) for cause in ("epistemic", "aleatoric", "modal")}
+    began = np.pad(correct[:, :-1], ((0, 0), (1, 0)), constant_values=True)
+    uncertain = {}
+    for cause in ("epistemic", "aleatoric", "modal"):
+        values = stacked(cause)
+        columns = zip(values.T, correct.T, began.T, strict=True)
+        uncertain[cause] = values.mean(axis=0)
+        uncertain[f"auroc_{cause}"] = np.array([auroc(value[b], ~right[b]) for value, right, b in columns])
     return OpenLoop(
-        count=np.full(questions.depth, len(rollouts), dtype=np.int64),
+        count=np.full(shape[1], len(rollouts), dtype=np.int64),
         correct=correct.mean(axis=0),
         correct_accepted=np.where(kept > 0, (correct * accepted).sum(axis=0) / np.maximum(kept, 1), np.nan),
         accepted=accepted.mean(axis=0),
         reward_mae=np.abs(stacked("rewards") - rewards).mean(axis=0),
         termination_error=(stacked("p_terminated") > 0.5).mean(axis=0),
-        **{cause: values.mean(axis=0) for cause, values in causes.items()},
-        **_detection(correct, causes),
+        judged=began.sum(axis=0).astype(np.float64),
+        **uncertain,
     )
 
 
-def _detection(correct: NDArray[np.bool_], causes: dict[str, Floats]) -> dict[str, Floats]:
-    """How well each uncertainty (starts, D) tells wrong transitions from correct ones that began correct, by depth."""
-    began = np.concatenate([np.ones((len(correct), 1), dtype=np.bool_), correct[:, :-1]], axis=1)
-    found = {"judged": began.sum(axis=0).astype(np.float64)}
-    for cause, values in causes.items():
-        columns = zip(values.T, correct.T, began.T, strict=True)
-        found[f"auroc_{cause}"] = np.array([auroc(value[b], ~right[b]) for value, right, b in columns])
-    return found
+# Beside reality ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moment:
+    """A moment of a real episode, from which an agent imagines."""
+
+    spec: TaskSpec
+    appearance: str
+    frame: Frame  #: What the agent sees. Shape (64, 64, 3).
+    macrostate: State  #: Where it sees it
+    before: Sequence[State] = ()  #: Macrostates of the same episode before
+
+    def beside(self, rollout: ImaginedRollout, rng: np.random.Generator) -> ComparedRollout:
+        """Put the truth beside a rollout that was imagined from here.
+
+        The rules give states and rewards, the kinematic mode gives frames: those that the agent would really see, old
+        or hiding something where the task's are. Where the rules leave several outcomes to chance, one that looks as
+        was imagined is taken if there is any, else ``rng`` draws. Once the rules end the episode its last macrostate is
+        held, with reward 0 and ``terminated`` True.
+        """
+        rules = self.spec.rules
+        over = rules.is_terminal(self.macrostate)
+        states = [*self.before, self.macrostate]
+        ruled = []
+        for step, action in enumerate(rollout.actions.tolist()):
+            reward = 0.0
+            if over:
+                states.append(states[-1])
+            else:
+                possible = [(outcome.probability, outcome) for outcome in rules.outcomes(states[-1], action)]
+                alike = [each for each in possible if self._as_imagined(each[1].macrostate, rollout, step)]
+                outcome = alike[0][1] if len(alike) == 1 else _drawn(alike or possible, rng)
+                states.append(outcome.macrostate)
+                reward = outcome.reward
+                over = outcome.terminated
+            ruled.append((reward, over))
+        shown = _in_frames(self.spec.sight, states, rng)[len(self.before) + 1 :]
+        frames = self.spec.render_macrostates(np.array(shown), self.appearance, rng) if shown else ()
+        read = [self.spec.as_observed(state) for state in shown]
+        pairs = zip(frames, read, ruled, strict=True)
+        real = [(frame, state, reward, over) for frame, state, (reward, over) in pairs]
+        return beside_reality(rollout, self.frame, self.macrostate, real)
+
+    def _as_imagined(self, state: State, rollout: ImaginedRollout, step: int) -> bool:
+        """Whether a macrostate reached by action number ``step`` looks as imagined; what is late was imagined late."""
+        sight = self.spec.sight
+        looks = {state}
+        if sight is not None:
+            taken = len(self.before) + step + 1
+            looks = {self.spec.as_observed(what) for _, what in sight.seen(state, taken)}
+            step += sight.lag
+        return step < len(rollout.macrostates) and tuple(rollout.macrostates[step].tolist()) in looks
+
+    def sampled(self, agent: Imaginer, seeds: SeedTree) -> tuple[ComparedRollout, ...]:
+        """Imagine this moment several times. The agent has seen the episode so far, and is not changed."""
+        rollouts = imagined_from(agent, [self.frame] * SAMPLED_ROLLOUTS, seeds, depth=SAMPLED_DEPTH)
+        rng = seeds.child("reality").generator()
+        return tuple(self.beside(rollout, rng) for rollout in rollouts)
+
+
+def _first_moments(spec: TaskSpec, starts: Sequence[State], appearance: str, rng: np.random.Generator) -> list[Moment]:
+    """How episodes begin in some macrostates."""
+    looks = [_clearest_look(spec.sight, start) for start in starts]
+    frames = spec.render_macrostates(np.array(looks, dtype=np.int64), appearance, rng)
+    pairs = zip(frames, starts, strict=True)
+    return [Moment(spec=spec, appearance=appearance, frame=frame, macrostate=start) for frame, start in pairs]
 
 
 def examples(
@@ -158,23 +242,10 @@ def examples(
     starts = spec.rules.start_states
     rng = SeedTree(0).child(purpose, "examples", spec.id).generator()
     picks = [starts[index] for index in rng.choice(len(starts), size=EXAMPLES, replace=len(starts) < EXAMPLES)]
-    frames = _first_frames(spec, picks, appearance, rng)
-    rollouts = AgentModel(agent).rollouts(
-        frames,
-        [None] * EXAMPLES,
-        depth=spec.horizon,
-        generators=[seeds.child(index).generator() for index in range(EXAMPLES)],
-    )
-    return tuple(
-        compare_rollout(spec, frame=frame, macrostate=np.array(start), rollout=rollout, appearance=appearance, rng=rng)
-        for frame, start, rollout in zip(frames, picks, rollouts, strict=True)
-    )
-
-
-def _first_frames(spec: TaskSpec, starts: Sequence[State], appearance: str, rng: np.random.Generator) -> Frame:
-    """A frame of each of N starts, as an episode begins. Shape (N, 64, 64, 3)."""
-    looks = [_clearest_look(spec.sight, start) for start in starts]
-    return spec.render_macrostates(np.array(looks, dtype=np.int64), appearance, rng)
+    moments = _first_moments(spec, picks, appearance, rng)
+    begin_episode(agent)
+    rollouts = imagined_from(agent, [moment.frame for moment in moments], seeds, depth=spec.horizon)
+    return tuple(moment.beside(rollout, rng) for moment, rollout in zip(moments, rollouts, strict=True))
 
 
 def imagine_sampled_rollouts(
@@ -185,154 +256,38 @@ def imagine_sampled_rollouts(
         return ()
     rng = SeedTree(0).child(purpose, "sampled_rollouts", spec.id).generator()
     start = spec.rules.start_states[int(rng.integers(len(spec.rules.start_states)))]
-    frame = _first_frames(spec, [start], appearance, rng)[0]
-    return sampled_rollouts_from(
-        agent, spec, frame=frame, macrostate=np.array(start), appearance=appearance, seeds=seeds, begins=True
-    )
-
-
-def sampled_rollouts_from(
-    agent: Imaginer,
-    spec: TaskSpec,
-    *,
-    frame: Frame,
-    macrostate: Macrostate,
-    appearance: str,
-    seeds: SeedTree,
-    before: Sequence[State] = (),
-    begins: bool = False,
-) -> tuple[ComparedRollout, ...]:
-    """Imagine one moment several times: the real ``frame``, seen in ``macrostate`` after those ``before``.
-
-    If it ``begins`` an episode, the agent is told so; otherwise it has seen the episode so far.
-    """
-    rollouts = AgentModel(agent).rollouts(
-        [frame] * SAMPLED_ROLLOUTS,
-        [None] * SAMPLED_ROLLOUTS,
-        depth=SAMPLED_DEPTH,
-        generators=[seeds.child(index).generator() for index in range(SAMPLED_ROLLOUTS)],
-        begins=begins,
-    )
-    rng = seeds.child("reality").generator()
-    compare = functools.partial(
-        compare_rollout, spec, frame=frame, macrostate=macrostate, appearance=appearance, rng=rng, before=before
-    )
-    return tuple(compare(rollout=rollout) for rollout in rollouts)
-
-
-def compare_rollout(
-    spec: TaskSpec,
-    *,
-    frame: Frame,
-    macrostate: Macrostate,
-    rollout: ImaginedRollout,
-    appearance: str,
-    rng: np.random.Generator,
-    before: Sequence[State] = (),
-) -> ComparedRollout:
-    """Put the truth beside a rollout imagined from ``frame``, which is seen in ``macrostate`` (M,).
-
-    The rules give states and rewards, the kinematic mode gives frames: those that the agent would really see after the
-    macrostates ``before`` of the same episode, old or hiding something where the task's are. Where the rules leave
-    several outcomes to chance, one that looks as was imagined is taken if there is any, else ``rng`` draws.
-    Once the rules end the episode its last macrostate is held, with reward 0 and ``terminated`` True.
-    """
-    start = state = tuple(int(value) for value in macrostate)
-    over = spec.rules.is_terminal(state)
-    real: list[tuple[State, float, bool]] = []
-    for step, action in enumerate(rollout.actions.tolist()):
-        reward = 0.0
-        if not over:
-            possible = spec.rules.outcomes(state, action)
-            alike = _as_imagined(spec, possible, rollout, step, len(before))
-            outcome = alike[0] if len(alike) == 1 else _draw(alike or possible, rng)
-            state = outcome.macrostate
-            reward = outcome.reward
-            over = outcome.terminated
-        real.append((state, reward, over))
-    seen = _in_frames(spec.sight, (*before, start, *(state for state, _, _ in real)), rng)[len(before) + 1 :]
-    frames = spec.render_macrostates(np.array(seen), appearance, rng) if real else ()
-    read = [(spec.as_observed(shown), reward, over) for shown, (_, reward, over) in zip(seen, real, strict=True)]
-    return beside_reality(rollout, frame, macrostate, frames, read)
+    begin_episode(agent)
+    return _first_moments(spec, [start], appearance, rng)[0].sampled(agent, seeds)
 
 
 def _in_frames(sight: Sight | None, states: Sequence[State], rng: np.random.Generator) -> Sequence[State]:
     """What the frame shows that the agent sees in each macrostate of an episode; -1 for what it hides."""
     if sight is None:
         return states
-    shown = []
-    for step, state in enumerate(states):
-        chances, whats = zip(*sight.seen(state, step), strict=True)
-        shown.append(whats[0 if len(whats) == 1 else int(rng.choice(len(whats), p=chances))])
+    looks = [sight.seen(state, step) for step, state in enumerate(states)]
+    shown = [look[0][1] if len(look) == 1 else _drawn(look, rng) for look in looks]
     return [shown[max(0, step - sight.lag)] for step in range(len(states))]
 
 
-def beside_reality(
-    rollout: ImaginedRollout,
-    frame: Frame,
-    macrostate: Sequence[int] | Macrostate,
-    frames: Sequence[Frame] | Frame,
-    real: Sequence[tuple[State, float, bool]],
-) -> ComparedRollout:
+def _drawn(choices: Sequence[tuple[float, T]], rng: np.random.Generator) -> T:
+    """One of the choices, in proportion to their probabilities."""
+    probabilities = np.array([probability for probability, _ in choices])
+    return choices[int(rng.choice(len(choices), p=probabilities / probabilities.sum()))][1]
+
+
+def beside_reality(rollout: ImaginedRollout, frame: Frame, macrostate: State, real: Sequence[Real]) -> ComparedRollout:
     """An imagined rollout from a ``frame`` that is seen in ``macrostate``, and what really came of it.
 
-    ``frames`` and ``real`` (what they show, reward, whether the episode has ended) have an entry for each macro-action
-    that was carried out.
+    ``real`` has an entry for each macro-action that was carried out.
     """
     done = len(real)
+    frames, states, rewards, over = zip(*real, strict=True) if real else ([], [], [], [])
     return ComparedRollout(
         start_frame=frame.copy(),
         start_macrostate=np.array(macrostate, dtype=np.int64),
         rollout=rollout,
         real_frames=np.array(frames, dtype=np.uint8).reshape(done, *frame.shape),
-        real_macrostates=np.array([state for state, _, _ in real], dtype=np.int64).reshape(done, len(macrostate)),
-        real_rewards=np.array([reward for _, reward, _ in real], dtype=np.float64),
-        real_terminated=np.array([over for _, _, over in real], dtype=np.bool_),
+        real_macrostates=np.array(states, dtype=np.int64).reshape(done, len(macrostate)),
+        real_rewards=np.array(rewards, dtype=np.float64),
+        real_terminated=np.array(over, dtype=np.bool_),
     )
-
-
-def _as_imagined(
-    spec: TaskSpec, possible: Sequence[Outcome], rollout: ImaginedRollout, step: int, before: int
-) -> tuple[Outcome, ...]:
-    """Those outcomes of the rollout's action number ``step`` that look as they were imagined.
-
-    ``before`` macro-actions of the episode came before the rollout. Where frames are late, so is what was imagined.
-    """
-    lag = 0 if spec.sight is None else spec.sight.lag
-    if step + lag >= len(rollout.macrostates):
-        return ()
-    imagined = tuple(rollout.macrostates[step + lag].tolist())
-
-    def looks(outcome: Outcome) -> set[State]:
-        if spec.sight is None:
-            return {outcome.macrostate}
-        return {spec.as_observed(what) for _, what in spec.sight.seen(outcome.macrostate, before + step + 1)}
-
-    return tuple(outcome for outcome in possible if imagined in looks(outcome))
-
-
-def _draw(outcomes: Sequence[Outcome], rng: np.random.Generator) -> Outcome:
-    """One of the outcomes, in proportion to their probabilities."""
-    probabilities = np.array([outcome.probability for outcome in outcomes])
-    return outcomes[int(rng.choice(len(outcomes), p=probabilities / probabilities.sum()))]
-
-
-def _alive(spec: TaskSpec) -> Alive:
-    """Whether some actions, chosen blindly from any of these macrostates, surely keep an episode going for so long."""
-
-    @functools.cache
-    def alive(support: frozenset[State], steps: int) -> bool:
-        return steps == 0 or bool(_safe_actions(spec, alive, support, steps))
-
-    return alive
-
-
-def _safe_actions(spec: TaskSpec, alive: Alive, support: Iterable[State], steps: int) -> list[int]:
-    """The actions after which the episode surely goes on, and can surely go on for ``steps - 1`` more."""
-    safe = []
-    for action in range(spec.n_actions):
-        outcomes = [outcome for state in support for outcome in spec.rules.outcomes(state, action)]
-        ended = any(outcome.terminated for outcome in outcomes)
-        if not ended and alive(frozenset(outcome.macrostate for outcome in outcomes), steps - 1):
-            safe.append(action)
-    return safe

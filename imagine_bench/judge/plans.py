@@ -10,17 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any
 
-import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
+from imagine_bench.arrays import Bools
+from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Frame, State
-from imagine_bench.interfaces.capabilities import ImaginedRollout
-from imagine_bench.judge.models import AgentModel
-from imagine_bench.judge.open_loop import beside_reality
+from imagine_bench.interfaces import State
+from imagine_bench.interfaces.capabilities import ImaginedRollout, begin_episode
+from imagine_bench.judge.open_loop import Real, beside_reality
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running import run_state
 from imagine_bench.running.trained import Trained
@@ -56,7 +54,7 @@ class PlanResult:
         return self.solved and self.done == self.shortest
 
     @property
-    def as_imagined(self) -> NDArray[np.bool_]:
+    def as_imagined(self) -> Bools:
         """Whether each macro-action that was carried out led where it was imagined to. Shape (done,)."""
         read = self.compared.rollout.macrostates
         real = self.compared.real_macrostates
@@ -93,49 +91,47 @@ def make_plans(
             yield carry_out(env, trained, number, max_epistemic=max_epistemic)
 
 
-def make_env(trained: Trained, execution: str) -> gymnasium.Env[Any, Any]:
+def make_env(trained: Trained, execution: str) -> Env:
     """The environment that plans are carried out in: the one that the agent is tested in, but for its execution."""
     protocol = trained.spec.protocol
     return run_state.make_env(protocol, protocol.task, testing=True, execution=execution)
 
 
 def carry_out(
-    env: gymnasium.Env[Any, Any],
+    env: Env,
     trained: Trained,
     number: int,
     *,
     max_epistemic: float | None = None,
-    on_step: Callable[[int], None] | None = None,  # told after each macro-action how many of the plan are done
-    on_plan: Callable[[Frame, ImaginedRollout], None] | None = None,
+    on_step: Callable[[int], None] | None = None,  # told how many of the plan are done, from 0, when it is made
 ) -> PlanResult:
     """Imagine plan ``number`` from one frame and, unless it is refused, let the arm do it."""
-    frame, info = env.reset(seed=episode_seed("planning", int(is_tuning_seed(trained.spec.seed)), number))
+    first, info = env.reset(seed=episode_seed("planning", int(is_tuning_seed(trained.spec.seed)), number))
+    frame = np.asarray(first)
     start = tuple(int(value) for value in info["macrostate"])
     rng = SeedTree(trained.spec.seed).child("planning", number).generator()
-    model = AgentModel(trained.imaginer)
-    (rollout,) = model.rollouts([frame], [None], depth=trained.task.horizon, generators=[rng])
+    agent = trained.imaginer
+    begin_episode(agent)
+    rollout = agent.imagine(frame, actions=None, depth=trained.task.horizon, rng=rng)
     refused = _refusal(rollout, max_epistemic)
-    if on_plan is not None:
-        on_plan(frame, rollout)
-    frames = []
-    real = []
+    tell = on_step or (lambda done: None)
+    tell(0)
+    real: list[Real] = []
     faults = 0
     solved = False
-    for step, action in enumerate([] if refused else rollout.actions, start=1):
-        seen, reward, terminated, truncated, info = env.step(int(action))
-        frames.append(seen)
+    for action in [] if refused else rollout.actions.tolist():
+        seen, reward, terminated, truncated, info = env.step(action)
         shown = trained.task.as_observed(info.get("shown", info["macrostate"]))
-        real.append((shown, float(reward), bool(terminated)))
+        real.append((np.asarray(seen), shown, float(reward), bool(terminated)))
         faults += bool(info["fault"])
         solved = bool(info["is_success"])
-        if on_step is not None:
-            on_step(step)
+        tell(len(real))
         if terminated or truncated:
             break
     return PlanResult(
         number=number,
         start=start,
-        compared=beside_reality(rollout, frame, start, frames, real),
+        compared=beside_reality(rollout, frame, start, real),
         refused=refused,
         solved=solved,
         shortest=fewest_actions(trained.task.rules, start),
@@ -151,14 +147,11 @@ def require_threshold(max_epistemic: float | None) -> None:
 
 def _refusal(rollout: ImaginedRollout, max_epistemic: float | None) -> str:
     """Why a plan must not be carried out, or an empty string."""
-    epistemic = rollout.epistemic
-    if max_epistemic is not None:
-        if float(epistemic.max()) <= max_epistemic:
-            return ""
-        step = int((epistemic > max_epistemic).argmax())
-        return f"epistemic uncertainty {epistemic[step]:.2g} at macro-action {step + 1} is above {max_epistemic:g}"
-    if rollout.accepted.all():
+    discarded = ~rollout.accepted if max_epistemic is None else rollout.epistemic > max_epistemic
+    if not discarded.any():
         return ""
-    step = int((~rollout.accepted).argmax())
-    why = f"epistemic uncertainty of the state {epistemic[step]:.2g}"
-    return f"the agent's filter discards macro-action {step + 1} ({why})"
+    step = int(discarded.argmax())
+    epistemic = f"{rollout.epistemic[step]:.2g}"
+    if max_epistemic is None:
+        return f"the agent's filter discards macro-action {step + 1} (epistemic uncertainty of the state {epistemic})"
+    return f"epistemic uncertainty {epistemic} at macro-action {step + 1} is above {max_epistemic:g}"

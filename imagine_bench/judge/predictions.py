@@ -11,6 +11,7 @@ from typing import ParamSpec, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Arrays, Images, Ints
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
 from imagine_bench.interfaces import Floats, Frame, State, TaskSpec
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
@@ -21,13 +22,14 @@ from imagine_bench.seeding import SeedTree
 _AT_ONCE = 96  # questions handed to a model at a time, to bound memory
 P = ParamSpec("P")
 T = TypeVar("T")
-Images = NDArray[np.uint8] | NDArray[np.floating]
+N = TypeVar("N", bound=np.generic)
+_OFFERED = ("rewards", "p_ended", "accepted", *UNCERTAINTIES)
 
 
 class ImageReader(Protocol):
     """What reads images; see :mod:`imagine_bench.agents.world_models.reader`."""
 
-    def read(self, pictures: Images) -> NDArray[np.int64]:
+    def read(self, pictures: Images) -> Ints:
         """Macrostates (N, M) of images (N, H, W) or (N, H, W, 3); -1 where one shows nothing of this world."""
 
 
@@ -58,6 +60,16 @@ class RenderedFrameIndex:
         """The macrostate of an image that is a rendered frame to the pixel; None for any other."""
         return self._shows.get(_key(image))
 
+    def read(self, images: Images, reader: ImageReader) -> Ints:
+        """Macrostates (N, S, D, M) of images (N, S, D, ...); a reader reads what was not rendered, equal ones once."""
+        flat = images.reshape(-1, *images.shape[3:])
+        keys = [_key(image) for image in flat]
+        unknown = {key: row for row, key in enumerate(keys) if key not in self._shows}
+        read = reader.read(flat[list(unknown.values())]).tolist() if unknown else []
+        shown = dict(zip(unknown, map(tuple, read), strict=True))
+        states = [self._shows.get(key) or shown[key] for key in keys]
+        return np.array(states, dtype=np.int64).reshape(*images.shape[:3], -1)
+
 
 def _key(image: Images) -> bytes:
     """A digest of an image (H, W, 3) or (H, W)."""
@@ -68,25 +80,24 @@ def _key(image: Images) -> bytes:
 class Predictions:
     """What a model imagines of an :class:`.EvalSet`, as read, in S futures."""
 
-    states: NDArray[np.int64]  #: Shape (N, S, D, M); -1 where an image shows nothing of this world.
+    states: Ints  #: Shape (N, S, D, M); -1 where an image shows nothing of this world.
     weights: Floats  #: Probability of each image at its depth. Shape (N, S, D).
-    rewards: Floats | None  #: Shape (N, S, D).
-    p_ended: Floats | None  #: Shape (N, S, D).
-    uncertainties: dict[str, Floats]  #: Those offered, by name, each (N, D).
-    accepted: NDArray[np.bool_] | None  #: Whether a filter of its own keeps it. Shape (N, D).
+    offered: Arrays  #: What else the model offers, by its name in :class:`.Imagined`. Shapes (N, S, D) or (N, D).
     cpu_s: float  #: CPU seconds of imagining, reading apart
     steps: int  #: Macro-actions imagined, N D of each future
 
-    @property
-    def epistemic(self) -> Floats | None:
-        """The epistemic uncertainty of the first step, if it is offered. Shape (N,)."""
-        offered = self.uncertainties.get("epistemic")
-        return None if offered is None else offered[:, 0]
+    def of_one_step(self, name: str) -> Floats | None:
+        """What the model offers of the first macro-action, by name, if it does. Shape (N, S) or (N,)."""
+        return self.offered[name][..., 0] if name in self.offered else None
+
+    def futures(self, row: int, step: int) -> list[tuple[State, float]]:
+        """Macrostate and probability of each future after a step. Length S."""
+        states = map(tuple, self.states[row, :, step].tolist())
+        return list(zip(states, self.weights[row, :, step].tolist(), strict=True))
 
     def distribution(self, row: int, step: int) -> Distribution:
         """Of the macrostates after a step."""
-        futures = zip(self.states[row, :, step].tolist(), self.weights[row, :, step].tolist(), strict=True)
-        return added_up((tuple(state), weight) for state, weight in futures if weight)
+        return added_up((state, weight) for state, weight in self.futures(row, step) if weight)
 
 
 def evaluate(
@@ -107,26 +118,19 @@ def evaluate(
         InvalidValueError: The model fails, or hands in what it must not; the message names model and method.
     """
     answers: list[Imagined] = []
-    states = []
     cpu_s = 0.0
     for at in range(0, len(questions.frames), _AT_ONCE):
-        some = slice(at, at + _AT_ONCE)
+        frames = questions.frames[at : at + _AT_ONCE]
         begun_s = time.process_time()
-        imagined = call(name, "imagine", model.imagine, questions.frames[some], questions.actions[some], samples, rng)
+        imagined = call(name, "imagine", model.imagine, frames, questions.actions[at : at + _AT_ONCE], samples, rng)
         cpu_s += time.process_time() - begun_s
-        rows = len(questions.frames[some])
-        require_imagined(imagined, name=name, rows=rows, depth=questions.depth, samples=samples)
-        answers.append(imagined)
-        states.append(read_images(imagined, reader, index, len(questions.states[0])))
-    offered = {each: _all_of(answers, each) for each in UNCERTAINTIES}
-    accepted = _all_of(answers, "accepted")
+        depth = questions.asked.shape[1]
+        answers.append(require_imagined(imagined, name=name, rows=len(frames), depth=depth, samples=samples))
+    given = {name: [getattr(each, name) for each in answers] for name in _OFFERED}
     return Predictions(
-        states=_joined(states, -1),
-        weights=_joined([weights_of(each) for each in answers], 0),
-        rewards=_padded(_all_of(answers, "rewards")),
-        p_ended=_padded(_all_of(answers, "p_ended")),
-        accepted=np.concatenate(accepted).astype(np.bool_) if accepted else None,
-        uncertainties={each: np.concatenate(parts) for each, parts in offered.items() if parts},
+        states=_joined([index.read(each.pictures, reader) for each in answers], -1),
+        weights=_joined([weights_of(each) for each in answers]),
+        offered={name: _joined(parts) for name, parts in given.items() if all(part is not None for part in parts)},
         cpu_s=cpu_s,
         steps=sum(int(np.prod(each.pictures.shape[:3])) for each in answers),
     )
@@ -143,48 +147,11 @@ def call(name: str, method: str, function: Callable[P, T], *arguments: P.args, *
         raise InvalidValueError(f"World model {name}: {method}() failed ({why}).") from error
 
 
-def read_images(
-    imagined: Imagined, reader: ImageReader, index: RenderedFrameIndex, coordinates: int
-) -> NDArray[np.int64]:
-    """Macrostates (N, S, D, M) of what was imagined; equal images are read once."""
-    shape = imagined.pictures.shape
-    images = imagined.pictures.reshape(-1, *shape[3:])
-    places: dict[bytes, list[int]] = {}
-    for row, image in enumerate(images):
-        places.setdefault(_key(image), []).append(row)
-    read = np.full((len(images), coordinates), -1, dtype=np.int64)
-    unknown = []
-    for rows in places.values():
-        state = index.shows(images[rows[0]]) if images.dtype == np.uint8 else None
-        if state is None:
-            unknown.append(rows)
-        else:
-            read[rows] = state
-    if unknown:
-        for rows, found in zip(unknown, reader.read(images[[rows[0] for rows in unknown]]), strict=True):
-            read[rows] = found
-    return read.reshape(*shape[:3], coordinates)
-
-
-def _all_of(answers: Sequence[Imagined], field: str) -> list[Floats]:
-    """A field of every batch; empty unless each offers it."""
-    there = [array for array in (getattr(each, field) for each in answers) if array is not None]
-    return there if len(there) == len(answers) else []
-
-
-def _padded(parts: Sequence[Floats]) -> Floats | None:
-    return _joined([part.astype(np.float64) for part in parts], 0) if parts else None
-
-
-N = TypeVar("N", np.int64, np.float64)
-
-
-def _joined(parts: Sequence[NDArray[N]], fill: int) -> NDArray[N]:
-    """Batches one behind another, with as many futures each: those missing have weight 0 and show nothing."""
+def _joined(parts: Sequence[NDArray[N]], missing: int = 0) -> NDArray[N]:
+    """Batches one behind another, with as many futures each: those that are missing weigh 0, or show -1, nothing."""
     most = max(part.shape[1] for part in parts)
-    whole = []
+    wide = []
     for part in parts:
-        missing = [(0, 0)] * part.ndim
-        missing[1] = (0, most - part.shape[1])
-        whole.append(np.pad(part, missing, constant_values=fill))
-    return np.concatenate(whole)
+        around = [(0, 0), (0, most - part.shape[1]), *[(0, 0)] * (part.ndim - 2)]
+        wide.append(np.pad(part, around, constant_values=missing))
+    return np.concatenate(wide)

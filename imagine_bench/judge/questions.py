@@ -8,13 +8,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import Frame, Rules, State, TaskSpec
-from imagine_bench.judge.truth import lasting_actions, transitions
-from imagine_bench.rules import Outcomes, outcomes_by_depth, states_of
+from imagine_bench.rules import Outcomes, advance, outcomes_by_depth, states_of
 from imagine_bench.seeding import SeedTree
 
 STATES = 400  # macrostates asked about at most; of more, values are not computed
@@ -29,6 +29,9 @@ COUNTERFACTUALS = 48  # macrostates in which every macro-action is imagined with
 
 Render = Callable[[Sequence[State], np.random.Generator], Frame]
 """Draws a frame (64, 64, 3) of each of N macrostates."""
+Asked = tuple[Sequence[State], Sequence[int]]
+"""The macrostates shown, and the macro-actions between and after them."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,31 +40,33 @@ class EvalSet:
 
     states: tuple[State, ...]  #: What the last frame shows. Length N.
     frames: Frame  #: Shape (N, K, 64, 64, 3).
-    actions: NDArray[np.int64]  #: Those between the frames, then those asked about. Shape (N, K - 1 + D).
+    actions: Ints  #: Those between the frames, then those asked about. Shape (N, K - 1 + D).
     truth: tuple[tuple[Outcomes, ...], ...]  #: By question and depth. N of length D.
 
     @property
-    def depth(self) -> int:
-        """Macro-actions asked about, D."""
-        return self.actions.shape[1] - self.frames.shape[1] + 1
-
-    @property
-    def asked(self) -> NDArray[np.int64]:
+    def asked(self) -> Ints:
         """The macro-actions asked about. Shape (N, D)."""
         return self.actions[:, self.frames.shape[1] - 1 :]
 
     @property
-    def first_actions(self) -> list[int]:
-        """The first macro-action of each question. Length N."""
-        found: list[int] = self.asked[:, 0].tolist()
-        return found
+    def pairs(self) -> list[tuple[State, int]]:
+        """Macrostate and first macro-action of each question. Length N."""
+        return list(zip(self.states, self.asked[:, 0].tolist(), strict=True))
+
+    @property
+    def macrostates(self) -> tuple[State, ...]:
+        """Each macrostate that is asked about, once."""
+        return tuple(dict.fromkeys(self.states))
 
 
 def one_step(spec: TaskSpec, render: Render) -> EvalSet:
-    """Every macro-action in every macrostate that an episode can be in, from :data:`FRAMES` frames each."""
+    """Every macro-action in every macrostate that an episode can be in, from :data:`FRAMES` frames each.
+
+    Questions are in the order of macrostates, of each in that of its macro-actions, and of each of its frames.
+    """
     rng = _generator(spec, "one_step")
-    pairs = [pair for pair in transitions(spec.rules, rng, STATES) for _ in range(FRAMES)]
-    return _eval_set(spec, render, [((state,), (action,)) for state, action in pairs], rng)
+    alike = itertools.product(_going_on(spec.rules, rng), range(spec.n_actions), range(FRAMES))
+    return _eval_set(spec, render, [((state,), (action,)) for state, action, _ in alike], rng)
 
 
 def after_the_end(spec: TaskSpec, render: Render) -> EvalSet | None:
@@ -71,80 +76,100 @@ def after_the_end(spec: TaskSpec, render: Render) -> EvalSet | None:
     """
     rng = _generator(spec, "after_the_end")
     over = [state for state in states_of(spec.rules) if spec.rules.is_terminal(state)]
-    pairs = list(itertools.product(over, range(spec.n_actions)))
-    if not pairs:
-        return None
-    chosen = np.sort(rng.choice(len(pairs), min(AFTER_THE_END, len(pairs)), replace=False))
-    return _eval_set(spec, render, [((pairs[index][0],), (pairs[index][1],)) for index in chosen], rng)
+    asked = [((state,), (action,)) for state in over for action in range(spec.n_actions)]
+    return _eval_set(spec, render, _some(asked, AFTER_THE_END, rng), rng) if asked else None
 
 
 def rollouts(spec: TaskSpec, render: Render) -> EvalSet:
     """Macro-actions that keep the episode going as surely as the rules allow, after a short real history."""
     rng = _generator(spec, "rollouts")
-    asked = []
+    asked: list[Asked] = []
     for start in _some_starts(spec.rules, rng):
-        actions = lasting_actions(spec.rules, start, HISTORY, rng)
+        actions = _lasting_actions(spec.rules, start, HISTORY, rng)
         states = [start]
         for action in actions:
             outcomes = spec.rules.outcomes(states[-1], action)
             drawn = rng.choice(len(outcomes), p=[outcome.probability for outcome in outcomes])
             states.append(outcomes[int(drawn)].macrostate)
-        later = lasting_actions(spec.rules, states[-1], DEPTH, rng)
-        asked.append((tuple(states), (*actions, *later)))
+        asked.append((states, actions + _lasting_actions(spec.rules, states[-1], DEPTH, rng)))
     return _eval_set(spec, render, asked, rng)
 
 
 def ranked(spec: TaskSpec, render: Render) -> EvalSet:
     """:data:`RANKED` random sequences from each start, one start behind another."""
     rng = _generator(spec, "ranked")
-    asked = [
-        ((start,), tuple(rng.integers(spec.n_actions, size=RANKED_DEPTH).tolist()))
-        for start in _some_starts(spec.rules, rng)
-        for _ in range(RANKED)
-    ]
+    starts = [start for start in _some_starts(spec.rules, rng) for _ in range(RANKED)]
+    asked = [((start,), rng.integers(spec.n_actions, size=RANKED_DEPTH).tolist()) for start in starts]
     return _eval_set(spec, render, asked, rng)
 
 
 def counterfactuals(spec: TaskSpec, render: Render) -> tuple[EvalSet, ...]:
     """The same frames of :data:`COUNTERFACTUALS` macrostates for each macro-action in turn."""
     rng = _generator(spec, "counterfactuals")
-    states = list(dict.fromkeys(state for state, _ in transitions(spec.rules, rng, STATES)))
-    picks = np.sort(rng.choice(len(states), min(COUNTERFACTUALS, len(states)), replace=False))
-    chosen = [states[index] for index in picks]
-    first = _eval_set(spec, render, [((state,), (0,)) for state in chosen], rng)
-    return tuple(
-        replace(
-            first,
-            actions=np.full_like(first.actions, action),
-            truth=tuple(outcomes_by_depth(spec.rules, state, [action]) for state in chosen),
-        )
-        for action in range(spec.n_actions)
-    )
+    states = _some(_going_on(spec.rules, rng), COUNTERFACTUALS, rng)
+    first = _eval_set(spec, render, [((state,), (0,)) for state in states], rng)
+    found = []
+    for action in range(spec.n_actions):
+        truth = tuple(outcomes_by_depth(spec.rules, state, [action]) for state in states)
+        found.append(replace(first, actions=np.full_like(first.actions, action), truth=truth))
+    return tuple(found)
+
+
+SETS = {"one_step": one_step, "rollouts": rollouts, "ranked": ranked, "after": after_the_end}
+"""What makes each set of questions that all models are asked once; the last may be None."""
 
 
 def _generator(spec: TaskSpec, name: str) -> np.random.Generator:
     return SeedTree(0).child("evaluation", "judge", name, spec.id).generator()
 
 
+def _going_on(rules: Rules, rng: np.random.Generator) -> Sequence[State]:
+    """Every macrostate that an episode can be in; where there are too many, :data:`STATES` that are drawn."""
+    alive = [state for state in states_of(rules) if not rules.is_terminal(state)]
+    return _some(alive, STATES, rng) if len(alive) > STATES else alive
+
+
+def _some(choices: Sequence[T], most: int, rng: np.random.Generator) -> list[T]:
+    """So many of them at most, drawn, in their order."""
+    return [choices[row] for row in np.sort(rng.choice(len(choices), min(most, len(choices)), replace=False))]
+
+
 def _some_starts(rules: Rules, rng: np.random.Generator) -> list[State]:
     """:data:`ROLLOUTS` start macrostates; different ones where there are as many."""
     starts = rules.start_states
-    return [starts[index] for index in rng.choice(len(starts), ROLLOUTS, replace=len(starts) < ROLLOUTS)]
+    return [starts[row] for row in rng.choice(len(starts), ROLLOUTS, replace=len(starts) < ROLLOUTS)]
 
 
-def _eval_set(
-    spec: TaskSpec,
-    render: Render,
-    asked: Sequence[tuple[tuple[State, ...], tuple[int, ...]]],
-    rng: np.random.Generator,
-) -> EvalSet:
-    """The set of (states shown, macro-actions between and after them)."""
-    shown = len(asked[0][0])
+def _lasting_actions(rules: Rules, state: State, depth: int, rng: np.random.Generator) -> list[int]:
+    """Random macro-actions after which the episode is least likely to be over, one after another."""
+    chosen: list[int] = []
+    outcomes: Outcomes = {(state, False): (1.0, 0.0)}
+    for _ in range(depth):
+        risks = [_risk(rules, outcomes, action) for action in range(rules.n_actions)]
+        chosen.append(int(rng.choice([action for action, risk in enumerate(risks) if risk == min(risks)])))
+        outcomes = advance(rules, outcomes, chosen[-1])
+    return chosen
+
+
+def _risk(rules: Rules, outcomes: Outcomes, action: int) -> tuple[float, int]:
+    """How likely an action ends an episode, and in how many macrostates every action would, right after it."""
+    after = [outcome for (before, over) in outcomes if not over for outcome in rules.outcomes(before, action)]
+    ended = sum(outcome.probability for outcome in after if outcome.terminated)
+    return ended, sum(not _can_last(rules, outcome.macrostate) for outcome in after if not outcome.terminated)
+
+
+def _can_last(rules: Rules, state: State) -> bool:
+    """Whether some macro-action surely does not end the episode there."""
+    return any(not any(o.terminated for o in rules.outcomes(state, action)) for action in range(rules.n_actions))
+
+
+def _eval_set(spec: TaskSpec, render: Render, asked: Sequence[Asked], rng: np.random.Generator) -> EvalSet:
+    """The set of these questions."""
     frames = render([state for states, _ in asked for state in states], rng)
-    truth = [outcomes_by_depth(spec.rules, states[-1], actions[shown - 1 :]) for states, actions in asked]
+    shown = len(asked[0][0])
     return EvalSet(
         states=tuple(states[-1] for states, _ in asked),
         frames=frames.reshape(len(asked), shown, *frames.shape[1:]),
         actions=np.array([actions for _, actions in asked], dtype=np.int64),
-        truth=tuple(truth),
+        truth=tuple(outcomes_by_depth(spec.rules, states[-1], actions[shown - 1 :]) for states, actions in asked),
     )

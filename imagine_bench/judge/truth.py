@@ -6,15 +6,14 @@ at the end.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Hashable, Iterable, Mapping
 from typing import TypeVar
 
 import numpy as np
 import scipy  # its parts load, slowly, when they are first used
 
-from imagine_bench.interfaces import Rules, State
-from imagine_bench.rules import Outcomes, advance, states_of
+from imagine_bench.interfaces import State
+from imagine_bench.rules import Outcomes
 
 MODE = 0.05  # least probability of an outcome that counts as a mode
 MISSED = 0.2  # a mode is missed if it is imagined less than this times as often as it happens
@@ -46,39 +45,6 @@ def expected_reward(outcomes: Outcomes) -> float:
     return sum(share * reward for share, reward in outcomes.values())
 
 
-def transitions(rules: Rules, rng: np.random.Generator, most: int) -> list[tuple[State, int]]:
-    """Every macro-action in every macrostate that an episode can be in; where there are too many, in ``most`` drawn."""
-    alive = [state for state in states_of(rules) if not rules.is_terminal(state)]
-    if len(alive) > most:
-        alive = [alive[index] for index in np.sort(rng.choice(len(alive), most, replace=False))]
-    return list(itertools.product(alive, range(rules.n_actions)))
-
-
-def lasting_actions(rules: Rules, state: State, depth: int, rng: np.random.Generator) -> list[int]:
-    """Random macro-actions after which the episode is least likely to be over, one after another."""
-    chosen: list[int] = []
-    outcomes: Outcomes = {(state, False): (1.0, 0.0)}
-    for _ in range(depth):
-        risks = [_risk(rules, outcomes, action) for action in range(rules.n_actions)]
-        best = [action for action, risk in enumerate(risks) if risk == min(risks)]
-        chosen.append(int(rng.choice(best)))
-        outcomes = advance(rules, outcomes, chosen[-1])
-    return chosen
-
-
-def _risk(rules: Rules, outcomes: Outcomes, action: int) -> tuple[float, int]:
-    """How likely an action ends an episode, and in how many macrostates every action would, right after it."""
-    after = [outcome for (before, over) in outcomes if not over for outcome in rules.outcomes(before, action)]
-    ended = sum(outcome.probability for outcome in after if outcome.terminated)
-    dead_ends = sum(not _can_last(rules, outcome.macrostate) for outcome in after if not outcome.terminated)
-    return ended, dead_ends
-
-
-def _can_last(rules: Rules, state: State) -> bool:
-    """Whether some macro-action surely does not end the episode there."""
-    return any(not any(o.terminated for o in rules.outcomes(state, action)) for action in range(rules.n_actions))
-
-
 def total_variation(exact: Mapping[State, float], imagined: Mapping[State, float]) -> float:
     """Half the sum of absolute differences of two distributions: 0 for equal ones, 1 for those that share nothing."""
     return 0.5 * sum(abs(exact.get(key, 0.0) - imagined.get(key, 0.0)) for key in {*exact, *imagined})
@@ -101,5 +67,5 @@ def missed_modes(exact: Mapping[State, float], imagined: Mapping[State, float]) 
 
 
 def hallucinated_modes(exact: Mapping[State, float], imagined: Mapping[State, float]) -> int:
-    """Outcomes imagined at least :data:`MODE` of the time that the rules make impossible."""
-    return sum(share >= MODE and exact.get(key, 0.0) == 0.0 for key, share in imagined.items())
+    """Macrostates imagined at least :data:`MODE` of the time that the rules make impossible."""
+    return sum(share >= MODE and key[0] >= 0 and not exact.get(key) for key, share in imagined.items())

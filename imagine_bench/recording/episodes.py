@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -27,7 +26,7 @@ from imagine_bench.interfaces.capabilities import (
     ValueReader,
     begin_episode,
 )
-from imagine_bench.judge.open_loop import compare_rollout, sampled_rollouts_from
+from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording.filmstrips import filmstrip, rgb, sampled_filmstrips
 from imagine_bench.recording.scene import blueprint, log_motion, log_shapes, look_target_m, macro_duration_s
 from imagine_bench.recording.stream import Recording, recording_file
@@ -247,15 +246,20 @@ class _EpisodeRecorder:
         seeds = SeedTree(self.seed)
         rng = seeds.child("recording", episode, step).generator()
         rollout = self.agent.imagine(frame, actions=None, depth=IMAGINED_DEPTH, rng=rng)
-        seen: dict[str, Any] = {"frame": frame, "macrostate": macrostate, "before": self.states}
-        seen["appearance"] = self.appearance
-        compared = compare_rollout(spec, **seen, rollout=rollout, rng=rng)
+        moment = Moment(
+            spec=spec,
+            appearance=self.appearance,
+            frame=frame,
+            macrostate=tuple(macrostate.tolist()),
+            before=self.states,
+        )
+        compared = moment.beside(rollout, rng)
         self.recording.sheet("/imagined/filmstrip", filmstrip(compared, spec.action_names, columns=IMAGINED_DEPTH))
         self._uncertainty_bars(compared)
         if is_random(spec.rules):  # several rollouts, since what happens next is partly chance
             branch = seeds.child("sampled_rollouts", episode, step)
-            sampled = sampled_rollouts_from(self.agent, spec, **seen, seeds=branch)
-            self.recording.sheet("/imagined/sampled_rollouts", sampled_filmstrips(sampled, spec))
+            sampled = sampled_filmstrips(moment.sampled(self.agent, branch), spec)
+            self.recording.sheet("/imagined/sampled_rollouts", sampled)
         if step == 0:
             self._by_depth(compared, f"/imagined/episode_{episode}")
 

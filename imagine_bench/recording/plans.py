@@ -75,8 +75,8 @@ class _PlanRecorder:
         self.recording.stream.set_time("plan", sequence=number)
         moments: list[tuple[float, int]] = []
 
-        def arrive(*_: object) -> None:
-            if moments:
+        def arrive(done: int) -> None:
+            if done:
                 self.clock_s += macro_duration_s(scene)
                 self.env_step += 1
             self.recording.set_clocks(self.clock_s, env_step=self.env_step)
@@ -84,11 +84,9 @@ class _PlanRecorder:
                 sequences = {"env_step": self.env_step, "plan": number}
                 log_motion(self.recording, scene.motion(), end_s=self.clock_s, sequences=sequences)
             moments.append((self.clock_s, self.env_step))
-            self.clock_s += _LOOK_S * (len(moments) == 1)
+            self.clock_s += _LOOK_S * (done == 0)
 
-        plan = carry_out(
-            self.env, self.trained, number, max_epistemic=self.max_epistemic, on_step=arrive, on_plan=arrive
-        )
+        plan = carry_out(self.env, self.trained, number, max_epistemic=self.max_epistemic, on_step=arrive)
         for done, (clock_s, env_step) in enumerate(moments):
             self.recording.set_clocks(clock_s, env_step=env_step)
             self._show(plan, done)

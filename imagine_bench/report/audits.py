@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from imagine_bench import reference, registry, statistics
 from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.causes import WhyAnalysis
+from imagine_bench.judge.causes import causes_of
 from imagine_bench.judge.plans import PlanResult, make_plans, require_threshold
 from imagine_bench.judge.verify import Verdict, verify_runs
 from imagine_bench.recording.filmstrips import filmstrip, png
@@ -32,7 +32,6 @@ from imagine_bench.running.trained import (
     protocol_of_agents,
     require_control,
 )
-from imagine_bench.seeding import evaluation_split
 from imagine_bench.store.bench_folder import newest_bench, require_either
 from imagine_bench.store.files import (
     csv_text,
@@ -239,12 +238,11 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
     appearance = protocol.appearance_in_tests
     folders = learners(bench)
     with lock(bench / ".why.lock", f"The folder {where}"):
-        analysis = WhyAnalysis(spec, appearance=appearance, purpose=evaluation_split(protocol.seeds[0]))
         rows: list[Sequence[object]] = []
         runs = []
         for run in counted(folders, "runs", total=len(folders)):
             trained = load_trained(run, encoder=encoder)
-            found = analysis.measure(trained)
+            found = causes_of(trained)
             head = {"agent": trained.spec.agent, "seed": trained.spec.seed}
             by_budget = {str(each.episodes): Counter(each.causes.values()) for each in found}
             runs.append({**head, "episodes": trained.episodes, "failures": by_budget})

@@ -206,7 +206,7 @@ def in_short(found: Judged) -> Section:
         "refuses to read them; fog, noise and blends of two frames should not be read."
     )
     samples = found.judgement.samples
-    truth = prepare(found.judgement, found.folder).rollouts.truth
+    truth = prepare(found.judgement, found.folder).asked["rollouts"].truth
     noise = np.mean([[sampling_noise_floor(shares(each), samples) for each in steps] for steps in truth], axis=0)
     chance = f"Drawing only {samples} futures adds at most {', '.join(map(decimals, noise))} to it, by depth."
     reader = Table.of("reader", [errors], "What the reader of images gets wrong itself.")
@@ -271,7 +271,7 @@ def where(found: Judged) -> Section:
     for group, values in groups.items():
         rows.append([*group, *(over_seeds(values.get(model, []), _number, share=True) for model in found.last)])
     header = ["by", "which", *map(_title, found.last)]
-    caption = f"Total variation of one step{found.after}; of a coordinate, that of it alone."
+    caption = f"Total variation of one step{found.after}."
     return Section("Where it fails", tables=[Table("where", header, rows, caption, "no such transition")])
 
 

@@ -40,7 +40,7 @@ def finished(root: Path, agent: str, task: str, **changes: Any) -> RunResult:
 def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint, why.Tested]:
     """A bench of one agent, and the causes of its first test's failures."""
     run = finished(root, agent, task, **changes)
-    found = why.WhyAnalysis(registry.task(task), appearance="clean").measure(load_trained(run.folder))
+    found = why.causes_of(load_trained(run.folder))
     for row, each in zip(run.checkpoints, found, strict=True):
         failed = [test for test, solved in enumerate(row.solved or "") if solved == "0"]
         assert list(each.causes) == failed, "every failure has a cause, and nothing else has"
@@ -72,10 +72,10 @@ def test_grasps_that_slip_are_the_cause_of_every_failure(tmp_path: Path) -> None
     row, found = asked(tmp_path, "sound", "arrows:cubes=2", evaluation_episodes=6, **changes)
     assert set(found.causes.values()) == {"fault"} and row.faults > 0 and row.kept is not None
     with closing(gymnasium.make(registry.task("arrows:cubes=2").env_id, physics={"plan_error_mm": 30.0})) as env:
-        lived = why._FailedEpisodes(
-            env, Sound(AgentContext(n_actions=4, preprocessing="", encoder=None, seeds=SeedTree(0))), 0
-        )
-        assert [sum(lived.of(row.kept, test).faults) for test in range(6)] == row.kept.faults.tolist()
+        agent = Sound(AgentContext(n_actions=4, preprocessing="", encoder=None, seeds=SeedTree(0)))
+        for test, count in enumerate(row.kept.faults):
+            seed = episode_seed("evaluation", 0, test)
+            assert sum(why.lived_again(env, agent, seed, row.kept.actions_of(test)).faults) == count
 
 
 def test_what_came_later_was_not_known_before(tmp_path: Path) -> None:
@@ -90,9 +90,9 @@ def test_a_course_is_what_was_seen_before_each_action(tmp_path: Path) -> None:
     seen = set[tuple[bool, ...]]()
     with closing(gymnasium.make(spec.env_id, execution="kinematic")) as env:
         for test in range(row.test_episodes):
-            episode = why._FailedEpisodes(env, agent, 0).of(row.kept, test)
-            frame, info = env.reset(seed=episode_seed("evaluation", 0, test))
-            assert episode.actions == row.kept.actions_of(test)
+            seed = episode_seed("evaluation", 0, test)
+            episode = why.lived_again(env, agent, seed, row.kept.actions_of(test))
+            frame, info = env.reset(seed=seed)
             for action, state, misread in zip(episode.actions, episode.states, episode.misread, strict=False):
                 assert state == tuple(info["macrostate"].tolist())
                 assert misread == (tuple(agent.read_frames(frame[None])[0].tolist()) != state)
@@ -103,14 +103,16 @@ def test_a_course_is_what_was_seen_before_each_action(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_asked_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    analysis = why.WhyAnalysis(registry.task("arrows:cubes=2"), appearance="clean")
-    for known in ({"dataset": "some", "after": ()}, {"dataset": "", "after": ("arrow_puzzle",)}):
-        trained: Any = SimpleNamespace(spec=SimpleNamespace(protocol=SimpleNamespace(**known)))
-        with pytest.raises(InvalidValueError, match="in a dataset or an earlier task"):
-            analysis.measure(trained)
-    seeing: Any = {"dataset": "", "after": (), "shows_frames_alone": False}
-    with pytest.raises(InvalidValueError, match="saw more than frames"):
-        analysis.measure(SimpleNamespace(spec=SimpleNamespace(protocol=SimpleNamespace(**seeing))))  # type: ignore[arg-type]
+    usual = {"dataset": "", "after": (), "shows_frames_alone": True}
+    for known, words in (
+        ({"dataset": "some"}, "in a dataset or an earlier task"),
+        ({"after": ("arrow_puzzle",)}, "in a dataset or an earlier task"),
+        ({"shows_frames_alone": False}, "saw more than frames"),
+    ):
+        spec = SimpleNamespace(protocol=SimpleNamespace(**{**usual, **known}))
+        trained: Any = SimpleNamespace(spec=spec, task=registry.task("arrows:cubes=2"))
+        with pytest.raises(InvalidValueError, match=words):
+            why.causes_of(trained)
     monkeypatch.setattr(observers, "MOST_STATES", 31)
     with pytest.raises(InvalidValueError, match="too many macrostates"):
         asked(tmp_path, "bad", "arrows:cubes=2", evaluation_episodes=2, budgets=(1,))

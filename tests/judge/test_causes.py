@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from imagine_bench import registry
 from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
-from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, _at, _place, true_model
+from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, drawn_by, place
+from imagine_bench.judge.values import true_model
 from imagine_bench.rules import fewest_actions, states_of
 from imagine_bench.store.results import PolicyTable
 
@@ -31,7 +32,7 @@ FAR = [s for s in RULES.start_states if fewest_actions(RULES, s) >= 2]
 def model_of(spec: TaskSpec, wrong: Callable[[State, int], bool] = lambda state, action: False) -> ExpectedOutcomes:
     """The rules as an agent's model, but for pairs about which it is wrong: there it expects nothing good to follow."""
     states = states_of(spec.rules)
-    truth = true_model(spec.rules)
+    truth = true_model(spec.rules, states)
     doubted = np.array([[wrong(state, action) for action in range(spec.n_actions)] for state in states])
     return ExpectedOutcomes(
         macrostates=np.array(states)[truth.following],
@@ -181,10 +182,10 @@ def test_a_number_finds_the_outcome_that_it_stands_for() -> None:
         shares = rng.dirichlet(np.ones(4))
         outcomes = [Outcome(float(p), (i,), 0.0, terminated=False, success=False) for i, p in enumerate(shares)]
         for outcome in outcomes:
-            before, probability = _place(outcomes, outcome.macrostate)
-            assert _at(outcomes, before + probability * rng.random()) is outcome
+            before, probability = place(outcomes, outcome.macrostate)
+            assert drawn_by(before + probability * rng.random(), outcomes) is outcome
         drawn = np.random.default_rng(9).choice(4, p=shares)
-        assert _at(outcomes, np.random.default_rng(9).random()) is outcomes[drawn], "as an environment draws"
+        assert drawn_by(np.random.default_rng(9).random(), outcomes) is outcomes[drawn], "as an environment draws"
 
 
 def test_a_scene_that_was_no_macrostate_is_no_experience() -> None:

@@ -17,7 +17,7 @@ from imagine_bench.interfaces.capabilities import ImaginedRollout
 from imagine_bench.judge.open_loop import (
     EXAMPLES,
     SAMPLED_ROLLOUTS,
-    compare_rollout,
+    Moment,
     examples,
     imagine_sampled_rollouts,
     open_loop,
@@ -30,7 +30,7 @@ from imagine_bench.seeding import TUNING_SEEDS, SeedTree, evaluation_split
 from imagine_bench.store.results import ComparedRollout
 
 PUZZLE, PICK_PLACE = labelled("arrow_puzzle"), labelled("pick_place")
-START = np.array([0, 0, 0, 0])
+START = (0, 0, 0, 0)
 """The human points at the left object."""
 ASKS_MIDDLE, ASKS_RIGHT, IMPOSSIBLE = (1, 0, 0, 1), (1, 0, 0, 2), (1, 1, 0, 2)
 
@@ -192,7 +192,7 @@ def compared(seed: int, *wishes: tuple[int, ...]) -> ComparedRollout:
     rng = np.random.default_rng(seed)
     rollout = imaginer().imagine(frame, actions=np.zeros(len(wishes), dtype=np.int64), depth=9, rng=rng)
     rollout = dataclasses.replace(rollout, macrostates=np.array(wishes))
-    return compare_rollout(PICK_PLACE, frame=frame, macrostate=START, rollout=rollout, appearance="clean", rng=rng)
+    return Moment(spec=PICK_PLACE, appearance="clean", frame=frame, macrostate=START).beside(rollout, rng)
 
 
 def test_examples_stand_beside_the_truth() -> None:
@@ -218,7 +218,7 @@ def test_reality_goes_as_was_imagined_where_it_may() -> None:
         for wish in (ASKS_MIDDLE, ASKS_RIGHT):
             assert tuple(compared(seed, wish).real_macrostates[0]) == wish
     reached = {tuple(compared(seed, IMPOSSIBLE).real_macrostates[0]) for seed in range(30)}
-    assert reached == {outcome.macrostate for outcome in PICK_PLACE.rules.outcomes(tuple(START), 0)}
+    assert reached == {outcome.macrostate for outcome in PICK_PLACE.rules.outcomes(START, 0)}
 
 
 def test_only_a_task_with_chance_has_sampled_rollouts() -> None:

@@ -22,7 +22,7 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
-from imagine_bench.judge.open_loop import compare_rollout
+from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording import episodes, stream
 from imagine_bench.recording.episodes import q_table, record_run
 from imagine_bench.recording.scene import log_motion, log_shapes
@@ -307,11 +307,10 @@ def test_compared_rollouts_follow_the_rules_as_late_as_the_agent_s_frames_and_hi
     for _ in range(before):
         moves = [each[0] for each in (spec.rules.outcomes(episode[-1], action) for action in range(spec.n_actions))]
         episode.append(next(each.macrostate for each in moves if not each.terminated))
-    rollout = FakeImaginer().imagine(np.zeros((64, 64, 3), np.uint8), actions=None, depth=6, rng=rng)
-    compared = compare_rollout(
-        spec, frame=np.zeros((64, 64, 3), np.uint8), macrostate=np.array(episode[-1]), rollout=rollout,
-        appearance="clean", rng=rng, before=episode[:-1],
-    )  # fmt: skip
+    frame = np.zeros((64, 64, 3), np.uint8)
+    rollout = FakeImaginer().imagine(frame, actions=None, depth=6, rng=rng)
+    moment = Moment(spec=spec, appearance="clean", frame=frame, macrostate=episode[-1], before=episode[:-1])
+    compared = moment.beside(rollout, rng)
     states = list(episode)
     rewards = []
     over = False

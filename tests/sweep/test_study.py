@@ -23,7 +23,7 @@ from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
-from imagine_bench.judge.causes import true_model
+from imagine_bench.judge.values import true_model
 from imagine_bench.protocols.data import Failure, Job, OnProgress, digest
 from imagine_bench.report.page import write_page
 from imagine_bench.report.sweep import study_page
@@ -231,7 +231,7 @@ def test_the_table_says_what_helps(tmp_path: Path) -> None:
 def test_what_isimagined_right_is_what_the_rules_have_too() -> None:
     task = registry.task("arrow_puzzle")
     states, actions = states_of(task.rules), task.n_actions
-    truth = true_model(task.rules)
+    truth = true_model(task.rules, states)
     alive = [row for row, state in enumerate(states) if not task.rules.is_terminal(state)]
     macrostates = np.array(states)[truth.following]
     half = truth.p_continues.copy()
