@@ -7,11 +7,15 @@ from collections.abc import Callable, Mapping
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, plain
-from imagine_bench.testing.common import NotOffered
-from imagine_bench.testing.of_agents import AGENT_CHECKS, checked_agent
-from imagine_bench.testing.of_models import MODEL_CHECKS, CheckedModel
-from imagine_bench.testing.of_options import OPTION_ROWS, CheckedOptions, watching_teaches_as_living
-from imagine_bench.testing.of_tasks import TASK_CHECKS
+from imagine_bench.testing.checks import (
+    AGENT_CHECKS,
+    MODEL_CHECKS,
+    TASK_CHECKS,
+    CheckedModel,
+    NotOffered,
+    checked_agent,
+)
+from imagine_bench.testing.options import OPTION_ROWS, CheckedOptions, watching_teaches_as_living
 
 Checks = Mapping[str, Callable[[], None]]
 _USUAL = "arrow_puzzle"

@@ -1,27 +1,49 @@
-"""``imagine-bench check TASK --physics``: does physics do what the rules say, and how nearly does it fail?"""
+"""``imagine-bench check TASK --physics``: does physics do what the rules say, and how nearly does it fail?
+
+Fidelity is measured on long random walks beside a perfect execution. Margins are how far each setting that makes a
+grasp hold may go before macro-actions fail.
+"""
 
 from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import scipy  # its parts load, slowly, when they are first used
 
-from imagine_bench import registry
+from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
-from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import APPEARANCES, PerformanceTargets, TaskSpec
+from imagine_bench.arrays import Bools
+from imagine_bench.errors import DivergedError, InvalidValueError
+from imagine_bench.interfaces import APPEARANCES, SENSES, Floats, PhysicsSettings, State, TaskSpec
 from imagine_bench.registry.machine import describe_environment, gl_renderer
+from imagine_bench.rules import states_of
+from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.files import require_writable, write_json
-from imagine_bench.testing.fidelity import Fidelity, measure_fidelity
-from imagine_bench.testing.margins import measure_margins
 
-_SLIPPED_MM = 5
-"""An object whose macro-action slips is only squared in the fingers, and moves less than a pushed one."""
+SWEEPS: dict[str, tuple[float, ...]] = {
+    "pad_friction": (1.2, 0.6, 0.3, 0.2, 0.1, 0.05, 0.03, 0.01, 0.003, 0.001),
+    "finger_force_n": (30, 10, 5, 3, 2, 1.5, 1, 0.9, 0.7, 0.5, 0.3, 0.1),
+    "object_mass": (1, 3, 5, 10, 15, 20, 30, 35, 40, 60),
+    "plan_error_mm": (0, 2, 4, 6, 8, 10, 12, 14, 17, 20, 25, 30, 40),
+    "plan_error_deg": (0, 5, 10, 15, 20, 25, 30, 32, 35, 40, 45),
+}
+"""Values of each setting, the first as built. Beyond 45 degrees a cube looks as if turned the other way."""
+HEAD = "| what | required | measured | |\n|---|---|---|---|"
+"""Head of a table of figures."""
+_CLEAN = APPEARANCES[0]
+_ACTIONS_A_WALK = 200  # between two resets: errors may accumulate
+_ACTIONS_A_VARIED_WALK = 5  # where poses vary, a turn undoes what the reset drew
+_WALKS = 5  # without a reset, of each way to sense poses
+_WALK_ACTIONS = 200
+_STANDS_M = 0.02  # an object so near to its height on the table stands there
+_QUARTER_DEG = 90.0
+_SLIPPED_MM = 5  # an object whose macro-action slips is only squared in the fingers, and moves less than a pushed one
 _SIGNS = {"<": operator.lt, "<=": operator.le, ">=": operator.ge}
 
 
@@ -39,10 +61,6 @@ class Figure:
         """Its row of a Markdown table."""
         verdict = "" if self.required == "–" else "met" if self.met else "NOT MET"
         return f"| {self.what} | {self.required} | {self.measured} | {verdict} |"
-
-
-HEAD = "| what | required | measured | |\n|---|---|---|---|"
-"""Head of a table of figures."""
 
 
 def figure_of(
@@ -65,7 +83,7 @@ def check_physics(
     *,
     turns: int = 2_000,
     trials: int = 200,
-    appearances: Sequence[str] = APPEARANCES[:1],
+    appearances: Sequence[str] = (_CLEAN,),
     show: Callable[[str], None] = print,
 ) -> bool:
     """Measure fidelity and margins of a task, show Markdown tables, and keep the figures and the machine's description.
@@ -111,37 +129,146 @@ def check_physics(
     return all(figure.met for figure in figures)
 
 
-def fidelity_figures(spec: TaskSpec, turns: int, appearance: str = APPEARANCES[0]) -> Iterator[Figure]:
+def _env(spec: TaskSpec, **options: Any) -> Any:
+    return gymnasium.make(spec.env_id, **options, disable_env_checker=True).unwrapped
+
+
+# Fidelity ----------------------------------------------------------------------------------------------------------
+
+
+def fidelity_figures(spec: TaskSpec, turns: int, appearance: str = _CLEAN) -> Iterator[Figure]:
     """Fidelity of random macro-actions, beside the task's targets if it has any."""
     targets = spec.targets
     found = measure_fidelity(spec, turns, appearance)
-    clean = appearance == APPEARANCES[0]
-    world = spec.id if clean else f"{spec.id} at {appearance}"
-    least = None if targets is None else targets.as_ruled if clean else targets.as_ruled_varied
+    world = spec.id if appearance == _CLEAN else f"{spec.id} at {appearance}"
     what = f"{world}: macro-actions exactly as the rules say, of {turns:,}"
-    yield figure_of(what, found.as_ruled / found.actions, ".2%", ">=", least)
-    if targets is not None:
-        yield from _of_poses(world, found, targets)
+    if targets is None:
+        yield figure_of(what, found.as_ruled / found.actions, ".2%")
+    else:
+        least = targets.as_ruled if appearance == _CLEAN else targets.as_ruled_varied
+        yield figure_of(what, found.as_ruled / found.actions, ".2%", ">=", least)
+        what = f"{world}: other objects moved, worst, mm"
+        yield figure_of(what, found.other_objects_mm, ".3f", "<", targets.other_objects_mm)
+        for what, values, most in (
+            ("position error, p99, mm", found.error_mm, targets.error_mm),
+            ("yaw error, p99, degrees", found.error_deg, targets.error_deg),
+        ):
+            if most is not None:
+                yield figure_of(f"{world}: {what}", float(np.percentile(values, 99)), ".2f", "<", most)
     if found.slips:
         yield from slips(world, found)
 
 
-def _of_poses(world: str, found: Fidelity, targets: PerformanceTargets) -> Iterator[Figure]:
-    what = f"{world}: other objects moved, worst, mm"
-    yield figure_of(what, found.other_objects_mm, ".3f", "<", targets.other_objects_mm)
-    for what, values, most in (
-        ("position error, p99, mm", found.error_mm, targets.error_mm),
-        ("yaw error, p99, degrees", found.error_deg, targets.error_deg),
-    ):
-        if most is not None:
-            yield figure_of(f"{world}: {what}", float(np.percentile(values, 99)), ".2f", "<", most)
+@dataclass
+class Fidelity:
+    """What a walk showed."""
+
+    actions: int = 0  #: macro-actions done
+    faults: list[str] = field(default_factory=list)  #: why some did not end as the rules say
+    other_objects_mm: float = 0.0  #: the furthest that an object moved which the action should leave where it stood
+    #: Of each object acted on, its distance from where a perfect execution leaves it.
+    error_mm: list[float] = field(default_factory=list)
+    #: Its yaw from there, to the nearest quarter turn, since objects have no marked side.
+    error_deg: list[float] = field(default_factory=list)
+    #: Of each macro-action that might slip: whether it did, and the probability that the rules gave to that.
+    slips: list[tuple[bool, float]] = field(default_factory=list)
+    slipped_mm: float = 0.0  #: the furthest that an object moved whose macro-action slipped
+
+    @property
+    def as_ruled(self) -> int:
+        """Macro-actions that ended as the rules say, without a fault."""
+        return self.actions - len(self.faults)
+
+
+def measure_fidelity(spec: TaskSpec, actions: int, appearance: str = _CLEAN) -> Fidelity:
+    """Walk at random in contact physics, judged by the objects' poses in the simulation and not by ``info`` alone.
+
+    Of a task without ``targets`` no object is known, and ``info`` alone judges.
+
+    Args:
+        spec: The task.
+        actions: Macro-actions of the measurement.
+        appearance: Says how far from their places a reset puts objects.
+    """
+    objects = () if spec.targets is None else spec.targets.objects
+    goes_on = spec.targets is not None and spec.targets.goes_on
+    real, perfect = (_env(spec, execution=each, appearance=appearance) for each in ("physics", "kinematic"))
+    found = Fidelity(actions=actions)
+    rng = SeedTree(0).child("speed", "physics", spec.id).generator()
+    walk_actions = _ACTIONS_A_WALK if appearance == _CLEAN else _ACTIONS_A_VARIED_WALK
+    play = [state for state in states_of(spec.rules) if not spec.rules.is_terminal(state)]
+    real.reset(seed=episode_seed("tuning", 0, actions))
+    standing_m = _poses(real, objects)[:, 2]  # every start has all objects on the table
+    fresh = True
+    for step in range(actions):
+        if fresh or step % walk_actions == 0:
+            options = {"macrostate": play[int(rng.integers(len(play)))]}
+            for env in (perfect, real):
+                _, info = env.reset(seed=episode_seed("tuning", 0, step), options=options)
+        before = _poses(real, objects)
+        state = info["macrostate"]
+        action = int(rng.integers(spec.n_actions))
+        *_, wanted = perfect.step(action)
+        _, _, terminated, _, info = real.step(action)
+        right = not info["fault"] and np.array_equal(info["macrostate"], wanted["macrostate"])
+        if right:
+            outcomes = spec.rules.outcomes(tuple(state.tolist()), action)
+            can_move = np.array([state != each.macrostate for each in outcomes])[:, : len(objects)]
+            moved = np.not_equal(state, info["macrostate"])[: len(objects)]
+            slip = sum(each.probability for each, moves in zip(outcomes, can_move, strict=True) if not moves.any())
+            if 0 < slip < 1:
+                found.slips.append((not moved.any(), slip))
+            poses = np.array([before, _poses(real, objects), _poses(perfect, objects)])
+            _compare(found, moved, can_move.any(axis=0), standing_m, poses)
+        else:
+            found.faults.append(info.get("fault_reason", f"{wanted['macrostate']} was to be reached"))
+        fresh = not right or (terminated and not goes_on)
+    for env in (real, perfect):
+        env.close()
+    return found
+
+
+def _poses(env: Any, objects: Sequence[str]) -> Floats:
+    """Positions and quaternions of the named bodies, now. Shape (N, 7)."""
+    if not objects:
+        return np.empty((0, 7))
+    motion = env.motion()
+    return np.asarray(motion.poses_in_world[-1][[motion.body_names.index(name) for name in objects]])
+
+
+def _compare(found: Fidelity, moved: Bools, can_move: Bools, standing_m: Floats, poses: Floats) -> None:
+    """Take in where the N objects are after a macro-action that ended as the rules say.
+
+    Args:
+        found: Changed in place.
+        moved: Objects whose coordinate changed. Shape (N,).
+        can_move: Objects that the action can move. Shape (N,).
+        standing_m: Height of each on the table. Shape (N,).
+        poses: Poses before the action, after it, and after a perfect execution. Shape (3, N, 7).
+    """
+    before, after, perfect = poses
+    stood = (np.abs(poses[:2, :, 2] - standing_m) < _STANDS_M).all(axis=0)
+    shifts_mm = 1e3 * (after - before)[:, :3]
+    others_mm = np.abs(shifts_mm[stood & ~can_move]).max(initial=0.0)
+    found.other_objects_mm = max(found.other_objects_mm, float(others_mm))
+    if not moved.any():
+        slipped_mm = np.linalg.norm(shifts_mm[can_move], axis=1).max(initial=0.0)
+        found.slipped_mm = max(found.slipped_mm, float(slipped_mm))
+    found.error_mm += (1e3 * np.linalg.norm((after - perfect)[moved, :3], axis=1)).tolist()
+    off_deg = (_yaw_deg(after) - _yaw_deg(perfect) + _QUARTER_DEG / 2) % _QUARTER_DEG - _QUARTER_DEG / 2
+    found.error_deg += np.abs(off_deg[moved]).tolist()
+
+
+def _yaw_deg(poses: Floats) -> Floats:
+    """Yaw of poses (N, 7), each a position and a quaternion w x y z, about the world's vertical. Shape (N,)."""
+    w, x, y, z = poses[:, 3:].T
+    return np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 def slips(world: str, found: Fidelity) -> Iterator[Figure]:
     """The rate of slips, within the 99 % interval of the rules' probability, and how far objects that slip move."""
     n = len(found.slips)
-    rate = float(np.mean([slipped for slipped, _ in found.slips]))
-    expected = float(np.mean([probability for _, probability in found.slips]))
+    rate, expected = np.mean(found.slips, axis=0)
     low, high = scipy.stats.binom.interval(0.99, n, expected) / np.float64(n)
     yield Figure(
         what=f"{world}: macro-actions that slip, of {n:,}",
@@ -150,3 +277,93 @@ def slips(world: str, found: Fidelity) -> Iterator[Figure]:
         met=bool(low <= rate <= high),
     )
     yield figure_of(f"{world}: objects that slip move, worst, mm", found.slipped_mm, ".2f", "<", _SLIPPED_MM)
+
+
+# Margins -----------------------------------------------------------------------------------------------------------
+
+
+def measure_margins(spec: TaskSpec, trials: int, show: Callable[[str], None]) -> dict[str, Any]:
+    """Sweep each setting alone, walk with true and nominal poses, show a Markdown table and return the figures.
+
+    A task whose environment takes no ``physics`` has none. A trial is one macro-action from a start that moves an
+    object if it succeeds. The same starts, actions and seeds serve every value.
+    """
+    try:
+        _env(spec, physics=PhysicsSettings()).close()
+    except TypeError:  # Gymnasium's, for a keyword that the environment does not take
+        show(f"No margins: the environment of {spec.id} takes no physics settings.")
+        return {}
+    show("| setting | value | as ruled | 95 % (Wilson) |\n|---|---|---|---|")
+    curves: dict[str, list[dict[str, float]]] = {name: [] for name in SWEEPS}
+    for name, values in SWEEPS.items():
+        for value in values:
+            right = as_ruled(spec, PhysicsSettings.of({name: float(value)}), trials)
+            low, high = statistics.wilson(right, trials)
+            point = {"value": float(value), "as_ruled": right, "trials": trials, "low": low, "high": high}
+            curves[name].append(point)
+            show(f"| {name} | {value:g} | {right} of {trials} | {low:.3f} to {high:.3f} |")
+    walks = [walk(spec, sense) for sense in SENSES]
+    for each in walks:
+        show(f"| sense | {each['sense']} | {each['as_ruled']} of {each['actions']} | {len(each['faults'])} faults |")
+    return {"built": asdict(PhysicsSettings()), "curves": curves, "walks": walks}
+
+
+def as_ruled(spec: TaskSpec, settings: PhysicsSettings, trials: int) -> int:
+    """How many of so many macro-actions end as the rules say and without a fault."""
+    env = _env(spec, physics=settings)
+    rng = SeedTree(0).child("margins", spec.id).generator()
+    starts = spec.rules.start_states
+    right = 0
+    for trial in range(trials):
+        start = starts[int(rng.integers(len(starts)))]
+        action = int(rng.choice(_moves(spec, start)))
+        env.reset(seed=episode_seed("tuning", 0, trial), options={"macrostate": start})
+        try:
+            *_, info = env.step(action)
+        except DivergedError:
+            continue
+        right += not info["fault"]
+    env.close()
+    return right
+
+
+def walk(spec: TaskSpec, sense: str) -> dict[str, Any]:
+    """Walk at random, without a reset, among actions that move an object and leave one to move; a fault ends a walk.
+
+    Returns:
+        The sense; macro-actions done, and as ruled; of each walk its length and what ended it early; and in mm the
+        furthest that a standing object came from where it stood at first.
+    """
+    env = _env(spec, physics=PhysicsSettings(sense=sense))
+    rng = SeedTree(0).child("margins", "walk", spec.id).generator()
+    lengths = []
+    faults = []
+    drift_m = 0.0
+    for number in range(_WALKS):
+        _, info = env.reset(seed=episode_seed("tuning", 1, number))
+        at_first = env.world.object_poses()
+        length = 0
+        while length < _WALK_ACTIONS and not info["fault"]:
+            state = tuple(info["macrostate"].tolist())
+            going_on = [a for a in _moves(spec, state) if all(_moves(spec, then) for then in _after(spec, state, a))]
+            *_, info = env.step(int(rng.choice(going_on)))
+            length += 1
+            off_m = env.world.object_poses() - at_first  # [N, 7]
+            standing = (np.abs(off_m[:, 2]) < _STANDS_M) & (not info["fault"])  # [N]
+            drift_m = max(drift_m, float(np.linalg.norm(off_m[standing, :2], axis=1).max(initial=0.0)))
+        lengths.append(length)
+        if info["fault"]:
+            faults.append(info["fault_reason"])
+    env.close()
+    done = {"sense": sense, "actions": sum(lengths), "as_ruled": sum(lengths) - len(faults)}
+    return {**done, "lengths": lengths, "faults": faults, "drift_mm": 1e3 * drift_m}
+
+
+def _after(spec: TaskSpec, state: State, action: int) -> list[State]:
+    return [outcome.macrostate for outcome in spec.rules.outcomes(state, action)]
+
+
+def _moves(spec: TaskSpec, state: State) -> Sequence[int]:
+    """Actions that change an object's coordinate, whatever people answer; people's is the last one."""
+    n = len(state) - 1
+    return [a for a in range(spec.n_actions) if all(then[:n] != state[:n] for then in _after(spec, state, a))]

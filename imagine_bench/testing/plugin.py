@@ -24,7 +24,7 @@ def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config
     chosen = {guest: config.getoption(f"imagine_bench_{guest}") for guest in _GUESTS}
     if not any(chosen.values()):
         return
-    from imagine_bench.testing import common, contract  # noqa: PLC0415 - nothing where no option is given
+    from imagine_bench.testing import checks, contract  # noqa: PLC0415 - nothing where no option is given
 
     try:
         found = contract.checks(**chosen)
@@ -33,7 +33,7 @@ def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config
     name = chosen["agent"] or chosen["model"] or chosen["task"]
     for words, check in ((f"{name}: {what}", check) for what, check in found.items()):
         nodeid = f"imagine-bench::{words}"
-        item = Check.from_parent(session, name=words, nodeid=nodeid, check=check, excuse=common.NotOffered)
+        item = Check.from_parent(session, name=words, nodeid=nodeid, check=check, excuse=checks.NotOffered)
         items.append(item)
 
 

@@ -53,11 +53,9 @@ def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint
         ("blind", "misread", "arrows:cubes=2"),
         ("bad", "values", "arrows:cubes=2"),
         ("not_greedy", "planning", "arrows:cubes=2"),
-        pytest.param("not_greedy", "planning", "pick_place", marks=pytest.mark.slow),
         ("wrong_model", "model", "arrows:cubes=2"),
         pytest.param("wrong_model", "model", "pick_place", marks=pytest.mark.slow),
         ("timid", "unexperienced", "arrows:cubes=2"),
-        pytest.param("timid", "unexperienced", "pick_place", marks=pytest.mark.slow),
         ("timid_modeller", "unexperienced", "arrows:cubes=2"),
     ],
 )
@@ -139,7 +137,6 @@ def best_sets(rules: Rules, horizon: int) -> list[dict[State, set[int]]]:
     [
         "arrows:cubes=2,slip=0.7",
         "arrows:cubes=2,fickle=0.3,slip=0.7",
-        pytest.param("arrows:cubes=3,fickle=0.2,slip=0.4", marks=pytest.mark.slow),
     ],
 )
 def test_unlucky_is_what_an_optimal_policy_fails_with_the_same_draws(task: str, tmp_path: Path) -> None:

@@ -9,14 +9,8 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.registry.builtin import guests
 from imagine_bench.running.control import plan_control
-from imagine_bench.testing.common import NotOffered
-from imagine_bench.testing.of_agents import checked_agent
-from imagine_bench.testing.of_options import (
-    OPTION_ROWS,
-    CheckedOptions,
-    require_every_field,
-    watching_teaches_as_living,
-)
+from imagine_bench.testing.checks import NotOffered, checked_agent
+from imagine_bench.testing.options import OPTION_ROWS, CheckedOptions, require_every_field, watching_teaches_as_living
 
 TASK = "arrow_puzzle:horizon=3"
 _HEAVY = ("dqn_", "dreamer_", "drqn", "imagination_exact", "lewm", "sb3_")

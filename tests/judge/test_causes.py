@@ -62,18 +62,6 @@ def cause(agent: PolicyTable, tried: NDArray[np.int64], happened: FailedEpisode,
 
 
 @pytest.mark.parametrize("start", FAR[::24])
-@pytest.mark.parametrize("modelled", [True, False])
-def test_one_misread_frame_is_charged_to_the_eyes(start: State, modelled: bool) -> None:
-    agent = does(OPTIMAL, model_of(SPEC) if modelled else None)
-    first = OPTIMAL[start]
-    second = ILLEGAL[RULES.outcomes(start, first)[0].macrostate]
-    blind = episode(start, [first, second], misread=[False, True])
-    assert cause(agent, ALL, blind) == "misread"
-    seeing = dataclasses.replace(blind, misread=[True, False])
-    assert cause(agent, ALL, seeing) == ("planning" if modelled else "values"), "it was not the frame that was misread"
-
-
-@pytest.mark.parametrize("start", FAR[::24])
 def test_the_best_stands_for_what_an_agent_does_where_it_reads_nothing(start: State) -> None:
     """What its model says there, from frames that it misreads, is not held against the model."""
     readable = np.array([state != start for state in STATES])
@@ -101,21 +89,6 @@ def test_what_was_never_experienced_is_charged_to_experience(start: State) -> No
     assert cause(agent, ALL, failed) == "model", "it was experienced, and the model is wrong all the same"
     assert cause(does(dict.fromkeys(STATES, 0), None), ALL, failed) == "values"
     assert cause(does(dict.fromkeys(STATES, 0), model_of(SPEC)), NONE, failed) == "planning", "the model needs no more"
-
-
-@pytest.mark.parametrize("start", FAR[::24])
-def test_a_policy_not_greedy_in_its_right_model_is_planning(start: State) -> None:
-    failed = episode(start, [ILLEGAL[start]])
-    assert cause(does(ILLEGAL, model_of(SPEC)), ALL, failed) == "planning"
-    assert cause(does(ILLEGAL, None), ALL, failed) == "values"
-
-
-@pytest.mark.parametrize("start", FAR[::24])
-def test_a_slip_of_physics_is_charged_to_physics(start: State) -> None:
-    bad = RULES.outcomes(start, ILLEGAL[start])[0].macrostate
-    slipped = episode(start, [OPTIMAL[start]], states=[start, bad], terminated=True, faults=[True])
-    assert cause(does(OPTIMAL, model_of(SPEC)), ALL, slipped) == "fault"
-    assert cause(does(OPTIMAL, None), ALL, slipped) == "fault"
 
 
 class Coin:

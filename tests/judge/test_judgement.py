@@ -250,9 +250,7 @@ _TWICE = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:mo
             InvalidValueError,
             r"No model of \('copy', 'structured'\) reads latents, which pick_place-",
         ),
-        ({"samples": 0}, InvalidValueError, "samples is 0"),
         ({"seeds": (0, 1, 0)}, InvalidValueError, r"seeds is \(0, 1, 0\); give each seed once"),
-        ({"models": ("copy", "exact", "copy")}, InvalidValueError, "give each world model or run once"),
         ({"models": _TWICE}, InvalidValueError, "give each world model or run once"),
     ],
 )  # fmt: skip

@@ -195,12 +195,6 @@ def test_what_is_written_holds_every_plan(wrong: list[PlanResult], right: list[P
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plans.csv", "plans.md", "plans.png", "summary.json"]
 
 
-def test_what_is_written_is_json_where_no_plan_was_solved(wrong: list[PlanResult], tmp_path: Path) -> None:
-    write_plans(tmp_path, [plan for plan in wrong if not plan.solved][:1], TASK, {})
-    text = (tmp_path / "summary.json").read_text()
-    assert json.loads(text, parse_constant=pytest.fail)["mean_length"] is None
-
-
 def test_the_recording_shows_the_same_plans_and_the_arm_moves(
     right: list[PlanResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,7 +14,7 @@ from imagine_bench.tasks.scenes.constants import HOME_QPOS_RAD, TABLE_HEIGHT_M
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import PHYSICS_RANGES, PhysicsSettings
-from imagine_bench.testing.margins import as_ruled, walk
+from imagine_bench.testing.physics import as_ruled, walk
 
 COMPILE = {"arrow_puzzle": compile_arrow_scene, "pick_place": compile_pick_scene}
 TASKS = tuple(COMPILE)

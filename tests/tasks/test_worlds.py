@@ -13,7 +13,7 @@ from imagine_bench.tasks.scenes.objects import OBJECTS
 from worlds import WORLDS
 
 from imagine_bench import registry
-from imagine_bench.testing.fidelity import measure_fidelity
+from imagine_bench.testing.physics import measure_fidelity
 
 FIXED = Appearance(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
 NAMES = ["pick_place", *(f"arrows:cubes={cubes}" for cubes in range(1, 7))]

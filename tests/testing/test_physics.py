@@ -7,17 +7,23 @@ import pytest
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
-from imagine_bench.testing import margins
-from imagine_bench.testing.fidelity import Fidelity, measure_fidelity
-from imagine_bench.testing.physics import check_physics, fidelity_figures, figure_of, slips
+from imagine_bench.testing import physics
+from imagine_bench.testing.physics import (
+    Fidelity,
+    check_physics,
+    fidelity_figures,
+    figure_of,
+    measure_fidelity,
+    slips,
+)
 
-SLIPPERY = margins.PhysicsSettings.of({"pad_friction": 0.01})
+SLIPPERY = physics.PhysicsSettings.of({"pad_friction": 0.01})
 
 
 def test_fidelity_and_margins_are_measured_and_kept(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(margins, "SWEEPS", {"pad_friction": (1.2, 0.01)})
-    monkeypatch.setattr(margins, "_WALKS", 2)
-    monkeypatch.setattr(margins, "_WALK_ACTIONS", 3)
+    monkeypatch.setattr(physics, "SWEEPS", {"pad_friction": (1.2, 0.01)})
+    monkeypatch.setattr(physics, "_WALKS", 2)
+    monkeypatch.setattr(physics, "_WALK_ACTIONS", 3)
     out = tmp_path / "deep" / "margins.json"
     words = ["check", "--physics", "pick_place", "--turns", "4", "--trials", "4", "--out", str(out)]
     assert main(words) == 0
@@ -33,16 +39,16 @@ def test_fidelity_and_margins_are_measured_and_kept(tmp_path, monkeypatch, capsy
 
 
 def test_a_walk_ends_with_its_first_fault(monkeypatch):
-    monkeypatch.setattr(margins, "_WALKS", 2)
-    make = margins._env
-    monkeypatch.setattr(margins, "_env", lambda spec, _: make(spec, SLIPPERY))
-    found = margins.walk(registry.task("pick_place"), "true")
+    monkeypatch.setattr(physics, "_WALKS", 2)
+    make = physics._env
+    monkeypatch.setattr(physics, "_env", lambda spec, **_: make(spec, physics=SLIPPERY))
+    found = physics.walk(registry.task("pick_place"), "true")
     assert (found["lengths"], found["as_ruled"], len(found["faults"])) == ([1, 1], 0, 2)
 
 
-@pytest.mark.parametrize("name", margins.SWEEPS)
+@pytest.mark.parametrize("name", physics.SWEEPS)
 def test_every_sweep_begins_as_the_scene_is_built(name):
-    assert margins.SWEEPS[name][0] == getattr(margins.PhysicsSettings(), name)
+    assert physics.SWEEPS[name][0] == getattr(physics.PhysicsSettings(), name)
 
 
 def test_fidelity_of_any_world_counts_what_slips():

@@ -27,15 +27,14 @@ from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentState, Observation, Transition
 from imagine_bench.interfaces.capabilities import ExternalTrainer, begin_episode
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.data import Progress, RunSpec
+from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import runner
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.control import plan_control
 from imagine_bench.running.evaluation import play
 from imagine_bench.running.run_state import Counters, Run, make_env
 from imagine_bench.store import encoders
-from imagine_bench.testing.common import NotOffered, require
-from imagine_bench.testing.of_agents import CheckedAgent, greedy, same_arrays
+from imagine_bench.testing.checks import CheckedAgent, NotOffered, greedy, require, same_arrays
 from imagine_bench.values import Setting
 
 _EPISODES = 2
@@ -64,6 +63,7 @@ class _Left(NamedTuple):
     learned: str
 
 
+_SEEN = ("execution", "split", "appearance", "physics", "observation", "observation_size")  # what environments read
 _TASK = "the task that is checked"
 OPTION_ROWS: Mapping[str, OptionRow] = {
     "dataset": OptionRow(fields=("dataset",), changes={"dataset": "a folder of two episodes"}),
@@ -174,18 +174,10 @@ class CheckedOptions:
             protocol=wanted, agent=self.agent, seed=0, encoder=encoder, dataset=paths.get("dataset"),
             checkpoint_every_s=1e9,
         )  # fmt: skip
-        env, test_env = (_environment(_world(wanted), testing=testing) for testing in (False, True))
+        world = Protocol(task=wanted.task, preset="check", agents=("random",), **{n: getattr(wanted, n) for n in _SEEN})
+        env, test_env = (_environment(world, testing=testing) for testing in (False, True))
         with tempfile.TemporaryDirectory() as folder:
-            return _carried_out(Run(spec, Path(folder), _silent, env, test_env))
-
-
-def _world(wanted: Protocol) -> Protocol:
-    """The part of a protocol that its environments are made from; the rest is as in any."""
-    return Protocol(
-        task=wanted.task, preset="check", agents=("random",), execution=wanted.execution, split=wanted.split,
-        appearance=wanted.appearance, physics=wanted.physics, observation=wanted.observation,
-        observation_size=wanted.observation_size,
-    )  # fmt: skip
+            return _carried_out(Run(spec, Path(folder), lambda progress: None, env, test_env))
 
 
 @functools.cache
@@ -196,26 +188,18 @@ def _environment(world: Protocol, *, testing: bool) -> Env:
     return env
 
 
-def _silent(progress: Progress) -> None:
-    del progress
-
-
 def _carried_out(run: Run) -> _Left:
     """Train, or test one whose training is a library's or none; a digest of what it did, earned and learned."""
     watched = _WatchedAgent(run.agent)
     if isinstance(run.agent, ExternalTrainer):
         runner.train_externally(run, run.agent, lambda budget: None)
-    if run.entry.external_training_loop:
-        run.agent = watched
-        runner.test(run)
-    elif run.entry.learns:
-        run.agent = watched
+    run.agent = watched
+    if run.entry.learns and not run.entry.external_training_loop:
         runner.transfer(run)
         runner.train(run, run.protocol.budgets[-1])
         episodes = run.protocol.episodes_before + run.protocol.budgets[-1]
         require(watched.begun >= episodes, f"told of {watched.begun} beginnings of {episodes} training episodes")
     else:
-        run.agent = watched
         runner.test(run)
     return watched.left(run.counters)
 
