@@ -219,7 +219,7 @@ def measure_fidelity(spec: TaskSpec, actions: int, appearance: str = _CLEAN) -> 
             if 0 < slip < 1:
                 found.slips.append((not moved.any(), slip))
             poses = np.array([before, _poses(real, objects), _poses(perfect, objects)])
-            _compare(found, moved, can_move.any(axis=0), standing_m, poses)
+            _compare(found, moved, np.logical_or.reduce(can_move), standing_m, poses)
         else:
             found.faults.append(info.get("fault_reason", f"{wanted['macrostate']} was to be reached"))
         fresh = not right or (terminated and not goes_on)
