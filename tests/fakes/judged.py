@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 from fake_reader import BlindReader
-from imagine_bench.agents.world_models.limits import Exact
+from imagine_bench.agents.world_models.limits import Copy, Exact
 from numpy.typing import NDArray
+from small_runs import context
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Frame, TaskSpec
@@ -19,6 +20,9 @@ from imagine_bench.judge.change import Streams, counterfactual_error, streams_of
 from imagine_bench.judge.predictions import Predictions, RenderedFrameIndex, evaluate
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.scores import one_step_scores, ranking_scores
+
+STILL = Copy(context())
+"""Says that nothing ever changes."""
 
 
 def labelled(task: str) -> TaskSpec:

@@ -9,8 +9,8 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from imagine_bench.agents.world_models.limits import Copy, Exact
-from judged import judged_world
+from imagine_bench.agents.world_models.limits import Exact
+from judged import STILL, judged_world
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame
@@ -72,7 +72,7 @@ def test_exact_notices_what_cannot_happen_at_once() -> None:
 
 def test_a_model_that_is_always_surprised_notices_nothing() -> None:
     there = judged_world(ARROWS)
-    answers = there.predictions(Copy(), there.one_step)
+    answers = there.predictions(STILL, there.one_step)
     assert change_detection_delay(there.streams, answers) == {"notice_slip": LENGTH, "notice_coupling": LENGTH}
     assert all(math.isnan(value) for value in change_detection_delay(None, answers).values())
 
@@ -81,7 +81,7 @@ class Unsure(Exact):
     """Exact, but that nothing changes is as likely to it as all else together; so surprise is never certain."""
 
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        right, still = super().imagine(frames, actions, samples, rng), Copy().imagine(frames, actions, samples, rng)
+        right, still = super().imagine(frames, actions, samples, rng), STILL.imagine(frames, actions, samples, rng)
         weights = [0.5 * np.asarray(each.probabilities) for each in (right, still)]
         return Imagined(
             pictures=np.concatenate([right.pictures, still.pictures], axis=1),
@@ -112,7 +112,7 @@ def test_copy_is_right_where_two_macro_actions_change_nothing() -> None:
     rules, states = there.spec.rules, there.counterfactuals[0].states
     stays = [[rules.outcomes(state, a)[0].macrostate == state for a in range(rules.n_actions)] for state in states]
     right = [a and b for row in stays for a, b in itertools.combinations(row, 2)]
-    assert there.counterfactual_error(Copy()) == pytest.approx(1.0 - np.mean(right))
+    assert there.counterfactual_error(STILL) == pytest.approx(1.0 - np.mean(right))
 
 
 class Unlucky(Exact):

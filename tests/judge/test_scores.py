@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from imagine_bench.agents.world_models.limits import Copy, Exact
-from judged import JudgedWorld, judged_world
+from imagine_bench.agents.world_models.limits import Exact
+from judged import STILL, JudgedWorld, judged_world
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Rules, State
@@ -54,12 +54,12 @@ def reached(rules: Rules, start: State, actions: list[int]) -> dict[State, float
 def test_copy_scores_what_enumeration_says(task: str) -> None:
     world = judged_world(task)
     rules = world.spec.rules
-    scores = world.scores(Copy())
+    scores = world.scores(STILL)
     alive = [state for state in rules.states or () if not rules.is_terminal(state)]
     stays = [reached(rules, state, [action]).get(state, 0.0) for state in alive for action in range(rules.n_actions)]
     assert scores["total_variation"] == pytest.approx(1.0 - np.mean(stays))
     assert math.isnan(scores["reward_error"]) and math.isnan(scores["auroc_wrong"])
-    deep = by_depth(world.rollouts, world.predictions(Copy(), world.rollouts))
+    deep = by_depth(world.rollouts, world.predictions(STILL, world.rollouts))
     for depth in (1, 4):
         pairs = zip(world.rollouts.states, world.rollouts.asked[:, :depth].tolist(), strict=True)
         away = [1.0 - reached(rules, state, actions).get(state, 0.0) for state, actions in pairs]
@@ -87,7 +87,7 @@ def test_copy_loses_what_always_doing_the_same_loses() -> None:
         best(rules, state, 5, lambda _: every) - best(rules, state, 5, lambda _: [0]) for state in rules.start_states
     ]
     short = dataclasses.replace(world.spec, horizon=5)
-    found = one_step_scores(short, world.one_step, world.predictions(Copy(), world.one_step), set())
+    found = one_step_scores(short, world.one_step, world.predictions(STILL, world.one_step), set())
     assert found["value_loss"] == pytest.approx(np.mean(losses))
     assert found["worst_value_loss"] == pytest.approx(max(losses)) and max(losses) > 0.0
     assert found["value_loss_by_start"] == pytest.approx(losses)
@@ -104,11 +104,11 @@ def test_after_the_end_is_what_no_training_contains() -> None:
         assert sum(a != b for a, b in zip(state, after, strict=True)) == 1, "a macro-action still turns a cube"
     exact, still = (
         after_the_end_scores(asked, world.predictions(model, asked), world.predictions(model, world.one_step))
-        for model in (world.exact, Copy())
+        for model in (world.exact, STILL)
     )
     assert (exact["after_the_end"], still["after_the_end"]) == (0.0, 1.0)
     assert exact["auroc_after_the_end"] == 0.5 and math.isnan(still["auroc_after_the_end"])
-    assert all(map(math.isnan, after_the_end_scores(None, None, world.predictions(Copy(), world.one_step)).values()))
+    assert all(map(math.isnan, after_the_end_scores(None, None, world.predictions(STILL, world.one_step)).values()))
 
 
 class Mistaken(Exact):
