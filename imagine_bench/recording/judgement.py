@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -24,30 +23,24 @@ def record_judgement(folder: Path, judgement: Judgement) -> Path | None:
 
     Returns the file, or None where no model was judged.
     """
-    spec, found = registry.task(judgement.task), shown(folder, judgement)
+    spec = registry.task(judgement.task)
+    found = shown(folder, judgement)
     if not found:
         return None
     one = next(iter(found.values()))
-    strips = {"real": ("the truth", one["futures_before"], one["futures_real"][0], one["futures"]["real"])}
+    strips = {"real": ("the truth", one["futures_real"][0], one["futures"]["real"])}
     for model, each in found.items():
-        title = model_entry(model).title
-        strips[file_name(model)] = (
-            title,
-            each["futures_before"],
-            each["futures_imagined"][0],
-            each["futures"]["imagined"],
-        )
-    with recording_file(
-        folder / "judgement.rrd", spec.id, _layout({name: each[0] for name, each in strips.items()})
-    ) as to:
+        strips[file_name(model)] = (model_entry(model).title, each["futures_imagined"][0], each["futures"]["imagined"])
+    path = folder / "judgement.rrd"
+    with recording_file(path, spec.id, _layout({name: title for name, (title, _, _) in strips.items()})) as to:
         for depth in range(1 + len(one["futures"]["real"])):
             to.stream.set_time("depth", sequence=depth)
-            action = "the start" if not depth else spec.action_names[one["futures_actions"][0][depth - 1]]
-            to.text("/action", f"**{depth}. {action}**" if depth else action)
-            for name, (_, before, pictures, outcomes) in strips.items():
-                to.log(f"/{name}/frame", rr.Image(before[0] if depth == 0 else pictures[depth - 1]))
+            action = f"**{depth}. {spec.action_names[one['futures_actions'][0][depth - 1]]}**" if depth else "the start"
+            to.text("/action", action)
+            for name, (_, pictures, outcomes) in strips.items():
+                to.log(f"/{name}/frame", rr.Image(pictures[depth - 1] if depth else one["futures_before"][0]))
                 to.text(f"/{name}/outcomes", _words(outcomes[depth - 1] if depth else {}))
-    return folder / "judgement.rrd"
+    return path
 
 
 def _words(outcomes: Mapping[str, float]) -> str:
@@ -57,16 +50,14 @@ def _words(outcomes: Mapping[str, float]) -> str:
 
 
 def _layout(titles: Mapping[str, str]) -> rrb.Blueprint:
-    columns: list[Any] = [
-        rrb.Vertical(
-            rrb.Spatial2DView(origin=f"/{name}/frame", name=title),
-            rrb.TextDocumentView(origin=f"/{name}/outcomes", name="outcomes"),
-        )
-        for name, title in titles.items()
-    ]
+    columns = []
+    for name, title in titles.items():
+        frame = rrb.Spatial2DView(origin=f"/{name}/frame", name=title)
+        columns.append(rrb.Vertical(frame, rrb.TextDocumentView(origin=f"/{name}/outcomes", name="outcomes")))
+    action = rrb.TextDocumentView(origin="/action", name="macro-action")
     return rrb.Blueprint(
-        rrb.Vertical(rrb.TextDocumentView(origin="/action", name="macro-action"), rrb.Horizontal(*columns),
-                     row_shares=[1, 8]),
-        rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"),
+        rrb.Vertical(action, rrb.Horizontal(*columns), row_shares=[1, 8]),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="depth"),
-    )  # fmt: skip
+    )

@@ -33,6 +33,7 @@ class _Wrong(Copy):
 
 
 class _Lacking:
+    __init__ = Copy.__init__
     fit = imagine = Copy.fit
 
 
@@ -88,9 +89,9 @@ class _Drawn(_Wrong):
     ],
 )
 def test_wrong_models_are_found(
-    monkeypatch: pytest.MonkeyPatch, made: Callable[[], Any], holds: str, words: str
+    monkeypatch: pytest.MonkeyPatch, made: Callable[[Any], Any], holds: str, words: str
 ) -> None:
-    monkeypatch.setattr(registry, "make_world_model", lambda *given: made())
+    monkeypatch.setattr(registry, "make_world_model", lambda name, context: made(context))
     found = checks(task="arrow_puzzle_easy", model="copy")
     for what, check in found.items():
         if what.startswith(holds):
