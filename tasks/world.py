@@ -19,7 +19,7 @@ from .parameters.distractors import Distraction
 from .parameters.observation import HIDDEN
 from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
-from .scenes.constants import AGENT_CAMERA
+from .scenes.constants import AGENT_CAMERA, Point
 from .scenes.fragments import Composite, draw_composite
 
 MAX_TILT_RAD = math.radians(10.0)
@@ -226,7 +226,7 @@ class World(abc.ABC):
         """The value nearest to an object's pose (7), and what is wrong with how it is there."""
 
     @abc.abstractmethod
-    def _hands_m(self, gesture: int) -> dict[int, tuple[float, float, float]]:
+    def _hands_m(self, gesture: int) -> dict[int, Point]:
         """Where people's hands are, by the number of their mocap body."""
 
     @abc.abstractmethod

@@ -47,7 +47,7 @@ class Layout:
     """Places of N cubes, left to right in the agent's frame."""
 
     slots_xy_m: tuple[tuple[float, float], ...]  #: nominal centres on the table
-    fingertips_m: tuple[tuple[float, float, float], ...]  #: nominal, in the world, pointing at each
+    fingertips_m: tuple[c.Point, ...]  #: nominal, in the world, pointing at each
     fovy_deg: float  #: field of view of the agent's camera
 
 

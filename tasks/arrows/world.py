@@ -93,7 +93,7 @@ class ArrowWorld(World):
             *orientation.about_vertical(-(_QUARTER_RAD * value - turned_rad)),
         )
 
-    def _hands_m(self, gesture: int) -> dict[int, tuple[float, float, float]]:
+    def _hands_m(self, gesture: int) -> dict[int, c.Point]:
         return {self._hand: self._layout.fingertips_m[gesture]}
 
     def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:

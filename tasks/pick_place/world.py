@@ -16,7 +16,7 @@ from ..motion import orientation
 from ..motion.executor import REST_OPENING_M, MacroResult
 from ..scenes.appearance import Appearance
 from ..scenes.arm import TCP_SITE, arm_columns
-from ..scenes.constants import TABLE_HEIGHT_M
+from ..scenes.constants import TABLE_HEIGHT_M, Point
 from ..scenes.hand import PALM_REACH_M, fingertip_m
 from ..scenes.objects import MATERIALS, OBJECTS, SLOTS_XY_M, standing_m
 from ..world import MAX_SKEW_RAD, World
@@ -89,7 +89,7 @@ class PickWorld(World):
         self.data.qpos[self._finger_qpos] = opening_m
         self.data.ctrl[self._finger_ctrl] = command_m
 
-    def _hands_m(self, gesture: int) -> dict[int, tuple[float, float, float]]:
+    def _hands_m(self, gesture: int) -> dict[int, Point]:
         """The right hand points, the left one opens its palm; idle hands rest at the table's edge."""
         points = gesture not in (OPEN_PALM, WITHDRAWN)
         return {

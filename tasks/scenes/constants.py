@@ -6,6 +6,8 @@ side (+x) and appears at the top of the agent's frame; the frame's right is -y.
 
 from __future__ import annotations
 
+Point = tuple[float, float, float]
+"""x, y and z in metres."""
 TIMESTEP_S = 0.008
 """The arrow puzzle's. Coarse, for speed: `make speed` measures that every turn still comes out right, with a yaw error
 under 1 degree. A finer step is more exact and costs in proportion; objects that are carried want at most 5 ms."""

@@ -69,22 +69,20 @@ def hand_meshes() -> dict[str, Mesh]:
     return {"hand": hand, "wrist": limb(_FOREARM, sides=10), "sleeve": limb(_SLEEVE, sides=12)}
 
 
-def fingertip_m(slot_xy_m: tuple[float, float]) -> tuple[float, float, float]:
+def fingertip_m(slot_xy_m: tuple[float, float]) -> c.Point:
     """Nominal tip of the index finger that points at what stands on a slot, in the world."""
     dx_m, dy_m, dz_m = c.FINGERTIP_IN_SLOT_M
     return (slot_xy_m[0] + dx_m, slot_xy_m[1] + dy_m, c.CUBE_REST_Z_M + dz_m)
 
 
-def add_pointing_hand(spec: mujoco.MjSpec, tip_m: tuple[float, float, float]) -> None:
+def add_pointing_hand(spec: mujoco.MjSpec, tip_m: c.Point) -> None:
     """Add a person's materials and the mocap body ``hand`` with its index fingertip at a place in the world."""
     spec.add_material(name="skin", rgba=(0.91, 0.68, 0.55, 1.0), specular=0.15, shininess=0.2)
     spec.add_material(name="cloth", rgba=(0.20, 0.35, 0.55, 1.0), specular=0.05)
     add_limb(spec, "hand", tip_m, hand_meshes())
 
 
-def add_limb(
-    spec: mujoco.MjSpec, name: str, pos_m: tuple[float, float, float], meshes: dict[str, Mesh]
-) -> mujoco.MjsBody:
+def add_limb(spec: mujoco.MjSpec, name: str, pos_m: c.Point, meshes: dict[str, Mesh]) -> mujoco.MjsBody:
     """Add a mocap body drawn by three meshes, which touch nothing: hand, bare wrist and sleeve, in this order.
 
     The agent's frame shows the hand alone.
@@ -104,7 +102,7 @@ def open_hand_meshes() -> dict[str, Mesh]:
     return {"palm": hand, "palm_wrist": limb(_OPEN_FOREARM, sides=10), "palm_sleeve": limb(_OPEN_SLEEVE, sides=12)}
 
 
-def add_open_hand(spec: mujoco.MjSpec, palm_m: tuple[float, float, float]) -> None:
+def add_open_hand(spec: mujoco.MjSpec, palm_m: c.Point) -> None:
     """Add the mocap body ``palm`` with the middle of its palm at a place in the world."""
     body = add_limb(spec, "palm", palm_m, open_hand_meshes())
     touch = {"mass": 0.0, "group": c.COLLISION_GROUP, "friction": (0.9, 0.01, 0.002)}

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from imagine_bench.interfaces import Floats
 
-Point = tuple[float, float, float]
+from .constants import Point
+
 _CAP_RAD = np.pi / 4
 """Latitude of the ring that rounds a limb's tip."""
 

@@ -77,7 +77,7 @@ _TOUCH = {"group": c.COLLISION_GROUP, "friction": (0.8, 0.005, 0.0001), "condim"
 """Of geoms that are felt and not drawn."""
 
 
-def standing_m(index: int) -> tuple[float, float, float]:
+def standing_m(index: int) -> c.Point:
     """Nominal position of object ``index`` on the table."""
     return (*SLOTS_XY_M[index], c.TABLE_HEIGHT_M + OBJECTS[index].grip_height_m)
 
@@ -169,7 +169,7 @@ def _body(spec: mujoco.MjSpec, index: int) -> mujoco.MjsBody:
     return body
 
 
-def _add_supports(body: mujoco.MjsBody, name: str, radius_m: float, corner_m: tuple[float, float, float]) -> None:
+def _add_supports(body: mujoco.MjsBody, name: str, radius_m: float, corner_m: c.Point) -> None:
     """Four spheres to stand on, at the corners of a rectangle about the body's z axis."""
     x_m, y_m, z_m = corner_m
     for number, (x_sign, y_sign) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1))):

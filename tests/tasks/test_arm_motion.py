@@ -51,27 +51,6 @@ def test_velocities_and_poses_belong_to_the_angles():
     assert motion.gripper_m.min() < 0.03 < motion.gripper_m.max()  # closed on a cube of 55 mm, and open
 
 
-@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
-def test_the_commands_alone_repeat_the_motion(task):
-    env = make(task)
-    env.unwrapped.capture_motion_hz = 1 / env.unwrapped.model.opt.timestep
-    env.reset(seed=3)
-    model, data = env.unwrapped.model, mujoco.MjData(env.unwrapped.model)
-    data.qpos[:], data.mocap_pos[:] = env.unwrapped.data.qpos, env.unwrapped.data.mocap_pos
-    data.mocap_quat[:] = env.unwrapped.data.mocap_quat
-    env.step(1)
-    motion = env.unwrapped.arm_motion()
-    joints = [int(model.joint(f"right_j{index}").qposadr[0]) for index in range(7)]
-    fingers = [int(model.joint(f"finger_{side}_slide").qposadr[0]) for side in ("left", "right")]
-    servos = [model.actuator(f"right_j{index}_servo").id for index in range(7)]
-    pads = [model.actuator(f"finger_{side}_servo").id for side in ("left", "right")]
-    for row in range(len(motion.time_s) - 1):
-        np.testing.assert_allclose(data.qpos[joints], motion.joint_rad[row], atol=1e-9)
-        np.testing.assert_allclose(data.qpos[fingers], motion.gripper_m[row], atol=1e-9)
-        data.ctrl[servos], data.ctrl[pads] = motion.joint_command_rad[row], motion.gripper_command_m[row]
-        mujoco.mj_step(model, data)
-
-
 def test_rates_above_the_simulation_s_are_interpolated():
     _, steps, _ = turned(1 / TIMESTEP_S)
     env, motion, info = turned(200)

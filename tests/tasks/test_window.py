@@ -70,16 +70,6 @@ def test_a_window_shows_the_motion_and_changes_no_bit(shown):
     assert not pygame.display.get_init()
 
 
-def test_outcomes_that_are_set_are_shown_too(shown):
-    env = make(render_mode="human", width=64, height=48, execution="kinematic")
-    env.reset(seed=0)
-    first = shown[-1]
-    env.step(0)
-    assert not np.array_equal(first, shown[-1])
-    env.close()
-    env.close()
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is a desktop")
 def test_who_must_be_seen_needs_a_desktop():
     words = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")

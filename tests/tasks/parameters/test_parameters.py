@@ -13,19 +13,6 @@ def chances(outcomes):
     return {each.macrostate: each.probability for each in outcomes}
 
 
-def test_slips_and_changing_goals_of_arrows_by_hand():
-    rules = registry.task("arrows:cubes=2,forbid=none,goal=00,slip=0.25,fickle=0.5").rules
-    after, before = (3, 1), (2, 1)
-    assert chances(rules.outcomes((*before, 0), 0)) == pytest.approx(
-        {(*after, 0): 0.375, (*after, 1): 0.375, (*before, 0): 0.125, (*before, 1): 0.125}
-    )
-    won = rules.outcomes((3, 0, 0), 0)
-    assert chances(won) == pytest.approx({(0, 0, 0): 0.75, (3, 0, 0): 0.125, (3, 0, 1): 0.125})  # what is over is over
-    assert [each.success for each in won] == [True, False, False]
-    always = registry.task("arrows:cubes=2,forbid=none,goal=00,fickle=1").rules
-    assert chances(always.outcomes((*before, 0), 0)) == {(*after, 1): 1.0}
-
-
 def test_parameters_of_pick_and_place_by_hand():
     rules = registry.task("pick_place:slip=0.2,fickle=0.4").rules
     table, held, wrong = (0, 0, 0, 1), (0, 1, 0, 3), (1, 0, 0, 4)

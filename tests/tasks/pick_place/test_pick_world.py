@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.motion.ik import ArmModel
-from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, PICKED, WITHDRAWN
+from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, WITHDRAWN
 from imagine_bench.tasks.pick_place.scene import TIMESTEP_S
 from imagine_bench.tasks.pick_place.spec import SPEC
 from imagine_bench.tasks.pick_place.world import PickWorld
@@ -172,25 +172,6 @@ def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
     np.testing.assert_allclose(after[1], tilted[1], atol=1e-12)
     assert not np.allclose(tilted[1], before[1], atol=1e-3)  # the arm really was elsewhere
     assert world.data.qpos[joint] == c.OBSERVATION_QPOS_RAD[1]
-
-
-@pytest.mark.parametrize(("state", "action", "intended"), EVERY_MOTION[3:6:2])
-def test_a_macro_action_is_a_function_of_positions_and_arguments(state, action, intended):
-    """In another world, after other actions and with velocities left over: the same bits, an object held included."""
-    one, other = PickWorld(FIXED), PickWorld(FIXED)
-    one.place(state, rng())
-    held = state.index(PICKED)
-    one.execute((held + 1) % 3, (*state[:3], state[3]))  # reaches out in vain, with the object
-    start = one.data.qpos.copy(), one.data.mocap_pos.copy(), one.data.mocap_quat.copy()
-    one.execute(action, intended)
-    other.place((0, 0, 0, 2), rng())
-    other.execute(2, (0, 0, 1, 3))
-    other.data.qpos[:], other.data.mocap_pos[:], other.data.mocap_quat[:] = start
-    other.data.qvel[:], other.data.qacc_warmstart[:] = 0.3, 7.0
-    other.update()
-    other.execute(action, intended)
-    np.testing.assert_array_equal(one.data.qpos, other.data.qpos)
-    np.testing.assert_array_equal(one.data.ctrl, other.data.ctrl)
 
 
 @pytest.mark.parametrize("seed", [83393, 3046])
