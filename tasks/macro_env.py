@@ -18,7 +18,7 @@ from imagine_bench.rules import states_of
 from imagine_bench.values import Json
 
 from .observations import Observer
-from .parameters.observation import delivered, hides
+from .parameters.parameters import delivered, hides
 from .rendering.cameras import FRAME_PX, human_camera_view
 from .rendering.window import HAS_PYGAME, Window
 from .scene_reader import FilmedScene

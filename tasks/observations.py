@@ -20,7 +20,7 @@ from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Frame, Rules, State
 from imagine_bench.rules import require_macrostates, states_of
 
-from .parameters.observation import HIDDEN
+from .parameters.parameters import HIDDEN
 from .rendering.cameras import FRAME_PX, agent_camera_view, human_camera_view
 from .rendering.renderer import Renderer, View
 from .scenes.appearance import Appearance

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, TaskSpec
 
-from .parameters.parameters import WorldParameters
-from .parameters.rules import WorldRules
+from .parameters.parameters import WorldParameters, WorldRules
 
 if TYPE_CHECKING:
     from .macro_env import MacroEnv

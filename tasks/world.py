@@ -16,7 +16,7 @@ from .motion import orientation
 from .motion.executor import MacroExecutor, MacroResult, at_rest
 from .motion.orientation import Sensing
 from .parameters.distractors import Distraction
-from .parameters.observation import HIDDEN
+from .parameters.parameters import HIDDEN
 from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import AGENT_CAMERA, Point

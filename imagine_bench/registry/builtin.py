@@ -17,7 +17,7 @@ _ARROWS = TaskEntry(
     env="imagine_bench.tasks.arrows.spec:make_limited_env",
     env_id="imagine_bench/Arrows-v0",
     horizon=None,
-    world="imagine_bench.tasks.arrows.description:Arrows",
+    world="imagine_bench.tasks.arrows.rules:Arrows",
 )
 TASKS: dict[str, TaskEntry] = {
     **{

@@ -22,8 +22,7 @@ from imagine_bench.rules import facts
 from imagine_bench.values import Setting
 
 from .. import specs
-from .description import Arrows
-from .rules import ArrowRules, Goal
+from .rules import ArrowRules, Arrows, Goal
 
 if TYPE_CHECKING:
     from ..macro_env import MacroEnv
@@ -80,7 +79,7 @@ def _described(world: Arrows, goal: Goal) -> str:
 
 
 def spec_of(**world: Setting) -> TaskSpec:
-    """A world of the family, by the fields of :class:`.description.Arrows`.
+    """A world of the family, by the fields of :class:`.rules.Arrows`.
 
     Raises:
         InvalidValueError: No such world, or one whose goal cannot be reached from anywhere.
@@ -129,7 +128,7 @@ def make_env(**options: Any) -> MacroEnv:
     """A world of the family, without a time limit.
 
     Args:
-        **options: Fields of :class:`.description.Arrows`, and the keyword arguments of MacroEnv.
+        **options: Fields of :class:`.rules.Arrows`, and the keyword arguments of MacroEnv.
 
     Raises:
         InvalidValueError, UnknownNameError: As :func:`spec_of`.

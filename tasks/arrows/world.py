@@ -15,7 +15,7 @@ from ..motion.executor import MacroResult
 from ..scenes import constants as c
 from ..scenes.appearance import Appearance
 from ..world import MAX_SKEW_RAD, World
-from .description import Arrows
+from .rules import Arrows
 from .scene import compile_arrow_scene, layout
 
 if TYPE_CHECKING:

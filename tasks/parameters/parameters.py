@@ -1,19 +1,66 @@
-"""The parameters of a world, and its name in one line: ``pick_place:slip=0.1``."""
+"""The parameters of a world: its name in one line, ``pick_place:slip=0.1``, what frames then show, and its rules.
+
+Gesture and lag: frames may hide what the human says, and come some macro-actions late. The first observations of an
+episode repeat the start. Slip: the fingers open too early, so that a macro-action leaves all as it is. Goal change:
+after a macro-action that ends nothing, the human may want something else.
+"""
 
 from __future__ import annotations
 
+import abc
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Self
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, ClassVar, Self, TypeVar
+
+import numpy as np
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief
-from imagine_bench.interfaces import State
+from imagine_bench.interfaces import Outcome, Rules, Sight, State
+from imagine_bench.rules import optimal_policy, tabulate
 from imagine_bench.values import Setting
 
-from .observation import GestureObservation
-
 GESTURES = ("always", "first")
+HIDDEN = -1
+_Seen = TypeVar("_Seen")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GestureObservation:
+    """Frames of macrostates whose last coordinate, the gesture, may be hidden.
+
+    Args:
+        gesture: ``"always"``, ``"first"``, or the probability that a frame shows it.
+        lag: Macro-actions that a frame is old.
+        always_shown: Macrostates whose gesture no frame hides.
+    """
+
+    gesture: str | float
+    lag: int
+    always_shown: Callable[[State], bool] = lambda macrostate: False
+
+    def seen(self, macrostate: State, step: int) -> tuple[tuple[float, State], ...]:
+        """What a frame taken after ``step`` macro-actions may show, as :meth:`.Sight.seen`."""
+        shown = self.gesture
+        if isinstance(shown, str):
+            shown = float(shown == "always" or step == 0)
+        if self.always_shown(macrostate):
+            shown = 1.0
+        both = ((shown, macrostate), (1.0 - shown, (*macrostate[:-1], HIDDEN)))
+        return tuple((share, what) for share, what in both if share)
+
+
+def hides(sight: Sight, macrostate: State, step: int, rng: np.random.Generator) -> bool:
+    """Whether a frame hides the gesture, drawn where that is a matter of chance."""
+    seen = sight.seen(macrostate, step)
+    which = 0 if len(seen) == 1 else int(rng.random() >= seen[0][0])
+    return seen[which][1][-1] == HIDDEN
+
+
+def delivered(under_way: tuple[_Seen, ...], newest: _Seen, lag: int) -> tuple[_Seen, ...]:
+    """What is under way once the newest observation is taken in; the first of it is due now."""
+    return (*under_way, newest)[-1 - lag :]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,3 +177,49 @@ class WorldParameters:
         if self.gesture in ("always", 1.0) and not self.lag:
             return None
         return GestureObservation(gesture=self.gesture, lag=self.lag, always_shown=always_shown)
+
+
+class WorldRules(Rules):
+    """The macrostate machine of a world with parameters; a task says what its macro-actions do without them."""
+
+    world: WorldParameters
+
+    def slipped(self, macrostate: State) -> Outcome:
+        """The outcome of a macro-action that leaves all as it is, for the fingers open too early."""
+        return self.judge(macrostate, 0, macrostate)
+
+    @abc.abstractmethod
+    def asked_otherwise(self, outcome: Outcome) -> Sequence[Outcome]:
+        """What an outcome becomes where the human says something else instead, each equally likely."""
+
+    def varied(self, macrostate: State, outcomes: tuple[Outcome, ...]) -> tuple[Outcome, ...]:
+        """Outcomes of a macro-action as they are with slips and a changing goal; equal ones are one."""
+        slip = self.world.slip
+        change = self.world.goal_change
+        if slip:
+            kept = [replace(each, probability=(1.0 - slip) * each.probability) for each in outcomes]
+            outcomes = (*kept, replace(self.slipped(macrostate), probability=slip))
+        if not change:
+            return outcomes
+        chances: dict[Outcome, float] = {}
+        for outcome in outcomes:
+            others = () if outcome.terminated else self.asked_otherwise(outcome)
+            share = change if others else 0.0
+            for each, chance in ((outcome, 1.0 - share), *((other, share / len(others)) for other in others)):
+                key = replace(each, probability=1.0)
+                chances[key] = chances.get(key, 0.0) + outcome.probability * chance
+        return tuple(replace(each, probability=chance) for each, chance in chances.items() if chance)
+
+    def require_action(self, action: int) -> None:
+        """Check a macro-action. Raises InvalidValueError: there is no such one."""
+        if not 0 <= action < self.n_actions:
+            raise InvalidValueError(f"Action {action} does not exist; give an integer from 0 to {self.n_actions - 1}.")
+
+    @cached_property
+    def _policy(self) -> dict[State, int]:
+        tables = tabulate(self)
+        return dict(zip(tables.index, optimal_policy(tables).tolist(), strict=True))
+
+    def optimal_action(self, macrostate: State) -> int:
+        """The action with the largest expected return (the lowest index among equals)."""
+        return self._policy[tuple(int(value) for value in macrostate)]

@@ -13,8 +13,7 @@ from typing import ClassVar
 
 from imagine_bench.interfaces import Outcome, State
 
-from ..parameters.parameters import WorldParameters
-from ..parameters.rules import WorldRules
+from ..parameters.parameters import WorldParameters, WorldRules
 
 N_OBJECTS = 3
 PLACED, PICKED, HANDED_OVER = range(3)

@@ -8,7 +8,7 @@ import json
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.description import COUPLINGS, FORBIDS, GOALS, Arrows, Turn
+from imagine_bench.tasks.arrows.rules import COUPLINGS, FORBIDS, GOALS, Arrows, Turn
 from imagine_bench.tasks.parameters.parameters import GESTURES
 
 from imagine_bench import registry

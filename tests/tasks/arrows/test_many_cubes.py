@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.description import Arrows
+from imagine_bench.tasks.arrows.rules import Arrows
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.scenes.appearance import appearance
 

@@ -6,7 +6,7 @@ import math
 import mink
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.description import MAX_CUBES
+from imagine_bench.tasks.arrows.rules import MAX_CUBES
 from imagine_bench.tasks.arrows.scene import layout
 from imagine_bench.tasks.motion.ik import ArmIK, ArmModel, UnreachableTargetError, pointing_down
 from imagine_bench.tasks.motion.trajectory import (
