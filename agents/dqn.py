@@ -231,7 +231,7 @@ class DQN:
 
 def build(hyperparameters: Hyperparameters[DQNSettings], context: AgentContext) -> DQN:
     """A DQN with its settings from one of the tables of :mod:`.dqn_settings`."""
-    settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = hyperparameters.of(context)
     device = prepare_torch(context.device)
     return DQN(load_perception(context), context.n_actions, settings, context.seeds, device)
 

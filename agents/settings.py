@@ -12,6 +12,7 @@ from types import UnionType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
+from imagine_bench.interfaces import AgentContext
 from imagine_bench.values import Setting
 
 if TYPE_CHECKING:
@@ -105,6 +106,10 @@ class Hyperparameters(Generic[S]):
     def names(self) -> frozenset[str]:
         """The dotted names of all settings."""
         return frozenset(flatten(next(iter(self.groups.values())).published))
+
+    def of(self, context: AgentContext) -> S:
+        """The settings that an agent's context asks for; raises as :meth:`resolve`."""
+        return self.resolve(context.hyperparameters, context.overrides, context.config_group)
 
     def resolve(self, hyperparameters: str, overrides: Mapping[str, Setting], group: str) -> S:
         """The settings of a set, with single ones replaced.

@@ -309,7 +309,7 @@ class FactoredAgent(CodeAgent):
 
 def make(context: AgentContext) -> FactoredAgent:
     """The agent ``factored:given``; InvalidValueError if the context's encoder gives no codes."""
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = HYPERPARAMETERS.of(context)
     prepare_torch(context.device)
     perception = load_code_perception(context, factored=settings.dynamics.factored)
     return FactoredAgent(perception, context.n_actions, settings, context.seeds)

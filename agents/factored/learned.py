@@ -170,7 +170,7 @@ def image(found: Sequence[appearance.SeenFactor], frames: Frame) -> NDArray[np.u
 
 def make(context: AgentContext) -> LearnedPerceptionAgent:
     """The agent ``factored``, of whatever frames are 64 x 64."""
-    settings = LEARNED.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = LEARNED.of(context)
     prepare_torch(context.device)
     perception = LearnedPerception(settings.perception, factored=settings.dynamics.factored)
     return LearnedPerceptionAgent(perception, context.n_actions, settings, context.seeds)

@@ -226,7 +226,7 @@ def build(
     hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS,
 ) -> _Kind:
     """Make an imagining agent of a class, with or without the filter; its device decides an ``auto`` precision."""
-    settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = hyperparameters.of(context)
     precision = settle(settings.model.precision, context.device)
     settings = replace(settings, model=replace(settings.model, precision=precision))
     device = prepare_torch(context.device)

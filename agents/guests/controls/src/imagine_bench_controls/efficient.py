@@ -105,6 +105,6 @@ class EfficientDQN(DQN):
 
 def make(context: AgentContext) -> EfficientDQN:
     """The ``dqn_efficient`` agent."""
-    settings = EFFICIENT.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = EFFICIENT.of(context)
     device = prepare_torch(context.device)
     return EfficientDQN(load_perception(context), context.n_actions, settings, context.seeds, device)

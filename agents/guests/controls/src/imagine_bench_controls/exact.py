@@ -203,7 +203,7 @@ def build(
             "This control is given the exact world, which an agent gets that is registered as privileged, in a world "
             "whose frames hide nothing; here there is none."
         )
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = HYPERPARAMETERS.of(context)
     device = prepare_torch(context.device)
     perception = load_perception(context)
     return kind(perception, context.n_actions, settings, context.seeds, device, context.exact_world)

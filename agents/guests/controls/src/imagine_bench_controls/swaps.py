@@ -110,7 +110,7 @@ class SwappingDQN(DQN):
 
 def make(context: AgentContext) -> SwappingDQN:
     """The ``dqn_swaps`` agent; InvalidValueError if the context's encoder gives no codes."""
-    settings = SWAPPING.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = SWAPPING.of(context)
     device = prepare_torch(context.device)
     perception = load_perception(context)
     if not perception.encoder.card.code_sizes:

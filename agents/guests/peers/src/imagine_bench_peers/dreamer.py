@@ -291,6 +291,6 @@ def _config(settings: DreamerSettings, *, pixels: bool) -> Any:
 def make(context: AgentContext) -> Dreamer:
     """The ``dreamer_v3`` agents: on pixels, or on latents where there is an encoder."""
     prepare_torch(context.device)
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = HYPERPARAMETERS.of(context)
     perception = None if context.encoder is None else load_perception(context)
     return Dreamer(settings, context.n_actions, context.seeds.child("library").integer(), context.device, perception)

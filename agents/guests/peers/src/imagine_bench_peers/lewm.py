@@ -202,5 +202,5 @@ def _network(settings: LeWMSettings, n_actions: int) -> LeWM:
 def make(context: AgentContext) -> LeWMPlanner:
     """The ``lewm`` agent."""
     prepare_torch(context.device)
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = HYPERPARAMETERS.of(context)
     return LeWMPlanner(settings, context.n_actions, context.seeds.child("library").integer(), context.device)

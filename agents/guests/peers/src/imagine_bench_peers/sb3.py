@@ -45,7 +45,7 @@ class LibraryAgent:
         prepare_torch(context.device)
         self._algorithm = _load(algorithm)
         self._device = context.device
-        self.settings = self.hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
+        self.settings = self.hyperparameters.of(context)
         self._keywords = self.settings.ppo if algorithm.endswith(":PPO") else self.settings.sb3
         self._seed = context.seeds.child("library").integer() % _SEEDS
         self._encoder = None if context.encoder is None else load_perception(context).encoder

@@ -64,6 +64,6 @@ class DRQN(RememberingAgent):
 
 def make(context: AgentContext) -> DRQN:
     """The ``drqn`` agent."""
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = HYPERPARAMETERS.of(context)
     device = prepare_torch(context.device)
     return DRQN(load_perception(context), context.n_actions, settings, context.seeds, device)

@@ -109,7 +109,7 @@ class CodeCountTableAgent(CountTableAgent):
 
 def build(context: AgentContext, *, directed: bool) -> CodeCountTableAgent:
     """A count table; InvalidValueError if the context's encoder gives no codes."""
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = HYPERPARAMETERS.of(context)
     return CodeCountTableAgent(load_codes(context), context.n_actions, settings, context.seeds, directed=directed)
 
 
@@ -121,5 +121,5 @@ make_directed = partial(build, directed=True)
 
 def make_directed_macrostate(context: AgentContext) -> CountTableAgent:
     """The ``count_table_directed_macrostate`` agent: R-max, shown the true state."""
-    settings = HYPERPARAMETERS.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = HYPERPARAMETERS.of(context)
     return CountTableAgent(read_macrostate, context.n_actions, settings, context.seeds, directed=True)

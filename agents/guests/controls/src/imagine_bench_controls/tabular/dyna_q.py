@@ -79,7 +79,7 @@ def build(
     context: AgentContext, *, hyperparameters: Hyperparameters[DynaQSettings], privileged: bool = False
 ) -> DynaQAgent:
     """An agent that reads codes, or, ``privileged``, the macrostate; InvalidValueError if the encoder has no codes."""
-    settings = hyperparameters.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = hyperparameters.of(context)
     read = read_macrostate if privileged else read_codes(load_codes(context))
     return DynaQAgent(read, context.n_actions, settings, context.seeds)
 

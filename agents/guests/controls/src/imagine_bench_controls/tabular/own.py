@@ -77,5 +77,5 @@ class OwnCountTableAgent(CountTableAgent):
 def make(context: AgentContext) -> OwnCountTableAgent:
     """The ``count_table_own`` agent, of whatever frames are 64 x 64."""
     prepare_torch(context.device)
-    settings = OWN.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = OWN.of(context)
     return OwnCountTableAgent(context.n_actions, settings, context.seeds)

@@ -69,7 +69,7 @@ class PosteriorSamplingAgent(CountTableAgent):
 
 def build(context: AgentContext, *, privileged: bool) -> PosteriorSamplingAgent:
     """An agent that reads codes, or, ``privileged``, the macrostate; InvalidValueError if the encoder has no codes."""
-    settings = POSTERIOR_SAMPLING.resolve(context.hyperparameters, context.overrides, context.config_group)
+    settings = POSTERIOR_SAMPLING.of(context)
     read = read_macrostate if privileged else read_codes(load_codes(context))
     return PosteriorSamplingAgent(read, context.n_actions, settings, context.seeds)
 
