@@ -24,7 +24,7 @@ from imagine_bench import registry
 from imagine_bench.data.folder import write_dataset
 from imagine_bench.environments import Env
 from imagine_bench.errors import ImagineBenchError
-from imagine_bench.interfaces import Agent, AgentState, Observation, Transition
+from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.interfaces.capabilities import ExternalTrainer, begin_episode
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import RunSpec
@@ -190,7 +190,7 @@ def _environment(world: Protocol, *, testing: bool) -> Env:
 
 def _carried_out(run: Run) -> _Left:
     """Train, or test one whose training is a library's or none; a digest of what it did, earned and learned."""
-    watched = _WatchedAgent(run.agent)
+    watched: Any = _WatchedAgent(run.agent)  # all that it has not is the agent's
     if isinstance(run.agent, ExternalTrainer):
         runner.train_externally(run, run.agent, lambda budget: None)
     run.agent = watched
@@ -201,7 +201,8 @@ def _carried_out(run: Run) -> _Left:
         require(watched.begun >= episodes, f"told of {watched.begun} beginnings of {episodes} training episodes")
     else:
         runner.test(run)
-    return watched.left(run.counters)
+    left: _Left = watched.left(run.counters)
+    return left
 
 
 class _WatchedAgent:
@@ -239,18 +240,6 @@ class _WatchedAgent:
             self._shown.update(np.asarray(part).tobytes() if part is not None else b"")
         for name in sorted(observation.more):
             self._shown.update(observation.more[name].tobytes())
-
-    def diagnostics(self) -> dict[str, float]:
-        """As the agent."""
-        return self._agent.diagnostics()
-
-    def state(self) -> AgentState:
-        """As the agent."""
-        return self._agent.state()
-
-    def restore(self, state: AgentState) -> None:
-        """As the agent."""
-        self._agent.restore(state)
 
     def left(self, counters: Counters) -> _Left:
         """Digests of what it was shown, and of actions, rewards and learned arrays; times are in none of them."""

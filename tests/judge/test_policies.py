@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from fake_results import bench_result
 from numpy.typing import NDArray
-from small_runs import Inline, small
 
 from imagine_bench import registry
 from imagine_bench.cli import main
@@ -21,8 +20,6 @@ from imagine_bench.report.data import collect
 from imagine_bench.report.page import Table
 from imagine_bench.report.sections import policies
 from imagine_bench.rules import fewest_actions, greedy, states_of
-from imagine_bench.running import bench as benches
-from imagine_bench.store.files import lock
 from imagine_bench.store.results import PolicyTable, RunResult
 
 HARD = registry.task("arrow_puzzle_hard")
@@ -102,19 +99,6 @@ def test_chance_in_the_rules_is_kept() -> None:
     assert total == pytest.approx(np.ones(len(total))) and idle.success.mean() < 0.9
 
 
-def test_wavering_between_two_ways_is_a_walk_by_chance() -> None:
-    """One legal turn half of the time and the other else: a fair walk on the ring, solved by hand."""
-    ways = [greedy(everywhere(HARD, lambda state, way=way: LEGAL[state][way]), 6) for way in (0, 1)]  # type: ignore[misc]
-    ends = terminations(HARD, 0.5 * (ways[0] + ways[1]), STARTS)
-    ring = np.zeros(13)  # the goal is at 0 and at 12, one turn a step
-    ring[[0, 12]] = 1.0
-    for _ in range(HARD.horizon):
-        ring[1:12] = (ring[:11] + ring[2:]) / 2
-    assert ends.success == pytest.approx(ring[optimal_length(HARD, STARTS).astype(int)])
-    assert ends.failure == pytest.approx(0.0)
-    assert ends.success + ends.late_success == pytest.approx(np.ones(66), abs=1e-4)
-
-
 def test_starts_of_tests_alone_are_followed() -> None:
     """Of rules that list no macrostates, whose order begins with the starts."""
     task = registry.task("arrows:cubes=2")
@@ -151,13 +135,6 @@ def test_a_report_follows_what_was_held_from_every_start(tmp_path: Path) -> None
     assert rows[0]["macro-actions"] == "3.27"
     assert str(whole.rows[1][1]).startswith(f"{50 + 50 * bad.success.mean():.1f} [")
     assert page_of(lambda run: None) == ()
-
-
-def test_an_analysis_is_made_by_one_process_at_a_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    result = benches.bench(small(budgets=(1,), evaluation_episodes=1), {}, root=tmp_path, launcher=Inline())
-    with lock(result.folder / ".why.lock", "This"):
-        assert main(["why", str(result.folder)]) == 2
-    assert "is in use by process" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
