@@ -80,7 +80,7 @@ HYPERPARAMETERS = Hyperparameters.everywhere(FactoredSettings())
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedPerceptionSettings:
-    """How an agent learns to see; see :mod:`.learned_perception`."""
+    """How an agent learns to see; see :class:`.perception.LearnedPerception`."""
 
     #: Most frames of its own that it remembers, 12 kB each; then perception stays as it is.
     frames: int = setting(1000, between(4, 100_000))

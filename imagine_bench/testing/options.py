@@ -8,6 +8,7 @@ in neither fails the contract.
 from __future__ import annotations
 
 import atexit
+import copy
 import dataclasses
 import functools
 import hashlib
@@ -282,4 +283,6 @@ def watching_teaches_as_living(one: CheckedAgent) -> None:
             actor.observe(transition, episode=episode)
             watcher.observe(transition, episode=episode)
     require(same_arrays(actor.state(), watcher.state()), "it learned otherwise from episodes that it was only shown")
+    learned = copy.deepcopy(actor.state())
     require(greedy(actor, starts) == greedy(watcher, starts), "it then acts otherwise")
+    require(same_arrays(learned, actor.state()), "acting with explore=False changes its state")

@@ -68,7 +68,7 @@ ROOMS: dict[str, dict[str, Sequence[str]]] = {
     },
     "own agent": {
         f"agents/factored/{name}.py": _FACTORED
-        for name in ("agent", "dynamics", "exploration", "factors", "model", "outcomes", "perception", "planner")
+        for name in ("agent", "dynamics", "factors", "model", "outcomes", "perception", "planner")
     },
 }  # fmt: skip
 """Of each room the files, and the tests of each file, those that find most first."""

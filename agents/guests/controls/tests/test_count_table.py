@@ -5,15 +5,13 @@ from __future__ import annotations
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import same
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.count_table import CodeCountTableAgent
 from imagine_bench_controls.tabular.counts import CountTable
 from imagine_bench_controls.tabular.settings import HYPERPARAMETERS
 
 from imagine_bench import registry, rules
-from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import Observation, Transition
+from imagine_bench.interfaces import Observation
 from imagine_bench.seeding import SeedTree
 
 LENGTH = 6
@@ -76,31 +74,6 @@ def test_only_news_change_what_is_predicted() -> None:
     assert table.largest_reward == 0.0
 
 
-def explored_after(learner: CodeCountTableAgent) -> int:
-    """Steps until every pair of a chain was tried, starting each episode of 2 x LENGTH steps at its left end."""
-    following = 0
-    for step in range(20_000):
-        at = 0 if step % (2 * LENGTH) == 0 else following
-        seen = Observation(frame=fake_codes.frame((at % 3, at // 3, 0)))
-        action = learner.act(seen, explore=True)
-        following = max(at - 1, 0) if action == LEFT else min(at + 1, LENGTH - 1)
-        then = Observation(frame=fake_codes.frame((following % 3, following // 3, 0)))
-        moved = Transition(
-            observation=seen, action=action, reward=-1.0, next_observation=then, terminated=False, truncated=False
-        )
-        learner.observe(moved, episode=0)
-        if learner.table.pairs == 2 * LENGTH:
-            return step + 1
-    return 20_000
-
-
-def test_directed_exploration_tries_a_chain_in_fewer_steps() -> None:
-    directed = [explored_after(agent(directed=True, n_actions=2, seed=seed)) for seed in range(5)]
-    by_chance = [explored_after(agent(directed=False, n_actions=2, seed=seed)) for seed in range(5)]
-    assert max(directed) <= 8 * LENGTH
-    assert max(directed) < np.mean(by_chance)
-
-
 def test_directed_exploration_ends_in_greedy_actions() -> None:
     learner = agent(directed=True)
     live(learner, 600)
@@ -112,28 +85,3 @@ def test_directed_exploration_ends_in_greedy_actions() -> None:
         values = learner.q_values(seen)
         assert values[learner.act(seen, explore=True)] == pytest.approx(values.max())
     assert fake_codes.success(learner) == 1.0
-
-
-def test_tests_change_nothing() -> None:
-    learner = agent(directed=True)
-    live(learner, 30)
-    before = learner.state()
-    for code in fake_codes.starts():
-        learner.act(Observation(frame=fake_codes.frame(code)), explore=False)
-    assert same(before, learner.state())
-
-
-def test_a_snapshot_of_the_other_exploration_is_refused() -> None:
-    with pytest.raises(ArtefactError, match="'directed' is False in the snapshot and True in this agent"):
-        agent(directed=True).restore(agent(directed=False).state())
-    with pytest.raises(ArtefactError, match=r"controller\.epsilon_decay"):
-        agent(directed=True).restore(agent(directed=True, name="published").state())
-
-
-def test_its_exploration_is_the_settings_of_the_dqn() -> None:
-    dqn = registry.load("imagine_bench.agents.dqn_settings:HYPERPARAMETERS")
-    for group, settings in HYPERPARAMETERS.groups.items():
-        for name in settings.sets:
-            own, theirs = (each.resolve(name, {}, group).controller for each in (HYPERPARAMETERS, dqn))
-            for field in ("discount", "epsilon_min", "epsilon_max", "epsilon_decay"):
-                assert getattr(own, field) == getattr(theirs, field)

@@ -55,11 +55,6 @@ def test_returns_by_hand_across_ends() -> None:
     }
 
 
-def test_one_step_is_the_replay_of_a_dqn() -> None:
-    memory = filled(10, [(1.0, ""), (2.0, "end"), (4.0, "")])
-    assert returns(memory, 1) == {0.0: (1.0, 1.0, GAMMA), 1.0: (2.0, 2.0, 0.0), 2.0: (4.0, 3.0, GAMMA)}
-
-
 def test_a_full_ring_joins_no_new_row_to_an_old_one() -> None:
     """Capacity 3: rows 3 and 4 overwrote 0 and 1, whose end is gone; row 2 goes on to 3, and 4 is the newest."""
     memory = filled(3, [(0.0, "cut"), (0.0, ""), (1.0, ""), (2.0, ""), (4.0, "")])
@@ -81,12 +76,6 @@ def test_a_reset_keeps_a_share_of_the_hidden_layers_and_nothing_of_the_last() ->
     assert not learner.controller.optimiser.state, "moments begin anew"
     slow = learner.controller.target.parameters()
     assert all(torch.equal(one, other) for one, other in zip(slow, after, strict=True))
-
-    other = agent(reuse__kept=0.0)
-    live(other, range(3), np.random.default_rng(0))
-    held = [part.detach().clone() for part in other.controller.network.parameters()]
-    other.reset_controller()
-    assert not any(torch.equal(one, new) for one, new in zip(held, other.controller.network.parameters(), strict=True))
 
 
 @pytest.mark.parametrize(("every", "resets"), [(0, 0), (5, 4), (4, 5), (100, 0)])

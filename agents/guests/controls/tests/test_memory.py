@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 from agent_states import same
-from fake_latents import ACTIONS, CODES, LATENTS, FakeEncoder, built, frame, transition, with_own_settings
+from fake_latents import ACTIONS, LATENTS, FakeEncoder, built, frame, transition, with_own_settings
 from imagine_bench_controls.memory import drqn, imagination
 from imagine_bench_controls.memory.agent import RememberingAgent
-from imagine_bench_controls.memory.readout import last_seen
 from imagine_bench_controls.memory.sequences import START, Recurrence, SequenceMemory
 
 from imagine_bench.interfaces import Observation
@@ -75,36 +74,6 @@ def test_what_the_first_frame_said_is_done_later(name: str, episodes: int) -> No
     agent = make(name, **LEARNING)
     recall(agent, range(episodes), np.random.default_rng(0))
     assert [second(agent, cue) for cue in range(ACTIONS)] == list(range(ACTIONS))
-
-
-@pytest.mark.parametrize("name", MAKERS)
-def test_acting_greedily_changes_nothing(name: str) -> None:
-    agent = make(name)
-    recall(agent, range(4), np.random.default_rng(1))
-    before = agent.state()
-    chosen = [second(agent, cue) for cue in (1, 2, 1)]
-    assert chosen[0] == chosen[2]
-    assert same(before, agent.state())
-
-
-@pytest.mark.parametrize("name", MAKERS)
-def test_a_restored_agent_goes_on_in_the_same_bits(name: str) -> None:
-    whole, again = (make(name) for _ in range(2))
-    recall(whole, range(5), np.random.default_rng(2))
-    again.restore(whole.state())
-    for agent in (whole, again):
-        recall(agent, range(5, 9), np.random.default_rng(3))
-    assert same(whole.state(), again.state())
-
-
-def test_memory_depends_on_every_frame_and_action() -> None:
-    agent = make("drqn")
-    found = remembered(agent, [1, 0, 0], [0, 2])
-    assert torch.equal(found[:LATENTS], CODES[0])
-    for frames, actions in (([2, 0, 0], [0, 2]), ([1, 0, 0], [1, 2]), ([1, 0, 0], [0, 0]), ([0], [])):
-        state = remembered(agent, frames, actions)
-        assert torch.equal(state[:LATENTS], found[:LATENTS])
-        assert not torch.allclose(state[LATENTS:], found[LATENTS:])
 
 
 def test_what_is_seen_while_acting_is_the_state_and_is_forgotten() -> None:
@@ -229,20 +198,6 @@ def test_a_new_task_keeps_dynamics_and_recurrence_which_the_model_s_updates_trai
     assert len(agent.real) == 0
     recall(agent, range(1), np.random.default_rng(1))
     assert not kept("recurrence")
-
-
-def test_lone_frames_begin_without_a_past() -> None:
-    agent = make("imagination_memory")
-    lone, _ = agent.perception.posterior(frame(3))
-    assert torch.allclose(lone, agent.perceive(frame(3)), atol=1e-6)
-    mu, sigma = agent.perception.encoder.encode(np.stack([frame(3), frame(1)]))
-    assert torch.allclose(mu[0], lone, atol=1e-6) and not sigma[:, LATENTS:].any()
-    assert agent.read_frames(np.stack([frame(4)])).tolist() == FakeEncoder().read_macrostate(CODES[4:5]).tolist()
-
-
-def test_last_seen_is_the_newest_value_of_each_coordinate() -> None:
-    read = np.array([[1, 2], [0, 0], [1, 1], [1, 2]])  # of coordinates of 2 and 2 values: 2 is "not seen"
-    assert last_seen(read, (2, 2)).tolist() == [[1, -1], [0, 0], [1, 1], [1, 1]]
 
 
 class CueEncoder(FakeEncoder):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import same
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
 from imagine_bench_controls.tabular.counts import CountTable
@@ -27,21 +25,6 @@ def agent(
 ) -> PosteriorSamplingAgent:
     settings = POSTERIOR_SAMPLING.resolve("fast", overrides, "chapter_5")
     return PosteriorSamplingAgent(read, actions, settings, SeedTree(seed))
-
-
-def live(learner: PosteriorSamplingAgent, steps: int, seed: int = 1) -> None:
-    """Train on the tiny world of wheels, episodes of at most 6 steps; the last transition of one says so."""
-    rng = np.random.default_rng(seed)
-    code = fake_codes.starts()[0]
-    length = 0
-    for _ in range(steps):
-        action = learner.act(Observation(frame=fake_codes.frame(code)), explore=True)
-        length = length + 1
-        learner.observe(replace(fake_codes.transition(code, action), truncated=length == 6), episode=0)
-        code, _, ended = fake_codes.step(code, action)
-        if ended or length == 6:
-            code = fake_codes.starts()[int(rng.integers(len(fake_codes.starts())))]
-            length = 0
 
 
 def at(state: int) -> Observation:
@@ -70,19 +53,6 @@ def test_the_posterior_is_the_dirichlet_of_the_counts(concentration: float) -> N
     mean = (first[0] + first[1]) / 2
     assert drawn.mean() == pytest.approx(mean, abs=0.015)
     assert drawn.var() == pytest.approx((second[0] + second[1]) / 2 - mean**2, abs=0.006)
-
-
-def test_many_counts_leave_the_model_of_the_counts() -> None:
-    table = CountTable(2)
-    rng = np.random.default_rng(0)
-    for state in range(4):
-        for action in (0, 1):
-            for _ in range(3_000):
-                table.add(state, action, (state + 1 + action) % 4, float(state == 3), state == 3)
-    exact = table.action_values(0.9, untried=0.0)
-    drawn = table.sampled_values(0.9, 0.1, rng)
-    for state in range(4):
-        np.testing.assert_allclose(drawn[state], exact[state], atol=0.02)
 
 
 def test_what_was_never_tried_may_be_anything_that_was_seen() -> None:
@@ -129,18 +99,3 @@ def test_it_explores_deeply() -> None:
 
     assert np.mean([reached(seed, by_chance=False) for seed in range(2)]) > 10
     assert np.mean([reached(seed, by_chance=True) for seed in range(2)]) < 1
-
-
-def test_it_learns_the_tiny_world_and_ends_greedy() -> None:
-    learner = agent()
-    live(learner, 300)
-    assert fake_codes.success(learner) == 1.0  # type: ignore[arg-type]
-
-
-def test_tests_change_nothing() -> None:
-    learner = agent()
-    live(learner, 30)
-    before = learner.state()
-    for code in fake_codes.starts():
-        learner.act(Observation(frame=fake_codes.frame(code)), explore=False)
-    assert same(before, learner.state())

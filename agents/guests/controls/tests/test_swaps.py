@@ -100,14 +100,6 @@ def test_an_outcome_that_differs_is_unknown_for_good() -> None:
         assert learner.outcomes[code] == swaps._UNSURE
 
 
-def test_no_share_is_the_dqn() -> None:
-    learner = agent(**{"swaps.share": 0.0})
-    live(learner, 30)
-    codes = {(row, action) for row, action in live(learner, 30, seed=1)}
-    batch = learner.draw_batch(learner.real)
-    assert set(zip(read(batch.z), batch.action.tolist(), strict=True)) <= codes
-
-
 def test_latents_have_no_parts_to_swap(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = SimpleNamespace(encoder=SimpleNamespace(card=SimpleNamespace(code_sizes=())))
     monkeypatch.setattr(swaps, "load_perception", lambda context: plain)

@@ -12,9 +12,8 @@ from small_runs import measured, run_observed, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
+from imagine_bench.errors import ArtefactError, SetupError
 from imagine_bench.interfaces import AgentState
-from imagine_bench.interfaces.capabilities import ExternalTrainer
 from imagine_bench.protocols.control import context_of
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import runner
@@ -108,22 +107,6 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(
     assert whole.training_success.tolist() == again.training_success.tolist()
 
 
-def test_the_registry_knows_agents_with_a_loop_of_their_own() -> None:
-    for name, entry in registry.agents().items():
-        if entry.settings.startswith("imagine_bench_peers.sb3_settings:"):
-            agent = registry.make_agent(name, context_of(spec(name)))
-            assert isinstance(agent, ExternalTrainer) and entry.external_training_loop
-        else:
-            assert not entry.external_training_loop
-
-
-def test_a_world_model_counts_in_steps_and_updates() -> None:
-    agent = registry.make_agent(IMAGINING[0], context_of(spec(IMAGINING[0])))
-    assert agent._steps_an_episode(10) == 10 + 4 * 3, "four imagined episodes of depth three"  # type: ignore[attr-defined]
-    agent._learner.updates = 7  # type: ignore[attr-defined]
-    assert agent.diagnostics()["gradient_updates"] == 7.0
-
-
 def test_its_episodes_start_where_all_agents_of_a_seed_start() -> None:
     entry = registry.task_entry("arrow_puzzle")
     with_starts = training_starts(gymnasium.make(entry.env_id, execution="kinematic"), 3)
@@ -151,17 +134,6 @@ def test_latents_are_those_of_our_own_agents() -> None:
     wrapped.close()
 
 
-def test_latents_of_another_task_or_of_no_name_are_refused() -> None:
-    from imagine_bench.agents.encoders.latent_observation import LatentObservation
-
-    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
-    with pytest.raises(InvalidValueError, match=r"pick_place reads frames as 'small_rgb', this .* 'gray_strips'"):
-        LatentObservation(env, "pick_place-clean")
-    with pytest.raises(UnknownNameError, match=r"No encoder 'arrow_puzle-clean'\. Did you mean 'arrow_puzzle-clean'"):
-        LatentObservation(env, "arrow_puzle-clean")
-    env.close()
-
-
 def test_it_is_never_taken_up_again_half_way() -> None:
     agent = registry.make_agent("sb3_dqn", context_of(spec("sb3_dqn")))
     with pytest.raises(ArtefactError, match="cannot be taken up again; run its bench anew"):
@@ -185,20 +157,6 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         sb3.make_qrdqn(context)
     with pytest.raises(SetupError, match=sentence):  # before hours of other agents, not after them
         plan("arrow_puzzle", "quick", agents=("dqn", "sb3_qrdqn"))
-
-
-@pytest.mark.parametrize(
-    ("overrides", "error", "words"),
-    [
-        ({"sb3.gamma": 1.5}, InvalidValueError, r"sb3\.gamma is 1\.5; it must lie in \[0, 1\]"),
-        ({"sb3.learning_rate": 0.0}, InvalidValueError, r"sb3\.learning_rate is 0\.0; it must be above 0"),
-        ({"sb3.batch_size": 0}, InvalidValueError, r"sb3\.batch_size is 0; it must lie in"),
-        ({"sb3.tau": 0.1}, UnknownNameError, "No setting 'sb3.tau'"),
-    ],
-)
-def test_bad_settings_are_refused(overrides: dict[str, Any], error: type[Exception], words: str) -> None:
-    with pytest.raises(error, match=words):
-        registry.load("imagine_bench_peers.sb3_settings:HYPERPARAMETERS").resolve("fast", overrides, "chapter_5")
 
 
 def spec(agent: str) -> RunSpec:

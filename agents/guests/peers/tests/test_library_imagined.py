@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-import torch
 from counting_model import RuledModel, ruled
 from fake_latents import ACTIONS, CODES, built, frame
 from gymnasium.utils.env_checker import check_env
@@ -52,50 +51,6 @@ def test_one_imagined_episode_ends_as_in_the_vector() -> None:
     assert kinds == {(False, False, True), (True, False, True), (False, True, True), (False, True, False)}
     with pytest.raises(InvalidValueError, match="has 2 episodes side by side; give one of num_envs 1"):
         ImaginedEnv(ImaginedVectorEnv(ruled(TASK), RuledModel(TASK).encode(TASK.rules.states).numpy(), num_envs=2))
-
-
-def success_rate(model: Any) -> float:
-    """Of the greedy policy, from every start, by the rules."""
-    code = RuledModel(TASK)
-    solved = 0
-    for start in TASK.rules.start_states:
-        state: State = start
-        for _ in range(TASK.horizon):
-            action, _ = model.predict(code.encode([state])[0].numpy(), deterministic=True)
-            (outcome,) = TASK.rules.outcomes(state, int(action))
-            state = outcome.macrostate
-            if outcome.terminated:
-                solved += outcome.success
-                break
-    return solved / len(TASK.rules.start_states)
-
-
-@pytest.mark.slow
-def test_dqn_that_only_imagines_the_true_rules_solves_the_task() -> None:
-    model = sb3.DQN(
-        "MlpPolicy", puzzle(), learning_rate=1e-3, gamma=0.95, learning_starts=200, train_freq=1, gradient_steps=1,
-        target_update_interval=500, exploration_fraction=0.5, buffer_size=20_000, seed=0, device="cpu",
-    )  # fmt: skip
-    untrained = success_rate(model)
-    model.learn(12_000)
-    assert untrained < 0.2 and success_rate(model) > 10 * TASK.facts().chance_level
-
-
-@pytest.mark.parametrize("algorithm", ["DQN", "PPO"])
-def test_the_same_seed_learns_the_same_in_imagination(algorithm: str) -> None:
-    few = {"learning_starts": 8, "buffer_size": 100} if algorithm == "DQN" else {"n_steps": 16, "batch_size": 16}
-
-    def learned() -> dict[str, torch.Tensor]:
-        model = getattr(sb3, algorithm)("MlpPolicy", puzzle(), seed=5, device="cpu", **few)
-        before = {name: value.clone() for name, value in model.policy.state_dict().items()}
-        model.learn(64)
-        after = model.policy.state_dict()
-        assert any(not torch.equal(before[name], after[name]) for name in before), "it learned"
-        return after
-
-    first = learned()
-    again = learned()
-    assert all(torch.equal(first[name], again[name]) for name in first)
 
 
 class Ring(gymnasium.Env[Any, Any]):
