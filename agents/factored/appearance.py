@@ -231,11 +231,6 @@ def contours(images: Images) -> Images:
     return np.stack([np.gradient(log, axis=1), np.gradient(log, axis=2)], axis=-1)
 
 
-def changed(before: Images, after: Images) -> Mask:
-    """Pixels of N pairs of images that one of a pair has and the other has not within a pixel. Shape (N, 64, 64)."""
-    return np.maximum(_beyond(before, after), _beyond(after, before)).max(axis=-1) > _CHANGE
-
-
 def _beyond(one: Images, other: Images) -> Images:
     """How far ``other`` lies outside of what ``one`` shows there and a pixel around."""
     around = (1, 3, 3, 1)
@@ -245,8 +240,14 @@ def _beyond(one: Images, other: Images) -> Images:
 
 
 def changes(images: Images) -> Mask:
-    """Where successive images (N, 64, 64, 3) differ, small holes closed. Shape (N - 1, 64, 64)."""
-    change = np.pad(changed(images[:-1], images[1:]), ((0, 0), (2, 2), (2, 2)))
+    """Where one of two successive images (N, 64, 64, 3) shows what the other does not show within a pixel.
+
+    Small holes are closed. Shape (N - 1, 64, 64).
+    """
+    before = images[:-1]
+    after = images[1:]
+    change = np.maximum(_beyond(before, after), _beyond(after, before)).max(axis=-1) > _CHANGE
+    change = np.pad(change, ((0, 0), (2, 2), (2, 2)))
     return np.asarray(scipy.ndimage.binary_closing(change, np.ones((1, 3, 3)))[:, 2:-2, 2:-2])
 
 
@@ -284,9 +285,11 @@ def regions(change: Mask, pixels: Mask) -> list[Mask]:
         if sum(map(np.sum, parted)) < _MOST * mask.sum():
             found.append(mask)
         else:
-            rest = _hanging(mask & ~np.isin(pieces, inside))
             found += parted
-            found += [each for each in rest if each.sum() >= _LEAST_PX and _thick(each) >= _COMPACT]
+            for rest in _hanging(mask & ~np.isin(pieces, inside)):
+                thick = scipy.ndimage.binary_opening(rest, np.ones((2, 2))).sum()
+                if rest.sum() >= _LEAST_PX and thick >= _COMPACT * rest.sum():
+                    found.append(rest)
     least = [_LEAST_PX if mask[_INNER].sum() < mask.sum() else _LEAST_INNER_PX for mask in found]
     return sorted((mask for mask, few in zip(found, least, strict=True) if mask.sum() >= few), key=np.sum, reverse=True)
 
@@ -295,11 +298,6 @@ def _hanging(pixels: Mask) -> list[Mask]:
     """Groups of pixels (64, 64) that hang together, up to two pixels apart."""
     label, count = scipy.ndimage.label(scipy.ndimage.binary_dilation(pixels), np.ones((3, 3)))
     return [pixels & (label == index + 1) for index in range(count)]
-
-
-def _thick(pixels: Mask) -> float:
-    """Share of pixels (64, 64) that are in a square of two by two of them."""
-    return float(scipy.ndimage.binary_opening(pixels, np.ones((2, 2))).sum() / pixels.sum())
 
 
 def crops(shapes: Images, mask: Mask) -> Images:

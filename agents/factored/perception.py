@@ -65,17 +65,17 @@ class CodePerception:
         """What the evaluation's probe reads from N codes; the agent must not use it. Shape (N, M)."""
         return self._encoder.read_macrostate(self.latents(codes))
 
-    def images(self, codes: Sequence[Code]) -> appearance.Images:
+    def images(self, codes: Sequence[Code] | Codes) -> appearance.Images:
         """N codes as the encoder decodes them to images, for people."""
         return self._encoder.decode(self.latents(codes))
 
 
 def load_code_perception(context: AgentContext, *, factored: bool) -> CodePerception:
-    """The perception of an agent that reads codes; InvalidValueError if the context's encoder gives none."""
+    """The perception of an agent or a model that reads codes; InvalidValueError if the encoder gives none."""
     encoder = load_perception(context).encoder
     if not encoder.card.code_sizes:
         raise InvalidValueError(
-            f"This agent reads codes of factors, and encoder {encoder.card.recipe.name!r} gives continuous latents; "
+            f"Codes of factors are needed, and encoder {encoder.card.recipe.name!r} gives continuous latents; "
             "give one made with `imagine-bench encoder --recipe codes`."
         )
     return CodePerception(encoder, factored=factored)

@@ -3,37 +3,32 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.nn import functional
 
-from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Floats, Frame
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined
 
-from ..encoders.encoder import Encoder
-from ..encoders.perception import load_perception, prepare_torch
+from ..encoders.perception import prepare_torch
 from ..factored.factors import Codes, CodeTransition
 from ..factored.model import FactoredModel
+from ..factored.perception import CodePerception, load_code_perception
 from ..factored.settings import HYPERPARAMETERS
 
 
 class StructuredModel:
     """Codes, tables and decoder as a world model."""
 
-    def __init__(self, encoder: Encoder, context: AgentContext) -> None:
-        if not encoder.card.code_sizes:
-            raise InvalidValueError("The structured model reads codes; give an encoder of the recipe 'codes'.")
-        self.encoder = encoder
-        self.sizes = encoder.card.code_sizes
+    def __init__(self, perception: CodePerception, context: AgentContext) -> None:
+        self.perception = perception
+        self.sizes = perception.sizes
         settings = HYPERPARAMETERS.resolve(context.hyperparameters, {}, context.config_group)
         self.model = FactoredModel(self.sizes, context.n_actions, settings)
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Count every transition; nothing is random."""
         del rng
-        codes = list(map(tuple, self._codes(dataset.frames).tolist()))
+        codes = self.perception.codes(dataset.frames)
         before = dataset.rows[0]
         rows = zip(before, dataset.actions.tolist(), dataset.rewards.tolist(), dataset.terminated.tolist(), strict=True)
         for row, action, reward, terminated in rows:
@@ -49,7 +44,7 @@ class StructuredModel:
         asked = actions[:, frames.shape[1] - 1 :]
         rows, depth = asked.shape
         shape = (rows, samples, depth)
-        codes = np.repeat(self._codes(frames[:, -1]), samples, axis=0)
+        codes = np.repeat(np.array(self.perception.codes(frames[:, -1])), samples, axis=0)
         alive = np.ones(rows * samples)
         drawn = []
         rewards = np.zeros(shape)
@@ -88,16 +83,10 @@ class StructuredModel:
         ends = outcomes @ self.model.outcomes.ends
         return following, reward, ends, 1.0 - known * (1.0 - untested), 1.0 - likeliest
 
-    def _codes(self, frames: Frame) -> Codes:
-        """Codes of frames (N, 64, 64, 3). Shape (N, P)."""
-        parts = self.encoder.encode(frames)[0].split(self.sizes, dim=1)
-        return torch.stack([part.argmax(dim=1) for part in parts], dim=1).numpy()
-
     def _pictures(self, codes: Codes) -> NDArray[np.uint8]:
         """Pictures of codes (..., P), each different code drawn once. Shape (rows, H, W) or (rows, H, W, 3)."""
         different, which = np.unique(codes.reshape(-1, codes.shape[-1]), axis=0, return_inverse=True)
-        hot = [functional.one_hot(torch.from_numpy(v.copy()), n) for v, n in zip(different.T, self.sizes, strict=True)]
-        drawn = self.encoder.decode(torch.cat(hot, dim=1).float())
+        drawn = self.perception.images(different)
         return (drawn * 255.0).round().astype(np.uint8)[which.ravel()]
 
     def parameters(self) -> int:
@@ -108,4 +97,4 @@ class StructuredModel:
 def make(context: AgentContext) -> StructuredModel:
     """The model for a task; InvalidValueError if the context's encoder gives no codes."""
     prepare_torch(context.device)
-    return StructuredModel(load_perception(context).encoder, context)
+    return StructuredModel(load_code_perception(context, factored=True), context)
