@@ -32,8 +32,6 @@ _AT_ONCE = 64
 """Codes whose counts are read at once, so that tables of many values need little memory."""
 _TABLES = 2
 """Structures before those of tables."""
-EVERY = slice(None)
-"""All actions."""
 
 
 class FactorPrediction(NamedTuple):
@@ -110,16 +108,16 @@ class FactorDynamics:
         changes = np.where(stayed < tried, 1.0 - self.weights()[:, 0], 0.0)
         return np.array([changes @ tried, changes @ stayed])
 
-    def predict(self, codes: Codes, actions: slice = EVERY) -> FactorPrediction:
-        """Predict the next values after some actions in ``codes`` (N, P)."""
-        expected, unknown = self._average(codes, actions, self._pseudo, self._fails(), self._by_itself)
+    def predict(self, codes: Codes) -> FactorPrediction:
+        """Predict the next values after each action in ``codes`` (N, P)."""
+        expected, unknown = self._average(codes, self._pseudo, self._fails(), self._by_itself)
         return FactorPrediction(expected, np.where(unknown < self.settings.least_unknown, 0.0, unknown))
 
     def seen(self, codes: Codes) -> Floats:
         """Frequencies of the next values without any prior; zeros for an action that was never tried. (N, A, K)."""
         tried, stayed = self._tried()
         turns = self._pooled / np.maximum(self._pooled.sum(axis=1, keepdims=True), 1.0)
-        seen, _ = self._average(codes, EVERY, 0.0, stayed / np.maximum(tried, 1.0), turns)
+        seen, _ = self._average(codes, 0.0, stayed / np.maximum(tried, 1.0), turns)
         return seen * (tried[:, None] > 0.0)
 
     def happens(self, codes: Codes, actions: Ints) -> tuple[Floats, Floats]:
@@ -134,37 +132,33 @@ class FactorDynamics:
         chance = np.where((seen.sum(axis=1) > unknown)[:, None], seen, predicted.expected[each, actions])
         return chance / chance.sum(axis=1, keepdims=True), unknown
 
-    def _average(
-        self, codes: Codes, actions: slice, pseudo: float, fails: Floats, by_itself: Floats
-    ) -> tuple[Floats, Floats]:
+    def _average(self, codes: Codes, pseudo: float, fails: Floats, by_itself: Floats) -> tuple[Floats, Floats]:
         """Average over the structures: the next values, (N, A, K), and the weight of the prior, (N, A).
 
         Args:
             codes: Codes (N, P).
-            actions: The A actions that are asked about.
             pseudo: Counts that the prior of each row of a table is worth.
-            fails: How often each action leaves the factor at its value, where rows are alike. One a macro-action.
+            fails: How often each action leaves the factor at its value, where rows are alike. Shape (A,).
             by_itself: Next values of a factor that changes by itself. Shape (K, K).
         """
         if len(codes) > _AT_ONCE:
             some = (codes[first : first + _AT_ONCE] for first in range(0, len(codes), _AT_ONCE))
-            means, priors = zip(*(self._average(few, actions, pseudo, fails, by_itself) for few in some), strict=True)
+            means, priors = zip(*(self._average(few, pseudo, fails, by_itself) for few in some), strict=True)
             return np.concatenate(means), np.concatenate(priors)
-        weight = self.weights()[actions]
+        weight = self.weights()
         weight[weight <= _NEGLIGIBLE] = 0.0
-        fails = fails[actions]
         apart, alike = weight[:, _TABLES:].T.reshape(2, len(self.parents), -1)  # [T, A]
         matters = np.flatnonzero((apart + alike).any(axis=1))
         alike = alike[matters]
         each = np.arange(len(codes))
         own = codes[:, self.factor]
-        counts = self.counts[self._rows(codes)[:, matters], actions]  # [N, T, A, K]
+        counts = self.counts[self._rows(codes)[:, matters]]  # [N, T, A, K]
         total = counts.sum(axis=3)
         stayed = counts[each, ..., own]
         least = 0.0 if pseudo else 1.0
         tables = apart[matters] / np.maximum(total + pseudo, least)
         goes = alike * (1.0 - fails) / np.maximum(total - stayed + pseudo, least)
-        unsure = fails * pseudo / np.maximum(self._tried()[0][actions] + pseudo, least)
+        unsure = fails * pseudo / np.maximum(self._tried()[0] + pseudo, least)
         expected = weight[None, :, :1] * np.eye(self.values)[own][:, None, :]
         expected = expected + weight[:, 1, None] * by_itself[own][:, None]
         expected += ((tables + goes)[..., None] * counts).sum(axis=1)
@@ -202,15 +196,12 @@ class Dynamics:
         self.settings = settings
         self._seen = 0
         self._pooled_at = 0
-        self.changed_at = np.zeros(n_actions, dtype=np.int64)
-        """How many transitions were seen when what is predicted of each action changed last. Shape (A,)."""
 
     def add(self, code: Codes, action: int, following: Codes) -> None:
         """Learn from one transition from a code (P,) to values of those that move."""
         for factor, value in zip(self.factors, following.tolist(), strict=True):
             factor.add(code, action, value)
         self._seen += 1
-        self.changed_at[action] = self._seen
         if self._seen >= _GROWTH * self._pooled_at:
             self._pool()
 
@@ -218,13 +209,12 @@ class Dynamics:
         """Learn anew how factors change by themselves, and how often actions fail, of each factor and of all."""
         pseudo = self.settings.pseudo_fails
         self._pooled_at = self._seen
-        self.changed_at[:] = self._seen
         each = [factor.pool() for factor in self.factors]
         tried, stayed = np.sum(each, axis=0)
         fails = (stayed + self.settings.fails) / (tried + 1.0)
         for factor, (own_tried, own_stayed) in zip(self.factors, each, strict=True):
             factor.fails = float((own_stayed + pseudo * fails) / (own_tried + pseudo))
 
-    def predict(self, codes: Codes, actions: slice = EVERY) -> list[FactorPrediction]:
-        """What some actions would make of each factor in ``codes`` (N, P)."""
-        return [factor.predict(codes, actions) for factor in self.factors]
+    def predict(self, codes: Codes) -> list[FactorPrediction]:
+        """What each action would make of each factor in ``codes`` (N, P)."""
+        return [factor.predict(codes) for factor in self.factors]

@@ -11,7 +11,7 @@ import numpy as np
 
 from imagine_bench.interfaces import Floats
 
-from .dynamics import EVERY, Dynamics
+from .dynamics import Dynamics
 from .factors import Code, Codes, CodeTransition, Memory, contradictions, remembering
 from .outcomes import OutcomeModel
 from .settings import FactoredSettings, LearnedSettings
@@ -88,9 +88,9 @@ class FactoredModel:
         probability = np.where(seen, moved * brought[each, outcome], 0.0)
         return probability, np.where(seen, 1.0 - (1.0 - untested) * known, 1.0)
 
-    def moves(self, codes: Codes, actions: slice = EVERY) -> Moves:
-        """Where some actions would lead from ``codes`` (N, P)."""
-        factors = self.dynamics.predict(codes, actions)
+    def moves(self, codes: Codes) -> Moves:
+        """Where each action would lead from ``codes`` (N, P)."""
+        factors = self.dynamics.predict(codes)
         chance, following = self._branches([factor.expected for factor in factors])
         if self.memory is not None:
             before = np.broadcast_to(codes[:, None, None, -1], chance.shape)

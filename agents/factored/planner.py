@@ -15,9 +15,8 @@ import numpy as np
 
 from imagine_bench.interfaces import Floats
 
-from .dynamics import EVERY
-from .factors import Code, Codes, Ints
-from .model import FactoredModel, Moves
+from .factors import Code, Ints
+from .model import FactoredModel
 from .settings import PlanningSettings
 
 _KEPT = 20
@@ -33,9 +32,6 @@ Objective = Literal["value", "optimistic", "novelty"]
 
 class PredictedTransitions:
     """Codes that were met, numbered in rows, and what every action would lead to from those that were asked about.
-
-    What an action does is predicted anew where the model's dynamics of it changed; what it brings whenever anything
-    was learned.
 
     Attributes:
         reward: Expected reward. Shape (rows, A), as of ``unknown`` and ``ends``.
@@ -58,10 +54,6 @@ class PredictedTransitions:
         self.continues = np.zeros(triples)
         self.next = np.zeros(triples, dtype=np.int64)
         self.known = np.zeros(0, dtype=np.bool_)
-        self._chance = np.zeros(triples)
-        self._following = np.zeros(triples, dtype=np.int64)
-        self._certain = np.zeros(pairs)
-        self._moved_at = np.zeros(pairs, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -79,11 +71,13 @@ class PredictedTransitions:
         rows = rows[~self.known[rows]]
         if not len(rows):
             return
-        self._move(rows)
-        moves = Moves(self._codes(self._following[rows]), self._chance[rows], self._certain[rows])
-        found = self._model.results(self._codes_of(rows), moves)
+        sizes = self._model.sizes
+        numbers = np.array([self._numbers[row] for row in rows.tolist()])
+        codes = np.stack(np.unravel_index(numbers, sizes), axis=-1)
+        moves = self._model.moves(codes)
+        found = self._model.results(codes, moves)
         follows = found.p_continues > _HAPPENS
-        numbers, which = np.unique(self._following[rows][follows], return_inverse=True)
+        numbers, which = np.unique(np.ravel_multi_index(tuple(moves.following[follows].T), sizes), return_inverse=True)
         following = np.zeros(follows.shape, dtype=np.int64)
         following[follows] = np.array([self.row(number) for number in numbers.tolist()], dtype=np.int64)[which]
         self._grow()
@@ -93,29 +87,6 @@ class PredictedTransitions:
         self.next[rows] = following
         self.continues[rows] = np.where(follows, found.p_continues, 0.0)
         self.known[rows] = True
-
-    def _move(self, rows: Ints) -> None:
-        """Predict where actions lead from ``rows``, whose dynamics changed since."""
-        changed_at = self._model.dynamics.changed_at
-        stale = self._moved_at[rows] != changed_at
-        new = stale.all(axis=1)
-        every = [(slice(action, action + 1), stale[:, action] & ~new) for action in range(len(changed_at))]
-        for actions, among in [(EVERY, new), *every]:
-            if among.any():
-                some = rows[among]
-                moves = self._model.moves(self._codes_of(some), actions)
-                following = np.ravel_multi_index(tuple(np.moveaxis(moves.following, -1, 0)), self._model.sizes)
-                self._following[some, actions] = following
-                self._chance[some, actions] = moves.chance
-                self._certain[some, actions] = moves.known
-        self._moved_at[rows] = changed_at
-
-    def _codes_of(self, rows: Ints) -> Codes:
-        return self._codes(np.array([self._numbers[row] for row in rows.tolist()]))
-
-    def _codes(self, numbers: Ints) -> Codes:
-        """Codes (..., P) of their numbers (...)."""
-        return np.stack(np.unravel_index(numbers, self._model.sizes), axis=-1)
 
     def _grow(self) -> None:
         """Room for every row, at least twice as much as before."""

@@ -67,12 +67,11 @@ class _Chain:
 
     n_actions = 1
     outcomes = SimpleNamespace(rewards=np.array([10.0]))
-    dynamics = SimpleNamespace(changed_at=np.ones(1, dtype=np.int64))
 
     def __init__(self, length: int, branches: int) -> None:
         self.length, self.branches, self.sizes = length, branches, (length,)
 
-    def moves(self, codes: NDArray[np.int64], actions: slice) -> Moves:
+    def moves(self, codes: NDArray[np.int64]) -> Moves:
         following = np.zeros((len(codes), 1, self.branches, 1), dtype=np.int64)
         following[:, 0, 0] = np.minimum(codes + 1, self.length - 1)
         chance = np.zeros((len(codes), 1, self.branches))
