@@ -200,7 +200,7 @@ def test_another_task_is_no_reason_to_remember(monkeypatch: pytest.MonkeyPatch, 
     learner.reset_for_new_task()
     tried: list[int] = []
     monkeypatch.setattr(own, "choose", lambda rows, *_: tried.append(contradictions(rows)))
-    for episode in range(40, 60):
+    for episode in range(40, 52):
         for transition in played(learner, np.random.default_rng((1, episode)), explore=True):
             learner.observe(replace(transition, reward=-transition.reward), episode=episode)
     rows = learner.replay
