@@ -123,15 +123,13 @@ def find(frames: Frame, begins: Mask | None = None, actions: Ints | None = None)
     shapes = contours(images)
     begins = np.zeros(len(frames), dtype=np.bool_) if begins is None else begins
     actions = np.full(len(frames), -1) if actions is None else actions
-    parts = _parts(images, shapes, begins, actions)
-    factors: list[tuple[tuple[Part, ...], Codes]]
-    factors = [((part,), values[:, None]) for part, values in parts]
-    while (pair := _first_bound([_numbers(joint) for _, joint in factors])) is not None:
-        one, other = pair
-        parts_1, joint_1 = factors[one]
-        parts_2, joint_2 = factors.pop(other)
-        factors[one] = ((*parts_1, *parts_2), np.concatenate([joint_1, joint_2], axis=1))
-    return [SeenFactor(parts, np.unique(joint, axis=0)) for parts, joint in factors]
+    factors = [SeenFactor((part,), values[:, None]) for part, values in _parts(images, shapes, begins, actions)]
+    while (pair := _first_bound([factor.joint for factor in factors])) is not None:
+        other = factors.pop(pair[1])
+        one = factors[pair[0]]
+        joint = np.concatenate([one.joint, other.joint], axis=1)
+        factors[pair[0]] = SeenFactor((*one.parts, *other.parts), joint)
+    return [factor._replace(joint=np.unique(factor.joint, axis=0)) for factor in factors]
 
 
 def _parts(images: Images, shapes: Images, begins: Mask, actions: Ints) -> list[tuple[Part, Ints]]:
@@ -190,13 +188,9 @@ def quiet(images: Images, rests: Images) -> Images:
     return np.where(shown[..., None], images, np.float32(_MEDIAN_COLOR))
 
 
-def _numbers(joint: Codes) -> Ints:
-    """Joint values (N, parts) as numbers (N,)."""
-    return np.unique(joint, axis=0, return_inverse=True)[1].ravel()
-
-
-def _first_bound(values: list[Ints]) -> tuple[int, int] | None:
-    """The first two factors, by their values (N,), that do not vary freely, or None."""
+def _first_bound(joint: list[Codes]) -> tuple[int, int] | None:
+    """The first two factors, by their joint values (N, parts), that do not vary freely, or None."""
+    values = [np.unique(each, axis=0, return_inverse=True)[1].ravel() for each in joint]
     pairs = itertools.combinations(range(len(values)), 2)
     return next(((one, other) for one, other in pairs if bound(values[one], values[other])), None)
 
