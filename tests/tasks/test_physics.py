@@ -49,12 +49,8 @@ def test_the_defaults_are_the_scene_as_built(task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_settings_reach_the_scene(task):
-    built, env = make(task), make(task, physics={"pad_friction": 0.3, "finger_force_n": 2.0, "object_mass": 5.0})
-    tips = [index for index in range(env.model.ngeom) if "_tip_" in env.model.geom(index).name]
-    np.testing.assert_allclose(env.model.geom_friction[tips], [[0.3, 0.0025, 0.0001]] * len(tips))
-    fingers = [env.model.actuator(f"finger_{side}_servo").id for side in ("left", "right")]
-    np.testing.assert_array_equal(env.model.actuator_forcerange[fingers], [[-2, 2]] * 2)
+def test_objects_alone_become_heavier(task):
+    built, env = make(task), make(task, physics={"object_mass": 5.0})
     for name in registry.task(task).targets.objects:
         assert env.model.body(name).mass == 5 * built.model.body(name).mass
         np.testing.assert_allclose(5 * env.model.body(name).invweight0, built.model.body(name).invweight0)

@@ -41,12 +41,6 @@ def test_one_action_is_asked_for_in_play_and_none_after_an_end():
             assert (outcome.reward, outcome.terminated, outcome.success) == (-5.0, True, False)
 
 
-def test_a_pick_as_asked_leaves_the_human_three_wishes():
-    outcomes = RULES.outcomes((0, 0, 0, 1), 1)
-    assert [outcome.macrostate for outcome in outcomes] == [(0, 1, 0, 0), (0, 1, 0, 2), (0, 1, 0, OPEN_PALM)]
-    assert all(outcome.probability == pytest.approx(1 / 3) and outcome.reward == 1.0 for outcome in outcomes)
-
-
 def test_the_human_keeps_pointing_while_an_object_is_put_back():
     (outcome,) = RULES.outcomes((1, 0, 0, 2), 0)
     assert (outcome.macrostate, outcome.reward, outcome.terminated) == ((0, 0, 0, 2), 0.0, False)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import arrow_outline
 from imagine_bench.tasks.scenes import hand, objects
-from imagine_bench.tasks.scenes.meshes import Mesh, arch, box, ellipsoid, limb, stack, turned_profile
+from imagine_bench.tasks.scenes.meshes import Mesh, box, stack
 
 
 def signed_volume_m3(mesh: Mesh) -> float:
@@ -39,13 +39,3 @@ def test_volumes_of_flat_solids_are_exact():
     assert signed_volume_m3(stack([outline, outline], (-0.1, 0.2))) == pytest.approx(0.3 * area)
     assert signed_volume_m3(box((0, 0, 0), (1, 2, 3))) == pytest.approx(6.0)
     assert signed_volume_m3(box((0, 0, 0), (1, 1, 1), taper=0.5)) == pytest.approx((1 + 0.25 + 0.5) / 3)
-
-
-def test_volumes_of_round_solids_are_approached():
-    fine = ellipsoid((1.0, 2.0, 3.0), (0.1, 0.2, 0.3), sides=96, rings=95)
-    assert signed_volume_m3(fine) == pytest.approx(4 / 3 * np.pi * 0.006, rel=5e-3)
-    tube = limb([(0, 0, 0, 0.1), (0, 0, 5, 0.1), (0, 0, 10, 0.1)], sides=96)
-    assert signed_volume_m3(tube) == pytest.approx(np.pi * 0.01 * 10, rel=0.02)
-    assert signed_volume_m3(turned_profile([(1.0, 0.0), (1.0, 2.0)], sides=96)) == pytest.approx(2 * np.pi, rel=1e-2)
-    rod = arch((0, 0, 0), radius=1.0, thickness=0.05)
-    assert rod.vertices[:, 0].min() == pytest.approx(-1.05, abs=1e-2)
