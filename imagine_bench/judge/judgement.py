@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,14 +112,6 @@ class Judgement:
         """The models that are fitted here."""
         return [model for model in self.models if not runs_of(model)]
 
-    def shown(self, model: str) -> ModelFit:
-        """The cell of a model whose images are kept: the first seed, the most transitions."""
-        return ModelFit(model, next(iter(runs_of(model)), self.seeds[0]), self.sizes[-1])
-
-    def files(self, cell: ModelFit) -> list[str]:
-        """The names of a cell's files: its scores and, of the one that is shown, its images."""
-        return [cell.file, cell.images] if cell == self.shown(cell.model) else [cell.file]
-
     @property
     def folder_name(self) -> str:
         """Where it is kept: the same for all that can be compared."""
@@ -171,7 +163,7 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
         data_of(judgement, folder, seed)
     prepare(judgement, folder)
     cells = judgement.cells
-    waiting = [cell for cell in cells if not all((folder / name).exists() for name in judgement.files(cell))]
+    waiting = [cell for cell in cells if not (folder / cell.file).exists()]
     failed: dict[str, None] = {}
     with tqdm(total=len(cells), initial=len(cells) - len(waiting), unit="fit", disable=None) as bar:
         for cell, why in _carried_out(judgement, folder, waiting, workers):
@@ -187,15 +179,13 @@ def _carried_out(
     judgement: Judgement, folder: Path, cells: Sequence[ModelFit], workers: int
 ) -> Iterator[tuple[ModelFit, str]]:
     """Each cell as it is done, and why it failed or an empty text."""
+    carry = functools.partial(carry_out, judgement, folder)
     if workers == 1:
-        yield from ((cell, carry_out(judgement, folder, cell)) for cell in cells)
+        yield from zip(cells, map(carry, cells), strict=True)
         return
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        jobs = {pool.submit(carry_out, judgement, folder, cell): cell for cell in cells}
-        for job in as_completed(jobs):
-            yield jobs[job], job.result()
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield from zip(cells, pool.map(carry, cells), strict=True)
 
 
 def carry_out(judgement: Judgement, folder: Path, cell: ModelFit) -> str:
@@ -204,7 +194,7 @@ def carry_out(judgement: Judgement, folder: Path, cell: ModelFit) -> str:
         found, images = judge_cell(judgement, folder, cell)
     except ImagineBenchError as error:
         return str(error)
-    if cell == judgement.shown(cell.model):
+    if cell.transitions == judgement.sizes[-1]:
         write_arrays(folder / cell.images, images)
     write_json(folder / cell.file, sealed(with_null(found)))
     return ""
@@ -396,14 +386,15 @@ def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
 
 
 def shown(folder: Path, judgement: Judgement) -> dict[str, dict[str, Any]]:
-    """By model, the images and the cell that are kept of :meth:`Judgement.shown`.
+    """By model, the images and the cell of its first seed that are kept, after the most transitions.
 
     Raises:
         ArtefactError: A file is damaged.
     """
-    found = {}
-    for model in judgement.models:
-        cell = judgement.shown(model)
-        if (folder / cell.file).exists():
-            found[model] = read_arrays(folder / cell.images) | read_sealed(folder / cell.file, "a judged cell")
+    found: dict[str, dict[str, Any]] = {}
+    for cell in kept(folder, judgement):
+        model = cell["model"]
+        images = folder / ModelFit(model, cell["seed"], cell["transitions"]).images
+        if model not in found and images.exists():
+            found[model] = read_arrays(images) | cell
     return found
