@@ -279,7 +279,18 @@ def radar() -> None:
                 values = (float(row[name] or "nan") for name in ("score", "low_95", "high_95"))
                 scores.setdefault(label_today(row["agent"]), {})[row["experiment"]] = statistics.Estimate(*values)
     spokes = list(dict.fromkeys(name for found in scores.values() for name in found))
-    figure = figures.radar_figure(spokes, {agent: [found[name] for name in spokes] for agent, found in scores.items()})
+    figure = plt.figure(figsize=(8.4, 6.8), layout="constrained")
+    axes = figure.add_subplot(projection="polar", theta_offset=np.pi / 2.0, theta_direction=-1)
+    angles = np.linspace(0.0, 2.0 * np.pi, len(spokes) + 1)
+    for agent, found in scores.items():
+        estimates = [found[name][:3] for name in (*spokes, spokes[0])]
+        middle, low, high = np.clip(estimates, 0.0, 1.0).T
+        axes.plot(angles, middle, "o-", color=figures.color(agent), label=agent_title(agent))
+        axes.vlines(angles, low, high, color=figures.color(agent), alpha=0.4)
+    axes.set(ylim=(0.0, 1.0), yticks=(0.25, 0.5, 0.75, 1.0))
+    axes.set_xticks(angles[:-1], [spoke.replace("_", " ") for spoke in spokes])
+    axes.tick_params(axis="x", pad=20)
+    figure.legend(loc="outside upper center", ncols=4)
     figure.savefig(HERE / "radar.png", dpi=90, facecolor="white")
 
 

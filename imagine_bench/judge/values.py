@@ -1,8 +1,4 @@
-"""What mistakes cost: plans that are optimal in a model, and policies of agents, followed by the exact rules.
-
-No episode is sampled. A test says how often an agent succeeds; :func:`terminations` says from which starts it does not,
-and how: a termination that is no success, or out of time, and then whether it would have come to a success, to another
-termination, or to none at all.
+"""What mistakes cost: plans that are optimal in a model, followed by the exact rules. No episode is sampled.
 
 Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizon.
 """
@@ -10,18 +6,15 @@ Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.arrays import Bools, Ints
-from imagine_bench.interfaces import Floats, Outcome, Rules, State, TaskSpec
-from imagine_bench.rules import evaluate, greedy, optimal_policy, tabulate
+from imagine_bench.interfaces import Floats, Outcome, Rules, State
 
 _TIE = 1e-9
-_PATIENCE = 1_000  # macro-actions after which a termination is taken for one that never comes
 Dynamics = Callable[[State, int], Sequence[Outcome]]
 """What may come of a macro-action in a macrostate, as :meth:`.Rules.outcomes` says it."""
 
@@ -103,42 +96,3 @@ def values_of_planning(truth: Model, model: Model, horizon: int, allowed: Bools 
         onward = truth.p_continues[every, actions] * values[truth.following[every, actions]]
         values[:-1] = truth.reward[every, actions] + onward.sum(axis=1)
     return values[:-1]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Terminations:
-    """How episodes of one agent terminate by the rules, from each of the S start macrostates. Each of shape (S,)."""
-
-    success: Floats  # probability of a success within the horizon
-    failure: Floats  # probability of another termination within the horizon
-    late_success: Floats  # probability of a success after the horizon, if episodes went on there
-    late_failure: Floats  # probability of another termination after it
-    length: Floats  # expected macro-actions within the horizon
-
-    @property
-    def endless(self) -> Floats:
-        """Probability of what remains: no termination at all."""
-        ended = self.success + self.failure + self.late_success + self.late_failure
-        return np.maximum(0.0, 1.0 - ended)  # but for rounding
-
-
-def optimal_length(spec: TaskSpec, starts: Sequence[State]) -> Floats:
-    """Expected macro-actions of an optimal agent within the horizon, from each start. Shape (S,)."""
-    tables = tabulate(spec.rules)
-    best = greedy(optimal_policy(tables), spec.n_actions)
-    return evaluate(tables, best, spec.horizon).length[[tables.index[start] for start in starts]]
-
-
-def terminations(spec: TaskSpec, policy: Floats, starts: Sequence[State]) -> Terminations:
-    """Follow a policy from S starts by the rules; its probabilities are (A, X), of the X macrostates of the rules."""
-    tables = tabulate(spec.rules)
-    within = evaluate(tables, policy, spec.horizon)
-    patient = evaluate(tables, policy, max(spec.horizon, _PATIENCE))
-    rows = [tables.index[start] for start in starts]
-    return Terminations(
-        success=within.success[rows],
-        failure=within.failure[rows],
-        late_success=(patient.success - within.success)[rows],
-        late_failure=(patient.failure - within.failure)[rows],
-        length=within.length[rows],
-    )

@@ -6,7 +6,6 @@ lists them in the order of the page.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Mapping
 
@@ -16,7 +15,6 @@ from matplotlib.figure import Figure
 from imagine_bench import reference
 from imagine_bench.report import figures, sections
 from imagine_bench.report.data import (
-    AREA,
     BASE_AGENT,
     DIFFERENCE,
     GAIN,
@@ -24,7 +22,6 @@ from imagine_bench.report.data import (
     Record,
     ReportData,
     agent_title,
-    by_budget,
     collect,
     estimated,
     frames_before,
@@ -38,10 +35,10 @@ from imagine_bench.report.page import (
     Section,
     Table,
     count,
-    decimals,
     made,
     p_value,
     percent,
+    printed,
     seconds,
     signed_percent,
 )
@@ -49,6 +46,14 @@ from imagine_bench.statistics import LEVEL, Estimate, first_lasting
 from imagine_bench.store.loading import archive_files
 from imagine_bench.store.results import BenchResult
 
+_AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
+    "against DQN": lambda record: agent_title(record["agent"]),
+    "real episodes": lambda record: f"{record['episodes']:,}",
+    "difference (points)": lambda record: estimated(record, DIFFERENCE, signed_percent),
+    "p": lambda record: printed(record["p_holm"], ".3f"),
+    "gain (%)": lambda record: estimated(record, GAIN, signed_percent),
+    "thesis (%)": lambda record: DASH if record.get("thesis_gain") is None else signed_percent(record["thesis_gain"]),
+}
 _NAMED = 4  # unfinished runs that are named; the others are counted
 
 
@@ -79,7 +84,7 @@ def bench_page(result: BenchResult) -> Page:
         sections=[section for make in SECTIONS if (section := make(data)) is not None],
         files=files,
         summary="\n\n".join([heading, _scores(data).text, "\n".join(answers)]),
-        **made(result, {agent: agent_title(agent) for agent in protocol.agents}),
+        facts=made(result, {agent: agent_title(agent) for agent in protocol.agents}),
     )
 
 
@@ -154,16 +159,7 @@ def success(data: ReportData) -> Section:
         "the thesis, with standard deviations."
     )
     image = figures.image("success", lambda: success_figure(data), caption)
-    excess = by_budget(
-        data,
-        "excess",
-        "macro-actions beyond the shortest plan, after",
-        "excess_macro_actions",
-        lambda record: decimals(record.get("excess_macro_actions", math.nan)),
-        "Means over the solved tests; the shortest plan from each start is exact, from the rules.",
-        "nothing was solved",
-    )
-    tables = [table for table in (_scores(data), excess, _seeds(data)) if table.rows]
+    tables = [_scores(data), _seeds(data)]
     return Section("Success against real experience", images=[image], tables=tables)
 
 
@@ -178,8 +174,8 @@ def _scores(data: ReportData) -> Table:
     for agent in data.result.protocol.agents:
         rows.append(row(agent_title(agent), {each["episodes"]: estimated(each, SCORE) for each in data.of(agent)}))
         if agent in data.thesis:
-            printed = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
-            rows.append(row(f"{agent_title(agent)}, thesis", printed))
+            cells = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
+            rows.append(row(f"{agent_title(agent)}, thesis", cells))
     rows.append(row("chance level", dict.fromkeys(budgets, percent(data.facts.chance_level))))
     rows.append(row("optimum", dict.fromkeys(budgets, percent(data.facts.optimum))))
     source = f" Thesis: {reference.success_source(str(data.spec.reference))}." if data.thesis else ""
@@ -204,70 +200,34 @@ def _seeds(data: ReportData) -> Table:
     return Table("seeds", header, rows, why_dash="the last test is not solved so far", folded="Every seed by itself")
 
 
-def area(data: ReportData) -> Section | None:
-    """Mean success up to each budget."""
-    words = (
-        "Mean success (%) over all real episodes up to each budget: straight lines between the tests, from the chance "
-        "level at episode 0. It is the area under the curve with a linear axis, so early learning counts."
-    )
-    table = by_budget(data, "areas", "mean success (%) up to", "area", functools.partial(estimated, columns=AREA))
-    return Section("Area under the success curve", [words], tables=[table]) if table.rows else None
-
-
 def gain(data: ReportData) -> Section | None:
     """Every learner against DQN, beside the thesis' gains."""
     if not data.compared:
         return None
     words = (
         "Difference: percentage points of test episodes solved. Gain: the same relative to DQN, (agent − DQN) / DQN, "
-        "the thesis' measure. One seed has no interval, nor has a gain over a DQN that may have solved nothing. "
-        "Solved alone: tests that one of two agents solved and the other did not, from the same starts and seeds, with "
-        "McNemar's exact test (Holm-corrected); it compares these trained agents, not two ways of training."
+        "the thesis' measure. One seed has no interval, nor has a gain over a DQN that may have solved nothing."
     )
-    sizes = [record["detectable_difference"] for record in data.records if "gain" in record]
+    records = [record for record in data.records if record["agent"] in data.compared]
+    sizes = [record["detectable_difference"] for record in records]
     detectable = ""
     if not math.isnan(sizes[0]):
         detectable = (
             f"p-values are Holm-corrected for {len(sizes)} cells. The smallest difference that would be shown with "
             f"probability 80 % is {percent(min(sizes))} to {percent(max(sizes))} points, by cell."
         )
-    difference = functools.partial(estimated, columns=DIFFERENCE, words=signed_percent)
-    tables = [
-        by_budget(data, "differences", "difference (points) after", "gain", difference, detectable),
-        by_budget(data, "gains", "gain (%) after", "gain", _gain, "", "DQN solved nothing to compare with"),
-        by_budget(
-            data,
-            "paired",
-            "solved alone : by DQN alone, after",
-            "gain",
-            _alone,
-            "",
-            "which tests were solved was not kept",
-        ),
-    ]
-    return Section("Gain over DQN", [words], tables=tables)
-
-
-def _gain(record: Record) -> str:
-    printed = record.get("thesis_gain")
-    return estimated(record, GAIN, signed_percent, "" if printed is None else f"; thesis {signed_percent(printed)}")
-
-
-def _alone(record: Record) -> str:
-    alone = DASH
-    if "alone" in record:
-        alone = f"{record['alone']:,} : {record['dqn_alone']:,} ({p_value(record['p_mcnemar_holm'])})"
-    return f"{alone}; ahead in {percent(record['probability_of_improvement'])} % of pairs of runs"
+    rows = [{heading: cell(record) for heading, cell in _AGAINST_DQN.items()} for record in records]
+    why = "not said by the thesis, one seed, or DQN solved nothing to compare with"
+    return Section("Gain over DQN", [words], tables=[Table.of("gains", rows, detectable, why)])
 
 
 def cost(data: ReportData) -> Section:
     """What each agent had had at the last budget, CPU seconds and faults."""
     rows = []
     for agent in data.result.protocol.agents:
-        runs = data.result.of(agent)
         last = data.of(agent)[-1]
         tested = None if known_agent(agent).learns else 1  # the one test of others stands at every budget
-        tests = [row for run in runs for row in run.checkpoints[:tested]]
+        tests = [row for run in data.result.of(agent) for row in run.checkpoints[:tested]]
         played = round(sum(row.mean_length * row.test_episodes for row in tests))
         rows.append(
             {
@@ -276,7 +236,6 @@ def cost(data: ReportData) -> Section:
                 "frames its encoder saw before": count(frames_before(data, agent)),
                 "gradient updates": count(last["gradient_updates"]),
                 "training (CPU s)": seconds(last["train_cpu_s"]),
-                "all tests (CPU s)": seconds(sum(row.eval_cpu_s for row in tests) / len(runs)),
                 "faults in all tests": f"{sum(row.faults for row in tests)} of {played:,}",
             }
         )
@@ -302,10 +261,10 @@ def success_figure(data: ReportData) -> Figure:
     (axes,) = figure.axes
     for level in (data.facts.optimum, data.facts.chance_level):
         axes.axhline(100.0 * level, **figures.REFERENCE)
-    for agent, printed in data.thesis.items():
-        near = [budget for budget in printed if budget <= 2.0 * max(ticks)]  # others would leave the run no room
+    for agent, by_budget in data.thesis.items():
+        near = [budget for budget in by_budget if budget <= 2.0 * max(ticks)]  # others would leave the run no room
         if near:
-            means, stds = 100.0 * np.array([printed[budget] for budget in near]).T
+            means, stds = 100.0 * np.array([by_budget[budget] for budget in near]).T
             axes.errorbar(near, means, stds, fmt="D:", color=figures.color(agent), fillstyle="none", linewidth=1.0)
     axes.set_xscale("log")
     axes.set_xticks(sorted(ticks), [f"{tick:,}" for tick in sorted(ticks)], rotation=45, ha="right")
@@ -318,14 +277,10 @@ SECTIONS: tuple[Callable[[ReportData], Section | None], ...] = (
     compared,
     success,
     sections.world,
-    area,
     gain,
-    sections.policies,
     sections.causes,
-    sections.acceptance,
     sections.open_loop,
     sections.rollouts,
-    sections.encoders_used,
     cost,
 )
 """The sections of the page, in their order. A new one is a function and a line here."""

@@ -16,7 +16,7 @@ from imagine_bench import reference, registry, statistics
 from imagine_bench.arrays import Arrays
 from imagine_bench.errors import SetupError, UnknownNameError
 from imagine_bench.interfaces import RenderMacrostates, RuleFacts, Rules, State, TaskSpec
-from imagine_bench.report.page import Table, estimate, percent
+from imagine_bench.report.page import estimate, percent
 from imagine_bench.rules import facts as rule_facts
 from imagine_bench.rules import fewest_actions
 from imagine_bench.statistics import Estimate
@@ -157,11 +157,8 @@ def _record(data: ReportData, agent: str, place: int, fewest: Callable[[State], 
     for kept in (row.kept for row in rows if row.kept is not None and data.installed):
         for test in np.flatnonzero(kept.success):
             beyond.append(int(kept.lengths[test]) - fewest(tuple(kept.starts[test].tolist())))
-    some = {
-        "excess_macro_actions": mean(beyond),
-        "acceptance": mean(row.diagnostics.get("imagination/acceptance_rate", math.nan) for row in rows),
-    }
-    record |= {name: value for name, value in some.items() if not math.isnan(value)}
+    if beyond:
+        record["excess_macro_actions"] = mean(beyond)
     if agent in data.learners and data.installed:
         areas = statistics.running_means(protocol.budgets, shares, data.facts.chance_level)[:, place]
         area = (statistics.iqm(areas), *statistics.interval(areas, trials=trials))
@@ -240,18 +237,6 @@ def summary_csv(data: ReportData) -> str:
     return csv_text([_SUMMARY_COLUMNS, *rows])
 
 
-def by_budget(
-    data: ReportData, name: str, first: str, column: str, cell: Callable[[Record], str], *texts: str
-) -> Table:
-    """A row an agent whose records have a column, and a column a budget; each record is put into words."""
-    rows = []
-    for agent in data.result.protocol.agents:
-        if any(column in record for record in data.of(agent)):
-            cells = {f"{record['episodes']:,}": cell(record) for record in data.of(agent)}
-            rows.append({first: agent_title(agent), **cells})
-    return Table.of(name, rows, *texts)
-
-
-def estimated(record: Record, columns: Sequence[str], words: Callable[[float], str] = percent, note: str = "") -> str:
+def estimated(record: Record, columns: Sequence[str], words: Callable[[float], str] = percent) -> str:
     """An estimate from its columns, with its interval."""
-    return estimate(Estimate(*(record[column] for column in columns)), words, note)
+    return estimate(Estimate(*(record[column] for column in columns)), words)

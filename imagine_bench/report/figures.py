@@ -1,4 +1,4 @@
-"""Figures in one style, color-blind-safe: small multiples of curves with their intervals, and the radar chart.
+"""Figures in one style, color-blind-safe: small multiples of curves with their intervals.
 
 A figure is drawn by a function that returns a matplotlib ``Figure``; :func:`image` makes a PNG of it. Filmstrips are
 images of their own.
@@ -7,7 +7,7 @@ images of their own.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 from zlib import crc32
 
@@ -60,9 +60,9 @@ def image(name: str, draw: Callable[[], Figure], caption: str) -> Image:
     return Image(name, png, caption)
 
 
-def color(name: str, known: Iterable[str] | None = None) -> str:
-    """The color of an agent, or of another learner of these known ones, the same in every figure."""
-    names = list(registry.agents() if known is None else known)
+def color(name: str) -> str:
+    """The color of an agent, the same in every figure."""
+    names = list(registry.agents())
     place = names.index(name) if name in names else crc32(name.encode())
     return COLORS[place % len(COLORS)]
 
@@ -103,26 +103,5 @@ def lines(
         axes.set_title(title, fontsize=9.5)
         axes.margins(y=0.06)  # lines along an axis are seen whole
     figure.supxlabel(xlabel)
-    names_above(figure)
-    return figure
-
-
-def names_above(figure: Figure) -> None:
-    """The names of the first panel's curves, above all panels."""
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
-
-
-def radar_figure(spokes: Sequence[str], scores: Mapping[str, Sequence[Estimate]]) -> Figure:
-    """Scores of agents, 0 in the middle and 1 at the rim, by spoke; NaN is a gap, and below 0 is drawn at 0."""
-    figure = Figure(figsize=(8.4, 6.8), layout="constrained")
-    axes = figure.add_subplot(projection="polar", theta_offset=np.pi / 2.0, theta_direction=-1)
-    angles = np.linspace(0.0, 2.0 * np.pi, len(spokes) + 1)
-    for agent, estimates in scores.items():
-        middle, low, high = np.clip([each[:3] for each in (*estimates, estimates[0])], 0.0, 1.0).T
-        axes.plot(angles, middle, "o-", color=color(agent), label=agent_title(agent))
-        axes.vlines(angles, low, high, color=color(agent), alpha=0.4)
-    axes.set(ylim=(0.0, 1.0), yticks=(0.25, 0.5, 0.75, 1.0))
-    axes.set_xticks(angles[:-1], [spoke.replace("_", " ") for spoke in spokes])
-    axes.tick_params(axis="x", pad=20)
-    names_above(figure)
     return figure

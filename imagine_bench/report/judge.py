@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.change import FALSE_ALARMS, LENGTH, SLIP
 from imagine_bench.judge.judgement import Judgement, kept, prepare, shown
 from imagine_bench.judge.models import model_entry, runs_of
-from imagine_bench.judge.scores import COVERAGES
 from imagine_bench.judge.truth import sampling_noise_floor, shares
 from imagine_bench.recording.filmstrips import TileRow, png, transition_sheet
 from imagine_bench.registry.entries import file_name
@@ -100,7 +98,6 @@ _SHARES = {
     *(name for name in COLUMNS if name.startswith("auroc")),
 }
 _WHY_DASH = "not offered by the model, or nothing to tell apart"
-_ANSWERED = {f"surest {share:.0%}": share for share in (0.25, 0.5, 0.75, 1.0)}  # of the questions
 Scores = Mapping[str, Any]
 """What is kept of a model that was fitted once."""
 
@@ -147,7 +144,6 @@ def judgement_page(found: Judged) -> Page:
         sections=sections,
         files={"scores.csv": _csv(found)},
         facts=flat("", read_json(found.folder / "judgement.json", "a judgement")),
-        protocol=flat("", dataclasses.asdict(judgement)),
         summary=sections[0].tables[0].text,
     )
 
@@ -180,22 +176,16 @@ def _title(model: str) -> str:
     return model_entry(model).title
 
 
-def _by_model(found: Judged, name: str, columns: Mapping[str, Callable[[Scores], float]], caption: str) -> Table:
-    """A row a model and number of transitions, a column a number over seeds; NaN where a model has none."""
+def _scores(found: Judged, table: str, names: Collection[str]) -> Table:
+    """A row a model and number of transitions, a column a score over seeds."""
     rows: list[list[str]] = []
     for (model, size), cells in found.cells.items():
         transitions = DASH if runs_of(model) else f"{size:,}"  # those of a trained agent are its bench's to say
-        rows.append([_title(model), transitions])
-        for column, value in columns.items():
-            rows[-1].append(over_seeds(list(map(value, cells)), _number, share=column in (_SHARES | _ANSWERED.keys())))
-    header = ["world model", "transitions", *(COLUMNS.get(column, column) for column in columns)]
-    return Table(name, header, rows, caption, _WHY_DASH)
-
-
-def _scores(found: Judged, name: str, names: Iterable[str]) -> Table:
-    columns = {each: functools.partial(score, name=each) for each in names}
+        scores = (over_seeds([score(cell, name) for cell in cells], _number, share=name in _SHARES) for name in names)
+        rows.append([_title(model), transitions, *scores])
+    header = ["world model", "transitions", *map(COLUMNS.__getitem__, names)]
     caption = "Interquartile means over seeds or runs, with 95 % intervals. 0 is best in every error; value loss is in "
-    return _by_model(found, name, columns, f"{caption}units of reward.")
+    return Table(table, header, rows, f"{caption}units of reward.", _WHY_DASH)
 
 
 def in_short(found: Judged) -> Section:
@@ -223,17 +213,6 @@ def question(found: Judged, title: str) -> Section:
     return Section(title, [_WORDS[title]], tables=[_scores(found, name, QUESTIONS[title])])
 
 
-def risk(found: Judged) -> Section:
-    """Errors of the answers that models are surest of."""
-
-    def error(share: float, cell: Scores) -> float:
-        return cell["risk"][COVERAGES.index(share)] if cell["risk"] else math.nan
-
-    columns = {name: functools.partial(error, share) for name, share in _ANSWERED.items()}
-    caption = "Total variation of the answers that a model is surest of: lower than of all where it knows its errors."
-    return Section("The errors of the surest answers", tables=[_by_model(found, "risk", columns, caption)])
-
-
 def compared(found: Judged) -> Section:
     """Each pair's difference in total variation at the most transitions, and a line on the two best that learned."""
     values = {model: [score(cell, "total_variation") for cell in cells] for model, cells in found.last.items()}
@@ -244,15 +223,14 @@ def compared(found: Judged) -> Section:
     rows: list[list[str]] = []
     answers = []
     for pair, each, p in zip(pairs, differences, holm([each.p for each in differences]), strict=True):
-        cell = estimate(each, number)
-        rows.append([*map(_title, pair), cell, number(p)])
+        rows.append([*map(_title, pair), estimate(each, number), number(p)])
         if set(pair) == set(best):
-            first, second = (f"{_title(model)} ({number(iqm(values[model]))})" for model in best)
-            verdict = f"difference {cell}, {p_value(p)}, Holm-corrected: "
-            verdict += "it is better" if p < 0.05 else "no difference is shown"
+            named = (f"{_title(model)} ({number(iqm(values[model]))})" for model in best)
+            better = "it is better" if p < 0.05 else "no difference is shown"
+            verdict = f"difference {estimate(each, number)}, {p_value(p)}, Holm-corrected: {better}"
             if math.isnan(p):
                 verdict = "one seed does not show which is better"
-            answers.append(f"Smallest total variation{found.after}: {first}, then {second}; {verdict}.")
+            answers.append(f"Smallest total variation{found.after}: {', then '.join(named)}; {verdict}.")
     header = ["model", "against", "difference of total variation", "p"]
     caption = f"Total variation of one step{found.after}; Yuen's test over seeds, p by Holm."
     table = Table("differences", header, rows, caption, "one seed says nothing", "Every pair")
@@ -311,7 +289,6 @@ def _joined(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
 SECTIONS: tuple[Callable[[Judged], Section | None], ...] = (
     in_short,
     images,
-    risk,
     *(functools.partial(question, title=title) for title in QUESTIONS),
     where,
     compared,

@@ -7,7 +7,7 @@ import functools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -104,9 +104,7 @@ class Page:
     answers: Sequence[str]  # the verdict, one line a finding
     sections: Sequence[Section]  # in their order
     files: Mapping[str, str]  # the CSV files beside the page, by name
-    facts: Sequence[tuple[str, str]] = ()  # how it was made: name and value
-    settings: Mapping[str, Sequence[tuple[str, str]]] = field(default_factory=dict)  # each learner's, by title
-    protocol: Sequence[tuple[str, str]] = ()  # the complete protocol: name and value
+    facts: Sequence[tuple[str, str]] = ()  # how it was made, protocol and settings: name and value
     summary: str = ""  # the report on a terminal
 
 
@@ -157,10 +155,10 @@ def p_value(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
 
 
-def estimate(found: statistics.Estimate, words: Callable[[float], str] = percent, note: str = "") -> str:
-    """``61.3 [55.0, 67.2]`` and a note, without the brackets where there is no interval."""
+def estimate(found: statistics.Estimate, words: Callable[[float], str] = percent) -> str:
+    """``61.3 [55.0, 67.2]``, without the brackets where there is no interval."""
     interval = "" if math.isnan(found.low) else f" [{words(found.low)}, {words(found.high)}]"
-    return f"{words(found.value)}{interval}{note}"
+    return f"{words(found.value)}{interval}"
 
 
 def over_seeds(values: Sequence[float], words: Callable[[float], str] = percent, *, share: bool = False) -> str:
@@ -211,26 +209,18 @@ def texts(page: Page) -> dict[str, str]:
     return {**page.files, **rendered}
 
 
-def made(result: Any, titles: Mapping[str, str]) -> dict[str, Any]:
-    """How a result of any kind was made: the fields ``facts``, ``settings`` and ``protocol`` of a Page.
+def made(result: Any, titles: Mapping[str, str]) -> list[tuple[str, str]]:
+    """How a result of any kind was made: the facts of its Page, with the settings of its learners by title.
 
-    ``titles`` are those of its learners. All seeds of one have the same settings.
+    All seeds of a learner have the same settings.
     """
-    protocol = result.protocol
     environment = result.environment
-    commit = str(environment.get("commit") or "").split("+")[0]
+    commit = str(environment.get("commit") or "").partition("+")[0]
     where = f"git checkout {commit} && " if commit else ""
-    settings = {title: flat("", result.of(name)[0].settings) for name, title in titles.items()}
-    return {
-        "facts": [
-            ("protocol", f"{result.protocol_hash}, preset {protocol.preset}"),
-            ("seeds", ", ".join(map(str, protocol.seeds))),
-            *flat("", environment),
-            ("reproduce", f"{where}{environment.get('command', '')}"),
-        ],
-        "settings": {title: rows for title, rows in settings.items() if rows},
-        "protocol": [(name, str(value)) for name, value in protocol.as_dict().items()],
-    }
+    settings = {title: result.of(name)[0].settings for name, title in titles.items()}
+    protocol = {"hash": result.protocol_hash, **result.protocol.as_dict()}
+    facts = flat("", {**environment, "protocol": protocol, "settings": settings})
+    return [("reproduce", f"{where}{environment.get('command', '')}"), *facts]
 
 
 def flat(prefix: str, value: object) -> list[tuple[str, str]]:

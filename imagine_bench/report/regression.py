@@ -69,7 +69,7 @@ def report_page(result: RegressionResult) -> Page:
         sections=[Section("What was compared", (_COMPARED,)), *sections],
         files={"results.csv": table_text(rows), **{f"{table.name}.csv": table.csv for table in tables}},
         summary="\n\n".join([sections[0].title, tables[0].text, *answers]),
-        **made(result, {pair.agent: pair.title for pair in result.pairs.values()}),
+        facts=made(result, {pair.agent: pair.title for pair in result.pairs.values()}),
     )
 
 

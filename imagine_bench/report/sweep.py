@@ -1,4 +1,4 @@
-"""The pages of sweeps: of a study, its differences; of the benchmark suite, a radar chart and every level."""
+"""The pages of sweeps: of a study, its differences; of the benchmark suite, its scores."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import itertools
 import math
 from collections.abc import Sequence
 
-from imagine_bench.report import figures
 from imagine_bench.report.data import agent_title
 from imagine_bench.report.page import (
     DASH,
@@ -22,9 +21,9 @@ from imagine_bench.report.page import (
     seconds,
     signed_percent,
 )
-from imagine_bench.statistics import Estimate, iqm
+from imagine_bench.statistics import iqm
 from imagine_bench.store.files import json_text, table_text, with_null
-from imagine_bench.sweep.grid import Study
+from imagine_bench.sweep.grid import Study, Variant
 from imagine_bench.sweep.run import Line, SuiteResult
 
 Row = dict[str, float | str]
@@ -34,7 +33,16 @@ Row = dict[str, float | str]
 
 def study_page(study: Study, lines: Sequence[Line]) -> Page:
     """Success of every variant at every budget, and its difference from what it is compared with."""
-    table, summary = _variants(study, lines)
+    rows: list[dict[str, str]] = []
+    for line in lines:
+        for place, budget in enumerate(study.budgets):
+            moved = estimate(line.difference[place], signed_percent) if line.difference else DASH
+            right = percent(float(line.imagined_right[:, place].mean()))
+            solved = percent(iqm(line.success[:, place]))
+            found = {"solved (%)": solved, "difference": moved, "imagined right": right}
+            rows.append({**_named(line.variant), "episodes": f"{budget:,}", **found, "CPU s": count(line.train_cpu_s)})
+    caption = "Difference in points; imagined right: outcomes of one macro-action that are expected rightly (%)."
+    table = Table.of("variants", rows, caption, "not compared, or no model to ask")
     seeds = ", ".join(map(str, study.seeds))
     return Page(
         title=study.question,
@@ -43,49 +51,15 @@ def study_page(study: Study, lines: Sequence[Line]) -> Page:
         "zero by chance.",
         answers=[],
         sections=[Section("Variants", tables=[table])],
-        files={
-            "seeds.csv": _seeds_csv(study, lines),
-            "summary.csv": summary,
-            "runs.json": json_text([_origin(line) for line in lines]),
-        },
-        protocol=flat("", dataclasses.asdict(study)),
+        files={"seeds.csv": _seeds_csv(study, lines), "runs.json": json_text([_origin(line) for line in lines])},
+        facts=flat("", dataclasses.asdict(study)),
         summary=table.text,
     )
 
 
-def _variants(study: Study, lines: Sequence[Line]) -> tuple[Table, str]:
-    """A row a variant and budget, as a table and as CSV."""
-    rows: list[dict[str, str]] = []
-    records: list[Row] = []
-    for line in lines:
-        for place, budget in enumerate(study.budgets):
-            one = line.variant
-            solved = iqm(line.success[:, place])
-            moved = line.difference[place] if line.difference else None
-            named = {"factor": one.factor, "variant": one.name, "agent": one.agent}
-            records.append(
-                {
-                    **named,
-                    "episodes": budget,
-                    "success_iqm": f"{solved:.6g}",
-                    "against": one.against or "",
-                    **dict(zip(("difference", "low_95", "high_95"), moved or [""] * 3, strict=False)),
-                    "cpu_s": f"{line.train_cpu_s:.1f}",
-                }
-            )
-            rows.append(
-                {
-                    **named,
-                    "episodes": f"{budget:,}",
-                    "solved (%)": percent(solved),
-                    "against": one.against or DASH,
-                    "difference": DASH if moved is None else estimate(moved, signed_percent),
-                    "imagined right": percent(float(line.imagined_right[:, place].mean())),
-                    "CPU s": count(line.train_cpu_s),
-                }
-            )
-    caption = "Difference in points; imagined right: outcomes of one macro-action that are expected rightly (%)."
-    return Table.of("variants", rows, caption, "not compared, or no model to ask"), table_text(records)
+def _named(variant: Variant) -> dict[str, str]:
+    against = variant.against or ""
+    return {"factor": variant.factor, "variant": variant.name, "agent": variant.agent, "against": against}
 
 
 def _origin(line: Line) -> dict[str, object]:
@@ -99,15 +73,11 @@ def _origin(line: Line) -> dict[str, object]:
 def _seeds_csv(study: Study, lines: Sequence[Line]) -> str:
     rows: list[Row] = []
     for line in lines:
-        one = line.variant
         cells = itertools.product(study.seeds, study.budgets)
         for (seed, budget), success, right in zip(cells, line.success.flat, line.imagined_right.flat, strict=True):
             rows.append(
                 {
-                    "factor": one.factor,
-                    "variant": one.name,
-                    "agent": one.agent,
-                    "against": one.against or "",
+                    **_named(line.variant),
                     "protocol": line.folder.name.rpartition("-")[2],
                     "seed": seed,
                     "episodes": budget,
@@ -125,9 +95,12 @@ def _seeds_csv(study: Study, lines: Sequence[Line]) -> str:
 def suite_page(result: SuiteResult) -> Page:
     """The page of what was run."""
     suite = result.suite
-    made = _made(result)
+    environments = [each.environment for levels in result.levels.values() for each in levels if each.environment]
+    commits = sorted({str(each.get("commit")) for each in environments})
+    made = flat("", {**(environments[0] if environments else {}), "commits of all benches": ", ".join(commits)})
     definition = {"suite": dataclasses.asdict(suite), "hash": suite.hash, "agents": list(result.agents)}
-    scores = _scores(result)
+    table = _scores(result)
+    questions = [f"{each.name}: {each.question}" for each in suite.experiments]
     return Page(
         title="The benchmark suite: what can each agent do?",
         subtitle=f"Suite {suite.name} {suite.hash} · {suite.execution} execution · {len(suite.seeds)} seed(s) · "
@@ -135,103 +108,64 @@ def suite_page(result: SuiteResult) -> Page:
         question="Each experiment changes one parameter of a world of arrows. Where is an agent between blind choice "
         "(0) and perfect play (1), which are exact?",
         answers=result.failures,
-        sections=[scores, _levels(result)],
-        facts=[("suite", f"{suite.name}, {suite.hash}"), ("seeds", ", ".join(map(str, suite.seeds))), *made],
-        protocol=flat("", dataclasses.asdict(suite)),
+        sections=[Section("Scores", questions, tables=[table])],
+        facts=made,
         files={
             "levels.csv": levels_csv(result),
             "scores.csv": scores_csv(result),
             "suite.json": json_text({**definition, "made": dict(made)}),
         },
-        summary="\n".join([scores.tables[0].text, *result.failures]),
+        summary="\n".join([table.text, *result.failures]),
     )
 
 
-def _scores(result: SuiteResult) -> Section:
-    by_agent: dict[str, list[Estimate]] = {agent: [] for agent in result.agents}
+def _scores(result: SuiteResult) -> Table:
+    experiments = result.suite.experiments
     rows = []
-    for each in result.suite.experiments:
-        for agent, found in by_agent.items():
-            found.append(result.score(each, agent))
-        rows.append([f"{each.name}: {each.dial}", *(estimate(found[-1], decimals) for found in by_agent.values())])
-    rows.append(["training of all levels and seeds (CPU s)", *(_cpu_s(result, agent) for agent in result.agents)])
-    spokes = [each.name for each in result.suite.experiments]
-    caption = (
-        "(success − chance) / (optimum − chance), mean over the levels of each experiment. The middle is blind choice, "
-        "the rim is perfect play. Lines across: 95 % intervals."
-    )
-    image = figures.image("radar", lambda: figures.radar_figure(spokes, by_agent), caption)
+    for each in experiments:
+        scores = (estimate(result.score(each, agent), decimals) for agent in result.agents)
+        rows.append([f"{each.name}: {each.dial}", *scores])
+    prices = ["training of all levels and seeds (CPU s)"]
+    for agent in result.agents:
+        trained = (level.train_cpu_s for each in experiments for level in result.levels[each.name, agent])
+        prices.append(seconds(len(result.suite.seeds) * sum(trained)))
     words = (
-        "Scores with 95 % intervals: Student's over seeds, and at least that of the tests. 0 is chance, 1 the exact "
-        "optimum, with memory where frames hide something or are late. Uncertainty is scored by the AUROC with which "
-        "epistemic uncertainty tells wrong imagined transitions from right ones, from 0.5 to 1; an agent that does not "
-        "say has 0.5."
+        "(success − chance) / (optimum − chance), mean over the levels of each experiment, with 95 % intervals: "
+        "Student's over seeds, and at least that of the tests. 0 is chance, 1 the exact optimum, with memory where "
+        "frames hide something or are late. Uncertainty is scored by the AUROC with which epistemic uncertainty tells "
+        "wrong imagined transitions from right ones, from 0.5 to 1; an agent that does not say has 0.5."
     )
     header = ["experiment: dial", *map(agent_title, result.agents)]
-    table = Table("suite", header, rows, words, "not run, or no imagined transition was wrong")
-    return Section("Scores", images=[image], tables=[table])
-
-
-def _cpu_s(result: SuiteResult, agent: str) -> str:
-    levels = [level for each in result.suite.experiments for level in result.levels[each.name, agent]]
-    return seconds(len(result.suite.seeds) * sum(level.train_cpu_s for level in levels))
-
-
-def _levels(result: SuiteResult) -> Section:
-    rows: dict[tuple[str, str], dict[str, str]] = {}
-    for (experiment, agent), levels in result.levels.items():
-        for found in levels:
-            level = found.level
-            row = rows.setdefault((experiment, level.name), {"experiment": experiment, "level": level.name})
-            row |= {"world": level.task, "real episodes": f"{level.episodes:,}"}
-            for end in ("chance", "optimum"):
-                known = percent(getattr(found.scale, end, math.nan))
-                row[end] = row.get(end, DASH) if known == DASH else known
-            row[agent] = percent(float(found.values.mean()))
-    caption = "Test episodes solved, or AUROC, in %: means over seeds."
-    header = ["experiment", "level", "world", "real episodes", "chance, %", "optimum, %"]
-    cells = [list(row.values()) for row in rows.values()]
-    table = Table("levels", [*header, *map(agent_title, result.agents)], cells, caption, "not run")
-    questions = [f"{each.name}: {each.question}" for each in result.suite.experiments]
-    return Section("Level by level", questions, tables=[table])
-
-
-def _made(result: SuiteResult) -> list[tuple[str, str]]:
-    """What made the first bench, and the commits of all."""
-    found = [each.environment for levels in result.levels.values() for each in levels if each.environment]
-    commits = sorted({str(each.get("commit")) for each in found})
-    return [*flat("", found[0] if found else {}), ("commits of all benches", ", ".join(commits))]
+    return Table("suite", header, [*rows, prices], words, "not run, or no imagined transition was wrong")
 
 
 def levels_csv(result: SuiteResult) -> str:
     """One row an experiment, level, agent and seed."""
     rows: list[Row] = []
     for (experiment, agent), levels in result.levels.items():
-        for found in levels:
+        for found in (each for each in levels if each.scale is not None):
             for seed, value, bench in zip(result.suite.seeds, found.values.tolist(), found.benches, strict=True):
-                if found.scale is not None:
-                    rows.append(
-                        {
-                            "experiment": experiment,
-                            "level": found.level.name,
-                            "task": found.level.task,
-                            "episodes": found.level.episodes,
-                            "agent": agent,
-                            "seed": seed,
-                            "value": "" if math.isnan(value) else value,
-                            **dataclasses.asdict(found.scale),
-                            "cpu_s": round(found.train_cpu_s, 1),
-                            "bench": bench,
-                        }
-                    )
+                rows.append(
+                    {
+                        "experiment": experiment,
+                        "level": found.level.name,
+                        "task": found.level.task,
+                        "episodes": found.level.episodes,
+                        "agent": agent,
+                        "seed": seed,
+                        "value": "" if math.isnan(value) else value,
+                        **vars(found.scale),
+                        "cpu_s": round(found.train_cpu_s, 1),
+                        "bench": bench,
+                    }
+                )
     return table_text(rows)
 
 
 def scores_csv(result: SuiteResult) -> str:
     """One row an experiment and agent."""
     rows: list[Row] = []
-    for each in result.suite.experiments:
-        for agent in result.agents:
-            ends = dict(zip(("score", "low_95", "high_95"), result.score(each, agent), strict=False))
-            rows.append({"experiment": each.name, "agent": agent, **with_null(ends)})
+    for each, agent in itertools.product(result.suite.experiments, result.agents):
+        ends = dict(zip(("score", "low_95", "high_95"), result.score(each, agent), strict=False))
+        rows.append({"experiment": each.name, "agent": agent, **with_null(ends)})
     return table_text(rows)

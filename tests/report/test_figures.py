@@ -65,15 +65,6 @@ def test_a_curve_has_a_band_exactly_where_there_are_intervals() -> None:
     assert {float(y) for x, y in band if x == 1.0} >= {0.25, 0.75}
 
 
-def test_the_radar_clips_scores_to_the_rim_and_leaves_gaps() -> None:
-    spokes = ("memory", "size", "transfer")
-    scores = {"dqn": [Estimate(-0.5, -1.0, 0.2), Estimate(np.nan, np.nan, np.nan), Estimate(1.0, 0.9, 1.2)]}
-    (axes,) = figures.radar_figure(spokes, scores).axes
-    radii = axes.get_lines()[0].get_ydata()
-    assert list(radii[[0, 2, 3]]) == [0.0, 1.0, 0.0] and np.isnan(radii[1])
-    assert [label.get_text() for label in axes.get_xticklabels()] == list(spokes)
-
-
 def test_no_two_registered_agents_share_a_color() -> None:
     own = ("random", "oracle", "dqn", "imagination", "imagination_uncertainty", "imagination_only", "factored")
     assert len({figures.color(agent) for agent in own}) == len(own)

@@ -222,7 +222,7 @@ def test_the_table_says_what_helps(tmp_path: Path) -> None:
     page = study_page(STUDY, lines)
     without, _, first, last = page.sections[0].tables[0].rows  # a row a variant and budget
     assert without[-2:] == ["–", "1"]
-    assert first[1:7] == ["mild", "table", "3", "50.0", "table", "+25.0 [+10.0, +40.0]"]
+    assert first[1:7] == ["mild", "table", "table", "3", "50.0", "+25.0 [+10.0, +40.0]"]
     assert last[-2:] == ["30.0", "2"], "right at the last budget, mean of seeds"
     rows = csv.DictReader(page.files["seeds.csv"].splitlines())
     assert [row["imagined_right"] for row in rows] == [""] * 4 + ["0.1000", "0.2000", "0.3000", "0.4000"]
