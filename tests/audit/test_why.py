@@ -23,7 +23,7 @@ from imagine_bench.rules import states_of
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
-from imagine_bench.store.files import lock, make_folder, write_bytes
+from imagine_bench.store.files import make_folder, write_bytes
 
 SPEC = registry.task("arrow_puzzle")
 
@@ -97,13 +97,6 @@ def test_an_agent_says_what_it_reads_and_expects(name: str) -> None:
         "meters": 0,
     } and before.arrays.keys() == after.arrays.keys()
     assert all(np.array_equal(array, after.arrays[name]) for name, array in before.arrays.items())
-
-
-def test_an_analysis_is_made_by_one_process_at_a_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    result = bench(small(budgets=(1,), evaluation_episodes=1), {}, root=tmp_path, launcher=Inline())
-    with lock(result.folder / ".why.lock", "This"):
-        assert main(["why", str(result.folder)]) == 2
-    assert "is in use by process" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
