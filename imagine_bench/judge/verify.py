@@ -7,6 +7,7 @@ agents would choose these actions again.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -83,23 +84,19 @@ def cost(found: Sequence[Verdict], cpu_s: float) -> str:
 
 
 class Replays:
-    """Episodes begun and played again in the protocol's own environments, each once."""
+    """Episodes begun and played again in the protocol's own environments, each test once."""
 
     def __init__(self, env: Env, test_env: Env) -> None:
         self._env = env
-        self._test_env = test_env
-        self._known: dict[tuple[int, ...], tuple[EpisodeRecord, bool]] = {}
+        self._play_test = functools.cache(functools.partial(replay, test_env))
 
     def start(self, seed: int) -> list[int]:
         """Where a training episode begins."""
         return replay(self._env, seed, [])[0].start
 
-    def test(self, seed: int, actions: list[int]) -> tuple[EpisodeRecord, bool]:
+    def test(self, seed: int, actions: Sequence[int]) -> tuple[EpisodeRecord, bool]:
         """A test episode, and whether the actions are all of it."""
-        key = (seed, *actions)
-        if key not in self._known:
-            self._known[key] = replay(self._test_env, seed, actions)
-        return self._known[key]
+        return self._play_test(seed, tuple(actions))
 
 
 def _verify_run(folder: Path, protocol: Protocol, seed: int, replays: Replays) -> int:
