@@ -12,7 +12,7 @@ __all__ = ["bench_page", "summary_table", "write_page", "write_report"]
 
 
 def write_report(result: BenchResult) -> Path:
-    """Write ``result.folder / "report"``: index.html, whose path is returned, report.md, CSV files and images.
+    """Write ``result.folder / "report"``: index.html, whose path is returned, CSV files and images.
 
     Raises:
         SetupError: The folder cannot be written.

@@ -59,8 +59,8 @@ _COUNTS = {
     "steps_as_imagined": "that led where imagined",
     "faults": "faults of the physics",
 }
-_CELLS = {"report.md": r"^\|.*$", "index.html": r"<t[dh][^>]*>(.*?)</t[dh]>"}
-"""What is compared of a report's pages: the cells of their tables; of other files it is every line."""
+_CELLS = {"index.html": r"<t[dh][^>]*>(.*?)</t[dh]>"}
+"""What is compared of a report's page: the cells of its tables; of other files it is every line."""
 
 
 def chosen(given: Path | None, root: Path, task: str | None) -> Path:
@@ -165,30 +165,27 @@ def plan_table(plans: Sequence[PlanResult], task: TaskSpec) -> Table:
 
 
 def write_plans(folder: Path, plans: Sequence[PlanResult], task: TaskSpec, origin: Mapping[str, object]) -> str:
-    """Write ``plans.csv``, ``summary.json``, ``plans.md``, ``plans.png`` and filmstrips of the first plans that failed.
+    """Write ``plans.csv``, ``summary.json``, ``plans.png``, the first plans, and ``failed.png``, the first failed.
 
-    The files of an earlier call, its recording included, go. ``plans.png`` shows the first plans;
-    ``summary.json`` holds the ``origin`` too. Returns the text to print.
+    The files of an earlier call, its recording included, go. ``summary.json`` holds the ``origin`` too.
+    Returns the text to print.
 
     Raises:
         SetupError: The folder cannot be written.
     """
     make_folder(folder)
     with writing(folder):
-        for earlier in (*folder.glob("failed_*.png"), folder / RECORDING):
-            earlier.unlink(missing_ok=True)
-    table = plan_table(plans, task)
+        for earlier in ("failed.png", RECORDING):
+            (folder / earlier).unlink(missing_ok=True)
     failures = [plan for plan in plans if not plan.solved]
-    words = "\n".join(f"- plan {plan.number} from {plan.start}: {plan.outcome}" for plan in failures)
     write_bytes(folder / "plans.csv", table_text([_row(plan) for plan in plans]).encode())
     write_json(folder / "summary.json", {**origin, **with_null(summarise(plans))})
-    heading = f"# {task.title}: plans imagined from one frame"
-    picture = "![Plans: real images above, imagined ones below](plans.png)"
-    write_bytes(folder / "plans.md", f"{heading}\n\n{table.markdown}\n\n{picture}\n\n{words}\n".encode())
-    write_bytes(folder / "plans.png", png(_stack(plans[:_SHOWN], task)))
-    for plan in failures[:_SHOWN]:
-        write_bytes(folder / f"failed_{plan.number:03d}.png", png(_stack([plan], task)))
+    for name, shown in (("plans.png", plans), ("failed.png", failures)):
+        if shown:
+            write_bytes(folder / name, png(_stack(shown[:_SHOWN], task)))
     facts = ", ".join(f"{name} {value}" for name, value in origin.items())
+    words = "\n".join(f"- plan {plan.number} from {plan.start}: {plan.outcome}" for plan in failures)
+    table = plan_table(plans, task)
     return f"{task.title}: {facts}\n\n{table.text}\n\n{words}\nFilmstrips: {folder / 'plans.png'}"
 
 

@@ -54,7 +54,6 @@ _AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
     "gain (%)": lambda record: estimated(record, GAIN, signed_percent),
     "thesis (%)": lambda record: DASH if record.get("thesis_gain") is None else signed_percent(record["thesis_gain"]),
 }
-_NAMED = 4  # unfinished runs that are named; the others are counted
 
 
 def bench_page(result: BenchResult) -> Page:
@@ -64,26 +63,26 @@ def bench_page(result: BenchResult) -> Page:
     files = {**archive_files(result), "summary.csv": summary_csv(data)}
     if any(row.open_loop for _, row in result.rows):
         files["open_loop.csv"] = open_loop_csv(result)
-    dataset = f"; trained first on dataset {protocol.dataset}" if protocol.dataset else ""
-    split = f"; tests start where training never does, {protocol.split}" if protocol.split else ""
+    dataset = f" · trained first on dataset {protocol.dataset}" if protocol.dataset else ""
+    split = f" · tests start where training never does, {protocol.split}" if protocol.split else ""
     interval = "95 % interval over seeds (Student's, of the trimmed mean)"
     if len(protocol.seeds) == 1:
         interval = "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
-    heading = (
-        f"{data.spec.title}: test episodes solved, % [{interval}]; preset {protocol.preset}, {protocol.execution}, "
-        f"{protocol.looks}, {len(protocol.seeds)} seed(s) x {protocol.evaluation_episodes} test episodes{dataset}"
+    subtitle = (
+        f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.looks}” · "
+        f"{len(protocol.seeds)} seed(s), {protocol.evaluation_episodes} test episodes{dataset}{split} · {interval} · "
+        f"protocol {result.protocol_hash}"
     )
     answers = verdict(data)
     return Page(
         title=f"{data.spec.title}: does imagination save real experience?",
-        subtitle=f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.looks}”{dataset}"
-        f"{split} · {interval} · protocol {result.protocol_hash}",
+        subtitle=subtitle,
         question="Does training on transitions that a learned world model imagines save real episodes? Every agent is "
         "tested without exploring, on the same new episodes, after each number of real training episodes.",
         answers=answers,
         sections=[section for make in SECTIONS if (section := make(data)) is not None],
         files=files,
-        summary="\n\n".join([heading, _scores(data).text, "\n".join(answers)]),
+        summary="\n\n".join([f"{data.spec.title}: {subtitle}", _scores(data).text, "\n".join(answers)]),
         facts=made(result, {agent: agent_title(agent) for agent in protocol.agents}),
     )
 
@@ -127,7 +126,7 @@ def _unfinished(result: BenchResult) -> list[str]:
         return []
     part = result.protocol
     whole = result.whole or part
-    named = "; ".join(result.missing[:_NAMED]) + ("; …" if len(result.missing) > _NAMED else "")
+    named = "; ".join(result.missing[:4]) + ("; …" if len(result.missing) > 4 else "")
     return [
         f"This bench is not finished: shown are {len(part.seeds)} of {len(whole.seeds)} seeds up to "
         f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {named}. "
@@ -166,20 +165,20 @@ def success(data: ReportData) -> Section:
 def _scores(data: ReportData) -> Table:
     """Ours, the thesis' below it, and the exact ends of the scale."""
     budgets = sorted(set(data.result.protocol.budgets).union(*data.thesis.values()))
-
-    def row(title: str, cells: Mapping[int, str]) -> dict[str, str]:
-        return {"solved (%) after": title, **{f"{budget:,}": cells.get(budget, DASH) for budget in budgets}}
-
-    rows = []
+    rows: list[tuple[str, Mapping[int, str]]] = []
     for agent in data.result.protocol.agents:
-        rows.append(row(agent_title(agent), {each["episodes"]: estimated(each, SCORE) for each in data.of(agent)}))
-        if agent in data.thesis:
+        rows.append((agent_title(agent), {each["episodes"]: estimated(each, SCORE) for each in data.of(agent)}))
+        if data.thesis[agent]:
             cells = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
-            rows.append(row(f"{agent_title(agent)}, thesis", cells))
-    rows.append(row("chance level", dict.fromkeys(budgets, percent(data.facts.chance_level))))
-    rows.append(row("optimum", dict.fromkeys(budgets, percent(data.facts.optimum))))
-    source = f" Thesis: {reference.success_source(str(data.spec.reference))}." if data.thesis else ""
-    return Table.of("scores", rows, f"Columns: real training episodes.{source}", "not tested")
+            rows.append((f"{agent_title(agent)}, thesis", cells))
+    rows.append(("chance level", dict.fromkeys(budgets, percent(data.facts.chance_level))))
+    rows.append(("optimum", dict.fromkeys(budgets, percent(data.facts.optimum))))
+    header = ["solved (%) after", *(f"{budget:,}" for budget in budgets)]
+    lines = [[title, *(cells.get(budget, DASH) for budget in budgets)] for title, cells in rows]
+    caption = "Columns: real training episodes."
+    if any(data.thesis.values()):
+        caption += f" Thesis: {reference.success_source(str(data.spec.reference))}."
+    return Table("scores", header, lines, caption, "not tested")
 
 
 def _mean_std(mean: float, std: float) -> str:
@@ -276,7 +275,6 @@ def success_figure(data: ReportData) -> Figure:
 SECTIONS: tuple[Callable[[ReportData], Section | None], ...] = (
     compared,
     success,
-    sections.world,
     gain,
     sections.causes,
     sections.open_loop,

@@ -15,6 +15,7 @@ import numpy as np
 from imagine_bench import reference, registry, statistics
 from imagine_bench.arrays import Arrays
 from imagine_bench.errors import SetupError, UnknownNameError
+from imagine_bench.exact.certificate import Certificate
 from imagine_bench.interfaces import RenderMacrostates, RuleFacts, Rules, State, TaskSpec
 from imagine_bench.report.page import estimate, percent
 from imagine_bench.rules import facts as rule_facts
@@ -83,7 +84,7 @@ class ReportData:
 
     result: BenchResult
     spec: TaskSpec  # the task
-    facts: RuleFacts  # chance level and optimum of the tests; the bench's certificate knows what frames hide
+    facts: RuleFacts | Certificate  # chance level and optimum of the tests; the certificate knows what frames hide
     learners: list[str]  # the agents that learn
     compared: list[str]  # those that are compared with DQN, where it was run
     thesis: dict[str, dict[int, tuple[float, float]]]  # its mean and standard deviation of success by agent and budget
@@ -105,8 +106,7 @@ def collect(result: BenchResult) -> ReportData:
     spec = known_task(protocol.task)
     learners = [agent for agent in protocol.agents if known_agent(agent).learns]
     compared = [agent for agent in learners if agent != BASE_AGENT and BASE_AGENT in learners]
-    thesis = {agent: reference.success(spec.reference, agent) for agent in protocol.agents if spec.reference}
-    thesis = {agent: rows for agent, rows in thesis.items() if rows}
+    thesis = {agent: reference.success(spec.reference, agent) if spec.reference else {} for agent in protocol.agents}
     data = ReportData(result, spec, _facts(result, spec), learners, compared, thesis, [])
     fewest = functools.cache(functools.partial(fewest_actions, spec.rules))
     for agent in protocol.agents:
@@ -120,14 +120,12 @@ def collect(result: BenchResult) -> ReportData:
     return data
 
 
-def _facts(result: BenchResult, spec: TaskSpec) -> RuleFacts:
-    facts = spec.facts()
+def _facts(result: BenchResult, spec: TaskSpec) -> RuleFacts | Certificate:
+    if result.certificate is not None:
+        return result.certificate
     if result.protocol.split is not None and spec.action_names:
-        facts = rule_facts(result.protocol.spec(testing=True).rules, spec.horizon)
-    known = result.certificate
-    if known is None:
-        return facts
-    return dataclasses.replace(facts, chance_level=known.chance_level, optimum=known.optimum)
+        return rule_facts(result.protocol.spec(testing=True).rules, spec.horizon)
+    return spec.facts()
 
 
 def _record(data: ReportData, agent: str, place: int, fewest: Callable[[State], int]) -> Record:
@@ -151,7 +149,7 @@ def _record(data: ReportData, agent: str, place: int, fewest: Callable[[State], 
         "train_cpu_s": mean(row.train_cpu_s for row in rows),
         "gradient_updates": mean(row.diagnostics.get("gradient_updates", math.nan) for row in rows),
     }
-    if budget in data.thesis.get(agent, {}):
+    if budget in data.thesis[agent]:
         record["thesis_mean"], record["thesis_std"] = data.thesis[agent][budget]
     beyond = []
     for kept in (row.kept for row in rows if row.kept is not None and data.installed):

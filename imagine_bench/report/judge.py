@@ -239,15 +239,14 @@ def compared(found: Judged) -> Section:
 
 def where(found: Judged) -> Section:
     """Total variation by what may make it hard."""
-    groups: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for model, cells in found.last.items():
-        for cell in cells:
-            for kind, each in cell["where"].items():
-                for name, value in each.items():
-                    groups.setdefault((kind, name), {}).setdefault(model, []).append(value)
+    every = [cell["where"] for cells in found.last.values() for cell in cells]
+    groups = dict.fromkeys((kind, name) for each in every for kind, names in each.items() for name in names)
     rows = []
-    for group, values in groups.items():
-        rows.append([*group, *(over_seeds(values.get(model, []), _number, share=True) for model in found.last)])
+    for kind, name in groups:
+        rows.append([kind, name])
+        for cells in found.last.values():
+            values = [cell["where"].get(kind, {}).get(name, math.nan) for cell in cells]
+            rows[-1].append(over_seeds(values, _number, share=True))
     header = ["by", "which", *map(_title, found.last)]
     caption = f"Total variation of one step{found.after}."
     return Section("Where it fails", tables=[Table("where", header, rows, caption, "no such transition")])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import functools
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +23,7 @@ DASH = "–"  # printed where there is no number; the table's caption says why
 
 @dataclass(frozen=True)
 class Table:
-    """A table of finished texts; one type for pages, Markdown, CSV and the terminal."""
+    """A table of finished texts; one type for pages, CSV and the terminal."""
 
     name: str  # its id in the page, and the name of its CSV file where it has one
     header: Sequence[str]  # names of the columns
@@ -61,12 +60,6 @@ class Table:
     def csv(self) -> str:
         """The table as a CSV file."""
         return csv_text([self.header, *self.rows])
-
-    @property
-    def markdown(self) -> str:
-        """The table as Markdown."""
-        first, *others = (f"| {' | '.join(map(markdown_text, row))} |" for row in (self.header, *self.rows))
-        return "\n".join([first, f"|{'---|' * len(self.header)}", *others])
 
 
 @dataclass(frozen=True)
@@ -106,11 +99,6 @@ class Page:
     files: Mapping[str, str]  # the CSV files beside the page, by name
     facts: Sequence[tuple[str, str]] = ()  # how it was made, protocol and settings: name and value
     summary: str = ""  # the report on a terminal
-
-
-def markdown_text(value: object) -> str:
-    """A text as Markdown shows it unchanged: in a line, its special characters escaped."""
-    return re.sub(r"([\\`*_<>|&~]|^#|(?<=\])(?=\())", r"\\\1", " ".join(str(value).split()))
 
 
 # How numbers are printed -------------------------------------------------------------------------------------------
@@ -180,7 +168,7 @@ def mean_std(values: Sequence[float] | NDArray[np.float64]) -> str:
 
 
 def write_page(folder: Path, page: Page) -> Path:
-    """Write a report: index.html, whose path is returned, report.md, the page's CSV files and images.
+    """Write a report: index.html, whose path is returned, the page's CSV files and images.
 
     Raises:
         SetupError: The folder cannot be written.
@@ -197,16 +185,13 @@ def texts(page: Page) -> dict[str, str]:
     """The files of a report, by name, but for its images."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("imagine_bench.report"),
-        autoescape=lambda name: str(name).endswith(".html.j2"),
+        autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters["md"] = markdown_text
     environment.filters["base64"] = lambda png: base64.b64encode(png).decode()
-    pages = {"report.md": "page.md.j2", "index.html": "page.html.j2"}
-    rendered = {name: environment.get_template(template).render(page=page) for name, template in pages.items()}
-    return {**page.files, **rendered}
+    return {**page.files, "index.html": environment.get_template("page.html.j2").render(page=page)}
 
 
 def made(result: Any, titles: Mapping[str, str]) -> list[tuple[str, str]]:

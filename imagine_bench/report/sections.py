@@ -1,4 +1,4 @@
-"""Sections of a bench's page on the world's exact facts, what policies do, why agents failed, and what they imagine."""
+"""Sections of a bench's page on why agents failed, and what they imagine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from imagine_bench.arrays import Arrays
-from imagine_bench.exact.certificate import certificate_rows
 from imagine_bench.judge.causes import CAUSES
 from imagine_bench.recording.filmstrips import filmstrip, png, sampled_filmstrips
 from imagine_bench.registry.entries import file_name
@@ -38,24 +37,7 @@ _MEASURES = {
 _KINDS = ("epistemic", "aleatoric", "modal")
 
 
-# What follows from the rules ----------------------------------------------------------------------------------------
-
-
-def world(data: ReportData) -> Section | None:
-    """What follows from the rules alone."""
-    found = data.result.certificate
-    if found is None:
-        return None
-    rows = {
-        "macrostates": f"{found.macrostates:,}, {found.starts:,} of them starts; {found.horizon} macro-actions",
-        "chance level": f"{percent(found.chance_level)} % by uniformly random macro-actions",
-        "optimum": f"{percent(found.optimum)} % by perfect play that remembers all that frames showed",
-        **certificate_rows(found),
-    }
-    words = "Nothing here is measured: all of it follows from the rules, by enumeration."
-    return Section(
-        "The world", [words], tables=[Table("certificate", ["", "certificate"], [*rows.items()], prose=True)]
-    )
+# Why agents failed ------------------------------------------------------------------------------------------------
 
 
 def causes(data: ReportData) -> Section | None:
@@ -88,19 +70,19 @@ def causes_table(rows: Iterable[Sequence[object]]) -> Table:
     Raises:
         ValueError: A cause that is none.
     """
-    found: dict[tuple[str, str], list[list[str]]] = {}
-    for row in rows:
-        agent, seed, budget, tests, _, cause = map(str, row)
-        if cause and cause not in CAUSES:
+    counts: dict[tuple[str, str], Counter[str]] = {}
+    tested: dict[tuple[str, str], dict[str, int]] = {}
+    for agent, seed, budget, tests, _, cause in (map(str, row) for row in rows):
+        if cause not in ("", *CAUSES):
             raise ValueError(f"{cause!r} is no cause")
-        found.setdefault((agent, budget), []).append([seed, tests, cause])
+        tested.setdefault((agent, budget), {})[seed] = int(tests)
+        counts.setdefault((agent, budget), Counter())[cause] += bool(cause)
     lines = []
-    for (agent, budget), own in found.items():
-        counts = Counter(cause for _, _, cause in own if cause)
-        total = counts.total()
-        tested = sum({seed: int(tests) for seed, tests, _ in own}.values())
-        shares = [percent(counts[name] / total) if total else DASH for name in CAUSES]
-        lines.append([agent_title(agent), f"{int(budget):,}", f"{total:,} of {tested:,}", *shares])
+    for (agent, budget), found in counts.items():
+        failures = found.total()
+        shares = [percent(found[name] / failures) if failures else DASH for name in CAUSES]
+        of = f"{failures:,} of {sum(tested[agent, budget].values()):,}"
+        lines.append([agent_title(agent), f"{int(budget):,}", of, *shares])
     header = ["agent", "real episodes", "failures", *(f"{name}, %" for name in CAUSES)]
     meanings = "; ".join(f"{name}: {words}" for name, words in CAUSES.items())
     return Table("causes", header, lines, f"Shares of the failures. {meanings}.", why_dash="nothing failed")

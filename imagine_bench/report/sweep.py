@@ -43,6 +43,7 @@ def study_page(study: Study, lines: Sequence[Line]) -> Page:
             rows.append({**_named(line.variant), "episodes": f"{budget:,}", **found, "CPU s": count(line.train_cpu_s)})
     caption = "Difference in points; imagined right: outcomes of one macro-action that are expected rightly (%)."
     table = Table.of("variants", rows, caption, "not compared, or no model to ask")
+    made = {**lines[0].environment, "study": dataclasses.asdict(study)}
     seeds = ", ".join(map(str, study.seeds))
     return Page(
         title=study.question,
@@ -51,8 +52,8 @@ def study_page(study: Study, lines: Sequence[Line]) -> Page:
         "zero by chance.",
         answers=[],
         sections=[Section("Variants", tables=[table])],
-        files={"seeds.csv": _seeds_csv(study, lines), "runs.json": json_text([_origin(line) for line in lines])},
-        facts=flat("", dataclasses.asdict(study)),
+        files={"seeds.csv": _seeds_csv(study, lines), "study.json": json_text(made)},
+        facts=flat("", made),
         summary=table.text,
     )
 
@@ -60,14 +61,6 @@ def study_page(study: Study, lines: Sequence[Line]) -> Page:
 def _named(variant: Variant) -> dict[str, str]:
     against = variant.against or ""
     return {"factor": variant.factor, "variant": variant.name, "agent": variant.agent, "against": against}
-
-
-def _origin(line: Line) -> dict[str, object]:
-    """Where a line's numbers come from."""
-    variant = line.variant
-    facts = {name: line.environment.get(name) for name in ("command", "commit", "versions", "machine")}
-    changed = {"settings": dict(variant.settings), "world": dict(variant.world)}
-    return {"variant": variant.name, **changed, "bench": line.folder.name, **facts}
 
 
 def _seeds_csv(study: Study, lines: Sequence[Line]) -> str:

@@ -103,7 +103,7 @@ def test_results_are_read_without_the_package(guest: Path, tmp_path: Path, capsy
         assert "Not installed here: task lights_out." in said
         assert re.search(r"^chance level +36.7$", said, re.MULTILINE), "the bench keeps chance and optimum"
         assert re.search(r"^optimum +100.0$", said, re.MULTILINE)
-        assert "nan" not in (folder / "report" / "report.md").read_text()
+        assert "nan" not in (folder / "report" / "index.html").read_text()
     assert main(["report", "--task", "lights_out", "--out", str(tmp_path)]) == 2
     assert main(["bench", "--task", "lights_out"]) == 2
     assert "No task 'lights_out'" in capsys.readouterr().err

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import time
 
-import numpy as np
 import pytest
 from small_runs import Inline, small
 
@@ -14,7 +12,6 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.exact.splits import split_of
-from imagine_bench.report import write_report
 from imagine_bench.report.data import collect
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.store.loading import archive_files, load_so_far
@@ -41,7 +38,6 @@ def test_the_certificate_is_that_of_the_tests_starts(result):
     assert result.certificate == certificate(spec) != certificate(registry.task("arrow_puzzle"))
     assert min(length for length, _ in result.certificate.plan_lengths) == 3
     facts = collect(result).facts
-    assert facts.mean_plan_length == np.average([3, 4, 5], weights=[12, 12, 6])
     assert (facts.chance_level, facts.optimum) == (result.certificate.chance_level, 1.0)
     assert facts.chance_level < registry.task("arrow_puzzle").facts().chance_level
 
@@ -49,8 +45,6 @@ def test_the_certificate_is_that_of_the_tests_starts(result):
 def test_it_is_read_back_and_drawn(result, tmp_path, monkeypatch):
     monkeypatch.delattr("imagine_bench.running.bench.certificate")  # nothing is computed again
     assert load_bench(result.folder).certificate == result.certificate
-    page = write_report(dataclasses.replace(result, folder=tmp_path)).read_text()
-    assert "The world" in page and 'id="certificate"' in page and "12 of them starts" not in page
     for name, text in archive_files(result).items():
         (tmp_path / name).write_text(text)
     assert load_so_far(tmp_path).certificate == result.certificate

@@ -199,7 +199,7 @@ def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tm
     assert cell["nothing"] == cell["total_variation"] == cell["after_the_end"] == 1.0
     assert cell["fit_s"] is None and set(cell["where"]["in its data"]) <= {"seen", "never"}
     assert "imaginer, seed 0  " in judgement_report(folder, one)
-    page = (folder / "report/report.md").read_text()
+    page = (folder / "report/index.html").read_text()
     assert "Smallest total variation" in page and "imaginer, seed 0 (1.00)" in page
     assert "one step after 40 transitions" in page
     folder, other = _judged(tmp_path, "copy", seeds=(1001,))
@@ -215,7 +215,7 @@ def test_the_folder_of_an_agent_stands_for_all_its_runs(runs: dict[str, Path], t
     assert list(shown(folder, one)) == [agent]
     (row,) = (line for line in judgement_report(folder, one).splitlines() if line.startswith("imaginer"))
     assert "seed" not in row
-    page = (folder / "report/report.md").read_text()
+    page = (folder / "report/index.html").read_text()
     assert "means over seeds or runs" in page
     assert "after 40 transitions" not in page
 

@@ -189,10 +189,10 @@ def test_what_is_written_holds_every_plan(wrong: list[PlanResult], right: list[P
     assert table.text in said and all(f"plan {plan.number} from" in said for plan in wrong if not plan.solved)
     assert table.rows[0] == ["plans", "12", "20"] and table.rows[1][2] == "17"
     assert (tmp_path / "plans.png").stat().st_size > 5_000
-    assert len(list(tmp_path.glob("failed_*.png"))) == min(6, len(wrong) - summary["solved"]) > 0
+    assert (tmp_path / "failed.png").is_file() and summary["solved"] < len(wrong)
     (tmp_path / "recording.rrd").write_text("old")
     write_plans(tmp_path, right[:1], TASK, {})
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["plans.csv", "plans.md", "plans.png", "summary.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["plans.csv", "plans.png", "summary.json"]
 
 
 def test_the_recording_shows_the_same_plans_and_the_arm_moves(
