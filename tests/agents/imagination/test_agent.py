@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 from agent_states import same
-from fake_latents import ACTIONS, CODES, built, frame, live, make_dqn, transition
+from fake_latents import CODES, built, frame, live, make_dqn, transition
 from imagine_bench.agents.dqn import DQN, epsilon
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination import model_only
 from imagine_bench.agents.imagination.agent import ImaginingAgent
 
-from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentState, Observation
 
 MAKERS: dict[str, Callable[..., DQN]] = {
@@ -46,9 +46,9 @@ def test_one_seed_acts_alike_until_imagination_begins() -> None:
 class Calls(list[tuple[str, tuple[Any, ...], dict[str, Any]]]):
     """The calls of methods that are watched, with their arguments; they still do what they did."""
 
-    def watch(self, owner: object, *names: str) -> None:
+    def watch(self, owner: object, of: str, *names: str) -> None:
         for name in names:
-            setattr(owner, name, self._noted(name, getattr(owner, name)))
+            setattr(owner, name, self._noted(f"{of}.{name}", getattr(owner, name)))
 
     def _noted(self, name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         def noted(*given: Any, **named: Any) -> Any:
@@ -59,50 +59,36 @@ class Calls(list[tuple[str, tuple[Any, ...], dict[str, Any]]]):
 
 
 def test_algorithm_1_in_its_order() -> None:
-    """Only the model's batches are spread and balanced; rollouts begin and explore as the robot does."""
+    """Only the model's batches are spread and balanced; rollouts begin and explore as the robot does.
+
+    After the last episode that imagines, updates are on real transitions.
+    """
     wider = {"spread": 4.0, "balance": 0.5}
     updates = {"model.updates_per_step": 3, "controller.updates_per_step": 2, "imagination.updates_per_step": 4}
-    agent = built(imagination_agents.make, {**updates, **{f"model.{name}": value for name, value in wider.items()}})
+    updates |= {f"model.{name}": value for name, value in wider.items()}
+    agent = built(imagination_agents.make, {**updates, "imagination.end_episode": 3})
     calls = Calls()
-    calls.watch(agent.real, "add", "sample")
-    calls.watch(agent.imagination.model, "update")
-    calls.watch(agent.imagination, "rollouts")
-    calls.watch(agent.imagination.memory, "sample")
+    calls.watch(agent.real, "real", "add", "sample")
+    calls.watch(agent.imagination.model, "model", "update")
+    calls.watch(agent.imagination, "imagined", "rollouts")
+    calls.watch(agent.imagination.memory, "imagined", "sample")
     agent.observe(transition(0, 1, 0.0, 1), episode=1)
-    waking = ["add", "sample", "sample", "sample", "update", "update", "update"]
+    waking = ["real.add", *["real.sample"] * 3, *["model.update"] * 3]
     assert [name for name, *_ in calls] == waking
-    assert [(given[0], named) for name, given, named in calls if name == "sample"] == [(8, {}), (8, {}), (24, wider)]
+    assert [(given[0], named) for name, given, named in calls if name == "real.sample"] == [(8, {})] * 2 + [(24, wider)]
     chances = []
     for state in (3, 0, 5):
         calls.clear()
         chances.append(epsilon(agent.steps, agent.settings.controller))
         agent.observe(transition(state, 1, 0.0, 1), episode=2)
-        assert [name for name, *_ in calls] == [*waking, "rollouts", *["sample"] * 4]
+        assert [name for name, *_ in calls] == [*waking, "imagined.rollouts", *["imagined.sample"] * 4]
         _, z, _, chance = calls[7][1]
         assert torch.equal(z, CODES[state])
         assert chance == chances[-1]
     assert chances[0] > chances[-1] > 0.0
-
-
-def test_after_imagination_updates_are_on_real_transitions() -> None:
-    """Two agents are one until the last episode that imagines; then one's imagined memory stays as it is."""
-    forever, ending = (
-        built(imagination_agents.make_uncertainty, {"imagination.end_episode": end}) for end in (None, 5)
-    )
-    histories = [live(agent, range(5), np.random.default_rng(0)) for agent in (forever, ending)]
-    assert histories[0] == histories[1]
-    imagined = ending.imagination.memory.added
-    assert imagined == forever.imagination.memory.added > 0
-    calls = Calls()
-    calls.watch(ending.real, "sample")
-    for agent in (ending, forever):
-        agent.observe(transition(0, 1, 0.0, 1), episode=5)
-    settings = ending.settings
-    rows = [settings.controller.batch_size]
-    model = settings.model.batch_size * settings.model.updates_per_step
-    instead = rows * settings.imagination.updates_per_step
-    assert [given[0] for _, given, _ in calls] == [*rows * settings.controller.updates_per_step, model, *instead]
-    assert ending.imagination.memory.added == imagined < forever.imagination.memory.added
+    calls.clear()
+    agent.observe(transition(0, 1, 0.0, 1), episode=3)
+    assert [name for name, *_ in calls] == [*waking, *["real.sample"] * 4]
 
 
 def test_real_and_imagined_transitions_never_mix() -> None:
@@ -141,8 +127,6 @@ def test_imagine_changes_nothing_and_follows_its_generator(trained: ImaginingAge
     assert np.array_equal(first.actions, actions)
     assert np.array_equal(first.epistemic, again.epistemic)
     assert not np.array_equal(first.epistemic, other.epistemic)
-    assert first.frames.shape == (4, 64, 64)
-    assert first.q_values.shape == (4, ACTIONS)
     assert np.array_equal(first.q_values[0], trained.q_values(Observation(frame=frame(1))))
     greedy = trained.imagine(frame(1), actions=None, depth=5, rng=np.random.default_rng(3))
     assert np.array_equal(greedy.actions, greedy.q_values.argmax(axis=1))
@@ -153,17 +137,13 @@ def test_diagnostics_are_means_since_the_last_call() -> None:
     agent = built(imagination_agents.make_uncertainty, {"imagination.threshold": 1e6})
     live(agent, range(4), np.random.default_rng(0))
     read = agent.diagnostics()
-    counters = {"epsilon", "real_transitions", "gradient_updates", "imagined_transitions"}
-    means = {f"loss/{name}" for name in ("dynamics", "reward", "termination", "bellman")}
-    means |= {f"time/{name}_s" for name in ("model", "controller", "imagination")}
-    means |= {"imagination/acceptance_rate", "imagination/mean_depth"}
-    assert set(read) == means | counters
     assert (read["real_transitions"], read["imagination/acceptance_rate"]) == (8.0, 1.0)
     settings = agent.settings
     waking = settings.controller.updates_per_step + settings.model.updates_per_step
     assert read["gradient_updates"] == 8 * waking + 4 * settings.imagination.updates_per_step
     assert read["imagination/mean_depth"] == pytest.approx(read["imagined_transitions"] / (4 * 3))
-    assert set(agent.diagnostics()) == counters
+    counters = {"epsilon", "real_transitions", "gradient_updates", "imagined_transitions"}
+    assert set(agent.diagnostics()) == counters < set(read)
 
 
 def test_a_dqn_beats_chance_on_a_small_contextual_task() -> None:
@@ -185,23 +165,17 @@ def test_a_snapshot_that_does_not_fit_names_the_first_difference() -> None:
     own = agent.state()
     missing = {name: array for name, array in own.arrays.items() if name != "real/mu"}
     wider = {**own.arrays, "real/mu": np.zeros((6, 9), np.float32)}
-    other = built(model_only.make_uncertainty, {"memory.real": 9}).state().values
+    plain = built(imagination_agents.make).state()
     for arrays, values, message in (
         (missing, own.values, "The snapshot lacks 'real/mu'"),
         (wider, own.values, r"'real/mu' in the snapshot is float32 \(6, 9\), in this agent float32 \(6, 4\)"),
-        (own.arrays, other, "'settings.memory.real' is 9 in the snapshot and 64 in this agent"),
+        (plain.arrays, plain.values, "'filtered' is False in the snapshot and True in this agent"),
     ):
         with pytest.raises(ArtefactError, match=message):
             agent.restore(AgentState(arrays=arrays, values=values))
     assert same(own, agent.state()), "a refused snapshot changes nothing"
-
-
-def test_snapshots_of_other_agents_are_refused() -> None:
-    dqn, plain, filtered = (built(make) for make in list(MAKERS.values())[:3])
     with pytest.raises(ArtefactError, match="has 'filtered'"):
-        dqn.restore(plain.state())
-    with pytest.raises(ArtefactError, match="'filtered' is True in the snapshot and False in this agent"):
-        plain.restore(filtered.state())
+        built(make_dqn).restore(plain)
 
 
 @pytest.mark.parametrize(
@@ -214,9 +188,3 @@ def test_snapshots_of_other_agents_are_refused() -> None:
 def test_a_context_that_cannot_work_is_one_clear_error(change: dict[str, Any], message: str) -> None:
     with pytest.raises(InvalidValueError, match=message):
         built(make_dqn, **change)
-
-
-def test_a_reward_that_is_no_number_stops_the_run() -> None:
-    agent = built(imagination_agents.make)
-    with pytest.raises(DivergedError, match="controller's loss is nan"):
-        agent.observe(transition(0, 0, float("nan"), 1), episode=0)

@@ -63,11 +63,10 @@ def test_imagination_predicts_with_the_chosen_weights(how: str) -> None:
     found = imagination.step(z, action, weights, generator).next_z
     means = imagination.model.predict(z, action, weights.dynamics).means[..., 0, :]  # [T, N, Z]
     whole = imagination.model.predict(z, action, None).means[0, :, 0]
-    near = [torch.isclose(found, mean, atol=1e-6).all() for mean in (means.mean(dim=0), whole)]
+    average, network = (torch.isclose(found, mean, atol=1e-6).all() for mean in (means.mean(dim=0), whole))
     of_one = torch.isclose(found, means, atol=1e-6).all(dim=-1)  # [T, N]
-    assert near == [how == "average", how == "network"]
-    assert bool(of_one.any(dim=0).all()) == (how == "sample")
-    assert how != "sample" or of_one.any(dim=1).all(), "all of them are drawn"
+    sample = of_one.any(dim=0).all() and of_one.any(dim=1).all()  # each row is of one, and all of them are drawn
+    assert (average, network, sample) == (how == "average", how == "network", how == "sample")
 
 
 @pytest.mark.parametrize("part", ["log_weights", "means", "log_sigmas"])
@@ -89,7 +88,6 @@ def test_a_rollout_ends_before_its_variance_overflows() -> None:
 
     imagination, counts = imagined(CountingModel(change=exploding), temperature=1.0)
     assert counts == (3, 15, 12)
-    assert sorted(imagination.memory.arrays()["next_z"][:, 1].round()) == sorted(3 * [1, 2, 3, 4])
     overflowed = torch.tensor([[0.1, 0.2], [0.1, torch.inf], [torch.nan, 0.2]])
     assert imagination.filter.score(overflowed).tolist() == [pytest.approx(0.2), torch.inf, torch.inf]
 
@@ -102,15 +100,12 @@ def test_a_closed_loop_that_runs_away_stays_a_number() -> None:
     with torch.no_grad():
         imagination.model.dynamics.weights[-1].mul_(30.0)
     z = torch.ones(8, 2)
-    action = torch.zeros(8, dtype=torch.int64)
-    kept = []
     for _ in range(10):
-        step = imagination.step(z, action, imagination.draw_weights(generator), generator)
-        assert all(part.isfinite().all() for part in (step.next_z, step.reward, step.p_terminated))
-        kept.append(imagination.keeps(step))
+        weights = imagination.draw_weights(generator)
+        step = imagination.step(z, torch.zeros(8, dtype=torch.int64), weights, generator)
         z = step.next_z
-    assert kept[0].all(), "it began as latents are"
-    assert not kept[-1].any(), "it did run away"
+        assert all(part.isfinite().all() for part in (z, step.reward, step.p_terminated))
+    assert not imagination.keeps(step).any(), "it did run away"
 
 
 _ALONE: dict[str, Any] = {"dropout": 0.0}
@@ -122,7 +117,6 @@ _ALONE: dict[str, Any] = {"dropout": 0.0}
         (_ALONE, {}, True, "The filter"),
         ({}, {"weight_samples": 1}, True, "The filter"),
         (_ALONE, {"curiosity": 0.5}, False, "imagination.curiosity"),
-        (_ALONE, {"confidence_scale": 0.3}, False, "imagination.confidence_scale"),
         ({**_ALONE, "members": 3}, {"reward_threshold": 1.0}, True, "imagination.reward_threshold"),
     ],
 )

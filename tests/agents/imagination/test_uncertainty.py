@@ -47,16 +47,6 @@ def test_each_cause_is_its_equation() -> None:
     torch.testing.assert_close(parts.modal, ((alpha * mu.square()).sum(2) - inner.square()).mean(0))  # 4.27
 
 
-def test_single_samples_and_components_have_no_spread() -> None:
-    mixtures = samples(torch.float64)
-    lone = Mixture(mixtures.log_weights[:1], mixtures.means[:1], mixtures.log_sigmas[:1])
-    assert decompose(lone).epistemic.abs().max() == 0.0
-    assert decompose(lone).modal.min() > 0.0
-    single = Mixture(torch.zeros(T, N, 1), mixtures.means[:, :, :1].float(), mixtures.log_sigmas[:, :, :1].float())
-    assert decompose(single).modal.abs().max() == 0.0
-    assert decompose(single).epistemic.min() > 0.0
-
-
 def test_a_sampled_value_is_as_uncertain_as_its_component() -> None:
     """Two components far apart: noise 1 and weights that move the mean by 1, noise 9 and weights that agree."""
     means = torch.tensor([[[[0.0], [100.0]]], [[[2.0], [100.0]]]])  # [T = 2, N = 1, K = 2, Z = 1]

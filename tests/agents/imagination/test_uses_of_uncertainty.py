@@ -14,6 +14,7 @@ from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.vector_env import ImaginedVectorEnv
 
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces.capabilities import ImaginedRollout
 
 UNCERTAINTY = 0.1
 
@@ -79,14 +80,11 @@ def test_an_environment_that_cannot_weigh_by_confidence_refuses_it() -> None:
 
 
 def test_a_shown_rollout_is_accepted_as_far_as_it_has_gathered_little() -> None:
-    def shown(**settings: float) -> tuple[np.ndarray, np.ndarray]:
+    def shown(**settings: float) -> ImaginedRollout:
         agent = built(make_uncertainty, {f"imagination.{name}": value for name, value in settings.items()})
-        rollout = agent.imagine(frame(0), actions=np.zeros(8, dtype=np.int64), depth=8, rng=np.random.default_rng(0))
-        return rollout.epistemic, rollout.accepted
+        return agent.imagine(frame(0), actions=np.zeros(8, dtype=np.int64), depth=8, rng=np.random.default_rng(0))
 
-    epistemic, _ = shown(threshold=0.0)
+    epistemic = shown(threshold=0.0).epistemic
     limit = float(np.cumsum(epistemic)[3]) * 1.001
-    _, accepted = shown(threshold=limit, accumulates=True)
-    assert accepted.tolist() == [True] * 4 + [False] * 4
-    _, alone = shown(threshold=max(limit, float(epistemic.max())))
-    assert alone.all(), "no step alone is too uncertain"
+    assert shown(threshold=limit, accumulates=True).accepted.tolist() == [True] * 4 + [False] * 4
+    assert shown(threshold=max(limit, float(epistemic.max()))).accepted.all(), "no step alone is too uncertain"
