@@ -56,6 +56,4 @@ def test_oracle_without_rules_or_macrostate_says_so() -> None:
 def test_a_foreign_snapshot_is_named() -> None:
     foreign = AgentState(arrays={"controller/value": np.zeros(3)}, values={})
     with pytest.raises(ArtefactError, match="'controller/value'; it is of another agent"):
-        make_oracle(context(optimal_policy=lambda: lambda *_: 0)).restore(foreign)
-    with pytest.raises(ArtefactError, match="differs from this agent's in 'generator'"):
-        make_random(context()).restore(AgentState(arrays={}, values={}))
+        make_random(context()).restore(foreign)

@@ -79,17 +79,16 @@ def test_a_loss_that_is_no_number_leaves_the_weights() -> None:
 
 def test_a_target_network_follows_at_its_rate() -> None:
     settings = ControllerSettings(hidden=(8,), discount=0.9, target_rate=0.25)
-    controller = Controller(3, 2, settings, torch.Generator().manual_seed(0))
+    controller, again = (Controller(3, 2, settings, torch.Generator().manual_seed(seed)) for seed in (0, 5))
     before = weights(controller.network)
     assert torch.equal(weights(controller.target), before)
     controller.update(batch())
     after = weights(controller.network)
     torch.testing.assert_close(weights(controller.target), before + 0.25 * (after - before))
     assert (after != before).any()
-    plain, again = make(), Controller(3, 2, settings, torch.Generator().manual_seed(5))
+    plain = make()
     plain.network.load_state_dict(controller.network.state_dict())
     assert controller.loss(batch()) != plain.loss(batch()), "the loss must use the target network's values"
     load_training(again, again.optimiser, training_arrays(controller, controller.optimiser))
-    assert controller.loss(batch()) == again.loss(batch())
     assert controller.update(batch()) == again.update(batch())
     assert torch.equal(weights(controller), weights(again)), "moments and steps are part of a snapshot"

@@ -165,12 +165,6 @@ def test_forty_episodes_solve_every_start_of_the_tiny_task(trained: FactoredAgen
     assert success(trained) == 1.0
 
 
-def test_before_anything_was_seen_everything_imagined_is_unknown() -> None:
-    blank = agent().imagine(frame((0, 1, 0)), actions=None, depth=2, rng=np.random.default_rng(0))
-    assert (blank.epistemic == 1.0).all() and not blank.accepted.any()
-    assert not blank.modal.any() and not blank.rewards.any() and not blank.p_terminated.any()
-
-
 def test_imagined_rollouts_go_and_end_as_in_the_world(trained: FactoredAgent) -> None:
     actions = np.array([0, 1, 3, 1])
     rollout = trained.imagine(frame((0, 2, 1)), actions=actions, depth=4, rng=np.random.default_rng(1))

@@ -66,8 +66,8 @@ def test_factors_and_values_are_found_in_few_frames_of_its_own() -> None:
     assert sorted(len(factor.joint) for factor in found) == [2, 3, 3]
     truth, fresh = walk(300, np.random.default_rng(1))
     codes, known = appearance.read(found, fresh)
-    pairs = {(tuple(code), true) for code, true in zip(codes.tolist(), truth, strict=True)}
-    assert len(pairs) == len({code for code, _ in pairs}) == len({true for _, true in pairs}) == len(set(truth)) > 6
+    named = set(zip(map(tuple, codes.tolist()), truth, strict=True))
+    assert len(named) == len({code for code, _ in named}) == len(set(truth)) > 6
     assert known.mean() > 0.98
 
 
@@ -110,9 +110,7 @@ def test_a_small_thing_is_a_factor_unless_the_border_cuts_it(top: int, found: in
     assert len(appearance.find(frames)) == found
 
 
-@pytest.mark.parametrize(
-    ("matters", "told", "rare"), [(True, True, 1), (True, False, 1), (False, True, 1), (True, True, 8)]
-)
+@pytest.mark.parametrize(("matters", "told", "rare"), [(True, False, 1), (False, True, 1), (True, True, 4)])
 def test_what_is_nearly_alike_is_parted_where_that_tells_what_follows(matters: bool, told: bool, rare: int) -> None:
     """Three marks in a ring, of which macro-actions show the next or the last; two are nearly alike.
 
@@ -154,8 +152,7 @@ def test_what_changes_only_between_episodes_is_a_factor_too() -> None:
     begins = np.arange(600) % 25 == 0
     assert appearance.find(frames) == [], "no pixel changes in 3 % of all steps"
     codes, _ = appearance.read(appearance.find(frames, begins), frames)
-    pairs = set(zip(map(tuple, codes.tolist()), places.tolist(), strict=True))
-    assert len(pairs) == len({code for code, _ in pairs}) == len(set(places.tolist())) == 4
+    assert len(np.unique(codes, axis=0)) == len(np.unique(np.column_stack([codes, places]), axis=0)) == 4
 
 
 def test_what_is_seen_once_in_ten_frames_is_a_value() -> None:
@@ -200,52 +197,24 @@ def test_a_look_that_was_never_seen_is_unknown() -> None:
     assert known[~without][:, wheel].mean() < 0.1 and known[without].all(axis=1).mean() > 0.95
 
 
-@pytest.mark.parametrize(("shift", "gain"), [((0, 0), 1.0), ((5, -5), 0.5), ((-3, 4), 2.0)])
+@pytest.mark.parametrize(("shift", "gain"), [((5, -5), 0.5), ((-3, 4), 2.0)])
 def test_shifted_and_dimmed_crops_are_alike_and_others_are_not(shift: tuple[int, int], gain: float) -> None:
-    def contours(kind: int, at: tuple[int, int], gain: float) -> NDArray[np.float32]:
-        image = np.full((1, 64, 64, 3), 0.4, dtype=np.float32)
-        image[0, 26 + at[0] : 38 + at[0], 26 + at[1] : 38 + at[1]] += shape(kind)[..., None].astype(np.float32)
-        return appearance.contours(gain * image)
-
     mask = np.zeros((64, 64), dtype=np.bool_)
     mask[16:48, 16:48] = True
-    one = appearance.crops(contours(0, (0, 0), 1.0), mask)
-    same_mark, other = (appearance.crops(contours(kind, shift, gain), mask) for kind in (0, 1))
-    assert appearance.distances(one, same_mark, mask, 1e-6) == pytest.approx(np.zeros((1, 1)), abs=1e-4)
-    assert appearance.distances(one, other, mask, 1e-6)[0, 0] > 0.5
-    far = appearance.crops(contours(0, (9, 0), 1.0), mask)
-    assert appearance.distances(one, far, mask, 1e-6)[0, 0] > 0.2, "it is compared at shifts of up to five pixels"
-    nothing = np.zeros_like(one)
-    assert appearance.distances(nothing, nothing, mask, 1e-6)[0, 0] == 0.0, "two empty crops are alike"
 
+    def crop(kind: int, down: int, right: int, gain: float = 1.0) -> NDArray[np.float32]:
+        image = np.full((1, 64, 64, 3), 0.4, dtype=np.float32)
+        image[0, 26 + down : 38 + down, 26 + right : 38 + right] += shape(kind)[..., None].astype(np.float32)
+        return appearance.crops(appearance.contours(gain * image), mask)
 
-def test_the_widest_gap_parts_the_groups() -> None:
-    rng = np.random.default_rng(0)
-    truth = rng.integers(3, size=30)
-    apart = np.where(truth[:, None] == truth, rng.uniform(0.05, 0.2, (30, 30)), rng.uniform(0.4, 0.5, (30, 30)))
-    apart = np.minimum(apart, apart.T) * (1.0 - np.eye(30))
-    label, cut = appearance.groups(apart)
-    assert len(set(zip(label.tolist(), truth.tolist(), strict=True))) == 3 and 0.15 < cut < 0.45
-    alike, _ = appearance.groups(np.where(np.eye(30) > 0, 0.0, 0.1))
-    assert not alike.any(), "jitter alone makes one group"
+    def distance(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+        return float(appearance.distances(one, other, mask, 1e-6)[0, 0])
 
-
-def test_neighbours_that_change_at_other_times_are_two_regions() -> None:
-    rng = np.random.default_rng(0)
-    bits = (rng.random((120, 2)) < 0.25).cumsum(axis=0) % 2
-
-    def regions(left: NDArray[np.int64], right: NDArray[np.int64]) -> list[NDArray[np.bool_]]:
-        images = np.ones((120, 64, 64, 3), dtype=np.float32)
-        images[:, 20:40, 10:30] += left[:, None, None, None]
-        images[:, 20:40, 30:50] += right[:, None, None, None]  # they touch
-        change = appearance.changes(images)
-        return appearance.regions(change, change.any(axis=0))
-
-    found = regions(bits[:, 0], bits[:, 1])
-    assert len(found) == 2 and not (found[0] & found[1]).any()
-    assert len(regions(bits[:, 0], bits[:, 0])) == 1, "what changes together is one"
-    later = np.where(np.arange(120) < 80, bits[:, 0], bits[:, 1])
-    assert len(regions(bits[:, 0], later)) == 2, "unless it did so for a while only"
+    one = crop(0, 0, 0)
+    assert distance(one, crop(0, *shift, gain)) == pytest.approx(0.0, abs=1e-4)
+    assert distance(one, crop(1, *shift, gain)) > 0.5
+    assert distance(one, crop(0, 9, 0)) > 0.2, "it is compared at shifts of up to five pixels"
+    assert distance(np.zeros_like(one), np.zeros_like(one)) == 0.0, "two empty crops are alike"
 
 
 def test_a_small_thing_that_a_large_one_touches_is_not_lost() -> None:
@@ -260,16 +229,13 @@ def test_a_small_thing_that_a_large_one_touches_is_not_lost() -> None:
 
 
 def test_what_does_not_vary_freely_is_one_factor() -> None:
-    rng = np.random.default_rng(0)
-    one, other = rng.integers(3, size=(2, 200))
+    one, other, turns = np.random.default_rng(0).integers(3, size=(3, 200))
+    first, second = ((turns == each).astype(np.int64) for each in (1, 2))
     assert not appearance.bound(one, other)
     assert appearance.bound(one, (one + 1) % 3), "a copy"
     assert appearance.bound(one, (one > 0).astype(np.int64)), "a coarser copy"
-    turns = rng.integers(3, size=200)
-    assert appearance.bound((turns == 1).astype(np.int64), (turns == 2).astype(np.int64)), "one excludes the other"
-    assert not appearance.bound((turns == 1).astype(np.int64)[:9], (turns == 2).astype(np.int64)[:9]), (
-        "chance may be why"
-    )
+    assert appearance.bound(first, second), "one excludes the other"
+    assert not appearance.bound(first[:9], second[:9]), "chance may be why"
 
 
 def test_it_learns_to_see_and_to_act_from_nothing(trained: Trained) -> None:
@@ -320,6 +286,6 @@ def test_what_was_done_is_remembered_with_its_frames(trained: Trained) -> None:
     for eyes in (learner.perception, resumed.perception):
         _, begins, actions = eyes.first(len(eyes.frames))
         assert actions[actions >= 0].tolist() == taken
-        assert begins.sum() == (actions < 0).sum() == EPISODES, "nothing was done in an episode's last frame"
-        assert (actions[:-1][begins[1:]] < 0).all() and actions[-1] < 0
+        assert begins.sum() == EPISODES
+        assert np.array_equal(actions < 0, np.roll(begins, -1)), "nothing was done in an episode's last frame"
         assert eyes.first(8)[2][-1] < 0, "what leads to a later frame is none of the first"

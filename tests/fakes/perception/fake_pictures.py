@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 
 import fake_codes
@@ -49,15 +50,31 @@ def hidden(code: Code) -> Code:
     return (*code[:2], HIDDEN)
 
 
+def _reward(code: Code, action: int) -> float:
+    return fake_codes.step(code, action)[1]
+
+
 def played(
-    learner: LearnedPerceptionAgent, rng: np.random.Generator, *, explore: bool, covered: bool = False, steps: int = 6
+    learner: LearnedPerceptionAgent | None,
+    rng: np.random.Generator,
+    *,
+    explore: bool = False,
+    covered: bool = False,
+    steps: int = 6,
 ) -> Iterator[Transition]:
-    """One episode in pictures of the world, cut after so many macro-actions; nothing is learned from it here."""
-    begin_episode(learner)
+    """One episode in pictures of the world, cut after so many macro-actions; nothing is learned from it here.
+
+    Macro-actions are those of the learner; if there is none, the better of two that are drawn, which takes less time.
+    """
+    if learner is not None:
+        begin_episode(learner)
     code = starts()[int(rng.integers(len(starts())))]
     seen = Observation(frame=picture(code, rng))
     for step in range(steps):
-        action = learner.act(seen, explore=explore)
+        if learner is None:
+            action = max(rng.integers(ACTIONS, size=2).tolist(), key=functools.partial(_reward, code))
+        else:
+            action = learner.act(seen, explore=explore)
         code, reward, ended = fake_codes.step(code, action)
         after = Observation(frame=picture(hidden(code) if covered else code, rng))
         yield Transition(
