@@ -50,10 +50,8 @@ def test_factors_and_values_are_found_without_being_told(found: DiscreteEncoder)
 def test_a_code_is_decoded_to_how_its_values_look(found: DiscreteEncoder) -> None:
     fresh, _ = images(200, np.random.default_rng(2), jitter=0.0)
     mu, log_variance = found.posterior(fresh)
-    assert torch.equal(mu.sum(dim=1), torch.full((200,), 2.0))
-    assert (log_variance < -10).all()
-    mean = fresh.mean(dim=0)
-    assert (found.mean(mu) - fresh).square().mean() < 0.5 * (mean - fresh).square().mean()
+    assert (mu.sum(dim=1) == 2.0).all() and (log_variance < -10).all()
+    assert (found.mean(mu) - fresh).square().mean() < 0.5 * (fresh.mean(dim=0) - fresh).square().mean()
 
 
 def test_still_images_have_no_factors() -> None:
@@ -62,12 +60,10 @@ def test_still_images_have_no_factors() -> None:
 
 
 def test_dependence_sees_what_correlation_does_not() -> None:
-    x = np.random.default_rng(0).normal(size=4000)
-    other = np.random.default_rng(1).normal(size=4000)
+    x, other = np.random.default_rng(0).normal(size=(2, 4000))
     table = dependence(np.stack([x, x**2, other], axis=1))
     assert abs(np.corrcoef(x, x**2)[0, 1]) < 0.1
-    assert table[0, 1] > 0.9
-    assert table[0, 2] < 0.1
+    assert table[0, 1] > 0.9 and table[0, 2] < 0.1
     assert np.array_equal(table, table.T)
 
 
@@ -77,11 +73,9 @@ def test_clouds_of_any_shape_are_counted_and_equal_points_joined(flushed: bool) 
     rng = np.random.default_rng(0)
     angle = rng.uniform(0, 2 * np.pi, size=2000)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) + 0.02 * rng.normal(size=(2000, 2))
-    dot = np.zeros((300, 2))
-    label = clouds(np.concatenate([ring, dot]))
-    assert set(label[2000:].tolist()) == {label[2000]}
+    label = clouds(np.concatenate([ring, np.zeros((300, 2))]))
     assert label.max() == 1
-    assert (label[:2000] != label[2000]).all()
+    assert (label[2000:] == label[2000]).all() and (label[:2000] != label[2000]).all()
 
 
 def torn(gap: float) -> np.ndarray:
@@ -99,5 +93,4 @@ def test_a_value_that_is_torn_by_a_narrow_gap_is_one(gap: float, values: int) ->
     assert all(len(owner) == 1 for owner in owners)
     assert (owners[0] == owners[1]) == (values == 3)
     assert owners[2] != owners[3]
-    if values == 3:
-        assert owners[0] == {0}, "the largest comes first, counted whole"
+    assert values == 4 or owners[0] == {0}, "the largest comes first, counted whole"

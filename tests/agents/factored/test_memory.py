@@ -9,7 +9,6 @@ from unittest import mock
 import fake_codes
 import numpy as np
 import pytest
-from fake_codes import starts
 from fake_pictures import HIDDEN, agent, hidden, played
 from imagine_bench.agents.factored import learned as own
 from imagine_bench.agents.factored.factors import CodeTransition, Memory, contradictions, remembering
@@ -27,16 +26,10 @@ def lived(episodes: int, rng: np.random.Generator, *, covered: bool) -> tuple[li
     """Random episodes of the world of two wheels and a lamp, which decides where the goal is."""
     rows, begins = [], []
     for _ in range(episodes):
-        code = starts()[int(rng.integers(len(starts())))]
-        for step in range(6):
-            action = int(rng.integers(ACTIONS))
-            after, reward, ended = fake_codes.step(code, action)
-            seen = (hidden(code) if step else code, hidden(after)) if covered else (code, after)
-            rows.append(CodeTransition(seen[0], action, seen[1], reward, ended))
+        for step, row in enumerate(fake_codes.drawn(rng)):
+            seen = (hidden(row.code) if step else row.code, hidden(row.following))
+            rows.append(row._replace(code=seen[0], following=seen[1]) if covered else row)
             begins.append(step == 0)
-            code = after
-            if ended:
-                break
     return rows, begins
 
 

@@ -22,7 +22,6 @@ from imagine_bench.seeding import SeedTree
     ("model", "filtered", "limits", "kept"),
     [
         ({}, True, {"threshold": 0.0}, 10),  # as uncertain as the threshold
-        ({"end_at": 4}, True, {}, 4),
         ({"uncertain_at": 5}, True, {}, 4),
         ({"uncertain_at": 5}, False, {}, 10),
         ({"uncertain_at": 1}, True, {}, 0),

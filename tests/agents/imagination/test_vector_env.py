@@ -136,7 +136,6 @@ def begun() -> ImaginedVectorEnv:
 @pytest.mark.parametrize(
     ("do", "words"),
     [
-        (lambda: puzzle(num_envs=0), "num_envs is 0 and horizon 10; each must be at least 1"),
         (lambda: ImaginedVectorEnv(ruled(TASK), np.zeros((3, 4), np.float32)), r"shape \(P, 15\)"),
         (lambda: puzzle().step(np.zeros(4, np.int64)), "call reset before step"),
         (lambda: begun().step(np.array([0, 0, 0, 6])), r"Actions \[0 0 0 6\] must be 4 in \[0, 6\)"),

@@ -120,21 +120,6 @@ def test_a_loss_that_is_no_number_stops_the_run() -> None:
         make().update(dataclasses.replace(batch, z=batch.z * float("inf")), draws(2))
 
 
-def test_a_member_s_update_does_not_depend_on_another_member() -> None:
-    """Gradients, Adam and the max-norm constraint: to the bit."""
-    one, other = (make(members=3, max_norm=0.5) for _ in range(2))
-    with torch.no_grad():
-        for weight in other.dynamics.parameters():
-            weight[1:] *= -3.0
-    for seed in range(3):
-        batch = chain_batch(32, draws(seed))
-        one.update(batch, draws(seed))
-        other.update(batch, draws(seed))
-    for first, second in zip(one.dynamics.parameters(), other.dynamics.parameters(), strict=True):
-        assert torch.equal(first[0], second[0])
-        assert not torch.equal(first[1:], second[1:])
-
-
 @pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-3), ("bfloat16", 0.05)])
 def test_it_trains_as_the_plain_model_does(precision: str, tolerance: float) -> None:
     """Without dropout nothing is random: the same weights and batches must go the same way."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import numpy as np
 import torch
 from imagine_bench.agents.factored.agent import FactoredAgent
+from imagine_bench.agents.factored.factors import CodeTransition
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench.agents.factored.settings import HYPERPARAMETERS
 from torch.nn import functional
@@ -73,6 +75,18 @@ def transition(code: tuple[int, ...], action: int) -> Transition:
 def starts() -> list[tuple[int, ...]]:
     codes = [(a, b, lamp) for a in range(3) for b in range(3) for lamp in range(2) if a != b]
     return [code for code in codes if code not in ((2, 1, 1), (1, 2, 0))]
+
+
+def drawn(rng: np.random.Generator, steps: int = 6) -> Iterator[CodeTransition]:
+    """One episode of drawn macro-actions, cut after so many."""
+    code = starts()[int(rng.integers(len(starts())))]
+    for _ in range(steps):
+        action = int(rng.integers(ACTIONS))
+        following, reward, ended = step(code, action)
+        yield CodeTransition(code, action, following, reward, ended)
+        code = following
+        if ended:
+            return
 
 
 def agent(seed: int = 0, **overrides: object) -> FactoredAgent:
