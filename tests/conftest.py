@@ -9,13 +9,18 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from importlib.machinery import SourceFileLoader
+from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 from unittest import mock
 
 import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from guest_packages import Guests
 
 LIMIT_CPU_S = 3.0
 """CPU seconds that a fast test may use on the machine whose calibration loop takes the seconds below."""
@@ -119,3 +124,13 @@ class CpuLimit:
 def pytest_configure(config: pytest.Config) -> None:
     """Hold every test of the session to the limit, plug-ins' tests too."""
     config.pluginmanager.register(CpuLimit(), "cpu-limit")
+
+
+@pytest.fixture
+def guests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Guests]:
+    """Packages of others, installed for one test."""
+    from guest_packages import Guests
+
+    installed = Guests(tmp_path / "site", monkeypatch)
+    yield installed
+    installed.forget()

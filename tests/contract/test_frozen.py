@@ -8,16 +8,14 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import pytest
 from fake_reader import BlindReader
-from guest_packages import install
+from guest_packages import Guests
 from small_runs import Inline
 
 from imagine_bench import registry
@@ -49,20 +47,15 @@ def _installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     site = tmp_path_factory.mktemp("site")
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # old paths warn
+        guests = Guests(site, patch)
         for name in DIGESTS:
-            folder = shutil.copytree(FROZEN / name, site / name, ignore=shutil.ignore_patterns("__pycache__"))
-            patch.syspath_prepend(install(folder))
-        registry.offers.cache_clear()
+            guests.add(shutil.copytree(FROZEN / name, site / name, ignore=shutil.ignore_patterns("__pycache__")))
         registry.offers(registry.AGENT_GROUP)
         registry.offers(registry.WORLD_MODEL_GROUP)
         for module in ("recaller.agent", "recaller.model"):
             registry.load(module)
         yield
-    for module in [name for name in sys.modules if name.partition(".")[0] in DIGESTS]:
-        sys.modules.pop(module)
-    for env in [env for env in gymnasium.registry if env.startswith("five_cubes/")]:
-        gymnasium.registry.pop(env)
-    registry.offers.cache_clear()
+        guests.forget()
 
 
 @pytest.mark.parametrize("name", DIGESTS)
@@ -130,29 +123,17 @@ def _blind(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     judgement.data_of.cache_clear()
 
 
-def judged(task: str, model: str, out: Path) -> int:
-    """The exit status of the smallest judgement of a model."""
-    few = "--sizes 30 --seeds 1000 --samples 2 --workers 1".split()
-    return main(["judge", "--task", task, "--models", model, *few, "--out", str(out)])
-
-
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    "task",
+    ["five_cubes", *(pytest.param(task, marks=pytest.mark.slow) for task in ("arrow_puzzle", "the agent's run"))],
+)
 @pytest.mark.usefixtures("_blind")
-def test_the_frozen_model_is_judged_in_the_arrow_puzzle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert judged("arrow_puzzle", "recall", tmp_path) == 0
-    assert "recall" in capsys.readouterr().out
-
-
-@pytest.mark.usefixtures("_blind")
-def test_the_frozen_model_is_judged_in_the_frozen_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert judged("five_cubes", "recall", tmp_path) == 0
-    assert "recall" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_blind")
-def test_the_frozen_agents_run_is_judged(
-    learned: RunResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_frozen_model_and_run_are_judged(
+    task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest
 ) -> None:
-    assert judged("arrow_puzzle", str(learned.folder), tmp_path) == 0
-    assert "recaller" in capsys.readouterr().out
+    model = "recall"
+    if task == "the agent's run":
+        task, model = "arrow_puzzle", str(request.getfixturevalue("learned").folder)
+    few = "--sizes 30 --seeds 1000 --samples 2 --workers 1".split()
+    assert main(["judge", "--task", task, "--models", model, *few, "--out", str(tmp_path)]) == 0
+    assert "recall" in capsys.readouterr().out

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from guest_packages import install
+from guest_packages import Guests
 from imagine_bench.agents.encoders import training
 from imagine_bench.agents.encoders.encoder import Encoder
 from small_runs import Inline
@@ -24,22 +23,16 @@ from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.trained import load_trained
 from imagine_bench.store import encoders
 
-_PYPROJECT = """
-[project]
-name = "their_things"
-version = "1.0"
-[project.entry-points."imagine_bench.encoders"]
-tiles = "their_things:TILES"
-blind = "their_things:BLIND"
-broken = "their_things:Tiles"
-[project.entry-points."imagine_bench.studies"]
-their_study = "their_things:STUDY"
-smoke = "their_things:STUDY"
-[project.entry-points."imagine_bench.regressions"]
-their_data = "their_things:DATA"
-[project.entry-points."imagine_bench.regressors"]
-their_regressor = "their_things:REGRESSOR"
-"""
+_OFFERS = {
+    registry.ENCODER_GROUP: {
+        "tiles": "their_things:TILES",
+        "blind": "their_things:BLIND",
+        "broken": "their_things:Tiles",
+    },
+    registry.STUDY_GROUP: {"their_study": "their_things:STUDY", "smoke": "their_things:STUDY"},
+    registry.REGRESSION_GROUP: {"their_data": "their_things:DATA"},
+    registry.REGRESSOR_GROUP: {"their_regressor": "their_things:REGRESSOR"},
+}
 _MODULE = '''
 import dataclasses
 import numpy as np
@@ -70,19 +63,11 @@ REGRESSOR = RegressorEntry(
 
 
 @pytest.fixture(autouse=True)
-def guest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    folder = tmp_path / "site"
-    folder.mkdir()
-    (folder / "pyproject.toml").write_text(_PYPROJECT)
-    (folder / "their_things.py").write_text(_MODULE)
-    monkeypatch.syspath_prepend(install(folder))
-    monkeypatch.delitem(sys.modules, "their_things", raising=False)
+def things(guests: Guests, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    guests.write("their_things", _MODULE, _OFFERS)
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
     few = replace(training.OFFERED, frames=600, held_out_frames=150, probe_steps=300)
     monkeypatch.setattr(training, "OFFERED", few)
-    registry.offers.cache_clear()
-    yield
-    registry.offers.cache_clear()
 
 
 def test_all_are_listed_and_named_in_results(capsys: pytest.CaptureFixture[str]) -> None:
@@ -91,7 +76,7 @@ def test_all_are_listed_and_named_in_results(capsys: pytest.CaptureFixture[str])
     for name in ("tiles", "their_study", "their_data", "their_regressor"):
         assert name in said
     assert "as study smoke, a name that is taken" in said and "and no EncoderEntry; mend" in said
-    assert versions()["their_things"].startswith("1.0+")
+    assert versions()["their_things"].startswith("1.2+")
 
 
 @pytest.mark.parametrize("agent", ["dqn", pytest.param("imagination", marks=pytest.mark.slow)])

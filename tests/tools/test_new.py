@@ -5,58 +5,39 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
-import gymnasium
 import pytest
-from guest_packages import install
+from guest_packages import Guests
 from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.rules import facts
 from imagine_bench.running.bench import bench, plan
-from imagine_bench.tools.new import new_package
-
-
-@pytest.fixture(autouse=True)
-def forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    yield
-    registry.offers.cache_clear()
-    for env_id in ("my_own/MyOwn-v0", "my_world/MyWorld-v0"):
-        gymnasium.registry.pop(env_id, None)
-    for module in ("my_own", "my_world"):
-        sys.modules.pop(module, None)
 
 
 @pytest.mark.parametrize("kind", ["task", "agent", "model"])
 def test_a_new_package_keeps_the_contract(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: str
+    guests: Guests, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
 ) -> None:
     assert main(["new", kind, "my_own", "--out", str(tmp_path)]) == 0
     assert f"imagine-bench check --{kind} my_own" in capsys.readouterr().out
-    monkeypatch.syspath_prepend(install(tmp_path / "my_own"))
-    registry.offers.cache_clear()
+    guests.add(tmp_path / "my_own")
     assert main(["check", f"--{kind}", "my_own"]) == 0, capsys.readouterr().out
 
 
-def test_the_new_packages_own_tests_find_a_fault(tmp_path: Path) -> None:
-    new_package("task", "my_own", tmp_path)
-    site = install(tmp_path / "my_own")
-    module = site / "my_own.py"
-    module.write_text(module.read_text().replace("self._state, self.np_random.bit_generator.state = state", "pass"))
+def test_the_new_packages_own_tests_find_a_fault(guests: Guests) -> None:
+    site = guests.new("task", "my_own", ("self._state, self.np_random.bit_generator.state = state", "pass"))
     environment = {**os.environ, "PYTHONPATH": str(site)}
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     said = subprocess.run(words, capture_output=True, text=True, env=environment, cwd=site, check=False).stdout
     assert "1 failed, 6 passed" in said and "put back in the same environment, it goes on otherwise" in said
 
 
-def test_the_new_agent_learns_the_new_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for kind, name in (("task", "my_world"), ("agent", "my_own")):
-        new_package(kind, name, tmp_path)
-        monkeypatch.syspath_prepend(install(tmp_path / name))
-    registry.offers.cache_clear()
+def test_the_new_agent_learns_the_new_task(guests: Guests, tmp_path: Path) -> None:
+    guests.new("task", "my_world")
+    guests.new("agent", "my_own")
     few = {"budgets": (100,), "evaluation_episodes": 100, "open_loop_starts": 0, "recorded_episodes": 0}
     wanted, paths = plan("my_world", "smoke", agents=("my_own",), execution="kinematic", **few)
     (run,) = bench(wanted, paths, root=tmp_path, launcher=Inline()).runs
