@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 import subprocess
 import sys
@@ -49,10 +48,8 @@ def walk(env, actions):
 @pytest.mark.parametrize("appearance", ["clean", "photo"])
 @pytest.mark.parametrize("task", WORLDS)
 def test_other_seeds_give_other_frames(task, appearance):
-    env, options = (
-        make(task, execution="kinematic", appearance=appearance),
-        {"macrostate": registry.task(task).rules.start_states[0]},
-    )
+    env = make(task, execution="kinematic", appearance=appearance)
+    options = {"macrostate": registry.task(task).rules.start_states[0]}
     frames = {env.reset(seed=seed, options=options)[0].tobytes() for seed in range(8)}
     env.close()
     assert len(frames) == 8
@@ -108,32 +105,6 @@ def share_of_other_pixels(one, other):
     return (np.abs(one.astype(int) - other).max(axis=2) > SHADE).mean()
 
 
-def test_another_process_draws_the_same_frames():
-    script = """
-        import hashlib, gymnasium, imagine_bench
-        env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance="strong")
-        digest = hashlib.sha256(env.reset(seed=3)[0].tobytes())
-        digest.update(env.step(1)[0].tobytes())
-        print(digest.hexdigest())
-    """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
-    env = make(execution="kinematic", appearance="strong")
-    digest = hashlib.sha256(env.reset(seed=3)[0].tobytes())
-    digest.update(env.step(1)[0].tobytes())
-    env.close()
-    assert done.stdout.strip() == digest.hexdigest()
-
-
-def test_frames_of_macrostates_depend_on_the_generator_alone():
-    spec = registry.task("arrow_puzzle")
-    macrostates = np.array([(0, 1, 2, 1), (3, 3, 0, 2)])
-    first = spec.render_macrostates(macrostates, "strong", np.random.default_rng(4))
-    spec.render_macrostates(macrostates[::-1], "strong", np.random.default_rng(5))
-    assert np.array_equal(first, spec.render_macrostates(macrostates, "strong", np.random.default_rng(4)))
-    assert not np.array_equal(first, spec.render_macrostates(macrostates, "strong", np.random.default_rng(6)))
-    assert spec.render_macrostates(macrostates[:0], "clean", np.random.default_rng(4)).shape == (0, 64, 64, 3)
-
-
 @pytest.mark.parametrize("task", WORLDS)
 @pytest.mark.parametrize(
     ("execution", "appearance"), [("physics", "strong"), ("kinematic", "strong"), ("kinematic", "photo")]
@@ -177,8 +148,6 @@ def test_a_state_of_another_environment_is_refused():
         with pytest.raises(InvalidValueError, match=r"is no state of .* made alike"):
             env.set_state(other.get_state())
         other.close()
-    with pytest.raises(InvalidValueError, match="None is no state of"):
-        env.set_state(None)
     env.close()
 
 
@@ -189,7 +158,7 @@ def test_a_state_of_another_environment_is_refused():
     ("task", "context"), [*((task, "fork") for task in WORLDS), (WORLDS[0], "spawn")], ids=lambda each: each
 )
 def test_async_vector_envs_match_single_ones(task, context):
-    """Also after this process has drawn: nothing of its OpenGL is used by the children."""
+    """Other processes draw the same, also after this one has drawn: nothing of its OpenGL is used by them."""
     single = make(task, execution="kinematic")
     expected = [single.reset(seed=5)[0], single.step(2)[0]]
     vector = gymnasium.make_vec(
@@ -239,23 +208,3 @@ def test_memory_stays_flat_over_resets(task):
     before_mb, after_mb = map(float, done.stdout.split())
     assert after_mb < 300
     assert after_mb - before_mb < 4
-
-
-def test_specs_are_cheap_and_importing_loads_nothing_heavy():
-    script = (
-        "import sys, imagine_bench; from imagine_bench import registry; "
-        "[registry.task(name) for name in registry.TASKS]; "
-        "print(sorted({'mujoco', 'dm_control', 'torch', 'mink', 'OpenGL'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.strip() == "[]"
-
-
-def test_maskable_ppo_trains_and_may_take_every_action():
-    sb3_contrib = pytest.importorskip("sb3_contrib")
-    env = make(execution="kinematic")
-    learner = sb3_contrib.MaskablePPO("MlpPolicy", env, n_steps=32, batch_size=32, n_epochs=1, seed=0)
-    assert learner.learn(64).num_timesteps == 64
-    _, info = env.reset(seed=0)
-    assert np.array_equal(env.unwrapped.action_masks(), info["action_mask"]) and info["action_mask"].all()
-    env.close()

@@ -16,8 +16,9 @@ from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
-from imagine_bench.errors import DivergedError, ImagineBenchError, InvalidValueError, UnknownNameError
+from imagine_bench.errors import DivergedError, ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, HELD_OUT, SceneReader
+from imagine_bench.testing.contract import checks, report
 
 TASKS = tuple(name for name in registry.TASKS if name != "arrows")  # which is arrow_puzzle once more
 INFO_KEYS = {
@@ -50,17 +51,22 @@ def env(request):
 # --- checkers ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("execution", EXECUTIONS)
 @pytest.mark.parametrize("task", WORLDS)
-def test_checkers_of_gymnasium_and_stable_baselines_are_content(task, execution):
-    env = make(task, execution=execution, render_mode="rgb_array", width=64, height=48)
-    with warnings.catch_warnings(record=True) as complaints:
-        warnings.simplefilter("always")
-        check_env(env.unwrapped, skip_render_check=execution == "physics")
-        if execution == "kinematic":
-            pytest.importorskip("stable_baselines3.common.env_checker").check_env(env, warn=True)
+def test_the_contracts_checks_and_stable_baselines_are_content(task):
+    """Every macrostate is begun in and told, and what follows is what the rules say, among others."""
+    assert report(checks(task)) == 0
+    env = make(task, render_mode="rgb_array", width=64, height=48, **KINEMATIC)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pytest.importorskip("stable_baselines3.common.env_checker").check_env(env, warn=True)
     env.close()
-    assert not complaints, [str(each.message) for each in complaints]
+
+
+@pytest.mark.parametrize("task", WORLDS)
+def test_gymnasiums_checker_is_content_in_physics(task):
+    env = make(task)
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()
 
 
 # --- spaces, info, ends ------------------------------------------------------------------------------------------
@@ -93,6 +99,7 @@ def test_an_episode_keeps_the_contract(env):
     frame, info = env.reset(seed=3)
     check_info(info, spec, after_step=False)
     assert tuple(info["macrostate"].tolist()) in spec.rules.start_states
+    assert info["action_mask"].all() and np.array_equal(env.unwrapped.action_masks(), info["action_mask"])
     for step in range(3):
         action = step % spec.n_actions
         before = tuple(info["macrostate"].tolist())
@@ -138,23 +145,6 @@ def test_a_task_unlike_its_registry_line_or_its_rules_is_named(field, monkeypatc
 
 
 @pytest.mark.parametrize("task", WORLDS)
-def test_every_macrostate_can_be_the_start_of_an_episode(task):
-    spec, env = registry.task(task), make(task, **KINEMATIC).unwrapped
-    generator = np.random.default_rng(0)
-    for state in spec.rules.states:
-        _, info = env.reset(options={"macrostate": state})
-        assert tuple(info["macrostate"].tolist()) == state
-        assert info["legal"] == spec.rules.is_legal(state)
-        assert not info["success"]
-        action = int(generator.integers(spec.n_actions))
-        _, reward, terminated, _, info = env.step(action)
-        expected = reached(spec, state, action, info)
-        assert (reward, terminated) == (expected.reward, expected.terminated)
-        assert info["legal"] == (expected.success or not expected.terminated)
-    env.close()
-
-
-@pytest.mark.parametrize("task", WORLDS)
 def test_starts_are_spread_over_the_start_states(task):
     env, starts = make(task, **KINEMATIC).unwrapped, registry.task(task).rules.start_states
     env.reset(seed=0)
@@ -169,24 +159,19 @@ def test_starts_are_spread_over_the_start_states(task):
     assert chi_square < len(starts) + 5 * np.sqrt(2 * len(starts))
 
 
-def test_views_are_of_the_asked_size_and_draw_no_random_number():
+def test_views_draw_no_random_number():
     env = make(appearance="strong", render_mode="rgb_array", width=80, height=60, camera="wrist", **KINEMATIC).unwrapped
     env.reset(seed=0)
     before = env.np_random.bit_generator.state
     first, again = env.render(), env.render()
     assert first.shape == (60, 80, 3) and np.array_equal(first, again) and not np.shares_memory(first, again)
+    assert env.human_view(64, 48).std() > 20, "the whole scene"
     env.shapes()
     env.motion()
-    human = env.human_view(64, 48)
-    assert human.shape == (48, 64, 3) and human.std() > 20, "the whole scene"
     assert env.np_random.bit_generator.state == before
     with pytest.raises(InvalidValueError, match="Image width -1"):
         env.human_view(-1, 48)
     env.close()
-    silent = make(**KINEMATIC).unwrapped
-    silent.reset(seed=0)
-    assert silent.render() is None
-    silent.close()
 
 
 # --- faults ------------------------------------------------------------------------------------------------------
@@ -238,8 +223,11 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
         ({"render_mode": "ansi"}, r"No render mode 'ansi'\..*Known: rgb_array, human"),
         ({"camera": "hunam"}, r"No camera 'hunam'\. Did you mean 'human'\? Known: .*human"),
         ({"width": 0}, r"Image width 0 must be an integer from 1 to 4096 pixels"),
-        ({"height": 99999}, r"Image height 99999 must be an integer from 1 to 4096 pixels"),
         ({"height": 64.5}, r"Image height 64\.5 must be an integer"),
+        ({"camera": np.array(["human", "wrist"])}, "No camera "),
+        ({"execution": np.ma.masked}, "No execution "),
+        ({"appearance": ["clean"]}, "No appearance "),
+        ({"render_mode": b"clean"}, "No render mode "),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
@@ -268,28 +256,13 @@ def kinematic():
         (np.ma.masked,) * 4,
         np.array([["x"]]),
         (0,) * 10**6,
+        itertools.repeat(0),
     ],
 )
 def test_a_wrong_macrostate_is_refused(kinematic, given):
-    with pytest.raises(
-        InvalidValueError, match=r"No macrostate .*; give one of the 192 of imagine_bench.*, such as \(0"
-    ):
+    with pytest.raises(InvalidValueError, match=r"No macrostate .*; give one of the 192 of imagine_b") as caught:
         kinematic.reset(options={"macrostate": given})
-
-
-def test_what_never_ends_is_no_macrostate(kinematic):
-    for endless in (itertools.repeat(0), itertools.count()):
-        with pytest.raises(InvalidValueError, match="No macrostate") as caught:
-            kinematic.reset(options={"macrostate": endless})
-        assert len(str(caught.value)) < 500
-
-
-@pytest.mark.parametrize("name", ["camera", "execution", "appearance", "render_mode"])
-@pytest.mark.parametrize("given", [np.array(["human", "wrist"]), np.ma.masked, ["clean"], b"clean"])
-def test_an_option_that_is_no_word_is_named(name, given):
-    make_env = gymnasium.envs.registration.load_env_creator(gymnasium.spec("imagine_bench/ArrowPuzzle-v0").entry_point)
-    with pytest.raises(UnknownNameError):
-        make_env(**{"execution": "kinematic", name: given})
+    assert len(str(caught.value)) < 500
 
 
 @pytest.mark.parametrize(
@@ -305,17 +278,12 @@ def test_wrong_reset_options_name_what_is_allowed(kinematic, options, message):
         kinematic.reset(options=options)
 
 
-def test_a_step_before_the_first_reset_is_refused():
-    env = make(**KINEMATIC).unwrapped
-    with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
-        env.step(0)
-    env.close()
-
-
-def test_an_episode_whose_simulation_blew_up_is_over(monkeypatch, tmp_path):
+def test_only_a_reset_begins_an_episode_also_where_a_simulation_blew_up(monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)  # MuJoCo's own log
     env = make().unwrapped
+    with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
+        env.step(0)
     env.reset(seed=0)
     env.world.data.joint("cube_2_joint").qpos[0] = 1e11
     with pytest.raises(DivergedError):
@@ -355,26 +323,19 @@ def test_shapes_and_motion_describe_the_scene():
     assert isinstance(env, SceneReader)
     env.reset(seed=0, options={"macrostate": (0, 1, 2, 1)})
     shapes, still = env.shapes(), env.motion()
-    names = [shape.name for shape in shapes]
-    assert len(set(names)) == len(names)
-    assert {"cube_0_box", "cube_2_arrow", "hand_skin", "table_top", "floor"} <= set(names)
-    assert {shape.body for shape in shapes} <= set(still.body_names)
-    assert any(shape.body == "right_l3" for shape in shapes)
+    names = {shape.name for shape in shapes}
+    assert len(names) == len(shapes) and {"cube_0_box", "hand_skin", "floor"} <= names
+    assert {"right_l3"} <= {shape.body for shape in shapes} <= set(still.body_names)
     for shape in shapes:
-        assert shape.kind in ("box", "sphere", "capsule", "cylinder", "ellipsoid", "mesh")
         assert (shape.vertices is None) == (shape.faces is None) == (shape.kind != "mesh")
-        assert shape.kind == "mesh" or shape.size[0] > 0
-        assert shape.rgba.shape == (4,)
-        assert shape.pose_in_body.shape == (7,)
-        if shape.faces is not None:
-            assert shape.faces.max() < len(shape.vertices)
+        assert shape.faces is None or shape.faces.max() < len(shape.vertices)
+        assert (*shape.rgba.shape, *shape.pose_in_body.shape) == (4, 7)
     assert still.poses_in_world.shape == (1, len(still.body_names), 7)
     env.capture_motion_hz = 20.0
     *_, info = env.step(2)
     motion = env.motion()
     env.close()
-    assert np.all(np.diff(motion.time_s) > 0)
-    assert motion.time_s[0] == 0.0
+    assert np.all(np.diff(motion.time_s) > 0) and motion.time_s[0] == 0.0
     assert motion.time_s[-1] == pytest.approx(info["sim_time_s"], abs=0.06)
     assert motion.poses_in_world.shape == (len(motion.time_s), len(motion.body_names), 7)
     moved = np.ptp(motion.poses_in_world[:, :, :3], axis=0).max(axis=1)
