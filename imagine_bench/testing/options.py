@@ -39,7 +39,7 @@ from imagine_bench.testing.checks import CheckedAgent, NotOffered, greedy, requi
 from imagine_bench.values import Setting
 
 _EPISODES = 2
-_TESTS = 8
+_TESTS = 4
 """Test episodes of an agent whose training is a library's or none: some end with their first macro-action."""
 Changes = Mapping[str, Any]
 

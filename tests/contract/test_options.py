@@ -15,9 +15,15 @@ from imagine_bench.testing.options import OPTION_ROWS, CheckedOptions, require_e
 TASK = "arrow_puzzle:horizon=3"
 _HEAVY = ("dqn_", "dreamer_", "drqn", "imagination_exact", "lewm", "sb3_")
 """Guests that train networks or load a library for longer than a fast test may last; those with tables are fast."""
+_DO_LESS = ("imagination", "imagination_only", "dqn_more_updates")
+"""Agents that do as much as another of the same class or less, which the fast tests check."""
 _GUESTS = {name for guest in guests() for name in guest.names.get(registry.AGENT_GROUP, ())}
 AGENTS = [
-    *sorted(name for name, entry in registry.AGENTS.items() if entry.make.startswith("imagine_bench.agents.")),
+    *(
+        pytest.param(name, marks=[pytest.mark.slow] * (name in _DO_LESS))
+        for name, entry in sorted(registry.AGENTS.items())
+        if entry.make.startswith("imagine_bench.agents.")
+    ),
     *(
         pytest.param(name, marks=[pytest.mark.slow] * name.startswith(_HEAVY))
         for name in sorted(_GUESTS & registry.agents().keys())
