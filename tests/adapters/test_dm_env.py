@@ -91,6 +91,12 @@ def test_physics_shows_the_scene_and_cannot_change_it():
     env.physics.data.qpos[:] = 0.0
     assert scene.data.qpos.any()
     env.close()
+    other = as_dm_env("CartPole-v1", seed=1)
+    other.reset()
+    assert other.step(0).reward == 1.0
+    with pytest.raises(InvalidValueError, match="no MuJoCo scene"):
+        _ = other.physics
+    other.close()
 
 
 def test_motion_turns_the_cube_before_the_reward():
@@ -113,7 +119,8 @@ def test_motion_turns_the_cube_before_the_reward():
 def test_viewer_runs_and_the_scene_moves():
     from dm_control.viewer import application, runtime
 
-    env, pixels, times, yaws = as_dm_env(ARROWS, seed=0, motion_hz=30), [], [], []
+    env = as_dm_env(ARROWS, seed=0, motion_hz=30)
+    pixels, times = [], []
 
     def frames(tick_func):
         app._pause_subject.value = False
@@ -121,7 +128,6 @@ def test_viewer_runs_and_the_scene_moves():
         for _ in range(20):
             pixels.append(tick_func().copy())
             times.append(env.physics.data.time)
-            yaws.append(np.arctan2(*env.physics.named.data.xmat["cube_0"][[3, 0]]))
 
     with mock.patch.object(application, "gui"):  # the window alone: no display is needed
         app = application.Application()
@@ -130,10 +136,7 @@ def test_viewer_runs_and_the_scene_moves():
     assert app._runtime.state is runtime.State.RUNNING
     assert times == sorted(times)
     assert times[-1] - times[1] == pytest.approx(1.8, abs=0.1)  # in real time
-    assert abs(yaws[-1] - yaws[0]) > 0.3
-    assert pixels[-1].shape == (240, 320, 3)
-    changed = [(frame != pixels[1]).any(axis=2).mean() for frame in pixels[2:]]
-    assert changed[-1] > 0.01
+    assert pixels[-1].shape == (240, 320, 3) and (pixels[-1] != pixels[1]).any(axis=2).mean() > 0.01
     app._renderer.release()
     app._render_surface.free()
     env.close()
@@ -156,7 +159,6 @@ def test_open_renderers_end_quietly():
     [
         ({"env": ARROWS, "motion_hz": -1.0}, "No motion at -1.0 Hz"),
         ({"env": ARROWS, "motion_hz": float("nan")}, "No motion at nan Hz"),
-        ({"env": gymnasium.make("CartPole-v1"), "motion_hz": 10.0}, "No motion at 10.0 Hz"),
         ({"env": gymnasium.make("CartPole-v1"), "render_mode": None}, "give them with an id"),
         ({"env": "Pendulum-v1"}, "No adapter for the spaces"),
     ],
@@ -164,15 +166,6 @@ def test_open_renderers_end_quietly():
 def test_what_cannot_be_is_one_clear_error(arguments, message):
     with pytest.raises(InvalidValueError, match=message):
         as_dm_env(**arguments)
-
-
-def test_other_environments_step_but_show_nothing():
-    env = as_dm_env("CartPole-v1", seed=1)
-    env.reset()
-    assert env.step(0).reward == 1.0
-    with pytest.raises(InvalidValueError, match="no MuJoCo scene"):
-        _ = env.physics
-    env.close()
 
 
 def test_missing_dm_control_is_one_clear_error():

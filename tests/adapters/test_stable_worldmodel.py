@@ -12,24 +12,16 @@ import pytest
 from imagine_bench import registry
 from imagine_bench.adapters.stable_worldmodel import SuccessTerminates
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.rules import facts
 
 KINEMATIC = {"execution": "kinematic"}
+TASKS = ("arrow_puzzle", "pick_place")
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::UserWarning")  # of the library's own
 
 
-def entry(task):
-    return registry.TASKS[task]
-
-
-def chance(task):
-    return facts(registry.task(task).rules, entry(task).horizon).chance_level
-
-
-@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+@pytest.mark.parametrize("task", TASKS)
 def test_only_success_terminates_and_all_else_is_as_before(task):
-    plain = gymnasium.make(entry(task).env_id, **KINEMATIC)
-    wrapped = SuccessTerminates(gymnasium.make(entry(task).env_id, **KINEMATIC))
+    plain, inner = (gymnasium.make(registry.TASKS[task].env_id, **KINEMATIC) for _ in range(2))
+    wrapped = SuccessTerminates(inner)
     rng = np.random.default_rng(0)
     ends = set()
     for seed in range(40):
@@ -51,7 +43,7 @@ def test_only_success_terminates_and_all_else_is_as_before(task):
 
 
 def test_a_recorded_macrostate_is_where_an_episode_begins():
-    env = SuccessTerminates(gymnasium.make(entry("arrow_puzzle").env_id, render_mode="rgb_array", **KINEMATIC))
+    env = SuccessTerminates(gymnasium.make(registry.TASKS["arrow_puzzle"].env_id, render_mode="rgb_array", **KINEMATIC))
     for state in registry.task("arrow_puzzle").rules.start_states[:5]:
         env.reset(seed=0)
         env.unwrapped.start_at(np.array([state]))
@@ -68,18 +60,19 @@ def test_another_environment_is_one_clear_error():
 
 def world(task, n=4, *, wrapped=True, **options):
     swm = pytest.importorskip("stable_worldmodel")
+    entry = registry.TASKS[task]
     made = swm.World(
-        entry(task).env_id, num_envs=n, image_shape=(64, 64), max_episode_steps=entry(task).horizon,
+        entry.env_id, num_envs=n, image_shape=(64, 64), max_episode_steps=entry.horizon,
         pre_wrappers=[SuccessTerminates] if wrapped else None, **KINEMATIC, **options,
     )  # fmt: skip
     made.set_policy(swm.policy.RandomPolicy(seed=0))
     return made
 
 
-@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+@pytest.mark.parametrize("task", TASKS)
 def test_a_random_policy_scores_chance_and_without_the_wrapper_nearly_everything(task):
     made, n = world(task), 1000
-    result, level = made.evaluate(episodes=n, seed=0), chance(task)
+    result, level = made.evaluate(episodes=n, seed=0), registry.task(task).facts().chance_level
     assert result["success_rate"] / 100 == pytest.approx(level, abs=3 * np.sqrt(level * (1 - level) / n))
     made.close()
     if task == "arrow_puzzle":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 
 import pytest
 
@@ -80,7 +81,10 @@ def test_weights_and_biases_files_are_whole(bench):
     assert rows == [(2, 0.05, -2.5), (4, 0.25, 3.0)]
 
 
-def test_what_cannot_be_is_one_clear_error(tmp_path, bench):
+def test_what_cannot_be_is_one_clear_error(tmp_path, bench, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "tensorboard.summary", None)
+    assert main(["report", str(bench), "--track", "tensorboard"]) == 2
+    assert "pip install 'imagine-bench[tracking]'" in capsys.readouterr().err
     with pytest.raises(UnknownNameError, match="Known: tensorboard, wandb"):
         track(bench, "mlflow")
     with pytest.raises(InvalidValueError, match="has been tested yet"):
@@ -88,9 +92,3 @@ def test_what_cannot_be_is_one_clear_error(tmp_path, bench):
     (bench / "dqn/seed_0/metrics.csv").write_text("examples,error\n1,0.5")
     with pytest.raises(InvalidValueError, match="compares no agents"):
         track(bench, "tensorboard")
-
-
-def test_a_missing_tool_is_one_clear_error(bench, monkeypatch, capsys):
-    monkeypatch.setitem(__import__("sys").modules, "tensorboard.summary", None)
-    assert main(["report", str(bench), "--track", "tensorboard"]) == 2
-    assert "pip install 'imagine-bench[tracking]'" in capsys.readouterr().err

@@ -20,8 +20,6 @@ def test_this_installation_works(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     for word in ("mujoco", "torch", "GL renderer", "processor", "Everything works."):
         assert word in out
-    facts = [line for line in out.splitlines() if not line.startswith(("Note", "Everything"))]
-    assert all("  " in line for line in facts), "columns are wide enough for every package's name"
 
 
 def with_version(**changed: str) -> Callable[[str], str]:
@@ -76,13 +74,9 @@ def test_the_command_is_what_a_shell_takes(monkeypatch: pytest.MonkeyPatch) -> N
     assert environment.command() == "imagine-bench describe"
 
 
-@pytest.mark.parametrize("package", ["mink", "jinja2", "safetensors"])
-def test_a_missing_package_is_named(package: str) -> None:
-    (complaint,) = doctor.unmet_requirements(with_version(**{package: "missing"}))
-    assert complaint.startswith(f"{package} is missing, but")
-
-
-def test_extras_of_a_bench_may_be_missing_and_are_named() -> None:
+def test_missing_packages_are_complaints_and_missing_extras_notes() -> None:
+    (complaint,) = doctor.unmet_requirements(with_version(mink="missing"))
+    assert complaint.startswith("mink is missing, but")
     without = with_version(torch="missing", matplotlib="missing")
     assert doctor.unmet_requirements(without) == [] and doctor.missing_extras() == []
     (note,) = doctor.missing_extras(without)
@@ -111,29 +105,21 @@ def test_missing_gl_is_a_complaint_and_exit_code_1(
     assert capsys.readouterr().out.splitlines()[-1] == "Wrong: No OpenGL for headless rendering: install libegl1."
 
 
-def test_the_environment_is_json_and_complete() -> None:
+def test_the_environment_is_complete() -> None:
     facts = environment.describe_environment()
     assert set(facts) == {"command", "commit", "versions", "machine", "gl_renderer", "threads_a_run"}
     assert "missing" not in facts["versions"].values()
-    assert facts["machine"]["cores"] >= 1 and facts["machine"]["cpu"]
     assert {"daqp", "stable-baselines3"} <= set(facts["versions"]), "a solver of mink's, and a peer of the tests' extra"
-    assert facts["gl_renderer"] and not facts["gl_renderer"].startswith("none")
 
 
-def test_a_task_is_described_with_its_exact_facts() -> None:
+def test_tasks_are_described_with_their_exact_facts(capsys: pytest.CaptureFixture[str]) -> None:
     said = describe_task("arrow_puzzle")
     assert "6: turn the left cube clockwise; turn" in said and "192, 54 of them starts" in said
     assert "left arrow (toward the human, right, toward the agent, left)" in said
     # 12 + 24 + 36 + 48 + 30 = 150 macro-actions over 54 starts
     assert "1 (12 starts), 2 (12 starts), 3 (12 starts), 4 (12 starts), 5 (6 starts); mean 2.78" in said
     assert "none: each has one outcome" in said and "arrow_puzzle-photo" in said
-
-
-def test_chance_is_described() -> None:
     assert "several outcomes" in describe_task("arrows:cubes=2,slip=0.2")
-
-
-def test_a_regression_task_is_described_too(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["describe", "toy_regression"]) == 0
     assert "in the variants base, low_data, high_noise" in capsys.readouterr().out
     assert main(["describe", "toy"]) == 2
