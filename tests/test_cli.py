@@ -75,6 +75,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
     [
         ("report a --merge", "--merge has no value; give at least one behind it, or leave it out."),
         ("plan HERE --max-epistemic=-1", "more epistemic uncertainty than -1.0: give at least 0."),
+        ("judge --workers 0 --out HERE", "0 workers cannot run anything; give at least 1."),
         ("sweep toy_regression", "toy_regression is of a regression task, in which no agent acts"),
         ("sweep arrow_puzzle --name factor", "No study 'factor'. Did you mean 'factors'?"),
         ("sweep arrow_puzzle --name suite", "ladder takes no --task; leave it out."),

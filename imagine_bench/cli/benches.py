@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -37,6 +36,7 @@ from imagine_bench.judge.verify import cost
 from imagine_bench.protocols.data import Encoders, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, load_so_far, plan
+from imagine_bench.running.launchers.jobs import at_a_time
 from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.results import BenchResult
@@ -302,6 +302,7 @@ class Judge:
         from imagine_bench.recording.judgement import record_judgement  # noqa: PLC0415 - as below
         from imagine_bench.report.judge import judgement_report  # noqa: PLC0415 - as below
 
+        workers = at_a_time(self.workers)
         usual = tuple(name for name, entry in registry.WORLD_MODELS.items() if entry.by_default)
         judgement = Judgement(
             task=self.task,
@@ -313,7 +314,7 @@ class Judge:
             policy=self.policy,
             encoder=self.encoder,
         )
-        folder, failed = judge(judgement, self.out, workers=self.workers or os.cpu_count() or 1)
+        folder, failed = judge(judgement, self.out, workers=workers)
         print(judgement_report(folder, judgement))
         print(f"Recording: {record_judgement(folder, judgement)}")
         if failed:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import keyword
 import re
 from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
 
 import jinja2
@@ -41,7 +42,7 @@ def new_package(kind: str, name: str, out: Path) -> str:
 
     Raises:
         UnknownNameError: Another kind than those of :data:`KINDS`.
-        InvalidValueError: A name that no module can have or that is taken, or a folder that exists.
+        InvalidValueError: A name that no module can have, or that one has, or that is taken; a folder that exists.
     """
     group = KINDS[require_known("kind of package", kind, KINDS)]
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,60}", name) or keyword.iskeyword(name):
@@ -54,6 +55,8 @@ def new_package(kind: str, name: str, out: Path) -> str:
     folder = out.expanduser() / name
     if folder.exists():
         raise InvalidValueError(f"{folder} exists; give another name or --out. Nothing was written.")
+    if find_spec(name) is not None:
+        raise InvalidValueError(f"{name!r} is a module that Python has already; give another name.")
     template = (resources.files("imagine_bench.tools") / "templates" / f"{kind}.py.j2").read_text()
     words = {"name": name, "camel": name.title().replace("_", ""), "title": name.replace("_", " ").capitalize()}
     code = jinja2.Environment(autoescape=False, keep_trailing_newline=True).from_string(template).render(**words)

@@ -52,6 +52,7 @@ def test_the_new_agent_learns_the_new_task(guests: Guests, tmp_path: Path) -> No
         (["task", "My-Task"], "'My-Task' cannot be a module; give small letters, digits and _, such as my_task."),
         (["task", "class"], "'class' cannot be a module"),
         (["agent", "dqn"], "'dqn' is a name of imagine_bench already; give another name."),
+        (["task", "imagine_bench"], "'imagine_bench' is a module that Python has already; give another name."),
         (["agent", "there"], "there exists; give another name or --out. Nothing was written."),
     ],
 )

@@ -51,10 +51,15 @@ def launcher(name: str, workers: int | None = None) -> Launcher:
         SetupError: It needs something that is not installed.
     """
     make = registry.load(LAUNCHERS[require_known("launcher", name, LAUNCHERS)])
-    at_a_time = usable_cores() if workers is None else workers
-    if at_a_time < 1:
+    return make(at_a_time(workers))
+
+
+def at_a_time(workers: int | None) -> int:
+    """So many processes, one a usable core for None. Raises InvalidValueError: fewer than one worker."""
+    processes = usable_cores() if workers is None else workers
+    if processes < 1:
         raise InvalidValueError(f"{workers} workers cannot run anything; give at least 1.")
-    return make(at_a_time)
+    return processes
 
 
 def absolute(job: Job) -> Job:
