@@ -39,8 +39,6 @@ _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
 _THESIS_BUDGETS = (250, 500, 1000, 1500, 2000, 3000, 4000, 5000, 6000)
 
 _AFTER_EPISODES = 100
-_FIRST_STAGE = 2000
-"""Real episodes to which all runs are taken first: the thesis' smallest budget, and below it waiting would not pay."""
 _AT_LEAST = {
     "after_episodes": 1,
     "demonstrations": 0,
@@ -208,12 +206,11 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
         if self.dataset is not None and not self.shows_frames_alone:
             raise InvalidValueError("A dataset holds 64 x 64 frames alone; leave the observation as it is by default.")
 
-    def work(self, agent: str, until: int | None = None) -> int:
-        """Return the episodes that a run of this agent plays up to the budget ``until``, for training and for tests."""
+    def work(self, agent: str) -> int:
+        """Return the episodes that a run of this agent plays, for training and for tests."""
         if not agent_entry(agent).learns:
             return self.evaluation_episodes
-        budgets = [budget for budget in self.budgets if until is None or budget <= until]
-        return self.episodes_before + budgets[-1] + len(budgets) * self.evaluation_episodes
+        return self.episodes_before + self.budgets[-1] + len(self.budgets) * self.evaluation_episodes
 
     @property
     def appearance_in_tests(self) -> str:
@@ -233,11 +230,6 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
             privileged = " (privileged)" if "state" in self.observation else ""
             words.append(f"agents see {self.observation} at {self.observation_size} pixels{privileged}")
         return ", ".join(words)
-
-    @property
-    def stages(self) -> tuple[int | None, ...]:
-        """See :class:`ProtocolData`: the thesis' smallest budget, then each one after it."""
-        return (*(budget for budget in self.budgets[:-1] if budget >= _FIRST_STAGE), None)
 
 
 def spec_of(name: str, split: str | None, *, testing: bool) -> TaskSpec:

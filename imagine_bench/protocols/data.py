@@ -96,17 +96,9 @@ class ProtocolData(ABC):
         """Twelve hex digits that change when anything in the protocol does."""
         return digest(self.as_dict())
 
-    @property
-    def stages(self) -> tuple[int | None, ...]:
-        """The order of work: all runs come to each of these budgets before any goes on; None is the end.
-
-        A long bench that is stopped early is then a whole bench of fewer episodes.
-        """
-        return (None,)
-
     @abstractmethod
-    def work(self, agent: str, until: int | None = None) -> int:
-        """Parts of work of a run of this agent as far as the budget ``until``, of whatever the protocol counts."""
+    def work(self, agent: str) -> int:
+        """Parts of work of a run of this agent, of whatever the protocol counts."""
 
 
 def require_types(one: DataclassInstance) -> None:
@@ -153,14 +145,13 @@ class RunSpec(Generic[P_co]):
     seed: int  #: One of the protocol's seeds
     encoder: Path | None = None  #: The encoder artefact, or None if the agent needs none
     dataset: Path | None = None  #: The folder of the dataset that comes first, or None
-    until: int | None = None  #: Budget after which it pauses, or None to the end
     checkpoint_every_s: float = 20.0  #: Seconds of work that a kill may cost
     observers: tuple[str, ...] = ()  #: What looks at it, each the ``"module:attr"`` of a :class:`.runner.RunObserver`
 
     @property
     def work(self) -> int:
         """Parts of work to do, of whatever the protocol counts."""
-        return self.protocol.work(self.agent, self.until)
+        return self.protocol.work(self.agent)
 
 
 @dataclass(frozen=True, kw_only=True)

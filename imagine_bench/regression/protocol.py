@@ -48,8 +48,8 @@ class RegressionProtocol(ProtocolData):
                 "[2, 100000]."
             )
 
-    def work(self, agent: str, until: int | None = None) -> int:
-        """Units of a run's work: 110 a variant, the last ten for measuring; it never pauses before its end."""
+    def work(self, agent: str) -> int:
+        """Units of a run's work: 110 a variant, the last ten for measuring."""
         return 110 * len(self.variants)
 
     def overrides_of(self, agent: str) -> dict[str, Setting]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -62,7 +61,7 @@ _LINE_EVERY_S = 15.0
 class ProgressBar(AbstractContextManager["ProgressBar"]):
     """Shows :class:`~imagine_bench.protocols.data.Progress` on a terminal as a bar, elsewhere as a line now and then.
 
-    ``specs`` are the runs to come, to their ends even where they pause on the way.
+    ``specs`` are the runs to come.
     """
 
     def __init__(self, specs: Sequence[RunSpec[ProtocolData]]) -> None:
@@ -92,8 +91,8 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
             return
         self._before.setdefault(run, progress.done)  # what an earlier session did took no time now
         self._done[run] = progress.done
-        pauses = progress.phase == "done"
-        if pauses and progress.done >= self._works[run]:
+        ended = progress.phase == "done"
+        if ended:
             self._finished.add(run)
         shown = f"{len(self._finished)} of {len(self._works)} runs done, {self._times()}"
         sentence = f"{shown}; {_sentence(progress, self._works[run])}"
@@ -101,7 +100,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
             self._bar.total = sum(self._works.values())
             self._bar.n = sum(self._done.values())
             self._bar.set_description_str(sentence)
-        elif pauses or time.monotonic() - self._shown_s > _LINE_EVERY_S:
+        elif ended or time.monotonic() - self._shown_s > _LINE_EVERY_S:
             self._shown_s = time.monotonic()
             print(sentence, file=sys.stderr, flush=True)
 
@@ -122,13 +121,12 @@ def counted(items: Iterable[Item], what: str, *, total: int) -> Iterable[Item]:
 
 
 def _sentence(progress: Progress, work: int) -> str:
-    """What a run is doing, and how far it is of all its ``work``; what is done as far as a budget waits for others."""
+    """What a run is doing, and how far it is of all its ``work``."""
     if progress.detail is not None:
         return f"{progress.agent} seed {progress.seed}: {progress.detail}, {100 * progress.done / work:.0f} %"
-    phase = "waiting" if progress.phase == "done" and progress.done < work else progress.phase
     success = "" if progress.success is None else f", success {100 * progress.success:.0f} %"
     return (
-        f"{progress.agent} seed {progress.seed}: {phase}, training episode {progress.episode}, "
+        f"{progress.agent} seed {progress.seed}: {progress.phase}, training episode {progress.episode}, "
         f"{100 * progress.done / work:.0f} % of its episodes{success}"
     )
 
@@ -273,7 +271,9 @@ def carry_out(
         for store, _ in work:
             _warn(store.begin_session(environment, certificate_of), store.folder)
             held.callback(store.save_time)
-        return _in_stages(work, launcher), missing
+        jobs = [job for store, paths in work for job in _jobs(store, paths)]
+        with ProgressBar([job.spec for job in jobs]) as show:
+            return list(launcher.launch(jobs, show)) if jobs else [], missing
 
 
 @functools.cache
@@ -291,31 +291,19 @@ def certificate_of(task: str, split: str | None) -> Certificate | None:
 _Bench = tuple[BenchStore, Encoders]
 
 
-def _in_stages(work: Sequence[_Bench], launcher: Launcher) -> list[Failure]:
-    """Take all runs as far as their protocol's next stage, again and again; one that failed goes no further."""
-    failures: list[Failure] = []
-    specs = [_job(store, paths, *pair, None).spec for store, paths in work for pair in store.missing()]
-    stages = itertools.zip_longest(*(store.protocol.stages for store, _ in work), fillvalue=0)
-    with ProgressBar(specs) as show:
-        for stage in stages:
-            failed = {failure.job.folder for failure in failures}
-            jobs = []
-            for (store, paths), until in zip(work, stage, strict=True):
-                order = store.protocol.agents  # those listed last cost most and come first of each seed
-                pairs = sorted(store.missing(until), key=lambda pair: (pair[1], -order.index(pair[0])))
-                jobs += [_job(store, paths, *pair, until) for pair in pairs]
-            left = [job for job in jobs if job.folder not in failed]
-            if left:
-                failures += launcher.launch(left, show)
-    return failures
+def _jobs(store: BenchStore, paths: Encoders) -> list[Job]:
+    """What is missing of a bench, seed by seed; agents that are listed last cost most and come first of each."""
+    order = store.protocol.agents
+    pairs = sorted(store.missing(), key=lambda pair: (pair[1], -order.index(pair[0])))
+    return [_job(store, paths, *pair) for pair in pairs]
 
 
-def _job(store: BenchStore, paths: Encoders, agent: str, seed: int, until: int | None) -> Job:
+def _job(store: BenchStore, paths: Encoders, agent: str, seed: int) -> Job:
     spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, dataset=paths.get("dataset"))
-    if registry.has_task(store.protocol.task):  # regressors have no encoder and pause nowhere
+    if registry.has_task(store.protocol.task):  # regressors have no encoder
         entry = registry.agent_entry(agent)
         encoder = paths[entry.encoder_kind] if entry.needs_encoder else None
-        spec = dataclasses.replace(spec, encoder=encoder, until=None if entry.external_training_loop else until)
+        spec = dataclasses.replace(spec, encoder=encoder)
     return Job(spec=spec, folder=store.run_folder(agent, seed))
 
 

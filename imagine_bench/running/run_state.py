@@ -199,10 +199,8 @@ class Run:
 
     @property
     def budgets_left(self) -> tuple[int, ...]:
-        """Budgets to come before the run pauses or ends."""
-        until = self.spec.until
-        budgets = [budget for budget in self.protocol.budgets if until is None or budget <= until]
-        return tuple(budgets[len(self.counters.rows) :])
+        """Budgets to come before the run ends."""
+        return self.protocol.budgets[len(self.counters.rows) :]
 
     @contextmanager
     def training_time(self) -> Iterator[None]:

@@ -68,7 +68,7 @@ class RunObserver:
 
 
 def run(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> None:
-    """Do a run, or what is left of it, as far as the budget at which it pauses, looked at by its observers.
+    """Do a run, or what is left of it, looked at by its observers.
 
     Nothing is done of a finished run.
 
@@ -86,7 +86,7 @@ def run(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> None:
 
 
 def _go_on(run: Run, observers: Sequence[RunObserver]) -> None:
-    """Train and test at every budget that is wanted now; after the last one of all, finish."""
+    """Train and test at every budget that is left, and finish."""
     try:
         if isinstance(run.agent, ExternalTrainer):
             train_externally(run, run.agent, lambda budget: _at_budget(run, budget, observers))
@@ -98,11 +98,10 @@ def _go_on(run: Run, observers: Sequence[RunObserver]) -> None:
                 _at_budget(run, budget, observers)
     except DivergedError as error:
         raise DivergedError(f"{error} The agent's state lies in {run.save('diverged')}.") from error
-    if len(run.counters.rows) == len(run.protocol.budgets):
-        measured = AtEnd()
-        for observer in observers:
-            measured.update(observer.at_end(run))
-        run_folder.finish(run.folder, **measured)
+    measured = AtEnd()
+    for observer in observers:
+        measured.update(observer.at_end(run))
+    run_folder.finish(run.folder, **measured)
     run.tell("done", at_once=True)
 
 

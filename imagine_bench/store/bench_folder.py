@@ -82,10 +82,9 @@ class BenchStore:
                 run_folder.require_run_of(self.run_folder(agent, seed), self.protocol, agent, seed)
         return found
 
-    def missing(self, until: int | None = None) -> list[tuple[str, int]]:
-        """Return the runs that are not finished, or have not come to the budget ``until``, seed by seed."""
-        unfinished = [pair for pair in self.pairs if not run_folder.is_done(self.run_folder(*pair))]
-        return [pair for pair in unfinished if until is None or run_folder.reached(self.run_folder(*pair)) < until]
+    def missing(self) -> list[tuple[str, int]]:
+        """Return the runs that are not finished, seed by seed."""
+        return [pair for pair in self.pairs if not run_folder.is_done(self.run_folder(*pair))]
 
     def begin_session(self, environment: Mapping[str, Json], certify: Certify = lambda task, split: None) -> list[str]:
         """Note that work starts now, in what :func:`.describe_environment` says; returns :meth:`changed`.

@@ -45,7 +45,6 @@ from imagine_bench.store.files import (
     sha256,
     sweep,
     sync_folder,
-    table_rows,
     table_text,
     write_arrays,
     write_bytes,
@@ -242,14 +241,6 @@ def recording_path(folder: Path) -> Path:
 def is_done(folder: Path) -> bool:
     """Return whether the run in ``folder`` is finished."""
     return (folder / _DONE).is_file()
-
-
-def reached(folder: Path) -> int:
-    """Return the last budget at which the run in ``folder`` was tested, 0 before the first."""
-    path = folder / _METRICS
-    with reading(path, "the metrics of a run"):
-        rows = table_rows(path.read_text()) if path.is_file() else []
-        return int(rows[-1]["episodes"]) if rows else 0
 
 
 @contextmanager

@@ -100,7 +100,7 @@ class Inline:
     """A launcher without processes that notes its order of work, and gives up after so many jobs."""
 
     def __init__(self, patience: int = 1000) -> None:
-        self.order: list[tuple[str, int, int | None]] = []
+        self.order: list[tuple[str, int]] = []
         self._patience = patience
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
@@ -108,7 +108,7 @@ class Inline:
         for job in jobs:
             if len(self.order) == self._patience:
                 raise KeyboardInterrupt
-            self.order.append((job.spec.agent, job.spec.seed, job.spec.until))
+            self.order.append((job.spec.agent, job.spec.seed))
             try:
                 run_observed(job.spec, job.folder, on_progress)
             except RuntimeError as error:

@@ -32,18 +32,6 @@ def far(seed: int, done: int, phase: Phase = "training", detail: str | None = No
     )
 
 
-def test_a_run_that_waits_for_others_at_a_budget_is_not_done(capsys: pytest.CaptureFixture[str]) -> None:
-    with ProgressBar(SPECS) as show:
-        show(far(0, 5))
-        show(far(0, 9, "done"))
-        show(far(0, WORK, "done"))
-        show(far(0, WORK, "done"))
-    waiting, done, again = capsys.readouterr().err.splitlines()
-    assert waiting.startswith("0 of 6 runs done") and "table seed 0: waiting, training episode 4, 47 % of" in waiting
-    assert done.startswith("1 of 6 runs done") and "table seed 0: done" in done
-    assert again.startswith("1 of 6 runs done")
-
-
 def test_time_left_counts_neither_what_was_done_before_nor_what_a_failed_run_lacks(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

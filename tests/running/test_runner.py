@@ -226,13 +226,12 @@ def test_kill_9_of_a_real_process_changes_nothing(tmp_path: Path) -> None:
 
 def test_a_table_that_a_kill_left_behind_comes_with_the_run(tmp_path: Path) -> None:
     """The checkpoint of a test is written before its row of the table."""
-    folder, spec = tmp_path / "run", RunSpec(protocol=small(budgets=(2, 4, 9)), agent="table", seed=0, until=4)
-    assert run_observed(spec, folder, lambda progress: None) is None, "it pauses"
-    table = (folder / "metrics.csv").read_text()
-    assert [line.split(",")[0] for line in table.splitlines()[1:]] == ["2", "4"]
-    (folder / "metrics.csv").unlink()
-    run_observed(spec, folder, lambda progress: None)
-    assert (folder / "metrics.csv").read_text() == table
+    do(tmp_path)
+    table = (tmp_path / "metrics.csv").read_text()
+    for name in ("DONE", "metrics.csv"):
+        (tmp_path / name).unlink()
+    do(tmp_path)
+    assert (tmp_path / "metrics.csv").read_text() == table
 
 
 def test_test_episodes_are_greedy_and_training_explores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

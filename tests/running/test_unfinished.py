@@ -1,0 +1,59 @@
+"""A bench is run seed by seed, and what is there of an unfinished one can be read."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from small_runs import Inline, small
+
+from imagine_bench.errors import ArtefactError, RunFailedError
+from imagine_bench.report import summary_table, write_report
+from imagine_bench.running import bench as benches
+from imagine_bench.store.loading import load_so_far
+from imagine_bench.store.results import BenchResult
+
+RUNS = [(agent, seed) for seed in (0, 1) for agent in ("imaginer", "table")]
+"""In their order of work: of each seed, agents that are listed last come first."""
+
+
+def bench(root: Path, launcher: Inline, **changes: object) -> BenchResult:
+    wanted = small(**{"budgets": (2, 4, 9), "agents": ("table", "imaginer"), "seeds": (0, 1), **changes})
+    return benches.bench(wanted, {}, root=root, launcher=launcher)
+
+
+def test_a_bench_lacks_its_unfinished_runs_alone(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        bench(tmp_path, Inline(patience=1))
+    (folder,) = tmp_path.glob("arrow_puzzle/*")
+    with pytest.raises(ArtefactError, match="No seed of this bench has brought every agent to 2 real episodes yet"):
+        load_so_far(folder)
+    with pytest.raises(KeyboardInterrupt):
+        bench(tmp_path, Inline(patience=1))
+    part = load_so_far(folder)
+    assert (part.protocol.seeds, part.protocol.budgets) == ((0,), (2, 4, 9))
+    assert part.missing == ("table seed 1: 0 of 9 real episodes", "imaginer seed 1: 0 of 9 real episodes")
+    assert folder.name == f"smoke-{part.protocol_hash}"
+    elsewhere = shutil.copytree(folder, tmp_path / "carried elsewhere")
+    assert load_so_far(elsewhere).protocol == part.protocol
+    assert "1 of 2 seeds up to 9 of 9 real episodes" in summary_table(part)
+    assert "This bench is not finished" in write_report(part).read_text()
+
+    launcher = Inline()
+    result = bench(tmp_path, launcher)
+    assert launcher.order == RUNS[2:]
+    assert result.missing == () and result.whole is None
+    bench(tmp_path, launcher)
+    assert launcher.order == RUNS[2:], "a finished bench is only read"
+    (folder / "table/seed_0/DONE").unlink()
+    part = load_so_far(folder)
+    assert part.protocol == result.protocol == part.whole
+    assert part.missing == ("table seed 0: its recording",)
+
+
+def test_a_failed_run_is_no_hindrance_to_others(tmp_path: Path) -> None:
+    launcher = Inline()
+    with pytest.raises(RunFailedError, match="1 of 2 runs failed"):
+        bench(tmp_path, launcher, agents=("failing",))
+    assert launcher.order == [("failing", 0), ("failing", 1)]
