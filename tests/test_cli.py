@@ -189,7 +189,7 @@ def test_a_bench_ends_with_a_table_a_report_and_recordings(
     assert f"Report:     {folder}/report/index.html" in said.out
     assert (folder / "report" / "index.html").stat().st_size > 10_000
     assert len(list(folder.glob("*/seed_0/recording.rrd"))) == 2
-    assert json.loads((folder / "environment.json").read_text())["versions"]["mujoco"].startswith("3.17")
+    assert json.loads((folder / "sessions.json").read_text())["environment"]["versions"]["mujoco"].startswith("3.17")
     assert main(words) == 0
     assert len(inline.order) == 2, "a finished bench is not run again"
     assert capsys.readouterr().out.splitlines()[-4:] == said.out.splitlines()[-4:]

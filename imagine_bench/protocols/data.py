@@ -83,8 +83,11 @@ class ProtocolData(ABC):
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """The inverse of :meth:`as_dict`; names of an earlier edition become today's labels."""
-        edition = edition_of(data["agents"], data.get("agent_names", FIRST))
-        agents = [agent_label(agent, {"agent_names": edition}) for agent in data["agents"]]
+        names = data["agents"]
+        if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+            return cls(**data)  # which says what is wrong with them
+        edition = edition_of(names, data.get("agent_names", FIRST))
+        agents = [agent_label(agent, {"agent_names": edition}) for agent in names]
         return cls(**{**data, "agents": agents, "agent_names": edition})
 
     def written_name(self, agent: str) -> str:

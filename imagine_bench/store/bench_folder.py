@@ -1,8 +1,8 @@
 """Where a bench lies: ``<root>/<task>/<preset>-<protocol hash>/<agent>/seed_<n>/``; other settings lie elsewhere.
 
-``protocol.json`` holds what is compared, ``environment.json`` what the first session ran on, and ``sessions.json`` when
-and with which command work went on. Nothing is ever overwritten by another protocol, for its hash is in the name. A
-bench that is kept for good is one file, ``bench.json``, and a table: see :mod:`.loading`.
+``protocol.json`` holds what is compared, and ``sessions.json`` what the first session ran on, the exact facts of the
+world, and when and with which command work went on. Nothing is ever overwritten by another protocol, for its hash is in
+the name. A bench that is kept for good is one file, ``bench.json``, and a table: see :mod:`.loading`.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ Certify = Callable[[str, str | None], Certificate | None]
 KEPT = "bench.json"
 """Protocol, environment and sessions in one file, as :mod:`.loading` keeps them for good."""
 _PROTOCOL = "protocol.json"
-_ENVIRONMENT = "environment.json"
 _SESSIONS = "sessions.json"
-_CERTIFICATE = "certificate.json"
+_EARLIER = ("environment", "certificate")
+"""Facts that lie in files of their own where a bench began before 2026-11-28."""
+_DECISIVE = ("commit", "versions", "gl_renderer")
 _NAME = re.compile("-([0-9a-f]{12})$")
 """The hash in a folder's name; whoever moves a bench elsewhere may leave it out."""
 
@@ -46,7 +47,7 @@ class BenchStore:
         self.protocol = protocol
         self.folder = folder
         self._began_s = time.monotonic()
-        self._sessions: list[dict[str, Json]] = []
+        self._facts: dict[str, Any] = {}
 
     @property
     def pairs(self) -> list[tuple[str, int]]:
@@ -92,40 +93,49 @@ class BenchStore:
         The first time, the exact facts of the protocol's world are kept too, which ``certify`` gives for its task and
         split.
         """
-        path = self.folder / _ENVIRONMENT
-        begun = path.exists()
-        if begun:
-            self._sessions = read_sealed(self.folder / _SESSIONS, "a bench's sessions")["sessions"]
-        elif isinstance(self.protocol, Protocol):
-            found = certify(self.protocol.task, self.protocol.split)
+        if (self.folder / _SESSIONS).exists():
+            self._facts = _facts(self.folder)
+        else:
+            self._facts = {"environment": environment, "sessions": []}
+            found = certify(self.protocol.task, self.protocol.split) if isinstance(self.protocol, Protocol) else None
             if found is not None:
-                write_json(self.folder / _CERTIFICATE, sealed(dataclasses.asdict(found)))
-        changed = self.changed(environment)
-        facts = _identity(environment)
-        session = {"started": datetime.now(UTC).isoformat(timespec="seconds"), "command": environment["command"]}
-        self._sessions.append({**session, "changed": {name: facts[name] for name in changed}})
+                self._facts["certificate"] = dataclasses.asdict(found)
+        changed = _changed(self._facts["environment"], environment)
+        started = datetime.now(UTC).isoformat(timespec="seconds")
+        self._facts["sessions"].append({"started": started, "command": environment["command"], "changed": changed})
         self._began_s = time.monotonic()
         self.save_time()
-        if not begun:
-            write_json(path, sealed(environment))  # last, so that a bench with an environment has sessions too
-        return changed
+        return list(changed)
 
     def changed(self, environment: Mapping[str, Json]) -> list[str]:
-        """Return names of facts that decide the bits and differ from the first session's; none before there was one."""
-        path = self.folder / _ENVIRONMENT
-        first = _identity(read_sealed(path, "a bench's environment") if path.exists() else environment)
-        return [name for name, fact in _identity(environment).items() if fact != first[name]]
+        """Return names of facts that decide the bits and differ from the first session's."""
+        return list(_changed(_facts(self.folder)["environment"], environment))
 
     def save_time(self) -> None:
-        """Note how long this session has lasted, so that a kill loses little of the count."""
-        self._sessions[-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
-        write_json(self.folder / _SESSIONS, sealed({"sessions": self._sessions}))
+        """Note how long this session has lasted."""
+        self._facts["sessions"][-1]["wall_s"] = round(time.monotonic() - self._began_s, 3)
+        write_json(self.folder / _SESSIONS, sealed(self._facts))
 
 
-def _identity(environment: Mapping[str, Any]) -> dict[str, Json]:
-    """Facts that decide the bits of a result."""
-    facts = {name: environment.get(name) for name in ("commit", "versions", "gl_renderer")}
-    return facts | {"cpu": environment.get("machine", {}).get("cpu")}
+def _changed(first: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Json]:
+    """Facts of an environment that decide the bits of a result, those that are not what they were at first."""
+    then, facts = (
+        {**{name: each.get(name) for name in _DECISIVE}, "cpu": each.get("machine", {}).get("cpu")}
+        for each in (first, now)
+    )
+    return {name: fact for name, fact in facts.items() if fact != then[name]}
+
+
+def _facts(folder: Path) -> dict[str, Any]:
+    """Environment, sessions and, where there is one, the certificate, as the files of a bench have them."""
+    if is_archive(folder):
+        return dict(read_json(folder / KEPT, "a kept bench"))
+    found = read_sealed(folder / _SESSIONS, "a bench's sessions")
+    for name in _EARLIER:
+        path = folder / f"{name}.json"
+        if name not in found and path.exists():
+            found[name] = read_sealed(path, f"the {name} of a bench")
+    return found
 
 
 def bench_folder(root: Path, protocol: ProtocolData) -> Path:
@@ -138,15 +148,7 @@ def bench_facts(folder: Path) -> dict[str, Any]:
 
     Raises ArtefactError: a file is missing or damaged.
     """
-    if is_archive(folder):
-        found = read_json(folder / KEPT, "a kept bench")
-    else:
-        found = {
-            "environment": read_sealed(folder / _ENVIRONMENT, "a bench's environment"),
-            **read_sealed(folder / _SESSIONS, "a bench's sessions"),
-        }
-        if (folder / _CERTIFICATE).exists():
-            found["certificate"] = read_sealed(folder / _CERTIFICATE, "a world's certificate")
+    found = _facts(folder)
     with reading(folder, "a bench with environment and sessions"):
         facts = {
             "environment": {**found["environment"], "sessions": found["sessions"]},
@@ -168,25 +170,25 @@ def require_either(given: Path | None, task: str | None) -> None:
 
 def newest_bench(root: Path, *tasks: str | None) -> Path:
     """Return the bench folder below ``root`` that was worked on last, of some tasks or of any, or ArtefactError."""
-    return _newest(root, f"*/{_SESSIONS}", "bench", [task for task in tasks if task]).parent
+    return _newest(root, f"*/{_SESSIONS}", "bench", tasks).parent
 
 
 def newest_recording(root: Path, *tasks: str | None) -> Path:
     """Return the recording below ``root`` that was written last, of some tasks or of any, or ArtefactError."""
-    return _newest(root, "**/recording.rrd", "recording", [task for task in tasks if task])
+    return _newest(root, "**/recording.rrd", "recording", tasks)
 
 
-def _newest(root: Path, pattern: str, what: str, tasks: Sequence[str]) -> Path:
+def _newest(root: Path, pattern: str, what: str, tasks: Sequence[str | None]) -> Path:
     """The file by ``pattern`` below the folders of some tasks, or of all, that was written last.
 
     A task's name without options also means it with any.
     """
-    names = [file_name(task) for task in tasks]
-    wanted = [f"{name}{options}" for name in names for options in ("", "-*")] or ["*"]
+    names = [task for task in tasks if task]
+    wanted = [f"{file_name(name)}{options}" for name in names for options in ("", "-*")] or ["*"]
     found = [path for name in wanted for path in root.glob(f"{name}/{pattern}")]
     if not found:
-        of = f" of {tasks[0]}" if len(tasks) == 1 else ""
-        some = next(iter(tasks), "arrow_puzzle")
+        of = f" of {names[0]}" if len(names) == 1 else ""
+        some = next(iter(names), "arrow_puzzle")
         raise ArtefactError(f"There is no {what}{of} below {root}; run 'imagine-bench bench --task {some}' first.")
     return max(found, key=lambda path: path.stat().st_mtime)
 

@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from safetensors.numpy import load, save
@@ -96,11 +96,8 @@ def unpack(kind: Any, values: Any, arrays: Mapping[str, Array]) -> Any:
     """
     origin = get_origin(kind)
     arguments = get_args(kind)
-    if origin in (Union, types.UnionType):
-        present = [argument for argument in arguments if argument is not types.NoneType]
-        if len(present) > 1 or (values is None and not arrays):
-            return values
-        return unpack(present[0], values, arrays)
+    if types.NoneType in arguments:  # one type or None; of plain values any may be
+        return unpack(arguments[0], values, arrays) if values is not None or arrays else None
     if origin is np.ndarray:
         return arrays[""]
     parts = grouped(arrays)
@@ -303,12 +300,8 @@ def _require_same(folder: Path, wanted: Mapping[str, Json], remedy: str) -> None
 
 def read_config(folder: Path) -> dict[str, Any]:
     """Return what was run: protocol, agent, seed, settings. Raises ArtefactError: it is missing or damaged."""
-    return _read(folder / _CONFIG, "a run's configuration; give a run's folder, .../<agent>/seed_<n>")
-
-
-def _read(path: Path, what: str) -> dict[str, Any]:
-    """A sealed file of a run. Raises ArtefactError: it is missing, damaged or of another format."""
-    values = read_sealed(path, what)
+    path = folder / _CONFIG
+    values = read_sealed(path, "a run's configuration; give a run's folder, .../<agent>/seed_<n>")
     if values.get("format") != FORMAT:
         raise ArtefactError(f"{path} was not written as {FORMAT!r}. It was left untouched.")
     return values
@@ -365,7 +358,8 @@ def require_done(folder: Path) -> dict[str, Any]:
 
     Raises ArtefactError: the run is unfinished, damaged or of another format.
     """
-    digests = _read(folder / _DONE, "the mark of a finished run")["sha256"]
+    config = read_config(folder)
+    digests = read_sealed(folder / _DONE, "the mark of a finished run")["sha256"]
     for name, written in digests.items():
         if name == _RECORDING and not recording_path(folder).exists():
             continue  # recordings are large, and nothing else needs them
@@ -374,7 +368,7 @@ def require_done(folder: Path) -> dict[str, Any]:
                 f"{folder / name} is not as the run left it (it was changed or damaged). It was left untouched; delete "
                 f"{folder} to run it anew."
             )
-    return read_config(folder)
+    return config
 
 
 def load_run(folder: Path) -> RunResult:

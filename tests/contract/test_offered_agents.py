@@ -64,7 +64,7 @@ def test_a_packages_agent_is_compared_like_one_of_ours(
     size = ["--agents", "their_agent", "--budgets", "2", "--evaluation-episodes", "2"]
     assert main([*words, *size, "--out", str(tmp_path / "runs")]) == 0
     folder = newest_bench(tmp_path / "runs")
-    noted = json.loads((folder / "environment.json").read_text())["versions"]["their_package"]
+    noted = json.loads((folder / "sessions.json").read_text())["environment"]["versions"]["their_package"]
     assert re.fullmatch(r"1\.2\+[0-9a-f]{8}", noted) and versions()["their_package"] == noted
     assert "Theirs" in (folder / "report" / "index.html").read_text()
     metrics = (folder / "their_agent/seed_0/metrics.csv").read_text().splitlines()

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 from bench_fakes import TableAgent
-from small_runs import Inline, collected, do, written
+from small_runs import Inline, collected, do
 
 from imagine_bench import registry
 from imagine_bench.cli import main
@@ -160,10 +160,3 @@ def test_a_wrong_command_is_one_sentence(
     said = capsys.readouterr().err
     assert sentence in said and said.count("\n") == 1
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
-
-
-def test_a_file_where_a_folder_should_be_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "set").write_text("mine")
-    with pytest.raises(InvalidValueError, match="exists; give another folder"):
-        written(tmp_path / "set")
-    assert (tmp_path / "set").read_text() == "mine"

@@ -52,9 +52,9 @@ def test_it_is_read_back_and_drawn(result, tmp_path, monkeypatch):
 
 def test_a_damaged_certificate_is_named(result, tmp_path):
     folder = shutil.copytree(result.folder, tmp_path / result.folder.name)
-    path = folder / "certificate.json"
+    path = folder / "sessions.json"
     path.write_text(path.read_text().replace('"optimum": 1.0', '"optimum": 0.5'))
-    with pytest.raises(ArtefactError, match=r"certificate\.json is damaged"):
+    with pytest.raises(ArtefactError, match=r"sessions\.json is damaged"):
         load_bench(folder)
 
 

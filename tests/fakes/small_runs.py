@@ -100,15 +100,19 @@ class Inline:
     """A launcher without processes that notes its order of work, and gives up after so many jobs."""
 
     def __init__(self, patience: int = 1000) -> None:
-        self.order: list[tuple[str, int]] = []
+        self.jobs: list[Job] = []
         self._patience = patience
+
+    @property
+    def order(self) -> list[tuple[str, int]]:
+        return [(job.spec.agent, job.spec.seed) for job in self.jobs]
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         failures = []
         for job in jobs:
-            if len(self.order) == self._patience:
+            if len(self.jobs) == self._patience:
                 raise KeyboardInterrupt
-            self.order.append((job.spec.agent, job.spec.seed))
+            self.jobs.append(job)
             try:
                 run_observed(job.spec, job.folder, on_progress)
             except RuntimeError as error:

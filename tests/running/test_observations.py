@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import gymnasium
-import numpy as np
 import pytest
 from fake_agents import FakeAgent
 from recordings import contents
@@ -18,8 +16,6 @@ from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import Agent, AgentContext, Observation, Transition
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
-from imagine_bench.running.evaluation import play
-from imagine_bench.running.run_state import environments
 from imagine_bench.running.trained import load_trained
 
 _FEW: dict[str, Any] = {"budgets": (3,), "evaluation_episodes": 2, "execution": "kinematic", "recorded_episodes": 1}
@@ -113,27 +109,3 @@ def test_a_run_that_saw_something_else_is_not_asked_with_frames(tmp_path: Path) 
     folder = bench(wanted, paths, root=tmp_path, launcher=Inline()).folder / "witness/seed_0"
     with pytest.raises(InvalidValueError, match="is of an agent that sees state at 64 pixels, and it would be asked"):
         load_trained(folder)
-
-
-class _Broken(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Its third observation has a part that no agent should be shown."""
-
-    def __init__(self, env: gymnasium.Env[Any, Any], part: Any) -> None:
-        super().__init__(env)
-        self.part, self.steps = part, 0
-
-    def step(self, action: Any) -> Any:
-        seen, *rest = super().step(action)
-        self.steps += 1
-        return (seen if self.steps < 2 else {**seen, "proprio": self.part}, *rest)
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize(
-    "part", [np.full(16, np.nan, dtype=np.float32), np.zeros(7, dtype=np.float32), np.zeros(16), None]
-)
-def test_a_part_that_goes_wrong_ends_the_run(part: Any) -> None:
-    wanted = Protocol(task="arrow_puzzle", preset="quick", observation="state,proprio", execution="kinematic")
-    with environments(wanted) as (env, _), pytest.raises(InvalidValueError, match="that is not in its space Dict"):
-        for seed in range(9):
-            list(play(_Broken(env, part), FakeAgent(), seed=seed, explore=True, privileged=False))

@@ -1,17 +1,15 @@
 """Protocols: complete, hashed, and strict about what they are given."""
 
 import dataclasses
-from pathlib import Path
 
-import numpy as np
 import pytest
+from fake_results import bench_result
 
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.registry import TASKS, task
 from imagine_bench.running.control import plan_control
-from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 BUNDLED = [name for name in TASKS if name != "arrow_puzzle_easy"]
 """Tasks whose encoders are bundled."""
@@ -103,6 +101,12 @@ def test_the_caller_overrides_the_task_overrides_the_preset(monkeypatch):
     assert protocol("arrow_puzzle", "smoke").seeds == PRESETS["smoke"]["seeds"]
 
 
+def test_agents_of_a_file_that_are_no_names_are_refused():
+    for agents in (-1, "dqn", [5], None):
+        with pytest.raises(InvalidValueError, match="agents was given"):
+            Protocol.from_dict({**protocol("arrow_puzzle").as_dict(), "agents": agents})
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
@@ -128,26 +132,11 @@ def test_bad_fields_say_what_is_allowed(changes, error, message):
         protocol(fields.pop("task"), fields.pop("preset", "quick"), **fields)
 
 
-def _run(agent, seed, budgets, successes=1):
-    checkpoints = tuple(
-        Checkpoint(
-            episodes=budget, env_steps=budget, test_episodes=4, successes=successes, mean_return=0.0, mean_length=1.0,
-            faults=0, train_cpu_s=0.0, eval_cpu_s=0.0,
-        )
-        for budget in budgets
-    )  # fmt: skip
-    return RunResult(
-        agent=agent, seed=seed, checkpoints=checkpoints, settings={}, training_success=np.zeros(0, bool),
-        training_length=np.zeros(0, int), imagined=(), folder=Path("runs"), recording=None,
-    )  # fmt: skip
-
-
-def test_a_bench_result_refuses_missing_and_mismatched_runs():
-    p = protocol("arrow_puzzle", agents=("dqn", "random"), seeds=(0, 1), budgets=(10, 20))
-    runs = tuple(_run(agent, seed, p.budgets, successes=seed) for agent in p.agents for seed in p.seeds)
-    whole = BenchResult(protocol=p, runs=runs, environment={}, folder=Path("runs"), wall_s=0.0)
-    np.testing.assert_array_equal(whole.success_rates("dqn"), [[0.0, 0.0], [0.25, 0.25]])
-    with pytest.raises(ArtefactError, match=r"\('random', 1\)\] and holds .*Run the same bench command again"):
-        dataclasses.replace(whole, runs=runs[:-1])
-    with pytest.raises(ArtefactError, match=r"has budgets \(10,\), the protocol says \(10, 20\)"):
-        dataclasses.replace(whole, runs=(*runs[:-1], _run("random", 1, (10,))))
+def test_a_bench_result_refuses_missing_and_mismatched_runs(tmp_path):
+    whole = bench_result(tmp_path)
+    first, *others = whole.runs
+    with pytest.raises(ArtefactError, match=r"should hold the runs .* and holds .*Run the same bench command again"):
+        dataclasses.replace(whole, runs=tuple(others))
+    short = dataclasses.replace(first, checkpoints=first.checkpoints[:-1])
+    with pytest.raises(ArtefactError, match=r"has budgets .*, the protocol says"):
+        dataclasses.replace(whole, runs=(short, *others))

@@ -13,11 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import bench_fakes
-import gymnasium
-import numpy as np
 import pytest
 from imagine_bench.tasks.macro_env import MacroEnv
-from small_runs import context, do, final_arrays, run_observed, same_but_for_time, small
+from small_runs import do, final_arrays, run_observed, same_but_for_time, small
 
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench.cli import observers
@@ -25,7 +23,6 @@ from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.data import Progress, RunSpec
 from imagine_bench.running import run_state
-from imagine_bench.running.evaluation import play_test_episode
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
 from imagine_bench.store.run_folder import load_newest
 
@@ -68,36 +65,6 @@ def test_a_run_counts_what_happens(tmp_path: Path) -> None:
     assert result.settings == {"rate": 0.5}
     assert (result.agent, result.seed, result.recording) == ("table", 3, None)
     assert told[-1].phase == "done" and told[-1].done == told[-1].work == 9 + 2 * 5
-
-
-def test_the_runner_itself_learns_from_every_transition_once(tmp_path: Path) -> None:
-    """The runner's episodes, replayed by hand through the environment, are the agent's very transitions."""
-    do(tmp_path / "run", budgets=(6,))
-    agent = bench_fakes.TableAgent(context())
-    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance="clean")
-    for episode in range(6):
-        frame, _ = env.reset(seed=episode_seed("training", 0, episode))
-        over = False
-        while not over:
-            before = bench_fakes.Observation(frame=frame)
-            action = agent.act(before, explore=True)
-            frame, reward, terminated, truncated, _ = env.step(action)
-            after = bench_fakes.Observation(frame=frame)
-            agent.observe(
-                Transition(
-                    observation=before,
-                    action=action,
-                    reward=float(reward),
-                    next_observation=after,
-                    terminated=terminated,
-                    truncated=truncated,
-                ),
-                episode=episode,
-            )
-            over = terminated or truncated
-    env.close()
-    assert np.abs(agent.table).sum() > 0
-    assert np.array_equal(final_arrays(tmp_path / "run")["table"], agent.table)
 
 
 def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
@@ -243,10 +210,6 @@ def test_test_episodes_are_greedy_and_training_explores(tmp_path: Path, monkeypa
         return act(agent, observation, explore=explore)
 
     monkeypatch.setattr(bench_fakes.TableAgent, "act", telling)
-    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
-    played = play_test_episode(env, bench_fakes.TableAgent(context()), seed=1, privileged=False)
-    env.close()
-    assert len(asked) == len(played.actions) > 0 and not any(asked)
-    asked.clear()
     result = do(tmp_path / "run", open_loop_starts=0)
     assert sum(asked) == result.training_length.sum(), "each training step explores, and no step of a test"
+    assert len(asked) > sum(asked)

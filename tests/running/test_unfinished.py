@@ -35,6 +35,8 @@ def test_a_bench_lacks_its_unfinished_runs_alone(tmp_path: Path) -> None:
     assert (part.protocol.seeds, part.protocol.budgets) == ((0,), (2, 4, 9))
     assert part.missing == ("table seed 1: 0 of 9 real episodes", "imaginer seed 1: 0 of 9 real episodes")
     assert folder.name == f"smoke-{part.protocol_hash}"
+    with pytest.raises(ArtefactError, match=r"seed 1: 0 of 9 real episodes\. Run the same bench command again to"):
+        benches.load_bench(folder)
     elsewhere = shutil.copytree(folder, tmp_path / "carried elsewhere")
     assert load_so_far(elsewhere).protocol == part.protocol
     assert "1 of 2 seeds up to 9 of 9 real episodes" in summary_table(part)

@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import json
 import tomllib
-from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,20 +16,20 @@ import pytest
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
 from imagine_bench.agents.settings import flatten
 from numpy.typing import NDArray
-from small_runs import run_observed
+from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.cli import main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.values import true_model
-from imagine_bench.protocols.data import Failure, Job, OnProgress, digest
+from imagine_bench.protocols.data import digest
 from imagine_bench.report.page import write_page
 from imagine_bench.report.sweep import study_page
 from imagine_bench.rules import states_of
 from imagine_bench.store.results import PolicyTable
 from imagine_bench.sweep.grid import BASE, STUDIES, Study, Variant, read_grid
-from imagine_bench.sweep.run import Line, imagined_right, run_study
+from imagine_bench.sweep.run import imagined_right, run_study
 
 STUDY = Study(
     name="fakes",
@@ -48,33 +47,20 @@ STUDY = Study(
 )
 
 
-class Here:
-    """Carries out jobs in this process, one after the other, and counts them."""
-
-    def __init__(self) -> None:
-        self.done: list[Job] = []
-
-    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
-        for job in jobs:
-            run_observed(job.spec, job.folder, on_progress)
-            self.done.append(job)
-        return ()
-
-
 def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
-    launcher = Here()
+    launcher = Inline()
     lines = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
     assert [(line.variant.name, line.success.shape) for line in lines] == [
         ("table", (2, 2)), ("mild", (2, 2)), ("imaginer", (2, 2)),
     ]  # fmt: skip
-    assert {job.spec.protocol.appearance for job in launcher.done[2:4]} == {"mild"}
+    assert {job.spec.protocol.appearance for job in launcher.jobs[2:4]} == {"mild"}
     assert lines[0].difference is None
     for line, base in ((lines[1], lines[0]), (lines[2], lines[1])):
         assert line.difference is not None
         expected = line.success.mean(axis=0) - base.success.mean(axis=0)
         assert [one.value for one in line.difference] == pytest.approx(expected.tolist())
     again = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
-    assert len(launcher.done) == 6, "what is done is not run again"
+    assert len(launcher.jobs) == 6, "what is done is not run again"
     assert all(np.array_equal(one.success, other.success) for one, other in zip(lines, again, strict=True))
     write_page(tmp_path / "out", study_page(STUDY, lines))
     rows = list(csv.DictReader((tmp_path / "out" / "seeds.csv").read_text().splitlines()))
@@ -82,6 +68,11 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
     made = json.loads((tmp_path / "out" / "study.json").read_text())
     assert [variant["name"] for variant in made["study"]["variants"]] == ["table", "mild", "imaginer"]
     assert made["versions"] and made["machine"]
+    right = dataclasses.replace(lines[1], imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]))
+    page = study_page(STUDY, [lines[0], right])
+    assert [row[-2] for row in page.sections[0].tables[0].rows] == ["–", "–", "–", "30.0"], "at the last budget"
+    rows = list(csv.DictReader(page.files["seeds.csv"].splitlines()))
+    assert [row["imagined_right"] for row in rows][4:] == ["0.1000", "0.2000", "0.3000", "0.4000"]
 
 
 @pytest.mark.parametrize(
@@ -126,12 +117,12 @@ world.physics = { pad_friction = 0.1 }
 
 
 def test_a_study_from_a_file_changes_the_world_too(tmp_path: Path) -> None:
-    path, launcher = tmp_path / "mine.toml", Here()
+    path, launcher = tmp_path / "mine.toml", Inline()
     path.write_text(_FILE)
     study = read_grid(path)
     assert (study.name, study.execution, study.variants[0].factor) == ("mine", "kinematic", BASE)
     lines = run_study(study, "arrow_puzzle", root=tmp_path, launcher=launcher)
-    worlds = [(job.spec.protocol.looks, job.spec.protocol.world) for job in launcher.done]
+    worlds = [(job.spec.protocol.looks, job.spec.protocol.world) for job in launcher.jobs]
     assert worlds == [
         ("clean", {"execution": "kinematic"}), ("clean, tested at strong", {"execution": "kinematic"}),
         ("clean", {"execution": "physics", "physics": {"pad_friction": 0.1}}),
@@ -193,38 +184,6 @@ def test_a_study_is_that_of_kept_results_and_its_settings_exist(name: str) -> No
         settings = registry.load(registry.agent_entry(variant.agent).settings)
         changed = settings.resolve("fast", variant.settings, "chapter_5")
         assert (changed == settings.resolve("fast", {}, "chapter_5")) == (not variant.settings)
-
-
-def test_the_last_rung_of_the_ladder_is_quick_but_for_the_filter() -> None:
-    chapter_5 = HYPERPARAMETERS.groups["chapter_5"]
-    rung = STUDIES["ladder"].variants[-1].settings
-    for name, change in chapter_5.sets["fast"].items():
-        if name.startswith(("model.", "controller.")):
-            assert rung[name] == change.value
-
-
-def test_the_table_says_what_helps(tmp_path: Path) -> None:
-    success = {name: np.array([[value, 0.9], [value, 0.9]]) for name, value in (("table", 0.25), ("mild", 0.5))}
-    from imagine_bench.statistics import Estimate
-
-    lines = [
-        Line(
-            variant=STUDY.variants[0], success=success["table"], train_cpu_s=1.0, folder=Path("a-b"), environment={},
-            difference=None, imagined_right=np.full((2, 2), np.nan),
-        ),
-        Line(
-            variant=STUDY.variants[1], success=success["mild"], train_cpu_s=2.0, folder=Path("a-c"), environment={},
-            difference=(Estimate(0.25, 0.1, 0.4), Estimate(0.0, -0.1, 0.1)),
-            imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]),
-        ),
-    ]  # fmt: skip
-    page = study_page(STUDY, lines)
-    without, _, first, last = page.sections[0].tables[0].rows  # a row a variant and budget
-    assert without[-2:] == ["–", "1"]
-    assert first[1:7] == ["mild", "table", "table", "3", "50.0", "+25.0 [+10.0, +40.0]"]
-    assert last[-2:] == ["30.0", "2"], "right at the last budget, mean of seeds"
-    rows = csv.DictReader(page.files["seeds.csv"].splitlines())
-    assert [row["imagined_right"] for row in rows] == [""] * 4 + ["0.1000", "0.2000", "0.3000", "0.4000"]
 
 
 def test_what_isimagined_right_is_what_the_rules_have_too() -> None:

@@ -124,9 +124,7 @@ def test_any_change_of_any_level_changes_the_hash():
         levels = (*first.levels[:-1], dataclasses.replace(first.levels[-1], **change))
         changed = dataclasses.replace(first, levels=levels)
         hashes.add(dataclasses.replace(LADDER, experiments=(changed, *others)).hash)
-    for change in ({"seeds": (5,)}, {"evaluation_episodes": 7}, {"execution": "physics"}):
-        hashes.add(dataclasses.replace(LADDER, **change).hash)
-    assert len(hashes) == 8
+    assert len(hashes) == 5
 
 
 def test_every_level_is_a_world_in_which_something_can_be_learned():
@@ -141,8 +139,6 @@ def test_every_level_is_a_world_in_which_something_can_be_learned():
 def test_names_that_do_not_exist_are_named():
     with pytest.raises(UnknownNameError, match="No experiment 'memry'"):
         LADDER.only(["memry"])
-    with pytest.raises(UnknownNameError, match="No agent 'nobody'"):
-        plan_level(TINY, TINY.experiments[1].levels[0], "nobody")
     with pytest.raises(InvalidValueError, match="each name once"):
         dataclasses.replace(TINY, experiments=TINY.experiments * 2)
 
