@@ -358,7 +358,6 @@ def require_done(folder: Path) -> dict[str, Any]:
 
     Raises ArtefactError: the run is unfinished, damaged or of another format.
     """
-    config = read_config(folder)
     digests = read_sealed(folder / _DONE, "the mark of a finished run")["sha256"]
     for name, written in digests.items():
         if name == _RECORDING and not recording_path(folder).exists():
@@ -368,7 +367,7 @@ def require_done(folder: Path) -> dict[str, Any]:
                 f"{folder / name} is not as the run left it (it was changed or damaged). It was left untouched; delete "
                 f"{folder} to run it anew."
             )
-    return config
+    return read_config(folder)
 
 
 def load_run(folder: Path) -> RunResult:

@@ -70,7 +70,7 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
     assert made["versions"] and made["machine"]
     right = dataclasses.replace(lines[1], imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]))
     page = study_page(STUDY, [lines[0], right])
-    assert [row[-2] for row in page.sections[0].tables[0].rows] == ["–", "–", "–", "30.0"], "at the last budget"
+    assert [row[-2] for row in page.sections[0].tables[0].rows] == ["–", "–", "20.0", "30.0"], "means of seeds"
     rows = list(csv.DictReader(page.files["seeds.csv"].splitlines()))
     assert [row["imagined_right"] for row in rows][4:] == ["0.1000", "0.2000", "0.3000", "0.4000"]
 
