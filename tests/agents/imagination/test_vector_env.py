@@ -53,11 +53,10 @@ def test_with_the_true_rules_every_transition_is_theirs() -> None:
         for i, (state, action, following) in enumerate(zip(read(before), actions.tolist(), read(reached), strict=True)):
             (rule,) = RULES.outcomes(state, action)
             assert (following, rewards[i], terminated[i]) == (rule.macrostate, rule.reward, rule.terminated)
-            assert truncated[i] == (age[i] == 4 and not terminated[i])
             seen.add((state, action))
+        assert (truncated == ((age == 4) & ~terminated)).all()
         ends |= set(zip(terminated.tolist(), truncated.tolist(), strict=True))
-        assert info["accepted"].all()
-        assert not info["epistemic"].any()
+        assert info["accepted"].all() and not info["epistemic"].any()
         assert set(read(after[ended])) <= set(RULES.start_states)
         age[ended] = 0
         before = after

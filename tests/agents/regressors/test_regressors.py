@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -74,7 +75,7 @@ def test_hidden_layers_decay_and_the_output_layer_does_not() -> None:
     assert moved == [True, True, False, True, False, False], "weights, then biases; hidden biases begin at 0"
 
 
-@pytest.mark.parametrize(("batch_size", "updates"), [(None, 1), (600, 1), (250, 3), (8, 75)])
+@pytest.mark.parametrize(("batch_size", "updates"), [(None, 1), (250, 3), (8, 75)])
 def test_an_epoch_takes_the_fewest_batches_of_at_most_that_size(batch_size: int | None, updates: int) -> None:
     line = RegressionData(inputs=np.linspace(-1, 1, 600)[:, None], targets=np.ones((600, 1)))
     model = regressor("mc_dropout", [line], [0], hidden=(4, 4), batch_size=batch_size, epochs=2)
@@ -137,11 +138,11 @@ def test_weight_samples_in_one_pass_are_those_of_a_loop(sizes: tuple[int, ...]) 
 
 
 def test_units_right_before_the_output_are_never_dropped() -> None:
-    network = NormedMLP((2, 16, 24, 32, 3), generators=[generator(0), generator(1)], dropout=0.5)
-    masks = network.draw_masks(200, [generator(2), generator(3)])
-    assert masks is not None and [tuple(mask.shape) for mask in masks] == [(2, 16, 200), (2, 24, 200)]
+    network = NormedMLP((2, 16, 24, 32, 3), generators=[generator()], dropout=0.5)
+    masks = network.draw_masks(200, [generator(2)])
+    assert masks is not None and [tuple(mask.shape) for mask in masks] == [(1, 16, 200), (1, 24, 200)]
     assert all(set(mask.unique().tolist()) == {0.0, 2.0} for mask in masks)
-    assert NormedMLP((2, 16, 3), generators=[generator(0)], dropout=0.5).draw_masks(9, [generator(1)]) is None
+    assert NormedMLP((2, 16, 3), generators=[generator()], dropout=0.5).draw_masks(9, [generator(1)]) is None
 
 
 def test_first_units_bend_all_over_the_data() -> None:
@@ -157,10 +158,10 @@ def test_a_likelihood_that_is_not_finite_changes_nothing() -> None:
     model = among([0, 1])
     x, y = data(2)
     y[1, 3, 0] = math.nan
-    before = [values.clone() for values in model.network.state_dict().values()]
+    before = copy.deepcopy(model.network.state_dict())
     with pytest.raises(DivergedError, match=r"A likelihood is not finite, .* Losses of the networks: \[\d.*, nan\]"):
         model.update(x, y)
-    after = model.network.state_dict().values()
+    after = model.network.state_dict()
     assert len(before) > len(list(model.network.parameters())), "the running statistics must be among them"
-    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert all(torch.equal(each, after[name]) for name, each in before.items())
     assert model.network.batches == 0
