@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 from unittest import mock
 
 import numpy as np
 import pytest
 import torch
+from agent_states import same
 from counting_model import CountingModel, practising
 from fake_latents import CODES, built, frame, live, make_dqn, transition
 from imagine_bench.agents.dqn import Controller, epsilon
@@ -95,6 +97,15 @@ def test_training_twice_from_equal_experience_gives_equal_bits() -> None:
 
     once = trained(often=False)
     assert all(np.array_equal(array, once[name]) for name, array in trained(often=True).items())
+
+
+def test_interrupted_training_goes_on_to_the_same_bits() -> None:
+    agent, resumed = (made(**{"controller.target_rate": 0.1}) for _ in range(2))
+    live(agent, range(3), np.random.default_rng(0))
+    assert all(agent.train_in_model() for _ in range(3))
+    resumed.restore(copy.deepcopy(agent.state()))
+    assert [train_in_model(each) for each in (agent, resumed)] == [5, 5]
+    assert same(agent.state(), resumed.state())
 
 
 def test_imagined_episodes_begin_where_real_ones_did() -> None:

@@ -8,10 +8,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.settings import WorldModelSettings
 from imagine_bench.agents.imagination.world_model import EnvironmentModel, log_cosh
 from imagine_bench.agents.replay import Batch
 from plain_torch import PlainWorldModel
+from torch.nn import functional
 
 from imagine_bench.errors import DivergedError
 
@@ -50,6 +52,18 @@ def test_log_cosh_is_itself_and_does_not_overflow() -> None:
     x = torch.linspace(-5.0, 5.0, 101, dtype=torch.float64)
     torch.testing.assert_close(log_cosh(x), x.cosh().log())
     assert log_cosh(torch.tensor(1e4)).item() == pytest.approx(1e4 - math.log(2.0))
+
+
+def test_losses_compare_what_is_predicted() -> None:
+    model, batch = make(dropout=0.0, reward_scale=10.0, precision="float32"), chain_batch(16, draws(1))
+    mixture = model.predict(batch.z, batch.action, None).map(lambda part: part[0])
+    reward, p_terminated = model.predict_outcome(batch.z, batch.action, batch.next_z)
+    expected = [
+        -mdn.log_likelihood(mixture, batch.next_z).mean(),
+        log_cosh((reward - batch.reward) / 10.0).mean(),
+        functional.binary_cross_entropy(p_terminated, batch.terminated),
+    ]
+    torch.testing.assert_close(losses(model, batch, draws(2)).detach(), torch.stack(expected), rtol=1e-4, atol=1e-5)
 
 
 def test_a_predicted_change_is_added_to_where_it_began() -> None:
