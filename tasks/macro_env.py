@@ -42,7 +42,7 @@ class EnvState:
     episode: Mapping[str, object] = field(repr=False)  #: what else it has of :data:`_EPISODE`
 
 
-_EPISODE = ("begun", "_latest", "_people", "_steps", "_observations", "_observed")
+_EPISODE = ("begun", "latest", "_people", "_steps", "_observations", "_observed")
 """Attributes that say where an episode stands: latest macro-action, and what lag keeps back."""
 
 
@@ -170,7 +170,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         super().reset(seed=seed)
         start = self._start({} if options is None else options)
         self.begun = True
-        self._latest = None
+        self.latest = None
         self._steps = 0
         self._observations = ()
         self._observed = ()
@@ -211,8 +211,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         if self.execution == "physics":
             self._people = self._mocap()
             self.world.executor.capture_motion_hz = self.capture_motion_hz
-            self._latest = self.world.execute(chosen, intended.macrostate)
-            fault = self._latest.fault
+            self.latest = self.world.execute(chosen, intended.macrostate)
+            fault = self.latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
         self._vary(move_objects=self.execution == "kinematic")
@@ -237,7 +237,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
 
     def diverged(self, error: DivergedError) -> Info:
         """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
-        self._latest = None
+        self.latest = None
         return self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=str(error))
 
     def render(self) -> Frame | None:
@@ -345,7 +345,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         return outcomes[int(self.np_random.choice(len(outcomes), p=chances / chances.sum()))]
 
     def _info(self, *, success: bool, legal: bool, fault: str | None) -> Info:
-        latest = self._latest
+        latest = self.latest
         return {
             "macrostate": np.array(self._macrostate, dtype=np.int64),
             "shown": np.array(self._observed[0], dtype=np.int64),

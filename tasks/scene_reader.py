@@ -89,7 +89,7 @@ class FilmedScene:
         self.world = world
         self.capture_motion_hz = motion_hz
         self._cameras: list[Renderer] = []
-        self._latest: MacroResult | None = None
+        self.latest: MacroResult | None = None
         self._people = self._mocap()
 
     @property
@@ -204,7 +204,7 @@ class FilmedScene:
 
     def _captured(self) -> Samples | None:
         """The motion of the latest macro-action, if it was captured."""
-        return self._latest.motion if self._latest is not None and len(self._latest.motion.time_s) else None
+        return self.latest.motion if self.latest is not None and len(self.latest.motion.time_s) else None
 
     def _mocap(self) -> tuple[Floats, Floats]:
         """Where people's hands are now: positions (nmocap, 3) and quaternions (nmocap, 4), copied."""

@@ -75,7 +75,7 @@ class World(abc.ABC):
         self.data = mujoco.MjData(model)
         self.sensing = Sensing()
         self._bodies = [model.body(body).id for body in objects]
-        self._level = level
+        self.level = level
         self._names = tuple(objects.values())
         self._varies = level.varies_every_frame
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
@@ -157,7 +157,7 @@ class World(abc.ABC):
         Where frames are patched of fragments, a fragment's pose holds too unless objects must not move: what lies
         where physics left it lies there.
         """
-        if self._level.pool is not None:
+        if self.level.pool is not None:
             self._patch(rng, move_objects=move_objects)
         elif self._varies:
             self._appearance.vary(rng)
@@ -172,7 +172,7 @@ class World(abc.ABC):
         objects, _ = self._objects()
         gesture = self._read_gesture()
         hidden = self.observed((*objects, gesture))[-1]  # light would tell what is hidden
-        self._composite = draw_composite(self._level, objects, hidden, rng)
+        self._composite = draw_composite(self.level, objects, hidden, rng)
         for index, (value, fragment) in enumerate(zip(objects, self._composite.objects, strict=True)):
             if move_objects:
                 x, y, _, yaw = fragment.offset
@@ -183,9 +183,7 @@ class World(abc.ABC):
         """Put hands off their places by shares of what the appearance allows in x, y, z and yaw, if they may vary."""
         if self._hands_vary():
             *shift, turn = offset
-            self._gesture(
-                gesture, [self._level.hand_offset_m * each for each in shift], self._level.hand_yaw_rad * turn
-            )
+            self._gesture(gesture, [self.level.hand_offset_m * each for each in shift], self.level.hand_yaw_rad * turn)
 
     def composite(self, frame: Frame) -> Frame:
         """What the agent's camera makes of a rendered frame (H, W, 3): itself but where frames are photographs."""
@@ -241,7 +239,7 @@ class World(abc.ABC):
     def _scaled(self, offset: Sequence[float]) -> tuple[float, float, float]:
         """Shares of what the appearance allows, in x, y and yaw, as metres and radians."""
         x, y, yaw = offset
-        return self._level.object_offset_m * x, self._level.object_offset_m * y, self._level.object_yaw_rad * yaw
+        return self.level.object_offset_m * x, self.level.object_offset_m * y, self.level.object_yaw_rad * yaw
 
     def _gesture(self, gesture: int, offset_m: Sequence[float] = (0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> None:
         x_m, y_m, z_m = offset_m

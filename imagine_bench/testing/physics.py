@@ -129,7 +129,8 @@ def check_physics(
     return all(figure.met for figure in figures)
 
 
-def _env(spec: TaskSpec, **options: Any) -> Any:
+def make_env(spec: TaskSpec, **options: Any) -> Any:
+    """The task's environment itself, without Gymnasium's wrappers; keywords as for ``gymnasium.make``."""
     return gymnasium.make(spec.env_id, **options, disable_env_checker=True).unwrapped
 
 
@@ -192,7 +193,7 @@ def measure_fidelity(spec: TaskSpec, actions: int, appearance: str = _CLEAN) -> 
     """
     objects = () if spec.targets is None else spec.targets.objects
     goes_on = spec.targets is not None and spec.targets.goes_on
-    real, perfect = (_env(spec, execution=each, appearance=appearance) for each in ("physics", "kinematic"))
+    real, perfect = (make_env(spec, execution=each, appearance=appearance) for each in ("physics", "kinematic"))
     found = Fidelity(actions=actions)
     rng = SeedTree(0).child("speed", "physics", spec.id).generator()
     walk_actions = _ACTIONS_A_WALK if appearance == _CLEAN else _ACTIONS_A_VARIED_WALK
@@ -289,7 +290,7 @@ def measure_margins(spec: TaskSpec, trials: int, show: Callable[[str], None]) ->
     object if it succeeds. The same starts, actions and seeds serve every value.
     """
     try:
-        _env(spec, physics=PhysicsSettings()).close()
+        make_env(spec, physics=PhysicsSettings()).close()
     except TypeError:  # Gymnasium's, for a keyword that the environment does not take
         show(f"No margins: the environment of {spec.id} takes no physics settings.")
         return {}
@@ -310,7 +311,7 @@ def measure_margins(spec: TaskSpec, trials: int, show: Callable[[str], None]) ->
 
 def as_ruled(spec: TaskSpec, settings: PhysicsSettings, trials: int) -> int:
     """How many of so many macro-actions end as the rules say and without a fault."""
-    env = _env(spec, physics=settings)
+    env = make_env(spec, physics=settings)
     rng = SeedTree(0).child("margins", spec.id).generator()
     starts = spec.rules.start_states
     right = 0
@@ -334,7 +335,7 @@ def walk(spec: TaskSpec, sense: str) -> dict[str, Any]:
         The sense; macro-actions done, and as ruled; of each walk its length and what ended it early; and in mm the
         furthest that a standing object came from where it stood at first.
     """
-    env = _env(spec, physics=PhysicsSettings(sense=sense))
+    env = make_env(spec, physics=PhysicsSettings(sense=sense))
     rng = SeedTree(0).child("margins", "walk", spec.id).generator()
     lengths = []
     faults = []

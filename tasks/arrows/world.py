@@ -32,7 +32,7 @@ class ArrowWorld(World):
 
     def __init__(self, level: Appearance, parameters: Arrows = _THESIS) -> None:
         self._turns = parameters.turns
-        self._layout = layout(parameters.cubes)
+        self.layout = layout(parameters.cubes)
         objects = {f"cube_{cube}": f"cube {cube}" for cube in range(parameters.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
         model = compile_arrow_scene(parameters.cubes, parameters.distractors)
@@ -44,7 +44,7 @@ class ArrowWorld(World):
         """What carries macro-actions out in contact physics, made when it is first needed."""
         from ..motion.turn import TurnExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
-        return TurnExecutor(self.model, self.data, self._layout.slots_xy_m, self.sensing)
+        return TurnExecutor(self.model, self.data, self.layout.slots_xy_m, self.sensing)
 
     def set_outcome(self, action: int, intended: State) -> None:
         """Kinematic execution: a turned cube stands where a good turn leaves it."""
@@ -84,7 +84,7 @@ class ArrowWorld(World):
         return self._objects()[0][cube] == intended[cube]
 
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        x_m, y_m = self._layout.slots_xy_m[index]
+        x_m, y_m = self.layout.slots_xy_m[index]
         right_m, up_m, turned_rad = self._scaled(offset)
         self.data.qpos[self.object_qpos[index]] = (
             x_m + right_m,
@@ -94,14 +94,14 @@ class ArrowWorld(World):
         )
 
     def _hands_m(self, gesture: int) -> dict[int, c.Point]:
-        return {self._hand: self._layout.fingertips_m[gesture]}
+        return {self._hand: self.layout.fingertips_m[gesture]}
 
     def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
         """The nearest direction of a cube's arrow, and what is wrong with how the cube stands."""
         turned_rad = orientation.yaw_rad(*pose[3:])
         quarters = round(turned_rad / _QUARTER_RAD)
         skew_rad = abs(turned_rad - quarters * _QUARTER_RAD)
-        off_m = math.dist(pose[:2], self._layout.slots_xy_m[index])
+        off_m = math.dist(pose[:2], self.layout.slots_xy_m[index])
         problem = self._tipped(index, pose)
         if problem is None and off_m > MAX_OFF_SLOT_M:
             problem = f"{self._names[index]} stands {1e3 * off_m:.0f} mm off its slot"
@@ -112,5 +112,5 @@ class ArrowWorld(World):
     def _read_gesture(self) -> int:
         """The slot that the fingertip is over."""
         fingertip_y_m = float(self.data.mocap_pos[self._hand, 1])
-        slots = self._layout.slots_xy_m
+        slots = self.layout.slots_xy_m
         return min(range(len(slots)), key=lambda slot: abs(slots[slot][1] - fingertip_y_m))

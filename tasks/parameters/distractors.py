@@ -12,12 +12,12 @@ from ..scenes import constants as c
 
 _TILES = (4, 8)
 """Of the screen, away from the robot and across."""
-_LOW_M = (0.695, -0.12)
-_HIGH_M = (0.795, 0.12)
+LOW_M = (0.695, -0.12)
+HIGH_M = (0.795, 0.12)
 """Corners of the screen in the plane of the table, behind whatever stands there and in every frame."""
 _THICKNESS_M = 0.002
-_RADIUS_M = 0.012
-_ON_SCREEN_M = np.array(_LOW_M) + _RADIUS_M, np.array(_HIGH_M) - _RADIUS_M
+RADIUS_M = 0.012
+_ON_SCREEN_M = np.array(LOW_M) + RADIUS_M, np.array(HIGH_M) - RADIUS_M
 """Where a ball's middle may be."""
 _ROLL_M = 0.03
 """The most that a ball rolls along each axis between two frames; at the screen's edge it turns back."""
@@ -30,9 +30,9 @@ def add_distractors(spec: mujoco.MjSpec, count: int) -> None:
     """Add the screen's tiles ``screen_i`` and mocap bodies ``distractor_1`` and on; nothing if the count is 0."""
     if not count:
         return
-    sizes_m = (np.array(_HIGH_M) - _LOW_M) / _TILES
+    sizes_m = (np.array(HIGH_M) - LOW_M) / _TILES
     for index, cell in enumerate(np.ndindex(_TILES)):
-        x_m, y_m = _LOW_M + (np.array(cell) + 0.5) * sizes_m
+        x_m, y_m = LOW_M + (np.array(cell) + 0.5) * sizes_m
         name = f"screen_{index}"
         spec.add_material(name=name, rgba=(0.5, 0.5, 0.5, 1.0), specular=0.0, emission=0.1)
         spec.worldbody.add_geom(
@@ -45,14 +45,12 @@ def add_distractors(spec: mujoco.MjSpec, count: int) -> None:
         )
     for ball in range(1, count):
         name = f"distractor_{ball}"
-        middle_m = np.mean([_LOW_M, _HIGH_M], axis=0)
+        middle_m = np.mean([LOW_M, HIGH_M], axis=0)
         spec.add_material(name=name, rgba=_RGBA[ball - 1], specular=0.2, shininess=0.3)
         body = spec.worldbody.add_body(
-            name=name, mocap=True, pos=(*middle_m, c.TABLE_HEIGHT_M + _THICKNESS_M + _RADIUS_M)
+            name=name, mocap=True, pos=(*middle_m, c.TABLE_HEIGHT_M + _THICKNESS_M + RADIUS_M)
         )
-        body.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(_RADIUS_M, 0, 0), material=name, **_DRAWN_ONLY
-        )
+        body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(RADIUS_M, 0, 0), material=name, **_DRAWN_ONLY)
 
 
 class Distraction:

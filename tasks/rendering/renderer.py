@@ -61,7 +61,7 @@ def _is_egl() -> bool:
     return sys.platform == "linux" and os.environ.get("MUJOCO_GL") == "egl"
 
 
-def _new_gl_context(width: int, height: int) -> Any:
+def new_gl_context(width: int, height: int) -> Any:
     """A current OpenGL context of the platform that MUJOCO_GL names, or a headless one."""
     try:
         if _is_egl():
@@ -88,7 +88,7 @@ def gl_renderer() -> str:
     Raises:
         SetupError: The machine has no OpenGL.
     """
-    context = _new_gl_context(64, 64)
+    context = new_gl_context(64, 64)
     try:
         from OpenGL import GL  # noqa: PLC0415  (after the platform is chosen)
 
@@ -136,7 +136,7 @@ class _Canvas:
 
     def __init__(self, model: mujoco.MjModel, view: View, thread: int | None) -> None:
         self.thread = thread
-        self.gl = _new_gl_context(view.width, view.height)
+        self.gl = new_gl_context(view.width, view.height)
         self._address = ctypes.cast(self.gl._context, ctypes.c_void_p).value if _is_egl() else None
         try:
             self.mjr = mujoco.MjrContext(_in_quality(model, view), mujoco.mjtFontScale.mjFONTSCALE_100.value)

@@ -258,8 +258,8 @@ def test_every_task_has_a_vector_id_and_keeps_its_default():
 
 def test_lanes_are_drawn_in_one_context_a_view(monkeypatch):
     made = []
-    make_context = rendering._new_gl_context
-    monkeypatch.setattr(rendering, "_new_gl_context", lambda *size: made.append(size) or make_context(*size))
+    make_context = rendering.new_gl_context
+    monkeypatch.setattr(rendering, "new_gl_context", lambda *size: made.append(size) or make_context(*size))
     rendering.close_contexts()
     vector = make(n=4, **KINEMATIC, appearance="strong", render_mode="rgb_array", width=48, height=32)
     vector.reset(seed=0)

@@ -32,7 +32,7 @@ def test_tests_have_starts_and_looks_that_training_never_saw(tmp_path: Path, mon
     reset, seen, shown = MacroEnv.reset, set(), set()
 
     def noted(env: MacroEnv, *, seed: int, options: Any = None) -> Any:
-        seen.add((seed >> 56, env.world._level.name))
+        seen.add((seed >> 56, env.world.level.name))
         return reset(env, seed=seed, options=options)
 
     monkeypatch.setattr(MacroEnv, "reset", noted)

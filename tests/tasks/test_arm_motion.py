@@ -68,7 +68,7 @@ def test_rates_above_the_simulation_s_are_interpolated():
     )
     np.testing.assert_allclose(motion.joint_rad_s[42], steps.joint_rad_s[26] * 0.75 + steps.joint_rad_s[27] * 0.25)
     np.testing.assert_array_equal(motion.joint_command_rad[41], steps.joint_command_rad[25])
-    quats = env.unwrapped._latest.motion.qpos[:, env.unwrapped.world.object_qpos[:, 3:]]
+    quats = env.unwrapped.latest.motion.qpos[:, env.unwrapped.world.object_qpos[:, 3:]]
     np.testing.assert_allclose(np.linalg.norm(quats, axis=-1), 1.0, atol=1e-12)
 
 

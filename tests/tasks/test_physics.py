@@ -144,7 +144,7 @@ def near_misses(task, actions):
         _, _, over, _, info = env.step(int(rng.integers(spec.n_actions)))
         assert not info["fault"], info["fault_reason"]
         data.mocap_pos[:] = people
-        for qpos in env._latest.motion.qpos:
+        for qpos in env.latest.motion.qpos:
             found |= touching(model, data, qpos, names)
             samples += 1
     return found, samples

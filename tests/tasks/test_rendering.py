@@ -65,8 +65,8 @@ def test_frames_are_new_upright_contiguous_arrays(world):
 
 def test_renderers_of_one_scene_and_view_share_a_context(world, monkeypatch):
     made = []
-    make = rendering._new_gl_context
-    monkeypatch.setattr(rendering, "_new_gl_context", lambda *size: made.append(size) or make(*size))
+    make = rendering.new_gl_context
+    monkeypatch.setattr(rendering, "new_gl_context", lambda *size: made.append(size) or make(*size))
     twin = ArrowWorld(appearance("clean"))
     twin.place((3, 3, 0, 2), np.random.default_rng(0))
     worlds = world, twin, PickWorld(appearance("clean"))
@@ -117,7 +117,7 @@ def test_a_context_that_other_code_damaged_is_not_shared(world, monkeypatch):
 
 
 def test_no_context_is_made_before_the_first_frame(world, monkeypatch):
-    monkeypatch.setattr(rendering, "_new_gl_context", lambda *_: pytest.fail("made a context"))
+    monkeypatch.setattr(rendering, "new_gl_context", lambda *_: pytest.fail("made a context"))
     camera = own_camera(world.model)
     twin = pickle.loads(pickle.dumps(camera))  # as a pickled environment's
     with pytest.raises(pytest.fail.Exception, match="made a context"):
@@ -265,8 +265,8 @@ def test_scenes_of_several_threads_end_in_silence():
 
 def test_any_thread_draws_one_at_a_time(world, monkeypatch):
     made = []
-    make = rendering._new_gl_context
-    monkeypatch.setattr(rendering, "_new_gl_context", lambda *size: made.append(size) or make(*size))
+    make = rendering.new_gl_context
+    monkeypatch.setattr(rendering, "new_gl_context", lambda *size: made.append(size) or make(*size))
     camera = own_camera(world.model)
     before = camera.frame(world.data)
     with ThreadPoolExecutor(1) as first, ThreadPoolExecutor(1) as second:

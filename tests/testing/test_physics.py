@@ -40,8 +40,8 @@ def test_fidelity_and_margins_are_measured_and_kept(tmp_path, monkeypatch, capsy
 
 def test_a_walk_ends_with_its_first_fault(monkeypatch):
     monkeypatch.setattr(physics, "_WALKS", 2)
-    make = physics._env
-    monkeypatch.setattr(physics, "_env", lambda spec, **_: make(spec, physics=SLIPPERY))
+    make = physics.make_env
+    monkeypatch.setattr(physics, "make_env", lambda spec, **_: make(spec, physics=SLIPPERY))
     found = physics.walk(registry.task("pick_place"), "true")
     assert (found["lengths"], found["as_ruled"], len(found["faults"])) == ([1, 1], 0, 2)
 

@@ -31,8 +31,8 @@ def on_the_screen(env):
     rays = np.stack([right * tangent, up * tangent, -np.ones_like(right)], axis=-1) @ turn.T  # [64, 64, 3]
     depth = (place_m[2] - env.data.geom_xpos[env.model.geom("screen_0").id, 2]) / -rays[..., 2]
     hit_m = place_m[:2] + depth[..., None] * rays[..., :2]
-    wide_m = 2 * distractors._RADIUS_M  # a ball, and how much further away it seems for its height
-    low_m, high_m = np.array(distractors._LOW_M) - wide_m, np.array(distractors._HIGH_M) + wide_m
+    wide_m = 2 * distractors.RADIUS_M  # a ball, and how much further away it seems for its height
+    low_m, high_m = np.array(distractors.LOW_M) - wide_m, np.array(distractors.HIGH_M) + wide_m
     return ((hit_m > low_m) & (hit_m < high_m)).all(axis=-1)
 
 

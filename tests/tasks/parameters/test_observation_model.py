@@ -94,9 +94,9 @@ def test_what_was_moved_stands_as_if_it_never_was(id_, parameters, execution):
 
 def offsets(env):
     """How far objects stand off their places, as shares of what the appearance allows: x, y, yaw. Shape (N, 3)."""
-    poses, level = env.world.object_poses(), env.world._level
-    if hasattr(env.world, "_layout"):
-        places_m = np.array(env.world._layout.slots_xy_m)
+    poses, level = env.world.object_poses(), env.world.level
+    if hasattr(env.world, "layout"):
+        places_m = np.array(env.world.layout.slots_xy_m)
     else:
         places_m = np.array([standing_m(index)[:2] for index in range(len(poses))])
     yaw_rad = np.array([orientation.yaw_rad(*pose[3:]) for pose in poses])

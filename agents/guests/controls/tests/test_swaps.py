@@ -77,7 +77,7 @@ def test_a_swap_by_hand() -> None:
     """Action 0 turns the first wheel: the other factors come from elsewhere, where the outcome was seen once only."""
     learner = agent()
     learner.touched[0] = torch.tensor([True, False, False])
-    learner.outcomes = {(1, 0, 1): (10.0, 1.0), (1, 1, 0): swaps._UNSURE}
+    learner.outcomes = {(1, 0, 1): (10.0, 1.0), (1, 1, 0): swaps.UNSURE}
     batch = Batch(hot(*[(0, 2, 0)] * 4), torch.zeros(4, dtype=torch.int64), torch.full((4,), -1.0),
                   hot(*[(1, 2, 0)] * 4), torch.zeros(4))  # fmt: skip
     found = learner.swapped(batch, hot((2, 0, 1), (2, 1, 0), (0, 0, 0)))
@@ -97,7 +97,7 @@ def test_an_outcome_that_differs_is_unknown_for_good() -> None:
         learner.observe(type(moved)(observation=moved.observation, action=0, reward=reward,
                                     next_observation=moved.next_observation, terminated=moved.terminated,
                                     truncated=False), episode=0)  # fmt: skip
-        assert learner.outcomes[code] == swaps._UNSURE
+        assert learner.outcomes[code] == swaps.UNSURE
 
 
 def test_latents_have_no_parts_to_swap(monkeypatch: pytest.MonkeyPatch) -> None:

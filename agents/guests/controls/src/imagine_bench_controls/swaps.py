@@ -27,7 +27,7 @@ from imagine_bench.seeding import SeedTree
 
 from .settings import SWAPPING, SwappingSettings
 
-_UNSURE = (0.0, -1.0)
+UNSURE = (0.0, -1.0)
 """Of a next code that had several outcomes."""
 
 
@@ -51,7 +51,7 @@ class SwappingDQN(DQN):
         self.touched[transition.action] |= self._codes(z.unsqueeze(0))[0] != then
         code = tuple(then.tolist())
         outcome = (transition.reward, float(transition.terminated))
-        self.outcomes[code] = outcome if self.outcomes.get(code, outcome) == outcome else _UNSURE
+        self.outcomes[code] = outcome if self.outcomes.get(code, outcome) == outcome else UNSURE
         return z
 
     def draw_batch(self, memory: Transitions) -> Batch:
@@ -66,7 +66,7 @@ class SwappingDQN(DQN):
         touched = self.touched[batch.action[:count]]  # [N, P]
         before = torch.where(touched, before, theirs)
         after = torch.where(touched, after, theirs)
-        outcomes = [self.outcomes.get(tuple(code), _UNSURE) for code in after.tolist()]
+        outcomes = [self.outcomes.get(tuple(code), UNSURE) for code in after.tolist()]
         reward, ended = torch.tensor(outcomes, dtype=batch.reward.dtype, device=batch.z.device).reshape(-1, 2).T
         known = ended >= 0.0
         z = batch.z.clone()
