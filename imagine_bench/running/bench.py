@@ -122,13 +122,9 @@ def counted(items: Iterable[Item], what: str, *, total: int) -> Iterable[Item]:
 
 def _sentence(progress: Progress, work: int) -> str:
     """What a run is doing, and how far it is of all its ``work``."""
-    if progress.detail is not None:
-        return f"{progress.agent} seed {progress.seed}: {progress.detail}, {100 * progress.done / work:.0f} %"
+    doing = progress.detail or f"{progress.phase}, training episode {progress.episode}"
     success = "" if progress.success is None else f", success {100 * progress.success:.0f} %"
-    return (
-        f"{progress.agent} seed {progress.seed}: {progress.phase}, training episode {progress.episode}, "
-        f"{100 * progress.done / work:.0f} % of its episodes{success}"
-    )
+    return f"{progress.agent} seed {progress.seed}: {doing}, {100 * progress.done / work:.0f} % of its work{success}"
 
 
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
@@ -293,18 +289,15 @@ _Bench = tuple[BenchStore, Encoders]
 
 def _jobs(store: BenchStore, paths: Encoders) -> list[Job]:
     """What is missing of a bench, seed by seed; agents that are listed last cost most and come first of each."""
-    order = store.protocol.agents
-    pairs = sorted(store.missing(), key=lambda pair: (pair[1], -order.index(pair[0])))
-    return [_job(store, paths, *pair) for pair in pairs]
-
-
-def _job(store: BenchStore, paths: Encoders, agent: str, seed: int) -> Job:
-    spec = RunSpec(protocol=store.protocol, agent=agent, seed=seed, dataset=paths.get("dataset"))
-    if registry.has_task(store.protocol.task):  # regressors have no encoder
-        entry = registry.agent_entry(agent)
-        encoder = paths[entry.encoder_kind] if entry.needs_encoder else None
-        spec = dataclasses.replace(spec, encoder=encoder)
-    return Job(spec=spec, folder=store.run_folder(agent, seed))
+    protocol = store.protocol
+    acts = registry.has_task(protocol.task)  # regressors have no encoder
+    jobs = []
+    for agent, seed in sorted(store.missing(), key=lambda pair: (pair[1], -protocol.agents.index(pair[0]))):
+        entry = registry.agent_entry(agent) if acts else None
+        encoder = paths[entry.encoder_kind] if entry is not None and entry.needs_encoder else None
+        spec = RunSpec(protocol=protocol, agent=agent, seed=seed, encoder=encoder, dataset=paths.get("dataset"))
+        jobs.append(Job(spec=spec, folder=store.run_folder(agent, seed)))
+    return jobs
 
 
 def _warn(changed: Sequence[str], folder: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-import os
 import sys
 import types
 from collections.abc import Callable, Mapping
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 from small_runs import exact
 
-from imagine_bench.errors import ArtefactError, SetupError
+from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState
 from imagine_bench.running.evaluation import EvaluationCounts
 from imagine_bench.running.run_state import Counters
@@ -108,25 +107,6 @@ def test_the_newest_is_kept_alone(tmp_path: Path) -> None:
     assert load_newest(tmp_path / "nothing") is None
     save_snapshot(tmp_path / "other", snapshot(1)).rename(tmp_path / "checkpoint_000001_episode_1")
     assert newest_episode(tmp_path) == 2, "an older one that a kill left behind"
-
-
-def test_a_save_that_fails_half_way_keeps_the_one_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    save_snapshot(tmp_path, snapshot(1))
-    real, calls = os.fsync, []
-
-    def full_at_the_third(handle: int) -> None:
-        calls.append(handle)
-        if len(calls) == 3:
-            raise OSError(28, "No space left on device")
-        real(handle)
-
-    monkeypatch.setattr(os, "fsync", full_at_the_third)
-    with pytest.raises(SetupError, match="the disk is full"):
-        save_snapshot(tmp_path, snapshot(2))
-    assert newest_episode(tmp_path) == 1
-    assert list(tmp_path.glob(".partial*"))  # what the failure left behind ...
-    save_snapshot(tmp_path, snapshot(3))
-    assert not list(tmp_path.glob(".partial*"))  # ... goes with the next success
 
 
 @pytest.mark.parametrize("name", ["agent.safetensors", "runner.safetensors"])

@@ -85,15 +85,6 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path) ->
         assert str(os.getpid()) in (tmp_path / ".lock.holder").read_text()
 
 
-def test_a_lock_needs_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(path: Path, text: str) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_text", full)
-    with lock(tmp_path / ".lock", "The folder"), pytest.raises(BusyError), lock(tmp_path / ".lock", "The folder"):
-        pass
-
-
 @pytest.mark.parametrize(
     ("then", "now", "found"),
     [
