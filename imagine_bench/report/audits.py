@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -38,7 +36,6 @@ from imagine_bench.store.files import (
     lock,
     make_folder,
     table_text,
-    with_null,
     write_bytes,
     write_json,
     writing,
@@ -52,15 +49,12 @@ _COUNTS = {
     "solved": "solved",
     "optimal": "of these optimal",
     "refused": "refused as too uncertain",
-    "shortest": "macro-actions of a solved plan, the fewest",
-    "longest": "the most",
-    "mean_length": "mean",
     "steps": "macro-actions carried out",
     "steps_as_imagined": "that led where imagined",
     "faults": "faults of the physics",
 }
-_CELLS = {"index.html": r"<t[dh][^>]*>(.*?)</t[dh]>"}
-"""What is compared of a report's page: the cells of its tables; of other files it is every line."""
+_CELL = re.compile(r"<t[dh][^>]*>(.*?)</t[dh]>")
+_LINE = re.compile("^.*$", re.MULTILINE)
 
 
 def chosen(given: Path | None, root: Path, task: str | None) -> Path:
@@ -129,21 +123,17 @@ def plan_report(
     return text
 
 
-def summarise(plans: Sequence[PlanResult]) -> dict[str, float]:
-    """Counts over plans, and macro-actions of the solved ones (0 and NaN where none was).
+def summarise(plans: Sequence[PlanResult]) -> dict[str, int]:
+    """Counts over plans.
 
     ``steps`` are macro-actions carried out, ``steps_as_imagined`` those that led where they were imagined to, and
     ``faults`` those whose physics disagreed with the rules.
     """
-    lengths = [plan.done for plan in plans if plan.solved]
     return {
         "attempted": len(plans),
         "refused": sum(bool(plan.refused) for plan in plans),
-        "solved": len(lengths),
+        "solved": sum(plan.solved for plan in plans),
         "optimal": sum(plan.optimal for plan in plans),
-        "shortest": min(lengths, default=0),
-        "longest": max(lengths, default=0),
-        "mean_length": float(np.mean(lengths)) if lengths else math.nan,
         "steps": sum(plan.done for plan in plans),
         "steps_as_imagined": sum(int(plan.as_imagined.sum()) for plan in plans),
         "faults": sum(plan.faults for plan in plans),
@@ -154,13 +144,12 @@ def plan_table(plans: Sequence[PlanResult], task: TaskSpec) -> Table:
     """The counts, the thesis' beside them where it has any."""
     found = summarise(plans)
     thesis = {} if task.reference is None else reference.load(task.reference).get("plans", {})
-    low, high = statistics.wilson(int(found["solved"]), len(plans))
+    low, high = statistics.wilson(found["solved"], len(plans))
+    share = f" = {percent(found['solved'] / len(plans))} % [{percent(low)}, {percent(high)}]"
     rows = []
     for name, words in _COUNTS.items():
-        here = f"{found[name]:.4g}"
-        if name == "solved":
-            here += f" = {percent(found[name] / len(plans))} % [{percent(low)}, {percent(high)}]"
-        rows.append([words, here, str(thesis.get("optimal_among_solved" if name == "optimal" else name, DASH))])
+        printed = thesis.get("optimal_among_solved" if name == "optimal" else name, DASH)
+        rows.append([words, f"{found[name]}{share if name == 'solved' else ''}", str(printed)])
     return Table("plans", ["open-loop plans, carried out blindly", "here", "thesis"], rows)
 
 
@@ -179,7 +168,7 @@ def write_plans(folder: Path, plans: Sequence[PlanResult], task: TaskSpec, origi
             (folder / earlier).unlink(missing_ok=True)
     failures = [plan for plan in plans if not plan.solved]
     write_bytes(folder / "plans.csv", table_text([_row(plan) for plan in plans]).encode())
-    write_json(folder / "summary.json", {**origin, **with_null(summarise(plans))})
+    write_json(folder / "summary.json", {**origin, **summarise(plans)})
     for name, shown in (("plans.png", plans), ("failed.png", failures)):
         if shown:
             write_bytes(folder / name, png(_stack(shown[:_SHOWN], task)))
@@ -236,18 +225,13 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
     folders = learners(bench)
     with lock(bench / ".why.lock", f"The folder {where}"):
         rows: list[Sequence[object]] = []
-        runs = []
         for run in counted(folders, "runs", total=len(folders)):
             trained = load_trained(run, encoder=encoder)
-            found = causes_of(trained)
-            head = {"agent": trained.spec.agent, "seed": trained.spec.seed}
-            by_budget = {str(each.episodes): Counter(each.causes.values()) for each in found}
-            runs.append({**head, "episodes": trained.episodes, "failures": by_budget})
-            for each in found:  # a row a failure; and one a test without any, whose cause is empty
+            for each in causes_of(trained):  # a row a failure; and one a test without any, whose cause is empty
                 for failure in each.causes.items() or [("", "")]:
-                    rows.append((*head.values(), each.episodes, each.tests, *failure))
+                    rows.append((trained.spec.agent, trained.spec.seed, each.episodes, each.tests, *failure))
         table = causes_table(rows)
-        made = {**provenance(protocol.hash), "appearance": appearance, "frames": "kinematic", "runs": runs}
+        made = {**provenance(protocol.hash), "appearance": appearance, "frames": "kinematic"}
         make_folder(where)
         write_bytes(where / "causes.csv", csv_text([HEAD, *rows]).encode())
         write_json(where / "summary.json", made)
@@ -280,9 +264,9 @@ def _report_complaint(folder: Path) -> str:
     bare = dataclasses.replace(page, sections=[dataclasses.replace(each, images=()) for each in page.sections])
     for name, text in texts(bare).items():
         path = folder / "report" / name
-        pattern = re.compile(_CELLS.get(name, "^.*$"), re.MULTILINE)
-        there = pattern.findall(path.read_text()) if path.is_file() else []
-        for has, wanted in zip_longest(there, pattern.findall(text), fillvalue="nothing"):
+        there = path.read_text() if path.is_file() else ""
+        pattern = _CELL if name == "index.html" else _LINE  # of the page, the cells of its tables
+        for has, wanted in zip_longest(pattern.findall(there), pattern.findall(text), fillvalue="nothing"):
             if has != wanted:
                 return f"{name} has {brief(has)} where the runs give {brief(wanted)}."
     return ""

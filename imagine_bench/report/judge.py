@@ -237,21 +237,6 @@ def compared(found: Judged) -> Section:
     return Section("Against each other", tables=[table], answers=answers)
 
 
-def where(found: Judged) -> Section:
-    """Total variation by what may make it hard."""
-    every = [cell["where"] for cells in found.last.values() for cell in cells]
-    groups = dict.fromkeys((kind, name) for each in every for kind, names in each.items() for name in names)
-    rows = []
-    for kind, name in groups:
-        rows.append([kind, name])
-        for cells in found.last.values():
-            values = [cell["where"].get(kind, {}).get(name, math.nan) for cell in cells]
-            rows[-1].append(over_seeds(values, _number, share=True))
-    header = ["by", "which", *map(_title, found.last)]
-    caption = f"Total variation of one step{found.after}."
-    return Section("Where it fails", tables=[Table("where", header, rows, caption, "no such transition")])
-
-
 def images(found: Judged) -> Section | None:
     """One rollout, transitions after the end of an episode and the worst ten of each model, real and as imagined."""
     arrays_of = shown(found.folder, found.judgement)
@@ -289,7 +274,6 @@ SECTIONS: tuple[Callable[[Judged], Section | None], ...] = (
     in_short,
     images,
     *(functools.partial(question, title=title) for title in QUESTIONS),
-    where,
     compared,
 )
 """The sections of the page, in their order. A new one is a function and a line here."""

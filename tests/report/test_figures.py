@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from fake_results import WIDE, bench_result
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from imagine_bench.report import figures
 from imagine_bench.report.bench import success_figure
 from imagine_bench.report.data import ReportData, agent_title, collect, open_loop_means
 from imagine_bench.report.sections import open_loop_figure
-from imagine_bench.statistics import Estimate
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +53,6 @@ def test_lines_along_an_axis_are_not_clipped() -> None:
         low, high = axes.get_ylim()
         values = np.array([y for line in lines(axes) for _, y in line])
         assert low < values.min() and values.max() < high
-
-
-def test_a_curve_has_a_band_exactly_where_there_are_intervals() -> None:
-    axes = Figure().add_subplot()
-    figures.curve(axes, {1: Estimate(0.5, 0.25, 0.75), 2: Estimate(0.5, np.nan, np.nan)}, color="#000000")
-    assert lines(axes) == [[(1.0, 0.5), (2.0, 0.5)]]
-    band = np.concatenate([path.vertices for path in axes.collections[0].get_paths()])
-    assert {float(y) for x, y in band if x == 1.0} >= {0.25, 0.75}
 
 
 def test_no_two_registered_agents_share_a_color() -> None:
