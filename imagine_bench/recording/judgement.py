@@ -5,7 +5,6 @@ Timeline ``depth``, the macro-actions imagined so far; entities ``/real/...`` an
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import rerun as rr
@@ -28,36 +27,30 @@ def record_judgement(folder: Path, judgement: Judgement) -> Path | None:
     if not found:
         return None
     one = next(iter(found.values()))
-    strips = {"real": ("the truth", one["futures_real"][0], one["futures"]["real"])}
+    strips = {"real": (one["futures_real"][0], one["futures"]["real"])}
+    titles = {"real": "the truth"}
     for model, each in found.items():
-        strips[file_name(model)] = (model_entry(model).title, each["futures_imagined"][0], each["futures"]["imagined"])
-    path = folder / "judgement.rrd"
-    with recording_file(path, spec.id, _layout({name: title for name, (title, _, _) in strips.items()})) as to:
-        for depth in range(1 + len(one["futures"]["real"])):
-            to.stream.set_time("depth", sequence=depth)
-            action = f"**{depth}. {spec.action_names[one['futures_actions'][0][depth - 1]]}**" if depth else "the start"
-            to.text("/action", action)
-            for name, (_, pictures, outcomes) in strips.items():
-                to.log(f"/{name}/frame", rr.Image(pictures[depth - 1] if depth else one["futures_before"][0]))
-                to.text(f"/{name}/outcomes", _words(outcomes[depth - 1] if depth else {}))
-    return path
-
-
-def _words(outcomes: Mapping[str, float]) -> str:
-    """Outcomes, the likeliest first."""
-    rows = sorted(outcomes.items(), key=lambda pair: -pair[1])
-    return "\n".join(f"- {share:.0%} {words}" for words, share in rows)
-
-
-def _layout(titles: Mapping[str, str]) -> rrb.Blueprint:
-    columns = []
-    for name, title in titles.items():
-        frame = rrb.Spatial2DView(origin=f"/{name}/frame", name=title)
-        columns.append(rrb.Vertical(frame, rrb.TextDocumentView(origin=f"/{name}/outcomes", name="outcomes")))
+        name = file_name(model)
+        strips[name] = (each["futures_imagined"][0], each["futures"]["imagined"])
+        titles[name] = model_entry(model).title
+    columns = [
+        rrb.Vertical(
+            rrb.Spatial2DView(origin=f"/{name}/frame", name=title),
+            rrb.TextDocumentView(origin=f"/{name}/outcomes", name="outcomes"),
+        )
+        for name, title in titles.items()
+    ]
     action = rrb.TextDocumentView(origin="/action", name="macro-action")
-    return rrb.Blueprint(
-        rrb.Vertical(action, rrb.Horizontal(*columns), row_shares=[1, 8]),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline="depth"),
-    )
+    layout = rrb.Vertical(action, rrb.Horizontal(*columns), row_shares=[1, 8])
+    path = folder / "judgement.rrd"
+    with recording_file(path, spec.id, lambda _: layout, timeline="depth") as recording:
+        for depth in range(1 + len(one["futures"]["real"])):
+            recording.stream.set_time("depth", sequence=depth)
+            done = spec.action_names[one["futures_actions"][0][depth - 1]]
+            recording.text("/action", f"**{depth}. {done}**" if depth else "the start")
+            for name, (pictures, outcomes) in strips.items():
+                recording.log(f"/{name}/frame", rr.Image(pictures[depth - 1] if depth else one["futures_before"][0]))
+                likeliest = sorted(outcomes[depth - 1].items(), key=lambda pair: -pair[1]) if depth else ()
+                lines = [f"- {share:.0%} {words}" for words, share in likeliest]
+                recording.text(f"/{name}/outcomes", "\n".join(lines))
+    return path

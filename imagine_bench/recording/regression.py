@@ -12,10 +12,9 @@ import rerun.blueprint as rrb
 from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import RegressionSpec
-from imagine_bench.recording.scene import ROOT, log_motion, log_shapes, playing
-from imagine_bench.recording.stream import Recording, recording_file
+from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
+from imagine_bench.recording.stream import KINDS, Recording, recording_file
 
-_KINDS = {"epistemic": (204, 121, 167), "modal": (0, 158, 115), "aleatoric": (86, 180, 233)}
 _BLUE = (0, 114, 178)
 _GRAY = (150, 150, 150)
 _RED = (200, 30, 60)
@@ -38,26 +37,25 @@ def record_toy(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, name:
         rrb.Vertical(
             *(
                 rrb.TimeSeriesView(origin=f"/{variant}/{part}", name=f"{name}, {variant}: {part} over 100 x")
-                for part in ("y", *_KINDS)
+                for part in ("y", *KINDS)
             )
         )
         for variant in evaluations
     ]
-    layout = rrb.Blueprint(rrb.Horizontal(*columns), rrb.TimePanel(timeline=_TIMELINE), collapse_panels=True)
-    with recording_file(path, task.id, layout) as recording:
+    with recording_file(path, task.id, lambda _: rrb.Horizontal(*columns), timeline=_TIMELINE) as recording:
         for variant, data in evaluations.items():
+            root = f"/{variant}"
             x = data["x"]
             order = data["training_x"].argsort()
-            dots = {"training": (data["training_x"][order], data["training_y"][order], _GRAY)}
-            dots["prediction"] = (x, data["prediction"][0], _BLUE)
-            for dot, (places, values, color) in dots.items():
-                points = rr.SeriesPoints(colors=color, marker_sizes=1.5)
-                _curve(recording, f"/{variant}/y/{dot}", points, places, values)
-            for kind, color in _KINDS.items():
+            dots = rr.SeriesPoints(colors=_GRAY, marker_sizes=1.5)
+            _curve(recording, f"{root}/y/training", dots, data["training_x"][order], data["training_y"][order])
+            dots = rr.SeriesPoints(colors=_BLUE, marker_sizes=1.5)
+            _curve(recording, f"{root}/y/prediction", dots, x, data["prediction"][0])
+            for kind, color in KINDS.items():
                 true = np.atleast_2d(data[f"true_{kind}"])[0]
-                for line, variances, shade in (("estimated", data[kind][0], color), ("true", true, _GRAY)):
-                    look = rr.SeriesLines(colors=shade)
-                    _curve(recording, f"/{variant}/{kind}/{line}", look, x, np.sqrt(variances))
+                estimated = rr.SeriesLines(colors=color)
+                _curve(recording, f"{root}/{kind}/estimated", estimated, x, np.sqrt(data[kind][0]))
+                _curve(recording, f"{root}/{kind}/true", rr.SeriesLines(colors=_GRAY), x, np.sqrt(true))
     return path
 
 
@@ -81,10 +79,9 @@ def record_robot(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, nam
     )
     text = rrb.TextDocumentView(origin="/choice/text", name="What happens")
     curve = rrb.TimeSeriesView(origin="/choice/error", name="Error of each choice (m)")
-    layout = playing(rrb.Horizontal(view, rrb.Vertical(text, curve)))
-    with recording_file(path, task.id, layout) as recording:
+    layout = rrb.Horizontal(view, rrb.Vertical(text, curve))
+    with recording_file(path, task.id, lambda _: layout) as recording:
         log_shapes(recording, scene.shapes())
-        clock_s = 0.0
         for choice in range(CHOICES):
             scores = data["decision/epistemic"][0, choice]
             errors = data["decision/error"][0, choice]
@@ -100,18 +97,18 @@ def record_robot(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, nam
                 f"{100 * errors.mean():.1f} cm on average, the best by {100 * errors.min():.1f} cm, the worst by "
                 f"{100 * errors.max():.1f} cm."
             )
-            recording.set_clocks(clock_s, choice=choice + 1)
+            recording.set_clocks(choice=choice + 1)
             _show_candidates(recording, data["decision/points"][0, choice], scores)
             recording.text("/choice/text", words)
             motion = scene.movement(data["decision/joints"][0, choice, chosen], 25.0)
-            clock_s += float(motion.time_s[-1])
-            log_motion(recording, motion, end_s=clock_s, sequences={"choice": choice + 1}, only_moved=False)
-            recording.set_clocks(clock_s, choice=choice + 1)
+            recording.clock_s += float(motion.time_s[-1])
+            log_motion(recording, motion, only_moved=False)
+            recording.set_clocks()
             ends = _lifted(np.stack([data[f"decision/{end}"][0, choice, chosen] for end in ("reached", "points")]))
             recording.log("/choice/error_line", rr.LineStrips3D([ends], colors=_RED, radii=0.009))
-            recording.scalar("/choice/error", float(errors[chosen]))
+            recording.curves("/choice", {"error": errors[chosen]})
             recording.text("/choice/text", words + missed)
-            clock_s += _STILL_S
+            recording.clock_s += _STILL_S
     return path
 
 
@@ -122,7 +119,7 @@ def _lifted(points: Floats) -> Floats:
 
 def _show_candidates(recording: Recording, points: Floats, scores: Floats) -> None:
     ranks = scores.argsort().argsort()[:, None] / (len(scores) - 1)  # 0 the surest
-    colors = (1 - ranks) * _KINDS["modal"] + ranks * np.array([213, 94, 0])
+    colors = (1 - ranks) * KINDS["modal"] + ranks * np.array([213, 94, 0])
     recording.log("/choice/candidates", rr.Points3D(_lifted(points), colors=colors.astype(np.uint8), radii=0.022))
     angle = np.linspace(0, 2 * np.pi, 33)
     ring = points[scores.argmin()] + 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
