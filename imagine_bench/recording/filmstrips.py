@@ -22,6 +22,7 @@ STEP_PX = 144  # from column to column
 LABELS_PX = 108  # width of the column that names the rows
 TITLE_PX = 52  # three lines above a row's images
 _LINE_PX = 17
+_BORDER_PX = 3
 _LETTERS = 18  # of a line
 _BLANK_PX = 24
 INK = (28, 30, 34)
@@ -49,37 +50,34 @@ def sheet(rows: Sequence[tuple[str, Sequence[Tile]]], columns: int | None = None
 
     The image has shape (height, width, 3), uint8.
     """
-    room = max(len(tiles) for _, tiles in rows) if columns is None else columns
-    tops = []  # of the rows' images
-    height = 0
-    for _, tiles in rows:
-        tops.append(height + (TITLE_PX if any(tile.above for tile in tiles) else 0))
-        lines = max(1 + tile.below.count("\n") for tile in tiles)
-        height = tops[-1] + CELL_PX + _LINE_PX * lines + _BLANK_PX
-    canvas = Image.new("RGB", (LABELS_PX + room * STEP_PX, height), PAPER)
+    room = columns or max(len(tiles) for _, tiles in rows)
+    return np.concatenate([_row(name, tiles[:room], LABELS_PX + room * STEP_PX) for name, tiles in rows])
+
+
+def _row(name: str, tiles: Sequence[Tile], width: int) -> NDArray[np.uint8]:
+    top = TITLE_PX if any(tile.above for tile in tiles) else _BORDER_PX
+    bottom = top + CELL_PX
+    lines = max(1 + tile.below.count("\n") for tile in tiles)
+    canvas = Image.new("RGB", (width, bottom + _LINE_PX * lines + _BLANK_PX), PAPER)
     draw = ImageDraw.Draw(canvas)
-    for top, (name, tiles) in zip(tops, rows, strict=True):
-        draw.multiline_text((4, top + 40), textwrap.fill(name, 13), font=font(bold=True), fill=INK)
-        for column, tile in enumerate(tiles[:room]):
-            _place(canvas, tile, LABELS_PX + column * STEP_PX, top)
+    draw.multiline_text((4, top + 40), textwrap.fill(name, 13), INK, font(bold=True))
+    for column, tile in enumerate(tiles):
+        left = LABELS_PX + column * STEP_PX
+        title = "\n".join(textwrap.wrap(tile.above, _LETTERS)[:3])
+        draw.multiline_text((left, 4), title, INK, font(bold=True), spacing=2)
+        color = INK
+        if tile.right is not None:
+            color = RIGHT if tile.right else WRONG
+            edge = (left - _BORDER_PX, top - _BORDER_PX, left + CELL_PX + 2, bottom + 2)
+            draw.rectangle(edge, outline=color, width=_BORDER_PX)
+        if tile.frame is not None:
+            image = Image.fromarray(tile.frame).convert("RGB").resize((CELL_PX, CELL_PX), Image.Resampling.NEAREST)
+            paper = Image.new("RGB", image.size, PAPER)
+            canvas.paste(Image.blend(image, paper, 0.65 * tile.pale), (left, top))
+        if tile.cut:
+            draw.line([(left - 9, 0), (left - 9, canvas.height)], CUT, 3)
+        draw.multiline_text((left, bottom + 4), tile.below, color, font(), spacing=3)
     return np.asarray(canvas)
-
-
-def _place(canvas: Image.Image, tile: Tile, left: int, top: int) -> None:
-    draw = ImageDraw.Draw(canvas)
-    title = "\n".join(textwrap.wrap(tile.above, _LETTERS)[:3])
-    draw.multiline_text((left, top + 4 - TITLE_PX), title, font=font(bold=True), fill=INK, spacing=2)
-    color = INK
-    if tile.right is not None:
-        color = RIGHT if tile.right else WRONG
-        draw.rectangle([left - 3, top - 3, left + CELL_PX + 2, top + CELL_PX + 2], outline=color, width=3)
-    if tile.frame is not None:
-        image = Image.fromarray(tile.frame).convert("RGB").resize((CELL_PX, CELL_PX), Image.Resampling.NEAREST)
-        paper = Image.new("RGB", image.size, PAPER)
-        canvas.paste(Image.blend(image, paper, 0.65) if tile.pale else image, (left, top))
-    if tile.cut:
-        draw.line([(left - 9, top - _BLANK_PX), (left - 9, top + CELL_PX + _BLANK_PX)], fill=CUT, width=3)
-    draw.multiline_text((left, top + CELL_PX + 4), tile.below, font=font(), fill=color, spacing=3)
 
 
 def filmstrip(
@@ -102,20 +100,20 @@ def filmstrip(
         over = 0 < index <= done and bool(compared.real_terminated[index - 1])
         kept = bool(rollout.accepted[index])
         cut = not kept and bool(rollout.accepted[:index].all())
+        frame = None
         right = None
         truth = ""
         if index < done:
-            truth = f" ({_signed(compared.real_rewards[index])})"
-            right = np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
-        right = None if over else right
+            frame = compared.real_frames[index]
+            truth = f" ({compared.real_rewards[index]:+.1f})"
+            right = None if over else np.array_equal(rollout.macrostates[index], compared.real_macrostates[index])
         lines = (
             "episode over" if over else _verdict(right),
-            f"reward {_signed(rollout.rewards[index])}{truth}",
+            f"reward {rollout.rewards[index]:+.1f}{truth}",
             f"P(end) {rollout.p_terminated[index]:.2f}",
             f"epistemic {rollout.epistemic[index]:.2g}",
             "filter cuts here" if cut else "",
         )
-        frame = compared.real_frames[index] if index < done else None
         real.append(Tile(frame, f"{index + 1}. {action_names[action]}", pale=over, cut=cut))
         imagined.append(Tile(rgb(rollout.frames[index]), "", "\n".join(lines), right, not kept, cut))
     return sheet([("real", real), ("imagined", imagined)], None if columns is None else 1 + columns)
@@ -153,11 +151,10 @@ def transition_sheet(titles: Sequence[str], rows: Sequence[TileRow]) -> NDArray[
     """
     drawn: list[tuple[str, list[Tile]]] = []
     for name, images, judged in rows:
-        tiles = []
-        for place, image in enumerate(images):
-            right = None if judged is None else judged[place]
-            tiles.append(Tile(image, "" if drawn else titles[place], _verdict(right), right))
-        drawn.append((name, tiles))
+        rights = judged or [None] * len(images)
+        above = [""] * len(images) if drawn else titles
+        marked = zip(images, above, rights, strict=True)
+        drawn.append((name, [Tile(image, title, _verdict(right), right) for image, title, right in marked]))
     return sheet(drawn)
 
 
@@ -199,7 +196,3 @@ def font(*, bold: bool = False) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which travels with matplotlib."""
     file = resources.files("matplotlib") / f"mpl-data/fonts/ttf/DejaVuSans{'-Bold' if bold else ''}.ttf"
     return ImageFont.truetype(io.BytesIO(file.read_bytes()), 12)
-
-
-def _signed(value: float) -> str:
-    return f"{value:+.1f}".replace("-", "\u2212")

@@ -25,17 +25,20 @@ OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "sheeprl", "stable-baselines3"
 GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
 _CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")
 """What decides results, in a checkout."""
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def describe_environment() -> dict[str, Json]:
     """Command, commit, versions, machine, GL renderer (or why there is none), threads; JSON-like."""
+    try:
+        gl = gl_renderer()
+    except SetupError as error:
+        gl = f"none: {error}"
     return {
         "command": command(),
         "commit": commit(),
         "versions": versions(),
         "machine": machine(),
-        "gl_renderer": _gl_renderer_or_reason(),
+        "gl_renderer": gl,
         "threads_a_run": 1,
     }
 
@@ -105,30 +108,22 @@ def installed(package: str) -> str:
 
 def machine() -> dict[str, Any]:
     """Operating system, processor, cores this process may use, memory, NVIDIA GPU."""
+    gpus = _output("nvidia-smi", "--query-gpu=name", "--format=csv,noheader")
     return {
         "system": platform.platform(),
-        "cpu": cpu_model(),
+        "cpu": _cpu_model(),
         "cores": usable_cores(),
-        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
-        if hasattr(os, "sysconf")
-        else None,
-        "gpu": gpu_model(),
-        "thread_variables": {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ},
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "gpu": gpus.splitlines()[0] if gpus else None,
     }
 
 
-def cpu_model() -> str:
+def _cpu_model() -> str:
     """The processor's name as the system gives it."""
     known = Path("/proc/cpuinfo")
     lines = known.read_text().splitlines() if known.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else _output("sysctl", "-n", "machdep.cpu.brand_string") or platform.machine()
-
-
-def gpu_model() -> str | None:
-    """The first NVIDIA GPU's name, or None."""
-    names = _output("nvidia-smi", "--query-gpu=name", "--format=csv,noheader")
-    return names.splitlines()[0] if names else None
 
 
 def usable_cores() -> int:
@@ -139,13 +134,6 @@ def usable_cores() -> int:
 def gl_renderer() -> str:
     """Vendor and renderer of the OpenGL that draws the frames. Raises SetupError: there is none."""
     return registry.load(GL_RENDERER)()
-
-
-def _gl_renderer_or_reason() -> str:
-    try:
-        return gl_renderer()
-    except SetupError as error:
-        return f"none: {error}"
 
 
 def _output(*words: str) -> str | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -80,12 +80,11 @@ def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str
         version_of: The installed version of a package, ``"missing"`` where there is none.
     """
     complaints = []
-    for wanted in _requirements():
-        extra = _extra_of(wanted)
+    for wanted, extra in _requirements():
         version = version_of(wanted.name)
         missing = version == "missing"
         unwanted = version_of(_DM_CONTROL) == "missing" if extra == _DM_CONTROL else missing and extra
-        if extra is None or unwanted or (not missing and wanted.specifier.contains(version, prereleases=True)):
+        if unwanted or (not missing and wanted.specifier.contains(version, prereleases=True)):
             continue
         state = "is missing" if missing else f"{version} is installed"
         reason = _REASONS.get(wanted.name, "")
@@ -94,27 +93,21 @@ def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str
     return complaints
 
 
-def _requirements() -> list[Requirement]:
-    return [Requirement(text) for text in metadata.requires("imagine-bench") or []]
-
-
-def _extra_of(wanted: Requirement) -> str | None:
-    """The extra that brings a package: ``""`` if it always comes, None if it comes with development alone."""
-    marker = wanted.marker
-    extras = ("", *EXTRAS_OF_A_BENCH, _DM_CONTROL)
-    return next((extra for extra in extras if not marker or marker.evaluate({"extra": extra})), None)
+def _requirements() -> Iterator[tuple[Requirement, str]]:
+    """What is needed but for development, each with the extra that brings it, ``""`` where it always comes."""
+    for wanted in map(Requirement, metadata.requires("imagine-bench") or []):
+        for extra in ("", *EXTRAS_OF_A_BENCH, _DM_CONTROL):
+            if wanted.marker is None or wanted.marker.evaluate({"extra": extra}):
+                yield wanted, extra
+                break
 
 
 def missing_extras(version_of: Callable[[str], str] = installed) -> list[str]:
     """A sentence that names the extras of a bench that are not installed, or none; ``version_of`` as above."""
-    lacks = {_extra_of(each) for each in _requirements() if version_of(each.name) == "missing"} - {
-        "",
-        _DM_CONTROL,
-        None,
-    }
+    lacks = {extra for each, extra in _requirements() if version_of(each.name) == "missing"} - {"", _DM_CONTROL}
     if not lacks:
         return []
-    names = ",".join(sorted(str(extra) for extra in lacks))
+    names = ",".join(sorted(lacks))
     return [f"Environments work. A bench needs more: pip install 'imagine-bench[{names}]'."]
 
 
@@ -140,13 +133,6 @@ def unlocked_versions(lock: Path = _LOCK, version_of: Callable[[str], str] = ins
 
 
 def _notes(gpu: str | None, gl: str) -> list[str]:
-    notes = []
-    cuda = any((found.name or "").startswith("nvidia-") for found in metadata.distributions())
-    if gpu is None and cuda:
-        notes.append(
-            "torch is a CUDA build of several GB and there is no NVIDIA GPU: 'rm -r .venv && make setup' takes the "
-            "CPU build where it can be reached; TORCH_INDEX names another index of it."
-        )
-    if gpu is not None and any(name in gl.lower() for name in _SOFTWARE_GL):
-        notes.append(f"Frames are drawn in software ({gl}) although there is a GPU; its driver's EGL is not installed.")
-    return notes
+    if gpu is None or not any(name in gl.lower() for name in _SOFTWARE_GL):
+        return []
+    return [f"Frames are drawn in software ({gl}) although there is a GPU; its driver's EGL is not installed."]
