@@ -29,8 +29,7 @@ from imagine_bench.interfaces.capabilities import (
 )
 from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording.filmstrips import filmstrip, sampled_filmstrips
-from imagine_bench.recording.scene import Stage, scene_view
-from imagine_bench.recording.stream import KINDS, Recording, recording_file, sheet_view
+from imagine_bench.recording.stream import KINDS, Recording, recording_file, scene_view, sheet_view
 from imagine_bench.rules import is_random
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.results import ComparedRollout
@@ -63,16 +62,8 @@ def record_run(
     """
     spec = registry.task(task)
     privileged = registry.agent_entry(name).privileged
-    with recording_file(path, task, _layout) as recording:
-        recorder = _EpisodeRecorder(
-            recording=recording,
-            stage=Stage(recording, env),
-            spec=spec,
-            agent=agent,
-            appearance=appearance,
-            privileged=privileged,
-            seed=seed,
-        )
+    with recording_file(path, task, _layout, env=env) as recording:
+        recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged, seed)
         for episode in range(1, episodes + 1):
             recorder.record(env, episode)
     return path
@@ -93,12 +84,11 @@ def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> s
     return "\n".join(["```", *rows, "```", "\\> is the one it carries out."])
 
 
-@dataclass(kw_only=True)
+@dataclass
 class _EpisodeRecorder:
     """Records one episode after the other on a common clock; ``privileged`` agents are shown the macrostate."""
 
     recording: Recording
-    stage: Stage
     spec: TaskSpec
     agent: Agent
     appearance: str
@@ -127,7 +117,7 @@ class _EpisodeRecorder:
             self._log_imagination(observation.frame, info["macrostate"], episode, step)
             self.states.append(tuple(info["macrostate"].tolist()))
             seen, reward, terminated, truncated, info = env.step(np.int64(action))
-            self.stage.act()
+            self.recording.act()
             observation = self._log_frame(episode, seen, info)
             recording.curves("/real", {"reward": float(reward)})
             done = terminated or truncated
@@ -150,14 +140,14 @@ class _EpisodeRecorder:
             recording.text("/real/text", told)
             recording.sheet("/seen/factors", seen.picture)
             recording.clock_s += _STILL_S
-            recording.set_clocks(env_step=self.stage.env_step, episode=1)
+            recording.set_clocks(env_step=self.recording.env_step, episode=1)
 
     def _log_frame(self, episode: int, seen: Observed, info: Info) -> Observation:
         """A new real frame: set the clocks, show it and how the scene stands. Returns what the agent sees."""
         observation = Observation.of(seen, info, privileged=self.privileged)
-        if self.stage.env_step < 0:  # the timeline imagined_depth begins there and needs a scene to stand in
+        if self.recording.env_step < 0:  # the timeline imagined_depth begins there and needs a scene to stand in
             self.recording.set_clocks(imagined_depth=0)
-        self.stage.show(episode=episode)
+        self.recording.show(episode=episode)
         frame = observation.frame if observation.frame.size else self._unseen_frame(info)
         self.recording.log("/real/frame", rr.Image(frame))
         return observation
@@ -165,9 +155,11 @@ class _EpisodeRecorder:
     def _unseen_frame(self, info: Info) -> Frame:
         """For people, the frame of an agent that sees something else: as late as that, and hiding as much."""
         shown = np.asarray(info.get("shown", info["macrostate"]))
-        if self.stage.scene is not None and np.array_equal(shown, info["macrostate"]):
-            return self.stage.scene.agent_view()
-        return self.spec.render_macrostates(shown[None], self.appearance, np.random.default_rng(self.stage.env_step))[0]
+        if self.recording.scene is not None and np.array_equal(shown, info["macrostate"]):
+            return self.recording.scene.agent_view()
+        return self.spec.render_macrostates(
+            shown[None], self.appearance, np.random.default_rng(self.recording.env_step)
+        )[0]
 
     def _describe(self, heading: str, info: Info, last: str, frame: Frame) -> None:
         """What has happened, what is true, and what the frame shows where that is something else; what comes next.

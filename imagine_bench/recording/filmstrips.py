@@ -151,7 +151,7 @@ def transition_sheet(titles: Sequence[str], rows: Sequence[TileRow]) -> NDArray[
     """
     drawn: list[tuple[str, list[Tile]]] = []
     for name, images, judged in rows:
-        rights = judged or [None] * len(images)
+        rights: Sequence[bool | None] = judged or [None] * len(images)
         above = [""] * len(images) if drawn else titles
         marked = zip(images, above, rights, strict=True)
         drawn.append((name, [Tile(image, title, _verdict(right), right) for image, title, right in marked]))

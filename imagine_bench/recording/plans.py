@@ -15,8 +15,7 @@ import rerun.blueprint as rrb
 
 from imagine_bench.judge.plans import PlanResult, carry_out, make_env
 from imagine_bench.recording.filmstrips import filmstrip
-from imagine_bench.recording.scene import Stage, scene_view
-from imagine_bench.recording.stream import Recording, recording_file, sheet_view
+from imagine_bench.recording.stream import Recording, recording_file, scene_view, sheet_view
 from imagine_bench.running.trained import Trained
 
 _LOOK_S = 2.0  # how long the scene stands still while the plan is shown, before and after the arm moves
@@ -40,15 +39,14 @@ def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic:
         strip = sheet_view("/imagined/filmstrip", f"{task.title}: the plan, real above and imagined below")
         return rrb.Vertical(top, strip, row_shares=[1.45, 1.0])
 
-    with closing(make_env(trained, execution)) as env, recording_file(path, task.id, layout) as recording:
-        stage = Stage(recording, env)
+    with closing(make_env(trained, execution)) as env, recording_file(path, task.id, layout, env=env) as recording:
         moments: list[tuple[float, int]] = []
 
         def arrive(done: int) -> None:
             if done:
-                stage.act()
-            stage.show()
-            moments.append((recording.clock_s, stage.env_step))
+                recording.act()
+            recording.show()
+            moments.append((recording.clock_s, recording.env_step))
             recording.clock_s += _LOOK_S * (done == 0)
 
         for number in range(count):

@@ -12,8 +12,7 @@ import rerun.blueprint as rrb
 from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import RegressionSpec
-from imagine_bench.recording.scene import ROOT, log_motion, log_shapes
-from imagine_bench.recording.stream import KINDS, Recording, recording_file
+from imagine_bench.recording.stream import KINDS, ROOT, Recording, log_motion, log_shapes, recording_file
 
 _BLUE = (0, 114, 178)
 _GRAY = (150, 150, 150)
@@ -89,13 +88,11 @@ def record_robot(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, nam
             words = (
                 f"### Choice {choice + 1}\n\nA network ({name}) learned from {variant} random movements which joint "
                 "angles lead to a place. Green places it is surest of, orange ones least (epistemic uncertainty); it "
-                f"reaches for the one in the ring.\n\nIts uncertainty there is {scores[chosen]:.3g} rad², the largest "
-                f"of the 20 is {scores.max():.3g} rad²."
+                f"reaches for the one in the ring, where its uncertainty is {scores[chosen]:.3g} rad²."
             )
             missed = (
                 f"\n\n**It misses by {100 * errors[chosen]:.1f} cm** (red line). A random choice misses by "
-                f"{100 * errors.mean():.1f} cm on average, the best by {100 * errors.min():.1f} cm, the worst by "
-                f"{100 * errors.max():.1f} cm."
+                f"{100 * errors.mean():.1f} cm on average."
             )
             recording.set_clocks(choice=choice + 1)
             _show_candidates(recording, data["decision/points"][0, choice], scores)

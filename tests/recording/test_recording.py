@@ -25,8 +25,7 @@ from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
 from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording import episodes, stream
 from imagine_bench.recording.episodes import q_table, record_run
-from imagine_bench.recording.scene import log_motion, log_shapes
-from imagine_bench.recording.stream import entity_name, open_in_viewer, recording_file
+from imagine_bench.recording.stream import entity_name, log_motion, log_shapes, open_in_viewer, recording_file
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
