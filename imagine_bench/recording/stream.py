@@ -239,8 +239,8 @@ def recording_file(
 ) -> Iterator[Recording]:
     """A recording that is closed however the block ends, and gets its name only if it is complete.
 
-    It shows the scene of ``env``; ``layout`` is how it looks when opened, with nothing around it but the time; where that is ``sim_time``, it runs
-    over and over. Raises SetupError: the folder cannot be written.
+    It shows the scene of ``env``. ``layout`` is how it looks when opened, with nothing around it but the time; where
+    that is ``sim_time``, it runs over and over. Raises SetupError: the folder cannot be written.
     """
     make_folder(path.parent)
     partial = path.with_name(f"{path.stem}.partial.rrd")
