@@ -53,11 +53,11 @@ def as_dm_env(env: Env | str, *, seed: int | None = None, motion_hz: float = 0.0
         InvalidValueError: Keywords beside an environment, a negative rate, other spaces, or a rate above 0 for an
             environment that captures no motion.
     """
-    if not isinstance(env, str):
-        if kwargs:
-            raise InvalidValueError(f"{sorted(kwargs)} belong to gymnasium.make; give them with an id.")
-        return DmEnvironment(env, seed=seed, motion_hz=motion_hz)
-    return DmEnvironment(gymnasium.make(env, **kwargs), seed=seed, motion_hz=motion_hz)
+    if isinstance(env, str):
+        env = gymnasium.make(env, **kwargs)
+    elif kwargs:
+        raise InvalidValueError(f"{sorted(kwargs)} belong to gymnasium.make; give them with an id.")
+    return DmEnvironment(env, seed=seed, motion_hz=motion_hz)
 
 
 class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not typed

@@ -260,7 +260,7 @@ def recording_file(
                 loop_mode="all",
             ),
         )
-        stream.send_blueprint(rrb.Blueprint(layout(recording), *panels))
+        stream.send_blueprint(rrb.Blueprint(layout(recording), *panels), make_active=False)
         stream.flush()
         stream.disconnect()
     partial.replace(path)

@@ -18,7 +18,6 @@ from imagine_bench.errors import (
     ImagineBenchError,
     InvalidValueError,
     SetupError,
-    UnknownNameError,
     brief,
     lacking,
     plain,
@@ -151,10 +150,9 @@ def usable(group: str) -> dict[str, Any]:
     return {name: entry for name, entry in offers(group).items() if not isinstance(entry, SetupError)}
 
 
-def refused_offers() -> dict[str, SetupError]:
-    """What installed packages offer and cannot be used, by name: why."""
-    everything = [pair for group in _GROUPS for pair in offers(group).items()]
-    return {name: entry for name, entry in everything if isinstance(entry, SetupError)}
+def refused_offers() -> list[SetupError]:
+    """Why some of what installed packages offer cannot be used."""
+    return [entry for group in _GROUPS for entry in offers(group).values() if isinstance(entry, SetupError)]
 
 
 @functools.cache
@@ -255,8 +253,7 @@ def _options(base: str, entry: TaskEntry, said: str) -> dict[str, Setting]:
     kinds |= {old: kinds[new] for new, old in getattr(world, "NAMED", {}).items()}
     given = read_mapping(Path(said[1:])) if said.startswith("@") else parse_options(said, kinds, f"task {base}:")
     for key in given:
-        if key not in kinds:
-            raise UnknownNameError(f"option of task {base}", key, kinds)
+        require_known(f"option of task {base}", key, kinds)
     return given
 
 
@@ -313,8 +310,7 @@ def _entrant_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
 def setting_names(agent: str) -> frozenset[str]:
     """The dotted names of all settings that an agent has."""
     where = agent_entry(agent).settings
-    names: frozenset[str] = load(where).names() if where else frozenset()
-    return names
+    return load(where).names() if where else frozenset()
 
 
 def own_settings(agent: str, overrides: Mapping[str, Setting]) -> dict[str, Setting]:
@@ -326,8 +322,7 @@ def own_settings(agent: str, overrides: Mapping[str, Setting]) -> dict[str, Sett
     own = entrant(agent).settings
     names = setting_names(agent) if overrides or own else frozenset()
     for name in own:
-        if name not in names:
-            raise UnknownNameError("setting", name, sorted(names))
+        require_known("setting", name, sorted(names))
     return {**{name: value for name, value in overrides.items() if name in names}, **own}
 
 
@@ -393,8 +388,7 @@ def task(name: str) -> TaskSpec:
 
 def make_agent(name: str, context: AgentContext) -> Agent:
     """A new agent by its registered name. Raises SetupError: that of a package cannot be made."""
-    agent: Agent = _made(f"Agent {name}", agent_entry(name).make, context)
-    return agent
+    return _made(f"Agent {name}", agent_entry(name).make, context)
 
 
 def _made(what: str, target: str, *given: Any) -> Any:
@@ -405,8 +399,7 @@ def _made(what: str, target: str, *given: Any) -> Any:
 def regression(name: str) -> RegressionSpec:
     """The RegressionSpec of a registered regression task. Raises as :func:`task_entry`."""
     found = offered(name, REGRESSIONS, REGRESSION_GROUP)
-    spec: RegressionSpec = load(found) if isinstance(found, str) else found
-    return spec
+    return load(found) if isinstance(found, str) else found
 
 
 def regressor_entry(name: str) -> RegressorEntry:
@@ -440,11 +433,9 @@ def world_model_entry(name: str) -> WorldModelEntry:
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
     """A new regressor by its registered name. Raises as :func:`make_agent`."""
-    regressor: Regressor = _made(f"Regressor {name}", regressor_entry(name).make, context)
-    return regressor
+    return _made(f"Regressor {name}", regressor_entry(name).make, context)
 
 
 def make_world_model(name: str, *given: Any) -> WorldModel:
     """A new world model by its registered name, from what its entry says. Raises as :func:`make_agent`."""
-    model: WorldModel = _made(f"World model {name}", world_model_entry(name).make, *given)
-    return model
+    return _made(f"World model {name}", world_model_entry(name).make, *given)

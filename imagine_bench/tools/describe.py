@@ -68,7 +68,7 @@ def names() -> str:
     for guest in registry.absent_guests():
         absent = [name for each in guest.names.values() for name in each]
         lines.append(f"{'not installed':22}{', '.join(absent)} ({guest.install})")
-    return "\n".join([*lines, *(f"\n{error}" for error in registry.refused_offers().values())])
+    return "\n".join([*lines, *(f"\n{error}" for error in registry.refused_offers())])
 
 
 def _page(title: str, description: str, rows: dict[str, str]) -> str:
