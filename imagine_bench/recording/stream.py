@@ -5,7 +5,6 @@ A scene has one transform a body, with its shapes below it.
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
@@ -275,8 +274,8 @@ def open_in_viewer(path: Path) -> None:
     """
     if not path.is_file():
         raise ArtefactError(f"No recording {path}; a bench leaves them in its run folders as recording.rrd.")
-    displayed = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or not sys.platform.startswith("linux")
-    if not displayed or subprocess.run([sys.executable, "-m", "rerun", str(path)], check=False).returncode:
+    viewer = [sys.executable, "-m", "rerun", str(path)]
+    if subprocess.run(viewer, capture_output=True, check=False).returncode:
         raise SetupError(
             f"No display here to open {path}, or the viewer failed; copy it to a machine with one and run "
             f"'rerun {path.name}' there, or run 'rerun --serve-web {path}' here and open the address it prints."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -198,15 +197,9 @@ def test_viewing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.Monkey
         open_in_viewer(tmp_path / "none.rrd")
     there = tmp_path / "there.rrd"
     there.write_bytes(b"")
-    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setattr(sys, "platform", "linux")
-    with pytest.raises(SetupError, match=r"No display here .* run 'rerun there.rrd'"):
-        open_in_viewer(there)
-    monkeypatch.setenv("DISPLAY", ":99")
-    failed = subprocess.CompletedProcess[str]([], returncode=1)
+    failed = subprocess.CompletedProcess[bytes]([], returncode=1)
     monkeypatch.setattr(stream.subprocess, "run", lambda *_, **__: failed)
-    with pytest.raises(SetupError, match=r"the viewer failed; copy it .* or run 'rerun --serve-web"):
+    with pytest.raises(SetupError, match=r"No display .* the viewer failed; .* run 'rerun there.rrd' .* --serve-web"):
         open_in_viewer(there)
 
 
