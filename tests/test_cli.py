@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import get_args
 
@@ -192,6 +193,11 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     for kind in task_types().values():
         assert words >= {*kind.tasks(), *kind.learners(), *kind.presets}
     assert words >= {*GRIDS, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *bundled()}
+
+
+def test_the_program_says_which_version_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"imagine-bench {version('imagine-bench')}\n"
 
 
 def test_who_stops_reading_gets_no_traceback() -> None:
