@@ -7,7 +7,6 @@ import dataclasses
 import io
 import json
 import re
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from typing import NamedTuple
 import pytest
 from doc_cells import ROOT
 from fake_reader import BlindReader
-from guest_packages import install
+from guest_packages import Guests
 from recordings import contents, times
 from small_runs import Inline, small
 
@@ -108,15 +107,14 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Said]:
     (folder / "their_models.py").write_text(code + _MORE)
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        patch.syspath_prepend(install(folder))
-        registry.offers.cache_clear()
+        guests = Guests(folder, patch)
+        guests.add(folder)
         world = ["judge", "--task", "pick_place", "--out", str(root), "--workers", "1"]
         data = ["--sizes", "20", "60", "--seeds", "1000", "--samples", "2"]
         status = main([*world, *data, "--models", "nearest", "raises", "late", "unmade", "copy", "exact"])
         (made,) = (path.parent for path in root.glob("*/judgement.json"))
         yield Said(made, status, out.getvalue(), err.getvalue())
-    sys.modules.pop("their_models", None)
-    registry.offers.cache_clear()
+        guests.forget()
 
 
 def _of(*models: str) -> Judgement:
