@@ -7,7 +7,6 @@ uncertainties are known in closed form.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench.arrays import Arrays
 from imagine_bench.errors import require_known
@@ -15,12 +14,12 @@ from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import Predict, RegressionData, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
-DOMAIN = (-30.0, 30.0)
-"""Where the training inputs lie."""
-REGION = (-10.0, 10.0)
-"""Where the variants differ: little data, or much noise."""
-TEST_DOMAIN = (-30.0, 40.0)
-"""Where the networks are asked: beyond 30 they extrapolate."""
+EDGE = 30.0
+"""The training inputs lie in [-30, 30]."""
+REGION = 10.0
+"""The variants differ in [-10, 10]: little data, or much noise."""
+FARTHEST = 40.0
+"""The networks are asked in [-30, 40]: beyond 30 they extrapolate."""
 SAMPLES = 2000
 DECIMATION = 50
 SIGMA = 1.0
@@ -37,14 +36,9 @@ def branches(x: Floats) -> Floats:
     )
 
 
-def in_region(x: Floats) -> NDArray[np.bool_]:
-    """Whether inputs lie in the region where the variants differ."""
-    return (x >= REGION[0]) & (x <= REGION[1])
-
-
 def noise_sigma(variant: str, x: Floats) -> Floats:
     """Standard deviation of the noise at each input."""
-    return np.where((variant == "high_noise") & in_region(x), SIGMA_HIGH, SIGMA)
+    return np.where((variant == "high_noise") & (np.abs(x) <= REGION), SIGMA_HIGH, SIGMA)
 
 
 def require_variant(variant: str) -> None:
@@ -58,17 +52,18 @@ def training(variant: str, rng: np.random.Generator) -> RegressionData:
     Counts inside and outside of the region are at their expectation, so that all datasets of a variant are as long.
     """
     require_variant(variant)
-    inside = round(SAMPLES * (REGION[1] - REGION[0]) / (DOMAIN[1] - DOMAIN[0]))
+    inside = round(SAMPLES * REGION / EDGE)
     outside = SAMPLES - inside
     kept = round(inside / DECIMATION) if variant == "low_data" else inside
-    left = rng.uniform(DOMAIN[0], REGION[0], size=outside // 2)
-    right = rng.uniform(REGION[1], DOMAIN[1], size=outside - outside // 2)
-    return _with_targets(variant, np.concatenate([left, right, rng.uniform(*REGION, size=kept)]), rng)
+    left = rng.uniform(-EDGE, -REGION, size=outside // 2)
+    right = rng.uniform(REGION, EDGE, size=outside - outside // 2)
+    middle = rng.uniform(-REGION, REGION, size=kept)
+    return _with_targets(variant, np.concatenate([left, right, middle]), rng)
 
 
 def testing(variant: str, rng: np.random.Generator, count: int) -> RegressionData:
     """Points of the same process, uniform over the training domain: the region has its full share here."""
-    return _with_targets(variant, rng.uniform(*DOMAIN, size=count), rng)
+    return _with_targets(variant, rng.uniform(-EDGE, EDGE, size=count), rng)
 
 
 def _with_targets(variant: str, x: Floats, rng: np.random.Generator) -> RegressionData:
@@ -89,27 +84,24 @@ def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arr
     """The curves of figure 4.1 on a common grid, with the truth beside them.
 
     Returns:
-        ``x``, ``true_mean``, ``true_modal``, ``true_aleatoric`` (GRID,); ``true_epistemic`` (equation 4.6, which needs
-        the networks' means), ``prediction``, ``mean``, every score of :data:`SCORES` and, from new targets, the left
-        side of equation 4.8, ``squared_error``, (E, GRID); the training data of the first network.
+        ``x``, ``true_modal``, ``true_aleatoric`` (GRID,); ``true_epistemic`` (equation 4.6, which needs the networks'
+        means), ``prediction``, every score of :data:`SCORES` and, from new targets, the left side of equation 4.8,
+        ``squared_error``, (E, GRID); the training data of the first network.
     """
-    x = np.linspace(*TEST_DOMAIN, GRID)
+    x = np.linspace(-EDGE, FARTHEST, GRID)
     predicted = predict(np.broadcast_to(x[:, None], (len(seeds), GRID, 1)), "figure_4_1")
     data = training(variant, seeds[0].child("data").generator())
     repeated = np.repeat(x, predicted.drawn.shape[2])
     new = [_with_targets(variant, repeated, node.child("targets", variant).generator()).targets for node in seeds]
     missed = np.reshape(new, predicted.drawn.shape) - predicted.drawn
     scores = predicted.scores
-    mean = predicted.mean[..., 0]
-    true_mean = branches(x).mean(axis=-1)
+    bias = branches(x).mean(axis=-1) - predicted.mean[..., 0]
     return {
         "x": x,
-        "true_mean": true_mean,
         "true_modal": branches(x).var(axis=-1),  # equation 4.7
         "true_aleatoric": noise_sigma(variant, x) ** 2,
-        "true_epistemic": (true_mean - mean) ** 2 + scores["epistemic"],
+        "true_epistemic": bias**2 + scores["epistemic"],
         "prediction": predicted.prediction[..., 0],
-        "mean": mean,
         "squared_error": (missed[..., 0] ** 2).mean(axis=2),
         "training_x": data.inputs[:, 0],
         "training_y": data.targets[:, 0],

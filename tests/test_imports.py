@@ -37,7 +37,6 @@ FOLDERS = (
     "tasks",
     "tasks/arrows",
     "tasks/pick_place",
-    "tasks/robot_ik",
     "agents/networks",
     "agents/encoders",
     "agents",

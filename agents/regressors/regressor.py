@@ -17,7 +17,7 @@ from torch import Tensor
 
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import Floats
-from imagine_bench.interfaces.regression import Mixtures, Prediction, RegressorContext
+from imagine_bench.interfaces.regression import Prediction, RegressorContext
 
 from ..encoders.perception import prepare_torch
 from ..imagination import mixture as mdn
@@ -56,7 +56,6 @@ class MixtureRegressor:
         self._shift = self._tensor(targets.mean(axis=1))  # [E M, D]
         self._scale = self._tensor(np.maximum(targets.std(axis=1), 1e-6))
         self._y = (self._tensor(targets) - self._shift[:, None]) / self._scale[:, None]
-        self._trained: list[Callable[[Tensor], Mixture]] = []
         n_outputs = mdn.output_size(settings.components, self._y.shape[-1])
         sizes = (self._x.shape[-1], *settings.hidden, n_outputs)
         precision = hidden_dtype(settings.precision, context.device)
@@ -84,7 +83,6 @@ class MixtureRegressor:
             updates = [self.update(self._x[member, batch], self._y[member, batch]) for batch in chosen]
             losses.append(float(torch.stack(updates).mean()))
             on_epoch(epoch + 1, settings.epochs)
-        self._trained = [self._weight_samples(network) for network in range(len(self._samples))]
         return {"loss/likelihood": float(np.mean(losses))}
 
     def update(self, x: Tensor, y: Tensor) -> Tensor:
@@ -104,7 +102,7 @@ class MixtureRegressor:
         if not bool((losses + norms).isfinite().all()):
             raise DivergedError(
                 "A likelihood is not finite, or its gradient. Are the data? If so, lower learning_rate or raise "
-                f"sigma_floor. Losses of the networks: {losses.tolist()}; norms of their gradients: {norms.tolist()}."
+                f"sigma_floor. Losses of the networks: {losses.tolist()}."
             )
         self.optimiser.step()
         self.network.update_running_stats()
@@ -121,21 +119,14 @@ class MixtureRegressor:
         """Predict, with uncertainties; see :class:`imagine_bench.interfaces.regression.Regressor`."""
         own = self._generator(int(rng.integers(2**62)))
         other = self._generator(int(rng.integers(2**62)))
-        return Prediction(**self._by_rows(inputs, lambda samples: self._measure(samples, own, other)))
-
-    def pooled(self, inputs: Floats) -> Mixtures:
-        """All weight samples' mixtures side by side, equally likely."""
-        return Mixtures(**self._by_rows(inputs, lambda samples: _parts(mdn.average(samples, len(samples.means)))))
-
-    def _by_rows(self, inputs: Floats, measure: Callable[[Mixture], dict[str, Tensor]]) -> dict[str, Floats]:
-        """Measures of the weight samples of each network at its inputs, a few rows at a time. Shapes (E, N, ...)."""
         networks = []
-        for mixtures, x in zip(self._trained, self._tensor(inputs), strict=True):
-            parts = [measure(mixtures(rows)) for rows in x.split(_ROWS)]
+        for network, x in enumerate(self._tensor(inputs)):
+            parts = [self._measure(self._weight_samples(network, rows), own, other) for rows in x.split(_ROWS)]
             networks.append({name: torch.cat([part[name] for part in parts]) for name in parts[0]})
-        return {name: torch.stack([n[name] for n in networks]).double().cpu().numpy() for name in networks[0]}
+        fields = {name: torch.stack([network[name] for network in networks]) for name in networks[0]}
+        return Prediction(**{name: values.double().cpu().numpy() for name, values in fields.items()})
 
-    def _weight_samples(self, network: int) -> Callable[[Tensor], Mixture]:
+    def _weight_samples(self, network: int, x: Tensor) -> Mixture:
         """Inputs (N, X) to mixtures (T, N) in the units of the targets; the weight samples are always the same."""
         settings = self.settings
         first = network * settings.members
@@ -145,15 +136,10 @@ class MixtureRegressor:
             generator = self._generator(self._samples[network])
             shapes = [(settings.weight_samples, units) for units in settings.hidden[:-1]]
             masks = [dropout_mask(shape, settings.dropout, generator) for shape in shapes]
-        shift = self._shift[first]
+        samples = self._mixture(sample_outputs(folded, x, masks))
         scale = self._scale[first]
-
-        def mixtures(x: Tensor) -> Mixture:
-            samples = self._mixture(sample_outputs(folded, x, masks))
-            log_sigmas = samples.log_sigmas + scale.log()
-            return Mixture(samples.log_weights, samples.means * scale + shift, log_sigmas)
-
-        return mixtures
+        means = samples.means * scale + self._shift[first]
+        return Mixture(samples.log_weights, means, samples.log_sigmas + scale.log())
 
     def _measure(self, samples: Mixture, generator: torch.Generator, other: torch.Generator) -> dict[str, Tensor]:
         """Fields of a prediction of one network for a few rows."""
@@ -162,7 +148,9 @@ class MixtureRegressor:
         predictive = mdn.average(samples, self.settings.members)
         prediction = mdn.sample(predictive, 1.0, generator)
         return {
-            **_parts(predictive),
+            "weights": predictive.log_weights.exp(),
+            "means": predictive.means,
+            "sigmas": predictive.log_sigmas.exp(),
             "prediction": prediction,
             "sampled_variance": sampled_component_variance(samples, predictive, prediction, self.settings.members),
             "nll": nll(samples, prediction),
@@ -179,11 +167,6 @@ class MixtureRegressor:
 
     def _generator(self, seed: int) -> torch.Generator:
         return torch.Generator(device=self._device).manual_seed(seed)
-
-
-def _parts(mixture: Mixture) -> dict[str, Tensor]:
-    """The fields of :class:`Mixtures`."""
-    return {"weights": mixture.log_weights.exp(), "means": mixture.means, "sigmas": mixture.log_sigmas.exp()}
 
 
 def make_mc_dropout(context: RegressorContext) -> MixtureRegressor:

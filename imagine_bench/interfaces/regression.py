@@ -98,9 +98,6 @@ class Regressor(Protocol):
     def predict(self, inputs: Floats, rng: np.random.Generator) -> Prediction:
         """Predict from each network's own inputs (E, N, X); ``rng`` samples predictions and Monte-Carlo sums."""
 
-    def pooled(self, inputs: Floats) -> Mixtures:
-        """All weight samples' mixtures side by side: (E, N) of them, of T K components each. Inputs (E, N, X)."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class RegressorContext:

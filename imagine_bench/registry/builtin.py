@@ -122,7 +122,7 @@ DEMONSTRATOR = "oracle"
 
 REGRESSIONS = {
     "toy_regression": "imagine_bench.tasks.toy_regression:SPEC",
-    "robot_ik": "imagine_bench.tasks.robot_ik.spec:SPEC",
+    "robot_ik": "imagine_bench.tasks.robot_ik:SPEC",
 }
 """Regression tasks, each the ``"module:attr"`` of its RegressionSpec."""
 

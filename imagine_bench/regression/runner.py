@@ -1,34 +1,150 @@
-"""One run of a regression bench: one regressor, one seed, its networks on every variant, measured.
+"""Runs of a regression bench, and what they measured: each is one regressor, one seed, its networks on every variant.
 
 What a variant gave is written when it is measured, so a run that was killed and started again does only the variant
 anew at which it was, and ends in the same bits as one that was not; only CPU times differ.
+
+Networks that say how sure they are, are asked on points that they have never seen whether they are right about that
+(Gneiting & Raftery, "Strictly proper scoring rules, prediction, and estimation", 2007).
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import scipy  # its parts load, slowly, when they are first used
+
 from imagine_bench import registry
-from imagine_bench.arrays import Arrays
-from imagine_bench.interfaces import Floats
-from imagine_bench.interfaces.regression import Prediction, RegressorContext
-from imagine_bench.protocols.data import OnProgress, Phase, Progress, RunSpec, TaskType
-from imagine_bench.regression.calibration import calibrate
-from imagine_bench.regression.protocol import PRESETS, RegressionProtocol, plan
-from imagine_bench.regression.results import (
-    EVALUATION,
-    METRICS,
-    RegressionRun,
-    Row,
-    begun,
-    load_result,
-    load_run,
-    write,
+from imagine_bench.arrays import Arrays, Bools, Floats
+from imagine_bench.interfaces.regression import (
+    Mixtures,
+    Prediction,
+    RegressionData,
+    RegressionSpec,
+    Regressor,
+    RegressorContext,
 )
+from imagine_bench.protocols.data import OnProgress, Phase, Progress, RunSpec, TaskType
+from imagine_bench.regression.protocol import PRESETS, RegressionProtocol, plan
 from imagine_bench.seeding import SeedTree
+from imagine_bench.statistics import auroc
 from imagine_bench.store import run_folder
+from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_protocol_as
+from imagine_bench.store.files import grouped, read_arrays, table_rows, table_text, write_arrays, write_bytes
+from imagine_bench.store.results import AllRuns, OneRun
+
+LEVELS = (0.5, 0.8, 0.95)
+"""Probabilities of the central intervals whose coverage is reported."""
+METRICS = "metrics.csv"
+EVALUATION = "evaluation.npz"
+Row = dict[str, float | str]
+"""One network of one variant: ``variant``, ``network``, and every measure by name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressionRun(OneRun):
+    """One finished run of a regressor."""
+
+    rows: Sequence[Row]  #: one a variant and network
+    evaluations: Mapping[str, Arrays]  #: the task's own measurements by variant
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """All networks of one regressor on one variant, those of the first seed first."""
+
+    agent: str
+    variant: str
+    runs: tuple[RegressionRun, ...]  #: in the order of the protocol's seeds
+
+    @property
+    def title(self) -> str:
+        """Name of the regressor for people."""
+        return registry.regressor_entry(self.agent).title
+
+    @property
+    def label(self) -> str:
+        """Title of the regressor, and the variant."""
+        return f"{self.title}, {self.variant}"
+
+    def values(self, name: str) -> Floats:
+        """One measure of every network. Shape (seeds E,)."""
+        rows = [row for run in self.runs for row in run.rows]
+        return np.array([float(row[name]) for row in rows if row["variant"] == self.variant])
+
+    def arrays(self, name: str) -> Floats:
+        """A measurement of the task whose first axis is the network. Shape (seeds E, ...)."""
+        return np.concatenate([run.evaluations[self.variant][name] for run in self.runs])
+
+    @property
+    def first(self) -> Arrays:
+        """Everything measured in the run of the first seed."""
+        return self.runs[0].evaluations[self.variant]
+
+
+class RegressionResult(AllRuns[RegressionProtocol, RegressionRun]):
+    """All runs of a bench of regressors."""
+
+    @property
+    def pairs(self) -> dict[tuple[str, str], PairResult]:
+        """Every regressor on every variant, by both."""
+        return {
+            (agent, variant): PairResult(agent, variant, self.of(agent))
+            for agent in self.protocol.agents
+            for variant in self.protocol.variants
+        }
+
+
+def _write(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:
+    """Write what a run has measured so far; :func:`_begun` reads it, and the rows are on disk first."""
+    write_bytes(folder / METRICS, table_text(rows).encode())
+    named = {f"{variant}/{name}": arrays[name] for variant, arrays in evaluations.items() for name in arrays}
+    write_arrays(folder / EVALUATION, named)
+
+
+def _begun(folder: Path) -> tuple[list[Row], dict[str, Arrays]]:
+    """The rows and measurements of the variants that a run has done, in their order."""
+    if not (folder / EVALUATION).exists():
+        return [], {}
+    evaluations = grouped(read_arrays(folder / EVALUATION))
+    rows: list[Row] = table_rows((folder / METRICS).read_text(), texts=("variant",))
+    return [row for row in rows if row["variant"] in evaluations], evaluations
+
+
+def load_run(folder: Path) -> RegressionRun:
+    """Read a finished run.
+
+    Raises:
+        ArtefactError: It is unfinished, damaged or made by something else; the message names the file.
+    """
+    config = run_folder.require_done(folder)
+    recording = run_folder.recording_path(folder)
+    rows, evaluations = _begun(folder)
+    return RegressionRun(
+        agent=config["agent"],
+        seed=config["seed"],
+        settings=config["settings"],
+        rows=rows,
+        evaluations=evaluations,
+        folder=folder,
+        recording=recording if recording.is_file() else None,
+    )
+
+
+def load_result(folder: Path) -> RegressionResult:
+    """Read a finished bench of regressors.
+
+    Raises:
+        ArtefactError: It is no bench of regressors, a run is missing, or a file is damaged.
+    """
+    protocol = read_protocol_as(folder, RegressionProtocol)
+    found = BenchStore(folder, protocol).load(lambda run: load_run(run) if run_folder.is_done(run) else None)
+    runs = tuple(run for run in found.values() if run is not None)
+    return RegressionResult(protocol=protocol, runs=runs, **bench_facts(folder))
 
 
 def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> RegressionRun:
@@ -49,7 +165,7 @@ def run(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress
 def _go_on(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgress) -> None:
     protocol = spec.protocol
     task = registry.regression(protocol.task)
-    rows, evaluations = begun(folder)
+    rows, evaluations = _begun(folder)
 
     def tell(phase: Phase, detail: str, share: float = 0.0) -> None:
         """Tell how far the run is: ``share`` counts within the running variant."""
@@ -69,7 +185,7 @@ def _go_on(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgr
         measured, arrays = _learn(spec, folder, variant, tell)
         rows += measured
         evaluations[variant] = arrays
-        write(folder, rows, evaluations)
+        _write(folder, rows, evaluations)
     recorder = task.recorder or next(iter(spec.observers), None)
     if recorder is not None and protocol.recorded:
         tell("recording", "recording")
@@ -82,7 +198,7 @@ def _go_on(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgr
 def _learn(
     spec: RunSpec[RegressionProtocol], folder: Path, variant: str, tell: Callable[[Phase, str, float], None]
 ) -> tuple[list[Row], Arrays]:
-    """Train a regressor on a variant and measure it: a row a network, and arrays, calibration's below their name."""
+    """Train a regressor on a variant and measure it: a row a network, and the task's own arrays."""
     protocol = spec.protocol
     task = registry.regression(protocol.task)
     seeds = SeedTree(spec.seed)
@@ -109,12 +225,65 @@ def _learn(
     shared: Row = {**regressor.train(on_epoch)}  # of all networks together; the CPU seconds are a network's share
     trained_s = time.process_time()
     tell("testing", f"{variant}, measuring", 0.9)
-    rng = seeds.child("calibration", variant).generator()
-    rows, arrays = calibrate(task, regressor, variant, networks, points=protocol.test_points, rng=rng)
-    arrays |= task.evaluate(variant, predict, networks)
+    tests = [task.testing(variant, node.child("test", variant).generator(), protocol.test_points) for node in networks]
+    measured = calibrate(task, variant, tests, regressor, seeds.child("calibration", variant).generator())
+    arrays = task.evaluate(variant, predict, networks)
     shared["train_cpu_s"] = (trained_s - begun_s) / protocol.networks
     shared["measure_cpu_s"] = (time.process_time() - trained_s) / protocol.networks
-    return [{"variant": variant, "network": index, **row, **shared} for index, row in enumerate(rows)], arrays
+    rows: list[Row] = []
+    for index in range(protocol.networks):
+        own = {name: float(values[index]) for name, values in measured.items()}
+        rows.append({"variant": variant, "network": index, **own, **shared})
+    return rows, arrays
+
+
+def calibrate(
+    task: RegressionSpec, variant: str, tests: list[RegressionData], regressor: Regressor, rng: np.random.Generator
+) -> dict[str, Floats]:
+    """Measure every network on unseen points of its own.
+
+    The predictive distribution that is judged is the one from which the regressor samples its predictions.
+
+    Args:
+        task: Says how wrong a prediction is.
+        variant: Of the task.
+        tests: The points of each network, E times N rows.
+        regressor: E networks, trained on ``variant``.
+        rng: Samples the predictions.
+
+    Returns:
+        Measures of every network, (E,), by name.
+    """
+    inputs = np.stack([test.inputs for test in tests])
+    targets = np.stack([test.targets for test in tests])
+    prediction = regressor.predict(inputs, rng)
+    error = np.stack([task.errors(variant, *pair) for pair in zip(inputs, prediction.prediction, strict=True)])
+    wrong = error > task.wrong_above
+    measured = {
+        "error_mean": error.mean(axis=1),
+        "error_median": np.median(error, axis=1),
+        "wrong": wrong.mean(axis=1),
+        "log_score": log_score(prediction, targets).mean(axis=1),
+        **{f"coverage_{level:g}": coverage(prediction, targets, level).mean(axis=(1, 2)) for level in LEVELS},
+    }
+    for name, values in prediction.scores.items():
+        measured[f"auroc_{name}"] = np.array([auroc(*pair) for pair in zip(values, wrong, strict=True)])
+    return measured
+
+
+def coverage(mixtures: Mixtures, outcomes: Floats, level: float) -> Bools:
+    """Whether each of the outcomes (..., D) lies inside its central predictive interval of probability ``level``."""
+    scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas  # [..., K, D]
+    below = (mixtures.weights[..., None] * scipy.special.ndtr(scaled)).sum(axis=-2)
+    return np.abs(below - 0.5) <= 0.5 * level
+
+
+def log_score(mixtures: Mixtures, outcomes: Floats) -> Floats:
+    """Negative log density of the whole outcome, all dimensions together, in nats. Outcomes (..., D), result (...)."""
+    scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas
+    log_normal = (-0.5 * (scaled**2 + math.log(2.0 * math.pi)) - np.log(mixtures.sigmas)).sum(axis=-1)  # [..., K]
+    with np.errstate(divide="ignore"):
+        return np.asarray(-scipy.special.logsumexp(np.log(mixtures.weights) + log_normal, axis=-1))
 
 
 REGRESSION = TaskType(

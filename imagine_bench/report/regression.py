@@ -16,8 +16,7 @@ from scipy import stats
 from imagine_bench import reference, registry, statistics
 from imagine_bench.arrays import Arrays, Floats
 from imagine_bench.interfaces.regression import SCORES
-from imagine_bench.regression.calibration import CRPS_POINTS
-from imagine_bench.regression.results import PairResult, RegressionResult
+from imagine_bench.regression.runner import PairResult, RegressionResult
 from imagine_bench.report.figures import INK, image, small_multiples
 from imagine_bench.report.page import DASH, Page, Section, Table, decimals, estimate, made, mean_std, number
 from imagine_bench.store.files import table_text
@@ -37,9 +36,11 @@ _CALIBRATION = {
     "coverage_0.5": "in 50 % interval",
     "coverage_0.8": "in 80 % interval",
     "coverage_0.95": "in 95 % interval",
-    "transform_distance": "PIT distance",
-    "crps_shared": "CRPS",
+    "log_score": "negative log-likelihood",
+    "wrong": "wrong",
+    **{f"auroc_{name}": f"AUROC of {name.replace('_', ' ')}" for name in SCORES},
 }
+"""Measures of calibration, and their columns."""
 _COMPARED = (
     "Every model is a Bayesian mixture density network: it predicts a mixture of Gaussians, and its weights are "
     "uncertain, so that each weight sample predicts another mixture. The spread of their means is epistemic "
@@ -68,47 +69,30 @@ def report_page(result: RegressionResult) -> Page:
         answers=answers,
         sections=[Section("What was compared", (_COMPARED,)), *sections],
         files={"results.csv": table_text(rows), **{f"{table.name}.csv": table.csv for table in tables}},
-        summary="\n\n".join([sections[0].title, tables[0].text, *answers]),
+        summary="\n\n".join([tables[0].text, *answers]),
         facts=made(result, {pair.agent: pair.title for pair in result.pairs.values()}),
     )
 
 
 def _calibration(result: RegressionResult) -> Section:
     spec = registry.regression(result.protocol.task)
-    points = result.protocol.test_points
-    calibration = [
-        {
-            "": f"{pair.label}: {words}",
-            **_means(pair, {f"{prefix}{name}": title for name, title in _CALIBRATION.items()}),
-        }
+    rows = [
+        {"": pair.label, **{title: mean_std(pair.values(name)) for name, title in _CALIBRATION.items()}}
         for pair in result.pairs.values()
-        for prefix, words in (("", "predicts with"), ("pooled_", "all weight samples"))
     ]
-    found = {"wrong": "wrong", **{f"auroc_{name}": f"AUROC of {_words(name)}" for name in SCORES}}
-    detection = [{"": pair.label, **_means(pair, found)} for pair in result.pairs.values()]
     return Section(
         title="Calibration: as sure as it may be?",
         words=(
-            f"Each network is asked about {points} unseen points. An interval that is said to hold 80 % "
-            "of the outcomes should hold 80 %; the probability integral transform should be uniform (its distance "
-            "from that is given, 0 is best); the CRPS is a distance between prediction and outcome, lower is better, "
-            f"computed at the first {min(CRPS_POINTS, points)} of the points. "
-            "Two distributions are judged: the one that predictions are sampled from, and all weight samples pooled.",
+            f"Each network is asked about {result.protocol.test_points} unseen points. An interval that is said to "
+            "hold 80 % of the outcomes should hold 80 %, and the negative log-likelihood of the outcomes (nats) is "
+            "lower for better predictive distributions. The distribution is the one that predictions are sampled from.",
             f"A prediction is called wrong where its error, the {spec.error_name}, is above {spec.wrong_above:g}. The "
-            "second table says how well each uncertainty finds the wrong ones: the probability that a wrong "
+            "other columns say how well each uncertainty finds the wrong ones: the probability that a wrong "
             "prediction has the higher uncertainty of two (AUROC; 0.5 is chance, 1 is perfect). Means (standard "
             "deviations) over networks.",
         ),
-        tables=(
-            Table.of("calibration", calibration),
-            Table.of("auroc", detection, why_dash="all predictions of a network are wrong, or none"),
-        ),
+        tables=(Table.of("calibration", rows, why_dash="all predictions of a network are wrong, or none"),),
     )
-
-
-def _means(pair: PairResult, titles: Mapping[str, str]) -> Cells:
-    """Mean and standard deviation over networks of some measures, by title."""
-    return {title: mean_std(pair.values(name)) for name, title in titles.items()}
 
 
 def _words(name: str) -> str:
@@ -127,13 +111,11 @@ def _toy(result: RegressionResult) -> list[Section]:
             words=(
                 "Mean over the region [−10, 10] of the uncertainty of networks trained with little data (or much "
                 "noise) there, divided by that of the base networks. Truth: the noise is 9 times as large in the noisy "
-                "region. Rank correlation with distance: from the data, for x from 30 to 40. Rank correlation with "
-                "the truth: along x inside the training range [−30, 30], of standard deviations; true epistemic "
-                "uncertainty is equation 4.6, the squared error of the mean plus its variance, which is the estimate "
-                "itself: the correlation is with the error alone. Values are the median over networks, in brackets "
-                "the smallest and the largest. Little data and much noise are compared where base is run too.",
+                "region. Rank correlation with distance: from the data, for x from 30 to 40. Values are the median "
+                "over networks, in brackets the smallest and the largest. Little data and much noise are compared "
+                "where base is run too.",
             ),
-            tables=(Table.of("claims", claims, why_dash="the truth is constant"),),
+            tables=[Table.of("claims", claims)] if claims else [],
             answers=[" ".join(filter(None, claim.values())) for claim in claims if claim["asked"]],
         ),
         Section(
@@ -186,10 +168,6 @@ def _claims(result: RegressionResult, agent: str) -> list[Cells]:
     for variant, kind, words, asked in _CLAIMS:
         if {variant, "base"} <= pairs.keys():
             rows.append(claim(pairs["base"].title, words, change(pairs[variant], pairs["base"], kind), asked))
-    for variant, pair in pairs.items():
-        for kind in _KINDS:
-            words = f"{_words(variant)}: {kind}, rank correlation with the truth"
-            rows.append(claim(pair.title, words, agreement(pair, kind)))
     return rows
 
 
@@ -199,8 +177,7 @@ def claim(network: str, words: str, values: Floats, asked: str = "") -> Cells:
     if asked:
         sign, limit = asked.split()
         met = f"{_SIGNS[sign](values, float(limit)).sum()} of {len(values)}"
-    ends = f"[{number(values.min())}, {number(values.max())}]"
-    measured = DASH if np.isnan(values).any() else f"{number(float(np.median(values)))} {ends}"
+    measured = f"{number(float(np.median(values)))} [{number(values.min())}, {number(values.max())}]"
     return {"network": network, "claim": words, "measured": measured, "asked": asked, "networks that hold": met}
 
 
@@ -211,25 +188,10 @@ def change(pair: PairResult, base: PairResult, kind: str) -> Floats:
     """
     x = pair.first["x"]
     if pair.variant == base.variant:
-        rows = pair.arrays(kind)[:, x > _EDGE]
-        return _rank_correlations(rows, np.broadcast_to(x[x > _EDGE], rows.shape))
+        beyond = x > _EDGE
+        return np.array([stats.spearmanr(x[beyond], row[beyond]).statistic for row in pair.arrays(kind)])
     inside = np.abs(x) <= _REGION
     return pair.arrays(kind)[:, inside].mean(axis=1) / base.arrays(kind)[:, inside].mean(axis=1)
-
-
-def agreement(pair: PairResult, kind: str) -> Floats:
-    """Spearman's correlation of an uncertainty with its true value along x, where there is data. Shape (E,)."""
-    inside = np.abs(pair.first["x"]) <= _EDGE
-    terms = squared_error_terms(pair)
-    # equation 4.6 contains the estimate, which would agree with itself: the rest is the error of the mean
-    true = terms["bias²" if kind == "epistemic" else f"true {kind}"]
-    return _rank_correlations(pair.arrays(kind)[:, inside], true[:, inside])
-
-
-def _rank_correlations(values: Floats, others: Floats) -> Floats:
-    """Spearman's correlation row by row, not a number where the other is constant. Shape (E,)."""
-    rows = zip(values, others, strict=True)
-    return np.array([stats.spearmanr(*pair).statistic if np.ptp(pair[1]) else np.nan for pair in rows])
 
 
 def squared_error_terms(pair: PairResult) -> dict[str, Floats]:
@@ -295,10 +257,9 @@ def _robot(result: RegressionResult) -> list[Section]:
                 "The robot is shown 20 places and reaches for the one with the least uncertainty; the distance by "
                 "which it misses is cumulated over 50 choices: mean (standard deviation) over networks, in metres. "
                 "Random is the expectation of a choice by chance, min and max are the best and the worst choice in "
-                "hindsight, known model is the error of inverse kinematics with a known model of the arm. Ratios are "
-                "to the random choice by the same networks, in brackets their 95 % interval (Fieller): below 1 a "
-                "criterion beats chance. The simulated arm carries out every predicted configuration, and the place "
-                "its tip comes to rest at is measured.",
+                "hindsight. Ratios are to the random choice by the same networks, in brackets their 95 % interval "
+                "(Fieller): below 1 a criterion beats chance. The simulated arm carries out every predicted "
+                "configuration, and the place its tip comes to rest at is measured.",
                 "Rows named disc: the 20 places lie anywhere on the disc of the stretched arm, whose left part no "
                 "configuration reaches. A place out of reach is missed by its distance from the workspace at least: "
                 "does the robot know which places it cannot reach? In the other rows no place outside of the workspace "
@@ -337,22 +298,16 @@ def choices(pair: PairResult, part: str) -> list[Cells]:
     found = {}
     for name in SCORES:
         pick = pair.arrays(f"{part}/{name}").argmin(axis=-1)
-        found[name] = np.take_along_axis(errors, pick[..., None], axis=-1)[..., 0]
+        found[_words(name)] = np.take_along_axis(errors, pick[..., None], axis=-1)[..., 0]
     found |= {"min": errors.min(axis=-1), "max": errors.max(axis=-1), "random": errors.mean(axis=-1)}
-    for name in ("known_model", "mink_error"):  # the latter in runs of before 2026-11-28
-        if f"{part}/{name}" in pair.first:
-            found["known_model"] = pair.arrays(f"{part}/{name}")
-    sums = {_words(name): each.sum(axis=1) for name, each in found.items()}
-    ratios = {name: statistics.ratio(sums[name], sums["random"], paired=True) for name in map(_words, SCORES)}
+    sums = {name: each.sum(axis=1) for name, each in found.items()}
     prefix = "" if part == "decision" else f"{part}_"
-    blank = dict.fromkeys(("measure", "network", *sums, "known model"), DASH)
-    texts = {
-        "error_m": {name: mean_std(values) for name, values in sums.items()},
-        "ratio_to_random": {name: estimate(ratio, decimals) for name, ratio in ratios.items()},
-    }
-    return [
-        {**blank, "measure": f"{prefix}{measure}", "network": pair.label, **cells} for measure, cells in texts.items()
-    ]
+    means = {"measure": f"{prefix}error_m", "network": pair.label}
+    ratios = {"measure": f"{prefix}ratio_to_random", "network": pair.label, **dict.fromkeys(sums, DASH)}
+    means |= {name: mean_std(each) for name, each in sums.items()}
+    for name in map(_words, SCORES):
+        ratios[name] = estimate(statistics.ratio(sums[name], sums["random"], paired=True), decimals)
+    return [means, ratios]
 
 
 def workspace(data: Arrays) -> Figure:

@@ -4,18 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import stats
 
 from imagine_bench import registry
 from imagine_bench.interfaces.regression import Mixtures, Prediction
-from imagine_bench.regression.calibration import (
-    calibrate,
-    coverage,
-    crps,
-    log_score,
-    probability_transform,
-)
-from imagine_bench.seeding import SeedTree
+from imagine_bench.regression.runner import calibrate, coverage, log_score
 
 
 def mixture(rows: int, components: int = 3) -> Mixtures:
@@ -28,43 +21,21 @@ def mixture(rows: int, components: int = 3) -> Mixtures:
     )
 
 
-def cdf(m: Mixtures, row: int, dimension: int, y: float) -> float:
-    normal = stats.norm.cdf(y, m.means[row, :, dimension], m.sigmas[row, :, dimension])
-    return float((m.weights[row] * normal).sum())
-
-
-def gaussian(mean: float, sigma: float) -> Mixtures:
-    return Mixtures(weights=np.ones((1, 1)), means=np.full((1, 1, 1), mean), sigmas=np.full((1, 1, 1), sigma))
-
-
-def test_crps_integrates_the_squared_difference_of_distributions() -> None:
-    m = mixture(3)
-    outcomes = np.array([[0.3, -1.0], [5.0, 0.0]])  # of the first mixtures alone
-    closed = crps(m, outcomes)
-    for (row, dimension), y in np.ndenumerate(outcomes):
-        below = integrate.quad(lambda t, at=(row, dimension): cdf(m, *at, t) ** 2, -20, y)[0]
-        above = integrate.quad(lambda t, at=(row, dimension): (1 - cdf(m, *at, t)) ** 2, y, 20)[0]
-        assert closed[row, dimension] == pytest.approx(below + above, rel=1e-6)
-
-
-def test_crps_of_one_gaussian_and_of_a_point() -> None:
-    # Gneiting & Raftery 2007, equation 21, at the mean: sigma (2 pdf(0) - 1 / sqrt(pi))
-    expected = 2 * (2 * stats.norm.pdf(0) - 1 / np.sqrt(np.pi))
-    assert crps(gaussian(1.0, 2.0), np.array([[1.0]]))[0, 0] == pytest.approx(expected)
-    assert crps(gaussian(1.0, 1e-9), np.array([[3.5]]))[0, 0] == pytest.approx(2.5)
-
-
-def test_transforms_are_the_cdf_and_uniform_for_the_truth() -> None:
+def test_intervals_of_the_truth_hold_what_they_say() -> None:
     m = mixture(2000)
     rng = np.random.default_rng(1)
     chosen = np.array([rng.choice(3, p=weights) for weights in m.weights])
     rows = np.arange(2000)
     outcomes = m.means[rows, chosen] + m.sigmas[rows, chosen] * rng.standard_normal((2000, 2))
-    transforms = probability_transform(m, outcomes)
-    assert transforms[5, 1] == pytest.approx(cdf(m, 5, 1, outcomes[5, 1]))
-    assert stats.kstest(transforms.ravel(), "uniform").pvalue > 0.01
-    assert coverage(transforms, 0.8) == pytest.approx(0.8, abs=0.03)
-    assert coverage(np.array([0.0, 0.1, 0.25, 0.5, 0.9]), 0.5) == 2 / 5
+    for level in (0.5, 0.8, 0.95):
+        assert coverage(m, outcomes, level).mean() == pytest.approx(level, abs=0.03)
+
+
+def test_the_interval_of_one_gaussian_is_between_its_quantiles() -> None:
+    one = Mixtures(weights=np.ones((4, 1)), means=np.full((4, 1, 1), 1.0), sigmas=np.full((4, 1, 1), 2.0))
+    low, high = stats.norm.interval(0.8, 1.0, 2.0)
+    outcomes = np.array([low - 1e-6, low + 1e-6, high - 1e-6, high + 1e-6])[:, None]
+    assert coverage(one, outcomes, 0.8).ravel().tolist() == [False, True, True, False]
 
 
 def test_log_score_is_the_density() -> None:
@@ -81,11 +52,10 @@ class Knowing:
         toy = registry.regression("toy_regression")
         wrong = np.stack([toy.errors("base", *pair) for pair in zip(inputs, prediction, strict=True)])[..., None]
         constant = np.zeros(wrong.shape)
-        wide = self.pooled(inputs)
         return Prediction(
-            weights=wide.weights,
-            means=wide.means,
-            sigmas=wide.sigmas,
+            weights=np.ones(wrong.shape),
+            means=constant[..., None],
+            sigmas=np.full((*wrong.shape, 1), 1e6),
             prediction=prediction,
             mean=prediction,
             epistemic=wrong,
@@ -97,20 +67,16 @@ class Knowing:
             drawn=prediction[:, :, None],
         )
 
-    def pooled(self, inputs: np.ndarray) -> Mixtures:
-        shape = (*inputs.shape[:2], 1)
-        return Mixtures(weights=np.ones(shape), means=np.zeros((*shape, 1)), sigmas=np.full((*shape, 1), 1e6))
-
 
 def test_errors_are_paired_with_the_scores_of_the_same_points() -> None:
     task = registry.regression("toy_regression")
-    networks = (SeedTree(0), SeedTree(1))
-    rows, arrays = calibrate(task, Knowing(), "base", networks, points=130, rng=np.random.default_rng(0))  # type: ignore[arg-type]
-    assert arrays["calibration/error"].shape == (2, 130)
-    assert not np.array_equal(*arrays["calibration/error"])
-    for row in rows:
-        assert 0.0 < float(row["wrong"]) < 1.0
+    tests = [task.testing("base", np.random.default_rng(seed), 130) for seed in (0, 1)]
+    found = calibrate(task, "base", tests, Knowing(), np.random.default_rng(0))  # type: ignore[arg-type]
+    assert found["wrong"].shape == (2,) and found["error_mean"][0] != found["error_mean"][1]
+    for network in (0, 1):
+        row = {name: values[network] for name, values in found.items()}
+        assert 0.0 < row["wrong"] < 1.0
         assert row["auroc_epistemic"] == 1.0
         assert row["auroc_modal"] == row["auroc_nll"] == 0.0
         assert row["auroc_total"] == row["auroc_aleatoric"] == row["auroc_stationarity"] == 0.5
-        assert row["coverage_0.5"] == row["pooled_coverage_0.5"] == 1.0, "so wide: every outcome is near its median"
+        assert row["coverage_0.5"] == 1.0, "so wide: every outcome is near its median"

@@ -2,25 +2,24 @@
 
 A planar arm of three links sets random joint configurations and sees where its tip comes to rest; networks learn the
 way back, from places to configurations, of which there are several. Every predicted configuration is carried out in
-MuJoCo. Importing this module is cheap: MuJoCo loads with the first movement.
+MuJoCo.
 """
 
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
+from importlib import resources
 
+import mujoco
 import numpy as np
-import scipy  # its parts load, slowly, when they are first used
 
 from imagine_bench.arrays import Arrays
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Floats
+from imagine_bench.interfaces import Floats, Motion, Shape3D
 from imagine_bench.interfaces.regression import Predict, Prediction, RegressionData, RegressionSpec
 from imagine_bench.seeding import SeedTree
 
-if TYPE_CHECKING:
-    from .planar_arm import PlanarArm
+from .scene_reader import body_poses, motion_of, shapes_of
 
 LINKS_M = (0.5, 0.3, 0.2)
 LOW_RAD = np.array([-2 * np.pi / 3, -3.6, -3.6])
@@ -35,32 +34,75 @@ MAX_SAMPLES = 1_000_000
 GRID = 45
 """Points a side of the maps of figures 4.2 and 4.3, over the square that holds the workspace and a margin."""
 MARGIN_M = 1.1
+MOVE_S = 1.6
+"""Simulated seconds of a movement; the servos have come to rest by then (a test says how near)."""
+_REMEMBERED = 50_000
+"""Movements whose end is kept: every variant of a network's data begins with the same ones."""
+
+
+class PlanarArm:
+    """The arm above its table. It holds one simulation; use it from one thread."""
+
+    def __init__(self) -> None:
+        xml = (resources.files("imagine_bench.assets") / "planar_arm.xml").read_text()
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self._data = mujoco.MjData(self.model)
+        self._steps = round(MOVE_S / self.model.opt.timestep)
+        self._tip_at_rest = functools.lru_cache(maxsize=_REMEMBERED)(self._carry_out)
+
+    def execute(self, joints_rad: Floats) -> Floats:
+        """Let the servos move the arm from rest at zero to each configuration, and measure where its tip comes to rest.
+
+        Joints stop at their limits, so that a configuration beyond them is not reached.
+
+        Args:
+            joints_rad: Shape (N, 3).
+
+        Returns:
+            Positions of the tip in the plane, in metres. Shape (N, 2).
+
+        Raises:
+            InvalidValueError: A joint is NaN or infinite, which MuJoCo would take for 0.
+        """
+        if not np.isfinite(joints_rad).all():
+            raise InvalidValueError("Joints that are NaN or infinite cannot be carried out; give finite radians.")
+        places = [self._tip_at_rest(*target) for target in joints_rad.tolist()]
+        return np.array(places).reshape(-1, 2)
+
+    def _carry_out(self, *target_rad: float) -> tuple[float, ...]:
+        mujoco.mj_resetData(self.model, self._data)
+        self._data.ctrl[:] = target_rad
+        mujoco.mj_step(self.model, self._data, self._steps)
+        mujoco.mj_kinematics(self.model, self._data)
+        return tuple(self._data.site("tip").xpos[:2].tolist())
+
+    def movement(self, joints_rad: Floats, hz: float) -> Motion:
+        """How every body moves while the servos go from zero to one configuration (3,), sampled ``hz`` a second.
+
+        Samples are whole steps apart; the last one is where the arm has come to rest, if that divides the movement.
+        """
+        data = self._data
+        mujoco.mj_resetData(self.model, data)
+        data.ctrl[:] = joints_rad
+        every = round(1 / (hz * self.model.opt.timestep))
+        times_s = []
+        poses = []
+        for _ in range(0, self._steps + 1, every):
+            mujoco.mj_kinematics(self.model, data)
+            times_s.append(data.time)
+            poses.append(body_poses(data))
+            mujoco.mj_step(self.model, data, every)
+        return motion_of(self.model, times_s, poses)
+
+    def shapes(self) -> tuple[Shape3D, ...]:
+        """Every drawable part."""
+        return shapes_of(self.model)
 
 
 @functools.cache
 def arm() -> PlanarArm:
     """This process' arm."""
-    from .planar_arm import PlanarArm  # noqa: PLC0415  (MuJoCo loads with the first movement)
-
     return PlanarArm()
-
-
-def forward(joints_rad: Floats) -> Floats:
-    """Equation 4.29: where joints (..., 3) put the tip, in metres. Shape (..., 2)."""
-    angles = np.cumsum(joints_rad, axis=-1)
-    return np.stack([np.cos(angles) @ LINKS_M, np.sin(angles) @ LINKS_M], axis=-1)
-
-
-def solve(point_m: Floats, rng: np.random.Generator) -> Floats:
-    """Joints (3,) that put the tip at a place (2,) within reach: least squares from up to 50 random starts."""
-    for _ in range(50):
-        start_rad = rng.uniform(LOW_RAD, HIGH_RAD)
-        found = scipy.optimize.least_squares(
-            lambda joints_rad: forward(joints_rad) - point_m, start_rad, bounds=(LOW_RAD, HIGH_RAD)
-        )
-        if found.cost < 1e-8:
-            break
-    return np.asarray(found.x)
 
 
 def distance_to_workspace(points_m: Floats) -> Floats:
@@ -131,25 +173,18 @@ def evaluate(variant: str, predict: Predict, seeds: tuple[SeedTree, ...]) -> Arr
 
     Returns:
         ``decision/...``: ``points`` and where the tip came to rest instead, ``reached`` (E, DECISIONS, CANDIDATES, 2),
-        ``error``, ``joints`` and one entry a score of the same leading shape, and of the first candidate of each
-        choice the error of inverse kinematics with the true arm, ``known_model`` (E, DECISIONS).
-        ``disc/...``: the same but ``known_model`` of choices among points of the whole disc of the stretched arm, some
-        of them out of reach.
+        ``error``, ``joints`` and one entry a score of the same leading shape.
+        ``disc/...``: the same of choices among points of the whole disc of the stretched arm, some out of reach.
         ``map/...``: ``points`` (G, 2), ``outside_m`` (G,), ``error`` (E, G), NaN where unreachable, ``stationarity``
         (E, G), and the three uncertainties a joint (E, G, 3). ``babbling``: the first network's places (N, 2).
     """
     count = DECISIONS * CANDIDATES
     within = np.stack([draw_targets(node.child("candidates").generator(), count) for node in seeds])
     anywhere = np.stack([draw_places(node.child("disc").generator(), count) for node in seeds])
-    known = []
-    for points_m, node in zip(within[:, ::CANDIDATES], seeds, strict=True):
-        rng = node.child("known_model").generator()
-        known.append(errors(variant, points_m, np.stack([solve(point_m, rng) for point_m in points_m])))
     return {
         **_map(variant, predict, len(seeds)),
         **_decide("decision", within, predict(within, "decisions")),
         **_decide("disc", anywhere, predict(anywhere, "disc")),
-        "decision/known_model": np.stack(known),
         "babbling": training(variant, seeds[0].child("data").generator()).inputs,
     }
 

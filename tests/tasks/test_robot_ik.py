@@ -1,4 +1,4 @@
-"""The planar arm: equation 4.29 against MuJoCo, execution, workspace, inverse kinematics."""
+"""The planar arm: equation 4.29 against MuJoCo, execution, workspace, choices."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.robot_ik import spec as ik
-from imagine_bench.tasks.robot_ik.planar_arm import MOVE_S
+from imagine_bench.tasks import robot_ik as ik
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.regression import Prediction
@@ -19,20 +18,26 @@ def joints(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(ik.LOW_RAD, ik.HIGH_RAD, (count, 3))
 
 
+def forward(joints_rad: np.ndarray) -> np.ndarray:
+    """Equation 4.29: where joints (..., 3) put the tip, in metres. Shape (..., 2)."""
+    angles = np.cumsum(joints_rad, axis=-1)
+    return np.stack([np.cos(angles) @ ik.LINKS_M, np.sin(angles) @ ik.LINKS_M], axis=-1)
+
+
 def test_equation_4_29_is_the_models_forward_kinematics() -> None:
     model = ik.arm().model
     data = mujoco.MjData(model)
     for q in joints(50):
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
-        np.testing.assert_allclose(data.site("tip").xpos[:2], ik.forward(q), atol=1e-12)
+        np.testing.assert_allclose(data.site("tip").xpos[:2], forward(q), atol=1e-12)
 
 
 def test_joints_stop_at_their_limits() -> None:
     beyond = np.array([[3.0, 0.0, 0.0]])
     reached = ik.arm().execute(beyond)[0]
-    np.testing.assert_allclose(reached, ik.forward(np.array([ik.HIGH_RAD[0], 0.0, 0.0])), atol=1e-3)
-    assert np.linalg.norm(reached - ik.forward(beyond)[0]) > 0.5  # without limits it would be elsewhere
+    np.testing.assert_allclose(reached, forward(np.array([ik.HIGH_RAD[0], 0.0, 0.0])), atol=1e-3)
+    assert np.linalg.norm(reached - forward(beyond)[0]) > 0.5  # without limits it would be elsewhere
 
 
 def test_joints_that_are_no_numbers_are_not_carried_out() -> None:
@@ -42,9 +47,9 @@ def test_joints_that_are_no_numbers_are_not_carried_out() -> None:
 
 def test_a_movement_is_sampled_to_its_end() -> None:
     q = joints(1, seed=4)
-    motion = ik.arm().movement(q[0], 30.0)
-    assert motion.time_s[0] == 0.0 and motion.time_s[-1] == pytest.approx(MOVE_S)
-    np.testing.assert_allclose(np.diff(motion.time_s), 1 / 30, atol=ik.arm().model.opt.timestep)
+    motion = ik.arm().movement(q[0], 25.0)
+    assert motion.time_s[0] == 0.0 and motion.time_s[-1] == pytest.approx(ik.MOVE_S)
+    np.testing.assert_allclose(np.diff(motion.time_s), 1 / 25)
     still = ik.arm().movement(q[0], 100.0).poses_in_world[-1]
     np.testing.assert_allclose(motion.poses_in_world[-1], still, atol=1e-12)
 
@@ -57,14 +62,6 @@ def test_distance_to_the_workspace_against_brute_force() -> None:
     expected = np.maximum(nearest - 0.5, 0.0)
     np.testing.assert_allclose(ik.distance_to_workspace(points), expected, atol=1e-6)
     assert 50 < (expected > 0).sum() < 250  # both cases occur
-
-
-def test_inverse_kinematics_reaches_every_kind_of_target() -> None:
-    rng = np.random.default_rng(3)
-    targets = ik.draw_targets(rng, 60)
-    solved = np.stack([ik.solve(target, rng) for target in targets])
-    assert np.linalg.norm(ik.forward(solved) - targets, axis=1).max() < 2e-4
-    assert (solved >= ik.LOW_RAD).all() and (solved <= ik.HIGH_RAD).all()
 
 
 def test_targets_and_places_are_uniform() -> None:
@@ -87,7 +84,7 @@ def test_a_place_out_of_reach_is_missed_by_its_distance_at_least() -> None:
 def test_babbling_is_what_was_reached_and_the_joints_with_noise() -> None:
     data = ik.training("200", np.random.default_rng(6))
     commanded = joints(200, seed=6)
-    np.testing.assert_allclose(data.inputs, ik.forward(commanded), atol=2e-4)
+    np.testing.assert_allclose(data.inputs, forward(commanded), atol=2e-4)
     assert (data.targets - commanded).std() == pytest.approx(ik.NOISE_RAD, rel=0.1)
 
 
@@ -113,10 +110,8 @@ def test_decisions_are_carried_out_by_the_arm(monkeypatch: pytest.MonkeyPatch) -
     for part in ("decision", "disc"):
         reached, points = found[f"{part}/reached"], found[f"{part}/points"]
         assert reached.shape == points.shape == (2, ik.DECISIONS, ik.CANDIDATES, 2)
-        np.testing.assert_allclose(reached, ik.forward(found[f"{part}/joints"]), atol=2e-4)
+        np.testing.assert_allclose(reached, forward(found[f"{part}/joints"]), atol=2e-4)
         np.testing.assert_array_equal(found[f"{part}/error"], np.linalg.norm(reached - points, axis=-1))
-    assert found["decision/known_model"].shape == (2, ik.DECISIONS)
-    assert found["decision/known_model"].max() < 1e-3
     assert not np.array_equal(found["decision/points"][0], found["decision/points"][1]), "networks are asked elsewhere"
     outside = found["map/outside_m"] > 0
     assert np.isnan(found["map/error"][:, outside]).all() and np.isfinite(found["map/error"][:, ~outside]).all()

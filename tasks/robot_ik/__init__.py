@@ -1,1 +1,0 @@
-"""Inverse kinematics by motor babbling (thesis 4.5.2)."""
