@@ -7,7 +7,7 @@ import functools
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FunctionType
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import reference, registry, rules, statistics
-from imagine_bench.exact.certificate import Certificate, certificate
+from imagine_bench.exact.certificate import certificate
 from imagine_bench.registry.entries import agent_label, label_today
 from imagine_bench.running.bench import read_protocol
 from imagine_bench.store import encoders
@@ -27,6 +27,7 @@ KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json") if path.parent
 """The folders of kept benches."""
 
 Runs = dict[int, list[dict[str, str]]]
+Estimator = Callable[..., statistics.Estimate]
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,15 @@ def trials(budget: str, where: str) -> int:
     return int(runs(where)[int(budget)][0]["test_episodes"])
 
 
-def _compared(
-    text: str, treated: np.ndarray, base: np.ndarray, tests: int | None, *, only_ahead: bool = False
-) -> Compared:
-    found = statistics.difference(treated, base, trials=tests)
+def _compared(budget: str, treated: str, base: str, estimate: Estimator) -> Compared:
+    return _tested(scores(budget, treated), scores(budget, base), trials(budget, treated), estimate)
+
+
+def _tested(treated: np.ndarray, base: np.ndarray, tests: int, estimate: Estimator) -> Compared:
+    """An estimate, tested as the difference."""
     size = functools.partial(statistics.detectable, treated, base, trials=tests)
-    return Compared(text, found.p, size, bold=found.value > 0 or not only_ahead)
+    found = statistics.difference(treated, base, trials=tests)
+    return Compared(signed(estimate(treated, base, trials=tests)), found.p, size)
 
 
 def percent(share: float) -> str:
@@ -113,8 +117,9 @@ def ahead(budget: str, treated: str, base: str) -> str | list[Compared]:
     """The same; bold where it is ahead of the base. The base itself, and who does not learn, are not tested."""
     if treated == base or not registry.agent_entry(treated.rpartition("/")[2]).learns:
         return iqm(budget, treated)
-    pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
-    return [_compared(iqm(budget, treated), *pair, tests, only_ahead=True)]
+    found = _compared(budget, treated, base, statistics.difference)
+    is_ahead = statistics.iqm(scores(budget, treated)) > statistics.iqm(scores(budget, base))
+    return [replace(found, text=iqm(budget, treated), bold=bool(is_ahead))]
 
 
 def interval(value: float, low: float, high: float) -> str:
@@ -151,28 +156,30 @@ def seeds(budget: str, where: str) -> str:
 
 def difference(budget: str, treated: str, base: str) -> list[Compared]:
     """Difference of interquartile means, points [95 %]."""
-    pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
-    return [_compared(signed(statistics.difference(*pair, trials=tests)), *pair, tests)]
+    return [_compared(budget, treated, base, statistics.difference)]
 
 
 def gain(budget: str, treated: str, base: str) -> list[Compared]:
     """Gain of the means relative to the base, % [95 %]; tested as the difference."""
-    pair, tests = (scores(budget, treated), scores(budget, base)), trials(budget, treated)
-    return [_compared(signed(statistics.gain(*pair, trials=tests)), *pair, tests)]
+    return [_compared(budget, treated, base, statistics.gain)]
+
+
+def _curves(where: str) -> tuple[list[int], np.ndarray]:
+    """The budgets of an agent, and its scores at each. Shape (seeds, budgets)."""
+    budgets = sorted(runs(where))
+    return budgets, np.stack([scores(str(budget), where) for budget in budgets], axis=1)
 
 
 def area(budget: str, where: str, task: str = "arrow_puzzle") -> str:
     """Mean success over all episodes to a budget, %: interquartile mean [95 %]."""
-    budgets = sorted(runs(where))
-    table = np.stack([scores(str(each), where) for each in budgets], axis=1)
+    budgets, table = _curves(where)
     means = statistics.running_means(budgets, table, _facts(task).chance_level)[:, budgets.index(int(budget))]
     return interval(statistics.iqm(means), *statistics.interval(means, trials=trials(budget, where)))
 
 
 def reached(where: str, level: str) -> np.ndarray:
     """First test of every seed from which on all reach a level; NaN where there is none. Shape (seeds,)."""
-    budgets = sorted(runs(where))
-    table = np.stack([scores(str(each), where) for each in budgets], axis=1)
+    budgets, table = _curves(where)
     found = [statistics.first_lasting(budgets, row, float(level)) for row in table]
     return np.array([np.nan if each is None else each for each in found])
 
@@ -201,11 +208,8 @@ def price_to(where: str, level: str, what: str) -> str:
 def coverage(seeds_and_stuck: str, what: str) -> str:
     """A rate of the simulation of intervals and tests, %."""
     count, stuck = seeds_and_stuck.split("/")
-    (row,) = (
-        row for row in _json("coverage/coverage.json")["rows"]
-        if (row["seeds"], row["stuck"]) == (int(count), float(stuck))
-    )  # fmt: skip
-    return percent(row[what])
+    rows = {(row["seeds"], row["stuck"]): row for row in _json("coverage/coverage.json")["rows"]}
+    return percent(rows[int(count), float(stuck)][what])
 
 
 def episodes_to(where: str, level: str) -> str:
@@ -271,8 +275,8 @@ def study_difference(budget: str, folder: str, *variants: str) -> list[Compared]
     found, tests = [], STUDIES["factors"].evaluation_episodes
     for variant in variants:
         against = _study(folder, variant, budget)[0]["against"]
-        pair = np.array(_success(folder, variant, budget)), np.array(_success(folder, against, budget))
-        found.append(_compared(signed(statistics.difference(*pair, trials=tests)), *pair, tests))
+        pair = (np.array(_success(folder, each, budget)) for each in (variant, against))
+        found.append(_tested(*pair, tests, statistics.difference))
     return found
 
 
@@ -362,8 +366,7 @@ def judged_after(folder: str, model: str, score: str, transitions: str) -> str:
 
 def choice(folder: str, network: str, measure: str, criterion: str) -> str:
     """A cell of choices.csv: mean (standard deviation), or ratio [95 %]."""
-    (row,) = picked(f"{folder}/choices.csv", network=network, measure=measure)
-    return row[criterion]
+    return picked(f"{folder}/choices.csv", network=network, measure=measure)[0][criterion]
 
 
 def thesis_error(criterion: str, samples: str) -> str:
@@ -373,8 +376,7 @@ def thesis_error(criterion: str, samples: str) -> str:
 
 def claim(folder: str, network: str, text: str, column: str) -> str:
     """A cell of claims.csv."""
-    (row,) = picked(f"{folder}/claims.csv", network=network, claim=text)
-    return row[column]
+    return picked(f"{folder}/claims.csv", network=network, claim=text)[0][column]
 
 
 def decomposed(folder: str, network: str, where: str, column: str) -> str:
@@ -394,7 +396,6 @@ def fidelity(world: str, what: str) -> str:
     figures = {each["what"]: each for each in _json("speed/worlds.json")["figures"]}
     starts = [f"{world}{level}: {what}" for level in ("", " at strong")]
     found = [each["measured"] for start in starts for name, each in figures.items() if name.startswith(start)]
-    assert all(each["met"] for each in figures.values()) and len(found) in (0, 2)
     return " / ".join(found) or "–"
 
 
@@ -402,15 +403,14 @@ def probe(cubes: str, kind: str) -> str:
     """Held-out frames read right from an encoder of so many cubes, % by seed, and CPU seconds of the last seed."""
     paths = sorted(RESULTS.glob(f"arrows-encoders/arrows_{cubes}-clean{kind}-seed_*.json"))
     cards = [json.loads(path.read_text()) for path in paths]
-    return (
-        f"{', '.join(format(100 * card['probe']['mlp'], '.2f') for card in cards)}; {cards[-1]['cpu_s']['total']:.0f}"
-    )
+    right = ", ".join(f"{100 * card['probe']['mlp']:.2f}" for card in cards)
+    return f"{right}; {cards[-1]['cpu_s']['total']:.0f}"
 
 
 def margin(task: str, setting: str, value: str) -> str:
     """Macro-actions as ruled at a value of a setting, % [95 %, Wilson]."""
-    points = {f"{point['value']:g}": point for point in _json(f"margins/{task}.json")["curves"][setting]}
-    point = points[value]
+    curve = _json(f"margins/{task}.json")["curves"][setting]
+    (point,) = (point for point in curve if point["value"] == float(value))
     return interval(point["as_ruled"] / point["trials"], *statistics.wilson(point["as_ruled"], point["trials"]))
 
 
@@ -438,14 +438,9 @@ def shortest(task: str) -> str:
     return f"{_facts(task).mean_plan_length:.3f}"
 
 
-@functools.cache
-def _certificate(world: str) -> Certificate:
-    return certificate(registry.task(world))
-
-
 def certified(world: str, field: str) -> str:
     """A success probability of a world's certificate, %."""
-    return percent(getattr(_certificate(world), field))
+    return percent(getattr(certificate(registry.task(world)), field))
 
 
 CELLS: dict[str, Callable[..., str | list[Compared]]] = {

@@ -97,19 +97,6 @@ class RulesImaginer(TableAgent):
         )
 
 
-class Rememberer(TableAgent):
-    """Counts how many frames it was shown since its episode began, and the lengths that it counted."""
-
-    lengths: list[int] = []  # noqa: RUF012 - how a test finds them
-
-    def begin_episode(self) -> None:
-        self.lengths.append(0)
-
-    def act(self, observation: Observation, *, explore: bool) -> int:
-        self.lengths[-1] += 1
-        return super().act(observation, explore=explore)
-
-
 class FailingAgent(TableAgent):
     """Breaks in its third episode, with seed 1 only."""
 
@@ -189,7 +176,6 @@ AGENTS.update(
     imaginer=AgentEntry(make="bench_fakes:RulesImaginer", needs_encoder=False),
     failing=AgentEntry(make="bench_fakes:FailingAgent", needs_encoder=False),
     pupil=AgentEntry(make="bench_fakes:Pupil", needs_encoder=False),
-    rememberer=AgentEntry(make="bench_fakes:Rememberer", needs_encoder=False),
     nosy=AgentEntry(make="bench_fakes:NosyAgent", needs_encoder=False),
     nosy_privileged=AgentEntry(make="bench_fakes:NosyAgent", needs_encoder=False, privileged=True),
 )

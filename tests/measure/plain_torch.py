@@ -13,8 +13,6 @@ from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, WorldModelSettings
 from imagine_bench.agents.imagination.world_model import EnvironmentModel, log_cosh
-from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
-from imagine_bench.agents.networks.weight_samples import sample_outputs
 from imagine_bench.agents.regressors.regressor import MixtureRegressor
 from imagine_bench.agents.regressors.settings import RegressorSettings
 from imagine_bench.agents.replay import Batch
@@ -46,11 +44,9 @@ class _PlainMLP(nn.Module):
         super().__init__()
         self.dropout = dropout
         self.draws = draws
-        self.weights = nn.ParameterList()
-        self.biases = nn.ParameterList()
-        for n_in, n_out in pairwise(sizes):
-            self.weights.append(torch.randn(members, n_in, n_out, generator=draws) * math.sqrt(2.0 / (n_in + n_out)))
-            self.biases.append(torch.zeros(members, 1, n_out))
+        shapes = [(members, *pair) for pair in pairwise(sizes)]
+        self.weights = nn.ParameterList(nn.init.normal_(torch.empty(shape), 0.0, 0.1, draws) for shape in shapes)
+        self.biases = nn.ParameterList(torch.zeros(members, 1, n_out) for n_out in sizes[1:])
 
     def forward(self, x: Tensor) -> Tensor:
         *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
@@ -81,7 +77,8 @@ class PlainWorldModel:
 
     def losses(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Losses of the dynamics (summed over members), reward and termination on a batch."""
-        settings, (dynamics, reward, termination) = self.settings, self.networks
+        settings = self.settings
+        dynamics, reward, termination = self.networks
         inputs = torch.cat([batch.z, functional.one_hot(batch.action, self.actions).float()], dim=-1)
         outputs = dynamics(inputs.expand(settings.members, -1, -1))
         mixture = mdn.from_outputs(outputs, settings.components, self.latents, math.log(settings.sigma_floor))
@@ -102,11 +99,12 @@ class PlainWorldModel:
             if self.settings.gradient_clip is not None:
                 nn.utils.clip_grad_norm_(network.parameters(), self.settings.gradient_clip)
         self._adam.step()
+        if self.settings.max_norm is None:
+            return
         with torch.no_grad():
             for weight in [weight for network in self.networks for weight in network.weights]:
-                if self.settings.max_norm is not None:
-                    norm = weight.norm(dim=1, keepdim=True).clamp_min(1e-12)
-                    weight.mul_((self.settings.max_norm / norm).clamp_max(1.0))
+                norm = weight.norm(dim=1, keepdim=True).clamp_min(1e-12)
+                weight.mul_((self.settings.max_norm / norm).clamp_max(1.0))
 
 
 def model_update(hyperparameters: str, rounds: int = 25) -> dict[str, float]:
@@ -127,24 +125,6 @@ def model_update(hyperparameters: str, rounds: int = 25) -> dict[str, float]:
     return least_cpu_s({"plain": lambda: plain.update(batch), "ours": lambda: own.update(batch, draws)}, rounds)
 
 
-def weight_samples(rows: int, samples: int, rounds: int) -> dict[str, float]:
-    """T weight samples of a regressor for N rows: in one pass, and in a loop of forward passes."""
-    prepare_torch("cpu")
-    draws = torch.Generator().manual_seed(0)
-    sizes = (2, 256, 256, 256, mdn.output_size(10, 3))
-    network = MemberMLP(sizes, members=1, dropout=0.2, generator=draws)
-    x = torch.randn(rows, 2, generator=draws)
-    masks = [dropout_mask((samples, units), 0.2, draws) for units in sizes[1:-1]]
-
-    @torch.no_grad()
-    def loop() -> None:
-        outputs = x.new_empty(samples, rows, sizes[-1])
-        for t in range(samples):
-            outputs[t] = network(x[None], tuple(mask[t].view(1, 1, -1) for mask in masks))[0]
-
-    return least_cpu_s({"ours": lambda: sample_outputs(network, x, masks), "plain": loop}, rounds)
-
-
 def training(networks: int, rows: int, updates: int, rounds: int) -> dict[str, float]:
     """A number of updates of E regressors: as one batch, and one network after another."""
     draws = torch.Generator().manual_seed(0)
@@ -152,22 +132,11 @@ def training(networks: int, rows: int, updates: int, rounds: int) -> dict[str, f
     y = torch.randn(networks, rows, 3, generator=draws)
     data = RegressionData(inputs=x[0].double().numpy(), targets=y[0].double().numpy())
 
-    def regressors(count: int) -> MixtureRegressor:
-        seeds = tuple(map(SeedTree, range(count)))
-        return MixtureRegressor(
-            RegressorContext(datasets=(data,) * count, seeds=seeds), RegressorSettings(precision="auto")
-        )
+    def updating(count: int) -> Callable[[], object]:
+        """Updates of all networks, so many at a time."""
+        context = RegressorContext(datasets=(data,) * count, seeds=tuple(map(SeedTree, range(count))))
+        models = [MixtureRegressor(context, RegressorSettings(precision="auto")) for _ in range(networks // count)]
+        parts = list(zip(models, x.split(count), y.split(count), strict=True))
+        return lambda: [model.update(*data) for model, *data in parts for _ in range(updates)]
 
-    together = regressors(networks)
-    alone = [regressors(1) for _ in range(networks)]
-
-    def as_one() -> None:
-        for _ in range(updates):
-            together.update(x, y)
-
-    def one_by_one() -> None:
-        for index, model in enumerate(alone):
-            for _ in range(updates):
-                model.update(x[index : index + 1], y[index : index + 1])
-
-    return least_cpu_s({"ours": as_one, "plain": one_by_one}, rounds)
+    return least_cpu_s({"ours": updating(networks), "plain": updating(1)}, rounds)

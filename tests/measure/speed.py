@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import timeit
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from hashlib import sha256
@@ -111,10 +111,6 @@ def _child(code: str, *arguments: str) -> list[float]:
 
 def torch_ratios() -> Iterator[Figure]:
     """Batched code of the agents against a loop, and the world model's update against plain torch."""
-    for rows in (1, 16, 256, 4096):
-        found = plain_torch.weight_samples(rows, 50, 5)
-        what = f"50 weight samples in one pass, batch of {rows:,}, share of a loop"
-        yield figure_of(what, found["ours"] / found["plain"], ".2f", "<=", 1.0)
     found = plain_torch.training(10, 250, 3, 4)
     what = "training 10 networks of chapter 4 as one batch, times as fast as in turn"
     yield figure_of(what, found["plain"] / found["ours"], ".2f", ">=", 1.2)
@@ -133,28 +129,28 @@ def drawing(spec: TaskSpec) -> Iterator[Figure]:
     scene.agent_view()
     actions = SeedTree(0).child("speed", "kinematic").generator().integers(spec.n_actions, size=300).tolist()
 
-    def steps() -> None:
-        for action in actions:  # ends by rule are ignored, only the time limit resets
-            *_, truncated, _ = env.step(action)
-            if truncated:
-                env.reset()
-
-    least = least_cpu_s(
-        {
-            "mjr": _repeat(_mjr_alone(scene), len(actions)),
-            "frame": _repeat(scene.agent_view, len(actions)),
-            "steps": steps,
-        },
-        9,
-    )
+    draw = _mjr_alone(scene)
+    timed = {
+        "alone": lambda: [draw() for _ in actions],
+        "a frame": lambda: [scene.agent_view() for _ in actions],
+        "a kinematic macro-action with frame": lambda: walked(env, actions, to_the_limit=True),
+    }
+    least = least_cpu_s(timed, 9)
     env.close()
-    per_action = {name: 1e3 * seconds / len(actions) for name, seconds in least.items()}
-    name = spec.id
-    yield _ratio(
-        f"{name}: a frame, times MuJoCo's drawing alone", per_action["frame"], per_action["mjr"], "<=", 1.8, "CPU ms"
-    )
-    what = f"{name}: a kinematic macro-action with frame, times MuJoCo's drawing alone"
-    yield _ratio(what, per_action["steps"], per_action["mjr"], "<=", 4.0, "CPU ms")
+    alone_ms, *ours_ms = (1e3 * seconds / len(actions) for seconds in least.values())
+    for what, each_ms, target in zip(list(timed)[1:], ours_ms, (1.8, 4.0), strict=True):
+        yield _ratio(f"{spec.id}: {what}, times MuJoCo's drawing alone", each_ms, alone_ms, "<=", target, "CPU ms")
+
+
+def walked(env: gymnasium.Env, actions: Sequence[int], *, to_the_limit: bool = False) -> float:
+    """Act, with a reset at each end, or at time limits alone; the mean simulated seconds of a macro-action."""
+    simulated_s = []
+    for action in actions:
+        *_, terminated, truncated, info = env.step(action)
+        simulated_s.append(float(info["sim_time_s"]))
+        if truncated or (terminated and not to_the_limit):
+            env.reset()
+    return float(np.mean(simulated_s))
 
 
 def _mjr_alone(scene: gymnasium.Env) -> Callable[[], object]:
@@ -180,17 +176,12 @@ def physics(spec: TaskSpec) -> Iterator[Figure]:
     simulated_s = []
 
     def steps() -> None:
-        for action in rng.integers(spec.n_actions, size=25).tolist():
-            *_, terminated, truncated, info = env.step(action)
-            simulated_s.append(float(info["sim_time_s"]))
-            if terminated or truncated:
-                env.reset()
+        simulated_s.append(walked(env, rng.integers(spec.n_actions, size=25).tolist()))
 
-    steps()
-    simulated_s.clear()
+    steps()  # warms up
     least = least_cpu_s({"steps": steps, "mj_step": lambda: [mujoco.mj_step(model, data) for _ in range(2_000)]}, 5)
     env.close()
-    alone_s = least["mj_step"] / 2_000 * float(np.mean(simulated_s)) / model.opt.timestep
+    alone_s = least["mj_step"] / 2_000 * float(np.mean(simulated_s[1:])) / model.opt.timestep
     what = f"{spec.id}: a macro-action in physics, times mj_step alone for as long"
     yield _ratio(what, 1e3 * least["steps"] / 25, 1e3 * alone_s, "<=", 3.0, "CPU ms")
 
@@ -228,10 +219,7 @@ def lanes_gain(spec: TaskSpec, execution: str, lanes: int, turns: int, *, blocks
     many.reset(seed=0)
 
     def alone() -> None:
-        for action in rng.integers(spec.n_actions, size=rounds * lanes).tolist():
-            *_, terminated, truncated, _ = one.step(action)
-            if terminated or truncated:
-                one.reset()
+        walked(one, rng.integers(spec.n_actions, size=rounds * lanes).tolist())
 
     def together() -> None:
         for _ in range(rounds):
@@ -249,10 +237,6 @@ def lanes_gain(spec: TaskSpec, execution: str, lanes: int, turns: int, *, blocks
     many.close()
     gain, threads_gain = np.median(gains, axis=0)
     return float(gain), float(threads_gain)
-
-
-def _repeat(action: Callable[[], object], times: int) -> Callable[[], object]:
-    return lambda: [action() for _ in range(times)]
 
 
 def _ratio(what: str, ours: float, plain: float, sign: str, target: float, unit: str) -> Figure:

@@ -14,7 +14,10 @@ import ast
 import csv
 import hashlib
 import importlib
+import itertools
 import json
+import math
+import multiprocessing
 import os
 import shutil
 import signal
@@ -129,18 +132,18 @@ def drawn(file: str, seed: int) -> list[tuple[str, int, str, int]]:
 
 def sample(count: int, seed: int) -> Iterator[dict[str, Any]]:
     """So many changes, rooms by turns."""
-    rooms, left = {}, count
+    rooms = []
     for room, files in ROOMS.items():
-        rooms[room] = sorted((*each, file) for file in files for each in drawn(file, seed))
-    for turn in range(max(map(len, rooms.values()))):
-        for room, found in rooms.items():
-            if left and turn < len(found):
-                _, line, name, occurrence, file = found[turn]
-                before = (ROOT / file).read_text()
-                after = mutate_code(before, get_operator(name)(), occurrence)
-                if after is not None and bare(after) not in (None, bare(before)):
-                    left -= 1
-                    yield {"room": room, "file": file, "line": line, "operator": name.split("/")[1], "code": after}
+        rooms.append(sorted((*each, file, room) for file in files for each in drawn(file, seed)))
+    turns = itertools.chain.from_iterable(itertools.zip_longest(*rooms))
+    for _, line, name, occurrence, file, room in filter(None, turns):
+        if not count:
+            return
+        before = (ROOT / file).read_text()
+        after = mutate_code(before, get_operator(name)(), occurrence)
+        if after is not None and bare(after) not in (None, bare(before)):
+            count -= 1
+            yield {"room": room, "file": file, "line": line, "operator": name.split("/")[1], "code": after}
 
 
 def copy_checkout(where: Path) -> None:
@@ -157,27 +160,29 @@ def copy_checkout(where: Path) -> None:
 
 def fails(where: Path, tests: Sequence[str], log: Path, limit_s: float) -> tuple[str, float]:
     """``passed``, ``failed`` or ``timeout`` of some tests in a process of its own, and the seconds they took."""
-    start_s, child = time.monotonic(), os.fork()
-    if child == 0:
-        os.setsid()
-        os.chdir(where)
-        os.environ["PYTHONPATH"], sys.dont_write_bytecode = str(where), limit_s < float("inf")
-        sys.path.insert(0, str(where))
-        out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(out, 1)
-        os.dup2(out, 2)
-        here = [name for name in tests if (where / name).exists()]
-        os._exit(int(importlib.import_module("pytest").main(["-x", "-p", "no:cacheprovider", *here])))
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        took_s = time.monotonic() - start_s
-        if done:
-            return "passed" if status == 0 else "failed", took_s
-        if took_s > limit_s:
-            os.killpg(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            return "timeout", took_s
-        time.sleep(0.05)
+    start_s = time.monotonic()
+    child = multiprocessing.get_context("fork").Process(target=_test, args=(where, tests, log, limit_s < math.inf))
+    child.start()
+    child.join(None if limit_s == math.inf else limit_s)
+    took_s = time.monotonic() - start_s
+    if child.is_alive():
+        os.killpg(child.pid, signal.SIGKILL)
+        return "timeout", took_s
+    return "passed" if child.exitcode == 0 else "failed", took_s
+
+
+def _test(where: Path, tests: Sequence[str], log: Path, mutated: bool) -> None:
+    """Run some tests of a copy of the checkout, in a process that does nothing else."""
+    os.setsid()
+    os.chdir(where)
+    os.environ["PYTHONPATH"] = str(where)
+    sys.dont_write_bytecode = mutated
+    sys.path.insert(0, str(where))
+    with log.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    here = [name for name in tests if (where / name).exists()]
+    os._exit(int(importlib.import_module("pytest").main(["-x", "-p", "no:cacheprovider", *here])))
 
 
 def main() -> int:
@@ -204,7 +209,7 @@ def main() -> int:
         if not earlier:
             tests = tuple(ROOMS[mutant["room"]][mutant["file"]])
             if tests not in limits:
-                result, took_s = fails(where, tests, build / "mutants.log", float("inf"))
+                result, took_s = fails(where, tests, build / "mutants.log", math.inf)
                 if result != "passed":
                     sys.exit(f"{' '.join(tests)} fail without any change; see {build / 'mutants.log'}.")
                 limits[tests] = 20.0 + _SLOWEST * took_s
