@@ -85,7 +85,6 @@ def test_physics_shows_the_scene_and_cannot_change_it():
         before_s = env.physics.data.time
         env.step(action)
         np.testing.assert_array_equal(env.physics.data.qpos, scene.data.qpos)
-        np.testing.assert_array_equal(env.physics.data.mocap_pos, scene.data.mocap_pos)
         np.testing.assert_allclose(env.physics.data.xpos, scene.data.xpos, atol=1e-12)
         assert env.physics.data.time == before_s + env.info["sim_time_s"] > before_s
     env.physics.data.qpos[:] = 0.0
@@ -102,17 +101,14 @@ def test_physics_shows_the_scene_and_cannot_change_it():
 def test_motion_turns_the_cube_before_the_reward():
     env = as_dm_env(ARROWS, seed=0, motion_hz=10)
     start, yaws, steps = env.reset(), [], []
-    arm_before, moved = env.physics.named.data.xpos["right_hand"].copy(), 0.0
     while not steps or steps[-1].reward == 0.0:  # every macro-action has a reward
         steps.append(env.step(0))
         yaws.append(np.arctan2(*env.physics.named.data.xmat["cube_0"][[3, 0]]))
-        moved = max(moved, np.linalg.norm(env.physics.named.data.xpos["right_hand"] - arm_before))
     assert 10 < len(steps) < 60
     assert all(step.mid() and step.observation is start.observation for step in steps[:-1])
     turned = np.abs((np.array(yaws) - yaws[0] + np.pi) % (2 * np.pi) - np.pi)
     assert turned[-1] == pytest.approx(np.pi / 2, abs=np.radians(5))
     assert ((turned > 0.3) & (turned < 1.3)).any()
-    assert moved > 0.1
     env.close()
 
 

@@ -66,7 +66,7 @@ REGRESSOR = RegressorEntry(
 def things(guests: Guests, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     guests.write("their_things", _MODULE, _OFFERS)
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
-    few = replace(training.OFFERED, frames=600, held_out_frames=150, probe_steps=300)
+    few = replace(training.OFFERED, frames=400, held_out_frames=100, probe_steps=200)
     monkeypatch.setattr(training, "OFFERED", few)
 
 

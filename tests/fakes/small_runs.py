@@ -23,8 +23,10 @@ from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.runner import run
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
-from imagine_bench.store.results import RunResult
+from imagine_bench.store.results import Checkpoint, RunResult
 from imagine_bench.store.run_folder import load_newest
+
+_TIMES = {"train_cpu_s": 0.0, "eval_cpu_s": 0.0}
 
 
 def small(**changes: Any) -> Protocol:
@@ -52,8 +54,14 @@ def do(folder: Path, agent: str = "table", seed: int = 0, every_s: float = 20.0,
 
 
 def same_but_for_time(a: RunResult, b: RunResult) -> bool:
-    trained = np.array_equal(a.training_success, b.training_success)
-    return trained and np.array_equal(a.training_length, b.training_length) and measured(a) == measured(b)
+    def rows(result: RunResult) -> list[Checkpoint]:
+        return [dataclasses.replace(row, **_TIMES) for row in result.checkpoints]
+
+    arrays = [(a.training_success, b.training_success), (a.training_length, b.training_length)]
+    for one, other in zip(a.checkpoints, b.checkpoints, strict=True):
+        assert one.kept is not None and other.kept is not None
+        arrays += [(getattr(one.kept, name), getattr(other.kept, name)) for name in vars(one.kept)]
+    return rows(a) == rows(b) and all(np.array_equal(one, other) for one, other in arrays)
 
 
 def final_arrays(folder: Path) -> dict[str, NDArray[Any]]:
