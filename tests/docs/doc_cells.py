@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import reference, registry, rules, statistics
-from imagine_bench.exact.certificate import certificate
+from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.registry.entries import agent_label, label_today
 from imagine_bench.running.bench import read_protocol
 from imagine_bench.store import encoders
@@ -188,9 +188,11 @@ def price(budget: str, where: str, what: str) -> str:
     """What one run has had until a budget, mean over seeds: a column, or frames its encoder saw before."""
     folder, _, agent = where.rpartition("/")
     if what == "frames":
-        entry, protocol = registry.agent_entry(agent), read_protocol(RESULTS / folder)
-        card = encoders.card(protocol.encoder_of(entry.encoder_kind)) if entry.needs_encoder else None
-        return "0" if not entry.needs_encoder else "–" if card is None else f"{card['recipe']['frames']:,}"
+        entry = registry.agent_entry(agent)
+        if not entry.needs_encoder:
+            return "0"
+        card = encoders.card(read_protocol(RESULTS / folder).encoder_of(entry.encoder_kind))
+        return "–" if card is None else f"{card['recipe']['frames']:,}"
     values = [row.get(what) or "nan" for row in runs(where)[int(budget)]]
     mean = np.mean([float(value) for value in values])
     return "–" if np.isnan(mean) else f"{mean:,.0f}"
@@ -438,9 +440,14 @@ def shortest(task: str) -> str:
     return f"{_facts(task).mean_plan_length:.3f}"
 
 
+@functools.cache
+def _certificate(world: str) -> Certificate:
+    return certificate(registry.task(world))
+
+
 def certified(world: str, field: str) -> str:
     """A success probability of a world's certificate, %."""
-    return percent(getattr(certificate(registry.task(world)), field))
+    return percent(getattr(_certificate(world), field))
 
 
 CELLS: dict[str, Callable[..., str | list[Compared]]] = {

@@ -80,13 +80,6 @@ def test_the_command_asks_for_the_kept_comparison(folder: Path) -> None:
     assert set(differs) <= set(NOT_OPTIONS), "an option of the command does not give what was kept"
 
 
-def test_another_command_would_be_seen() -> None:
-    (folder,) = (folder for folder in KEPT if name(folder) == "arrow_puzzle-sb3_imagined")
-    assert differing(folder, planned(words(folder))) == []
-    assert differing(folder, planned([*words(folder), "--appearance", "mild"])) == ["appearance"]
-    assert differing(folder, planned([*words(folder), "--set", "controller.discount=0.5"])) != []
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", KEPT, ids=name)
 def test_the_command_leaves_a_bench_of_the_same_shape(folder: Path, tmp_path: Path) -> None:
