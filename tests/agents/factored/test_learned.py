@@ -135,6 +135,23 @@ def test_what_changes_only_between_episodes_is_a_factor_too() -> None:
     assert len(np.unique(codes, axis=0)) == len(np.unique(np.column_stack([codes, places]), axis=0)) == 4
 
 
+def test_what_is_seen_once_in_twenty_frames_is_a_value() -> None:
+    """Where most crops of a region have no contour at all."""
+    frames = gray(60)
+    frames[[5, 20, 40], 20:32, 20:32] += (100 * shape(0))[..., None].astype(np.uint8)
+    codes, known = appearance.read(appearance.find(frames), frames)
+    assert known.all() and np.argwhere(codes).tolist() == [[5, 0], [20, 0], [40, 0]]
+
+
+def test_the_widest_gap_parts_the_groups() -> None:
+    rng = np.random.default_rng(0)
+    truth = rng.integers(3, size=30)
+    apart = np.where(truth[:, None] == truth, rng.uniform(0.05, 0.2, (30, 30)), rng.uniform(0.4, 0.5, (30, 30)))
+    label, cut = appearance.groups(apart)
+    assert pairs(label, truth) == 3 and 0.15 < cut < 0.45
+    assert not appearance.groups(0.1 * (1.0 - np.eye(30)))[0].any(), "jitter alone makes one group"
+
+
 def test_what_changed_often_enough_is_a_factor_however_long_nothing_changed() -> None:
     """In 2.5 % of the steps, the share of one of many things; what changed half as often is none yet."""
     frames = gray(800)
