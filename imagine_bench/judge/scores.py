@@ -37,8 +37,6 @@ _TIE = 1e-9
 Scores = dict[str, float]
 Pairs = Sequence[tuple[Mapping[Value, float], Mapping[Value, float]]]
 """Exact and imagined probabilities of each question."""
-COVERAGES = tuple(round(0.05 * index, 2) for index in range(1, 21))
-"""Shares of the questions that are answered, the surest first."""
 
 
 def by_depth(questions: EvalSet, predictions: Predictions) -> list[float]:
@@ -67,7 +65,6 @@ def one_step_scores(
         **_reward_scores(questions, predictions),
         **_end_scores(questions, predictions),
         **_costs(spec, questions, predictions),
-        "where": _where(spec, questions, away, seen),
         **_uncertainty_scores(pairs, predictions, away, seen),
         "worst": np.argsort(-away, kind="stable")[:10].tolist(),
     }
@@ -232,19 +229,6 @@ def _end_scores(questions: EvalSet, predictions: Predictions) -> Scores:
     }
 
 
-def _where(spec: TaskSpec, questions: EvalSet, away: Floats, seen: Bools) -> dict[str, Scores]:
-    """Mean total variation by macro-action, and by whether it is in the data."""
-    labels = {
-        "action": [spec.action_names[action] for _, action in questions.pairs],
-        "in its data": ["seen" if each else "never" for each in seen],
-    }
-    found: dict[str, Scores] = {}
-    for kind, names in labels.items():
-        groups = {name: away[[each == name for each in names]] for name in dict.fromkeys(names)}
-        found[kind] = {name: float(group.mean()) for name, group in groups.items()}
-    return found
-
-
 def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Floats, seen: Bools) -> dict[str, Any]:
     """How well each uncertainty offered tells what it should."""
     wrong = away > _WRONG
@@ -261,7 +245,6 @@ def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Flo
         offered = predictions.of_one_step(uncertainty)
         found[f"auroc_{name}"] = math.nan if offered is None else auroc(offered, truth)
     epistemic = predictions.of_one_step("epistemic")
-    found["risk"] = [] if epistemic is None else risks(epistemic, away)
     return found | filter_scores(epistemic, predictions.of_one_step("accepted"), away)
 
 
@@ -289,13 +272,3 @@ def filter_scores(epistemic: Floats | None, kept: Any, away: Floats) -> Scores:
         of_wrong, of_right = (np.bincount(places[rows], minlength=len(levels)) / rows.sum() for rows in (wrong, ~wrong))
         found["best_skill"] = float(max(0.0, (of_right - of_wrong).cumsum().max()))
     return found
-
-
-def risks(uncertainty: Floats, away: Floats) -> list[float]:
-    """Mean error of the surest questions, by :data:`COVERAGES`; equally sure ones count in equal shares."""
-    order = np.argsort(uncertainty, kind="stable")
-    _, group = np.unique(uncertainty[order], return_inverse=True)
-    tied = np.bincount(group, weights=away[order]) / np.bincount(group)
-    total = np.concatenate([[0.0], tied[group].cumsum()])
-    counts = [max(1, round(share * len(away))) for share in COVERAGES]
-    return [float(total[count] / count) for count in counts]
