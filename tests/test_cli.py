@@ -84,6 +84,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
         ("report HERE", "protocol.json, a bench's protocol."),
         ("view --out HERE", "There is no recording below"),
         ("view HERE/x.rrd", "No recording"),
+        ("view HERE", "There is no recording below"),
         ("play arrow_puzzle --film --out HERE/film.mp4", "does not end in .gif"),
         ("play --film", "A film is of the oracle in a task"),
         ("check --physics", "Physics is measured of a task; give one."),

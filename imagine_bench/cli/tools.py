@@ -118,14 +118,17 @@ class EncoderCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewCommand(OfBench):
-    """Open a recording in the Rerun viewer: the .rrd file of the first word, or the newest of a task, or of all."""
+    """Open a recording in the Rerun viewer: the .rrd file of the first word, or the newest of a folder, task or all."""
 
     def __call__(self) -> None:
         """Find and open."""
         from imagine_bench.recording.stream import open_in_viewer  # noqa: PLC0415 - Rerun loads slowly
 
-        file, task = self.meant()
-        open_in_viewer(file or newest_recording(self.out, task))
+        path, task = self.meant()
+        if path is not None and path.is_dir():
+            of_run = path / "recording.rrd"
+            path = of_run if of_run.is_file() else newest_recording(path)
+        open_in_viewer(path or newest_recording(self.out, task))
 
 
 @dataclass(frozen=True, kw_only=True)

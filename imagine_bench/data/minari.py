@@ -31,7 +31,7 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
     name = re.sub(r"[^\w-]+", "_", f"{card['task']}-{card['policy']}")
     env_id = registry.task_entry(card["task"]).env_id
     made = {name: card[name] for name in ("execution", "appearance")}
-    written_below = mock.patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder))
+    written_below = mock.patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder.resolve()))
     with written_below, warnings.catch_warnings(), closing(gymnasium.make(env_id, **made)) as env:
         warnings.simplefilter("ignore")  # about what we do not know, such as whom to write to
         minari.create_dataset_from_buffers(

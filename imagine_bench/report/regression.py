@@ -69,7 +69,7 @@ def report_page(result: RegressionResult) -> Page:
         answers=answers,
         sections=[Section("What was compared", (_COMPARED,)), *sections],
         files={"results.csv": table_text(rows), **{f"{table.name}.csv": table.csv for table in tables}},
-        summary="\n\n".join([tables[0].text, *answers]),
+        summary="\n".join([tables[0].text, "", *answers]),
         facts=made(result, {pair.agent: pair.title for pair in result.pairs.values()}),
     )
 
@@ -116,7 +116,12 @@ def _toy(result: RegressionResult) -> list[Section]:
                 "where base is run too.",
             ),
             tables=[Table.of("claims", claims)] if claims else [],
-            answers=[" ".join(filter(None, claim.values())) for claim in claims if claim["asked"]],
+            answers=[
+                f"{claim['network']}, {claim['claim']}: {claim['measured']}, asked {claim['asked']}; "
+                f"{claim['networks that hold']} networks hold."
+                for claim in claims
+                if claim["asked"]
+            ],
         ),
         Section(
             title="Figure 4.1: what is uncertain, and why",

@@ -71,7 +71,8 @@ def test_a_hash_stands_for_the_content_alone() -> None:
 
 
 def test_minari_loads_the_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    written(tmp_path / "set", "minari")
+    monkeypatch.chdir(tmp_path)
+    written(Path("set"), "minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "set"))
     found = minari.load_dataset("arrow_puzzle-mixed-v0")
     episodes = collected()[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -139,7 +140,9 @@ def test_networks_err_by_the_sum_of_the_causes(toy: RegressionRun, tmp_path: Pat
 
 
 def test_a_page_shows_every_table_and_figure(toy: RegressionRun, tmp_path: Path) -> None:
-    page = write_page(tmp_path, report_page(result_of(TOY, toy, tmp_path)))
+    report = report_page(result_of(TOY, toy, tmp_path))
+    assert all(re.search(r"\], asked [≥≤>] \d; \d of 2 networks hold\.$", answer) for answer in report.answers)
+    page = write_page(tmp_path, report)
     names = {path.stem for path in page.parent.glob("*.png")} | {path.stem for path in page.parent.glob("*.csv")}
     assert names == {"figure_4_1_mc_dropout", "results", "claims", "decomposition", "calibration"}
     claims = (page.parent / "claims.csv").read_text().splitlines()
