@@ -33,7 +33,6 @@ MOVED = {
     "imagine_bench.machine": "imagine_bench.registry.machine",
     "imagine_bench.regression.interfaces": "imagine_bench.interfaces.regression",
     "imagine_bench.report.plots": "imagine_bench.report.figures",
-    "imagine_bench.report.radar": "imagine_bench.report.figures",
     "imagine_bench.store.archive": "imagine_bench.store.loading",
     "imagine_bench.studies": "imagine_bench.sweep.grid",
     "imagine_bench.studies.catalogue": "imagine_bench.sweep.grid",
