@@ -166,13 +166,11 @@ def test_async_vector_envs_match_single_ones(task, context):
 
 @pytest.mark.parametrize("task", WORLDS)
 def test_a_pickled_environment_goes_on_alike(task):
-    env = make(task, execution="kinematic", appearance="strong")
+    env = make(task, execution="kinematic", appearance="strong", observation="frame,state", size=48)
     env.reset(seed=1)
     twin = pickle.loads(pickle.dumps(env))
     for action in (0, 3, env.action_space.n - 1):
-        one, other = env.step(action), twin.step(action)
-        assert np.array_equal(one[0], other[0])
-        assert one[1:4] == other[1:4]
+        np.testing.assert_equal(env.step(action), twin.step(action))
     env.close()
     twin.close()
 

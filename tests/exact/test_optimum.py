@@ -18,9 +18,7 @@ from imagine_bench.rules import states_of
 WORLDS = {
     "seen": (Wheels(n=2, slip=0.2), Glimpse(), 4),
     "first": (Wheels(n=2, fickle=0.3), Glimpse(finger="first"), 3),
-    "first, sure": (Wheels(n=2), Glimpse(finger="first"), 3),
     "half": (Wheels(n=2, slip=0.1), Glimpse(finger=0.5), 3),
-    "lag 1": (Wheels(n=2, slip=0.3), Glimpse(lag=1), 4),
     "lag 2": (Wheels(n=2, slip=0.3), Glimpse(lag=2), 4),
     "lag 1, half": (Wheels(n=2, fickle=0.2), Glimpse(finger=0.5, lag=1), 3),
 }

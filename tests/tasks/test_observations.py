@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
-import warnings
-
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from worlds import WORLDS, draw_quickly
 
 from imagine_bench import registry
@@ -59,20 +55,11 @@ def test_all_parts_are_of_one_moment_of_the_same_walk(task, execution):
     whole.close()
 
 
-@pytest.mark.parametrize("choice", ["proprio", "human,state"])
-def test_gymnasium_s_checker_is_content(choice):
-    env = make(observation=choice, size=32, **KINEMATIC)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(env.unwrapped, skip_render_check=True)
-    assert isinstance(env.observation_space, gymnasium.spaces.Dict) == ("," in choice)
-    env.close()
-
-
 def test_a_gripper_that_holds_is_felt():
     env = make("pick_place", observation="proprio")
     empty, _ = env.reset(seed=0, options={"macrostate": (0, 0, 0, 2)})
     held, *_, info = env.step(2)
+    assert held in env.observation_space
     assert info["legal"] and np.flatnonzero(np.abs(held - empty) > 1e-6).tolist() == [7, 8]
     assert (held[7:9] < empty[7:9] - 0.002).all()
 
@@ -93,24 +80,13 @@ def test_every_size_shows_the_same_view():
         assert np.abs(image - images[2]).mean() < 0.4 * contrast  # sensor noise is each pixel's own
 
 
-def test_a_pickled_environment_observes_the_same_parts():
-    env = make(observation="frame,state", size=48, **KINEMATIC)
-    env.reset(seed=1)
-    twin = pickle.loads(pickle.dumps(env))
-    np.testing.assert_equal(env.step(1)[0], twin.step(1)[0])
-    env.close()
-    twin.close()
-
-
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
         ({"observation": "pixels"}, UnknownNameError, "frame, human, state, proprio"),
         ({"observation": "frame, state"}, UnknownNameError, "Did you mean 'state'"),
-        ({"observation": None}, UnknownNameError, "frame, human, state, proprio"),
         ({"observation": "state,frame,state"}, InvalidValueError, "names a part twice"),
         ({"size": 31}, InvalidValueError, "Observation size 31 must be an integer from 32 to 256 pixels"),
-        ({"size": 257}, InvalidValueError, "257"),
         ({"size": 64.0}, InvalidValueError, "64.0"),
     ],
 )

@@ -65,23 +65,7 @@ def wrap(angle_rad):
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 
-@pytest.mark.parametrize(("cube", "clockwise"), [(0, True), (1, False), (2, True)])
-def test_executed_turn_keeps_joint_speed_limits_and_returns(arm, turner, cube, clockwise):
-    model, data = turner.model, turner.data
-    place(model, data, (0.05, -0.05, QUARTER_RAD))
-    turner.capture_motion_hz = 1 / TIMESTEP_S
-    result = turner.turn(cube=cube, clockwise=clockwise)
-    turner.capture_motion_hz = 0.0
-    assert result.fault is None
-    np.testing.assert_allclose(result.motion.time_s[[0, 1, -1]], [0, TIMESTEP_S, result.sim_time_s])
-    arm_qpos = result.motion.qpos[:, arm_columns(model).qpos[:7]]
-    speed_rad_s = np.abs(np.diff(arm_qpos, axis=0)) / TIMESTEP_S
-    assert (speed_rad_s.max(axis=0) <= arm.speed_limit_rad_s).all()
-    assert (speed_rad_s.max(axis=0) / arm.speed_limit_rad_s).max() > 0.9
-    np.testing.assert_allclose(arm_qpos[[0, -1]], [OBSERVATION_QPOS_RAD] * 2, atol=1e-3)
-
-
-def test_servo_forces_stay_below_their_limits(turner):
+def test_a_turn_keeps_the_limits_of_speed_and_force_and_returns(arm, turner):
     """Replay one turn step by step and read the forces: within the limits, at rest far below, the grip firm.
 
     Gravity is compensated beside the servos, so that a motor would give the sum: the shoulder's goes beyond its limit.
@@ -91,8 +75,14 @@ def test_servo_forces_stay_below_their_limits(turner):
     peak, motor_peak_nm = np.zeros(model.nu), np.zeros(7)
     arm_dofs = [int(model.joint(f"right_j{index}").dofadr[0]) for index in range(7)]
     turner.capture_motion_hz = 1 / TIMESTEP_S
-    motion = turner.turn(cube=0, clockwise=True).motion
+    result = turner.turn(cube=0, clockwise=True)
+    motion = result.motion
     turner.capture_motion_hz = 0.0
+    np.testing.assert_allclose(motion.time_s[[0, 1, -1]], [0, TIMESTEP_S, result.sim_time_s])
+    arm_qpos = motion.qpos[:, arm_columns(model).qpos[:7]]
+    speed_share = np.abs(np.diff(arm_qpos, axis=0)).max(axis=0) / TIMESTEP_S / arm.speed_limit_rad_s
+    assert 0.9 < speed_share.max() <= 1.0
+    np.testing.assert_allclose(arm_qpos[[0, -1]], [OBSERVATION_QPOS_RAD] * 2, atol=1e-3)
     reached = data.qpos.copy()
     place(model, data, (0, 0, 0))
     turner.rest()
@@ -161,11 +151,10 @@ def test_an_arm_that_does_not_come_back_is_a_fault(turner):
 @pytest.mark.parametrize(
     ("quat", "position", "message"),
     [
-        ((math.cos(0.4), math.sin(0.4), 0, 0), (*SLOTS_XY_M[1], CUBE_Z_M), "cube 1 is tipped by 46 degrees"),
         ((math.cos(0.1), 0, math.sin(0.1), 0), (*SLOTS_XY_M[1], CUBE_Z_M), "cube 1 is tipped by 11 degrees"),
         ((1, 0, 0, 0), (1.4, 0, CUBE_Z_M), "cube 1 is out of reach: The gripper cannot reach"),
     ],
-    ids=["tipped", "leaning", "far"],
+    ids=["leaning", "far"],
 )
 def test_what_the_robot_cannot_do_is_a_fault(turner, quat, position, message):
     model, data = turner.model, turner.data

@@ -116,13 +116,18 @@ def test_lag_shows_the_frame_of_so_many_macro_actions_ago(id_):
         np.testing.assert_array_equal(macrostate, now[step][1])
 
 
-def test_a_state_holds_old_frames_and_what_is_hidden():
-    first, second = (make(IDS[0], gesture=0.5, lag=2, fickle=0.4) for _ in range(2))
+@pytest.mark.parametrize(
+    ("id_", "options"),
+    [(IDS[0], {"gesture": 0.5, "lag": 2, "fickle": 0.4, "appearance": "photo"}), (IDS[1], {"appearance": "strong"})],
+)
+def test_a_state_holds_old_frames_what_is_hidden_and_distractors(id_, options):
+    first, second = (make(id_, distractors=3, **options) for _ in range(2))
     walk(first, 4)
     state = pickle.loads(pickle.dumps(first.get_state()))
     second.reset(seed=9)
     second.set_state(state)
-    for action in (0, 3, 1, 5, 2, 2):
+    np.testing.assert_array_equal(first.agent_view(), second.agent_view())
+    for action in (0, 3, 1, 2, 2):
         np.testing.assert_array_equal(first.step(action)[0], second.step(action)[0])
 
 

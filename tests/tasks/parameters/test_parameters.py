@@ -34,17 +34,6 @@ def test_parameters_of_pick_and_place_by_hand():
             assert all(rules.judge(state, action, each.macrostate) == each for each in found)
 
 
-@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
-def test_a_parameter_at_0_changes_nothing(task):
-    plain, dialled = registry.task(task).rules, registry.task(f"{task}:slip=0,fickle=0.0").rules
-    assert dialled is plain
-    nearly = registry.task(f"{task}:slip=1e-12").rules
-    for state in plain.start_states:
-        for action in range(plain.n_actions):
-            expected, found = chances(plain.outcomes(state, action)), chances(nearly.outcomes(state, action))
-            assert {key: found[key] for key in expected} == pytest.approx(expected)
-
-
 def walk(name, execution, steps):
     """Probability that the rules gave to what came, and to slips and to a human elsewhere, and how often these came."""
     spec = registry.task(name)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance, between, looks_of
 
-from imagine_bench.appearance import FACTORS, POINTS, appearance_name, factors_of
+from imagine_bench.appearance import FACTORS, POINTS, appearance_name
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.judge.judgement import Judgement
 from imagine_bench.protocols.control import protocol
@@ -42,14 +42,6 @@ def test_one_appearance_has_one_name(given, name):
         assert Judgement(task="arrow_puzzle", models=("copy",), appearance=given).appearance == name
 
 
-def test_names_are_read_back_as_the_factors_they_say():
-    rng = np.random.default_rng(0)
-    for _ in range(300):
-        shares = {name: float(rng.choice([0.0, 0.5, 1.0, rng.uniform()])) for name in FACTORS if rng.random() < 0.6}
-        name = appearance_name(shares)
-        assert (POINTS.get(name) or factors_of(name) if "=" in name else POINTS[name]) == factors_of(shares)
-
-
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [
@@ -57,16 +49,13 @@ def test_names_are_read_back_as_the_factors_they_say():
         ("light=2", "Appearance has light='2'; give a number from 0 to 1."),
         ({"light": -0.1}, "Appearance has light=-0.1; give a number from 0 to 1."),
         ({"light": True}, "Appearance has light=True; give a number from 0 to 1."),
-        ({"light": None}, "Appearance has light=None; give a number from 0 to 1."),
         ("light=nan", "Appearance has light='nan'; give a number from 0 to 1."),
-        ("light=high", "Appearance has light='high'; give a number from 0 to 1."),
         (
             "ligth=0.5",
             "No factor of appearance 'ligth'. Did you mean 'light'? Known: light, colors, camera, pose, hand.",
         ),
         ("light=0.5,light=0.5", "names light twice; give it once."),
         ("light=0.5,strong", "No factor of appearance 'strong'. Known: light, colors, camera, pose, hand."),
-        ("light=0.5,hand", "Appearance has hand=''; give a number from 0 to 1."),
         (3, "No appearance '3'."),
     ],
 )
