@@ -44,15 +44,9 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> str:
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False).stdout
 
 
-def test_a_test_of_twice_the_limit_fails(report: str) -> None:
+def test_far_over_the_limit_fails_over_it_is_named_and_a_first_import_is_nobodys(report: str) -> None:
     assert "1 failed, 4 passed" in report
     assert "test_far_over" in report and "more than twice the limit of 0.1 CPU s" in report
-
-
-def test_a_test_over_the_limit_is_named(report: str) -> None:
     _, _, named = report.partition("fast tests over")
     assert "test_over" in named and "test_cheap" not in named and "test_marked_slow" not in named
-
-
-def test_a_first_import_is_nobodys(report: str) -> None:
     assert "test_first_import" not in report

@@ -249,44 +249,27 @@ def test_guests_import_documented_modules_only(path: Path) -> None:
     assert guest_offences(path, path.read_text()) == []
 
 
-@pytest.mark.parametrize(
-    ("line", "name"),
-    [
-        ("from imagine_bench.agents.dqn import DQN\nfrom imagine_bench.agents.attic import x", "agents.attic.x"),
-        ("import imagine_bench.store.files", "store.files"),
-        ("def f():\n    from imagine_bench.agents import baselines", "agents.baselines"),
-    ],
-)
-def test_an_undocumented_import_of_a_guest_would_be_seen(line: str, name: str) -> None:
+def test_an_undocumented_import_of_a_guest_would_be_seen() -> None:
+    line = "from imagine_bench.agents.dqn import DQN\nfrom imagine_bench.agents.attic import x"
     (found,) = guest_offences(_GUESTS[0].parent / "new.py", line)
-    assert found == f"imagine_bench.{name} is not listed in docs/reference/api.md"
+    assert found == "imagine_bench.agents.attic.x is not listed in docs/reference/api.md"
 
 
 @pytest.mark.parametrize(
     ("file", "line", "offence"),
     [
         ("tasks/new.py", "import torch", "torch is imported outside of agents"),
-        ("agents/new.py", "import mujoco.batch", "mujoco is imported outside of tasks"),
         ("imagine_bench/report/new.py", "import rerun as rr", "rerun is imported outside of imagine_bench/recording"),
         (
             "tasks/new.py",
             "from imagine_bench.seeding import x\nfrom imagine_bench import statistics",
             "may import only",
         ),
-        ("agents/new.py", "from imagine_bench.exact import splits", "may import only"),
         ("imagine_bench/registry/new.py", "import agents", "installed inside imagine_bench"),
         ("imagine_bench/store/new.py", "from ..running import runner", "imagine_bench/running stands above"),
         ("imagine_bench/store/new.py", "def f():\n    from imagine_bench.cli import main", "imagine_bench/cli stands"),
-        (
-            "imagine_bench/store/new.py",
-            "if TYPE_CHECKING:\n    import imagine_bench.judge",
-            "imagine_bench/judge stands",
-        ),
         ("imagine_bench/registry/new.py", "load('imagine_bench.running.runner:run')", "imagine_bench/running stands"),
-        ("imagine_bench/registry/new.py", "load(f'imagine_bench.cli:{name}')", "imagine_bench/cli stands above"),
-        ("imagine_bench/new.py", "from imagine_bench.interfaces import Frame", "imagine_bench/interfaces stands above"),
         ("imagine_bench/attic/new.py", "import imagine_bench.errors", "attic is a new folder"),
-        ("agents/networks/new.py", "from ..dqn import make", "agents stands above agents/networks"),
         ("agents/dqn_settings.py", "import torch", "settings import torch"),
         ("agents/new.py", "x = np.random.rand(3)", "draws from a global generator"),
         ("agents/new.py", "x = np.random.default_rng()", "without a seed"),
@@ -299,20 +282,6 @@ def test_an_undocumented_import_of_a_guest_would_be_seen(line: str, name: str) -
 def test_each_offence_would_be_seen(file: str, line: str, offence: str) -> None:
     (found,) = offences(_TOP / file, line)
     assert offence in found
-
-
-@pytest.mark.parametrize(
-    ("file", "line"),
-    [
-        ("agents/new.py", "import torch\nx = torch.randn(3, generator=g)\nfrom .networks import mlp"),
-        ("tasks/arrows/new.py", "import mujoco\nfrom imagine_bench.rules import facts\nfrom ..frames import frames_of"),
-        ("imagine_bench/store/new.py", "from imagine_bench import registry\nrng = np.random.default_rng(7)"),
-        ("imagine_bench/recording/new.py", "import rerun\nfrom imagine_bench.judge import plans\nfrom . import scene"),
-        ("imagine_bench/new.py", "from imagine_bench.errors import brief"),
-    ],
-)
-def test_imports_that_go_down_are_allowed(file: str, line: str) -> None:
-    assert offences(_TOP / file, line) == []
 
 
 @pytest.mark.parametrize("old", MOVED)

@@ -33,11 +33,6 @@ def packages() -> dict[str, Path]:
     return found
 
 
-def test_every_folder_with_python_is_installed() -> None:
-    listed = _PROJECT["tool"]["setuptools"]["packages"]
-    assert sorted(packages()) == sorted(listed)
-
-
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Names in a wheel built from a copy of the tracked and new files, so that the checkout stays as it is."""
@@ -179,6 +174,5 @@ def test_the_container_does_what_a_newcomer_does() -> None:
     assert gl_packages is not None
     (installs,) = re.findall(r"apt-get install (.*)", steps)
     assert {"make", "git", *gl_packages[1].split()} <= set(installs.split())
-    assert re.search(r"^RUN make setup$", steps, re.MULTILINE) and 'CMD ["make", "test"]' in steps
     python = re.search(r"^FROM python:(3\.\d+)-slim$", steps, re.MULTILINE)
     assert python is not None and python[1] in _PYTHONS

@@ -32,15 +32,9 @@ def test_joined_cells_are_cut_into_the_same_cells(cubes):
     np.testing.assert_allclose(preprocess(gray_name(cubes))(again), cells, atol=1 / 255)
 
 
-def test_whole_rgb_moves_channels_first():
+def test_rgb_has_its_channels_first_and_is_averaged_over_blocks():
     frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
-    pixels = whole_rgb(frames)
-    assert pixels.shape == (2, 3, 64, 64)
-    np.testing.assert_allclose(pixels[1, 2], frames[1, :, :, 2] / 255, atol=1e-6)
-
-
-def test_small_rgb_averages_blocks():
-    frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+    np.testing.assert_allclose(whole_rgb(frames), frames.transpose(0, 3, 1, 2) / 255, atol=1e-6)
     pixels = small_rgb(frames)
     assert pixels.shape == (2, 3, 32, 32)
     assert pixels.dtype == np.float32

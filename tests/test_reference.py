@@ -23,11 +23,6 @@ def test_section_3_2_3_gives_no_standard_deviation() -> None:
     assert reference.success_source("robot_ik") == ""
 
 
-def test_table_5_3() -> None:
-    assert reference.success("arrow_puzzle_hard", "dqn")[3000] == pytest.approx((0.4956, 0.0848))
-    assert reference.success("arrow_puzzle_hard", "imagination_uncertainty")[2000] == pytest.approx((0.5845, 0.0157))
-
-
 def test_tables_5_2_and_5_4_are_what_5_1_and_5_3_imply() -> None:
     for name in ("arrow_puzzle", "arrow_puzzle_hard"):
         base = reference.success(name, "dqn")

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from same_values import assert_same
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from imagine_bench import registry
@@ -14,21 +15,6 @@ from imagine_bench.errors import InvalidValueError
 
 ARROWS = "imagine_bench/ArrowPuzzle-vector-v0"
 KINEMATIC = {"execution": "kinematic"}
-
-
-def assert_same(ours, theirs):
-    """Observations and infos, equal to the bit and of the same types."""
-    assert type(ours) is type(theirs)
-    if isinstance(ours, dict):
-        assert set(ours) == set(theirs)
-        for key in ours:
-            assert_same(ours[key], theirs[key])
-    elif isinstance(ours, list):
-        for one, other in zip(ours, theirs, strict=True):
-            assert_same(one, other)
-    else:
-        assert np.asarray(ours).dtype == np.asarray(theirs).dtype
-        np.testing.assert_array_equal(ours, theirs)
 
 
 def both(task="arrow_puzzle", n=3, **options):

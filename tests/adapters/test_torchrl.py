@@ -35,15 +35,3 @@ def test_a_rollout_with_infos_is_our_episodes():
         ended += outcome.terminated
     assert ended > 5
     env.close()
-
-
-def test_a_vector_environment_is_rolled_out_as_single_ones():
-    make = registry.vector_id(ARROWS)
-    env = GymWrapper(gymnasium.make_vec(make, num_envs=3, autoreset_mode="Disabled", **KINEMATIC))
-    check_env_specs(env)
-    walked = env.rollout(40, break_when_any_done=False)
-    assert walked.batch_size == (3, 40) and walked["next", "done"].sum() > 10
-    goes_on = ~walked["next", "done"][:, :-1, 0]
-    after, before = walked["next", "observation"][:, :-1], walked["observation"][:, 1:]
-    assert torch.equal(after[goes_on], before[goes_on])
-    env.close()

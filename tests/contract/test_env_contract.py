@@ -10,14 +10,13 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
 from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
 from imagine_bench.errors import DivergedError, ImagineBenchError, InvalidValueError
-from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, HELD_OUT, SceneReader
+from imagine_bench.interfaces import EXECUTIONS, SceneReader
 from imagine_bench.testing.contract import checks, report
 
 TASKS = tuple(name for name in registry.TASKS if name != "arrows")  # which is arrow_puzzle once more
@@ -59,13 +58,6 @@ def test_the_contracts_checks_and_stable_baselines_are_content(task):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         pytest.importorskip("stable_baselines3.common.env_checker").check_env(env, warn=True)
-    env.close()
-
-
-@pytest.mark.parametrize("task", WORLDS)
-def test_gymnasiums_checker_is_content_in_physics(task):
-    env = make(task)
-    check_env(env.unwrapped, skip_render_check=True)
     env.close()
 
 
@@ -132,14 +124,13 @@ def test_the_horizon_truncates_and_does_not_terminate(task):
     env.close()
 
 
-@pytest.mark.parametrize("field", ["horizon", "env_id", "id", "action_names", "macrostate_names", "macrostate_values"])
+@pytest.mark.parametrize("field", ["horizon", "id", "macrostate_values"])
 def test_a_task_unlike_its_registry_line_or_its_rules_is_named(field, monkeypatch):
     spec = registry.task("arrow_puzzle")
-    wrong = {"horizon": 20, "env_id": "x/Y-v0", "id": "y"}.get(field) or getattr(spec, field)[:-1]
+    wrong = {"horizon": 20, "id": "y"}.get(field) or spec.macrostate_values[:-1]
     changed = dataclasses.replace(spec, **{field: wrong})
     monkeypatch.setattr("imagine_bench.tasks.arrows.spec.spec_of", lambda **world: changed)
-    numbers = {"action_names": "n_actions 5", "macrostate_names": "names 3", "macrostate_values": r"values \(4, 4, 4\)"}
-    what = numbers.get(field, f"{field} {wrong!r}")
+    what = r"values \(4, 4, 4\)" if field == "macrostate_values" else f"{field} {wrong!r}"
     with pytest.raises(InvalidValueError, match=rf"{what} where the registry line or the rules of arrow_puzzle say"):
         registry.task("arrow_puzzle")
 
@@ -335,9 +326,3 @@ def test_shapes_and_motion_describe_the_scene():
     assert by_name["right_hand"] > 0.1
     assert by_name["cube_0"] < 1e-3
     assert by_name["hand"] == by_name["world"] == 0.0
-
-
-def test_appearances_are_those_of_the_interfaces():
-    from imagine_bench.tasks.scenes.appearance import LEVELS
-
-    assert tuple(LEVELS) == (*APPEARANCES, *HELD_OUT.values())

@@ -56,12 +56,6 @@ def test_a_wheel_offers_every_agent_and_holds_one_package(installed: tuple[Path,
     assert modules <= names and f"{package}/py.typed" in names
 
 
-def test_every_agent_of_a_guest_is_in_the_registry_with_a_title_of_its_own() -> None:
-    for folder in FOLDERS:
-        for name in project(folder)["entry-points"][registry.AGENT_GROUP]:
-            assert registry.agents()[name].description != registry.AgentEntry(make="").description
-
-
 def test_the_extra_peers_names_the_guest_and_all_that_it_needs() -> None:
     extra = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]["peers"]
     named = {str(Requirement(text)) for text in extra}

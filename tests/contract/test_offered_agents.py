@@ -95,7 +95,6 @@ _LOADED = "which cannot be loaded "
     ("point", "target", "asked", "sentence"),
     [
         ("dqn", "their_package:ENTRY", "their_package:dqn", "as agent dqn, a name that is taken; give it another"),
-        ("ensemble", "their_package:ENTRY", "their_package:ensemble", "as agent ensemble, a name that is taken"),
         ("mine", "their_package:NONE", "mine", f"offers their_package:NONE as agent mine, {_LOADED}(AttributeError"),
         ("mine", "no_package:ENTRY", "mine", f"{_LOADED}(ModuleNotFoundError: No module named 'no_package"),
         ("mine", "their_broken:ENTRY", "mine", f"{_LOADED}(ZeroDivisionError: division by zero)"),

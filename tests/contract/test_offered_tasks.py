@@ -15,7 +15,7 @@ from small_runs import Inline
 
 from imagine_bench import registry, rules
 from imagine_bench.cli import main
-from imagine_bench.errors import ArtefactError, SetupError
+from imagine_bench.errors import ArtefactError
 from imagine_bench.report import summary_table
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.trained import learners, load_trained
@@ -103,15 +103,3 @@ def test_other_looks_are_another_encoder(site: Path) -> None:
     dark = dataclasses.replace(spec, render_macrostates=lambda *given: spec.render_macrostates(*given) // 2)
     places = [encoders.cached(each, "clean", "codes") for each in (spec, spec, dark)]
     assert places[0] == places[1] != places[2]
-
-
-def test_an_offer_that_is_no_task_costs_nobody_anything(
-    guests: Guests, site: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    guests.offer(site, {registry.TASK_GROUP: {"lights_out": "lights_out:SPEC"}})
-    with pytest.raises(SetupError, match=r"^The package lights_out offers .* and no TaskEntry"):
-        registry.task("lights_out")
-    assert registry.task("arrow_puzzle").id == "arrow_puzzle"
-    assert main(["bench", "--task", "lights_out"]) == 2
-    assert "and no TaskEntry" in capsys.readouterr().err
-    assert main(["list"]) == 0 and "and no TaskEntry" in capsys.readouterr().out

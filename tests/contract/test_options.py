@@ -67,8 +67,3 @@ def test_watching_episodes_teaches_as_living_them(agent: str) -> None:
 def test_options_of_training_are_refused_where_no_agent_learns(option: dict[str, object]) -> None:
     with pytest.raises(InvalidValueError, match="No agent of this bench learns"):
         plan_control(TASK, "smoke", agents=("random", "oracle"), **option)
-
-
-@pytest.mark.parametrize("agent", ["random", "oracle"])
-def test_agents_without_settings_take_none(agent: str) -> None:
-    assert not registry.setting_names(agent)

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_runs import final_arrays, measured, run_observed, small
+from agent_states import same
+from small_runs import final_state, measured, run_observed, small
 
 from imagine_bench import registry
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import run_state
 from imagine_bench.store import encoders
 from imagine_bench.store.results import RunResult
-from imagine_bench.store.run_folder import load_newest
 
 LEARNERS = [
     name
@@ -35,14 +35,6 @@ def do(folder: Path, agent: str, every_s: float) -> RunResult:
     encoder = encoders.own(registry.task("arrow_puzzle"), "clean", kind=registry.agents()[agent].encoder_kind)
     spec = RunSpec(protocol=protocol, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
     return run_observed(spec, folder, lambda progress: None)
-
-
-def own_values(folder: Path) -> str:
-    """What an agent keeps beside its arrays, but for times."""
-    snapshot = load_newest(folder / "checkpoints")
-    assert snapshot is not None
-    meters = {name: value for name, value in snapshot.agent.values["meters"].items() if not name.startswith("time/")}
-    return repr(sorted({**snapshot.agent.values, "meters": meters}.items()))
 
 
 _DO_LESS = (
@@ -74,9 +66,6 @@ def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pyt
     assert measured(whole) == measured(resumed)
     tables = agent in ("factored", "count_table_own") or registry.agents()[agent].encoder_kind == "codes"
     assert tables or any(name.startswith("loss/") for name in whole.checkpoints[-1].diagnostics)
-    assert own_values(tmp_path / "whole") == own_values(tmp_path / "run")
-    before, after = final_arrays(tmp_path / "whole"), final_arrays(tmp_path / "run")
-    assert set(before) == set(after)
-    assert [name for name in before if before[name].tobytes() != after[name].tobytes()] == []
+    assert same(final_state(tmp_path / "whole"), final_state(tmp_path / "run"))
     for one, other in zip(whole.imagined, resumed.imagined, strict=True):
         assert np.array_equal(one.rollout.frames, other.rollout.frames)

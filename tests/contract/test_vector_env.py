@@ -13,8 +13,8 @@ import time
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from imagine_bench.tasks.rendering import renderer as rendering
+from gymnasium.vector import AutoresetMode
+from same_values import assert_same
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
@@ -33,22 +33,6 @@ def make(task="arrow_puzzle", n=N_LANES, **options):
 def make_sync(mode, **options):
     options |= {"num_envs": N_LANES, "vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
     return gymnasium.make_vec("imagine_bench/ArrowPuzzle-v0", **options)
-
-
-def assert_same(one, other, where=""):
-    """Nested dicts, tuples and arrays, equal to the bit and of the same types."""
-    if isinstance(one, dict):
-        assert set(one) == set(other), where
-        for key in one:
-            assert_same(one[key], other[key], f"{where}/{key}")
-        return
-    one, other = np.asarray(one), np.asarray(other)
-    assert (one.dtype, one.shape) == (other.dtype, other.shape), where
-    if one.dtype == object:
-        for each, its in zip(one, other, strict=True):
-            assert type(each) is type(its) and np.array_equal(each, its), where
-    else:
-        assert np.array_equal(one, other), where
 
 
 def walk_both(one, other, steps, n_actions, *, mask):
@@ -228,31 +212,6 @@ def test_a_reset_forgets_what_a_lane_was_doing(monkeypatch):
     again, _ = vector.reset(seed=4)
     assert len(ended) == 2 and np.array_equal(first, again)
     assert np.array_equal(vector.step(np.array([0, 2]))[0], expected)
-    vector.close()
-
-
-def test_every_task_has_a_vector_id_and_keeps_its_default():
-    for entry in registry.TASKS.values():
-        spec = gymnasium.spec(registry.vector_id(entry.env_id))
-        assert spec.vector_entry_point and spec.entry_point is None and spec.max_episode_steps == entry.horizon
-        assert gymnasium.spec(entry.env_id).vector_entry_point is None
-    usual = gymnasium.make_vec("imagine_bench/ArrowPuzzle-v0", num_envs=1, **KINEMATIC)
-    assert isinstance(usual, SyncVectorEnv)
-    usual.close()
-
-
-def test_lanes_are_drawn_in_one_context_a_view(monkeypatch):
-    made = []
-    make_context = rendering.new_gl_context
-    monkeypatch.setattr(rendering, "new_gl_context", lambda *size: made.append(size) or make_context(*size))
-    rendering.close_contexts()
-    vector = make(n=4, **KINEMATIC, appearance="strong", render_mode="rgb_array", width=48, height=32)
-    vector.reset(seed=0)
-    vector.step(np.zeros(4, dtype=int))
-    images = vector.render()
-    assert [image.shape for image in images] == [(32, 48, 3)] * 4
-    assert made == [(64, 64), (48, 32)]
-    assert np.array_equal(images[1], vector.envs[1].render())
     vector.close()
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,20 +109,6 @@ class FailingAgent(TableAgent):
         super().observe(transition, episode=episode)
 
 
-class NosyAgent(TableAgent):
-    """Notes whether it was shown more than frames."""
-
-    seen: list[Any] = []  # noqa: RUF012 - the point of it
-
-    def __init__(self, context: AgentContext) -> None:
-        super().__init__(context)
-        self.seen.append(context.optimal_policy)
-
-    def act(self, observation: Observation, *, explore: bool) -> int:
-        self.seen.append(observation.macrostate)
-        return super().act(observation, explore=explore)
-
-
 class Pupil(TableAgent):
     """Notes all that it is shown, asks about random plans whenever it may, and counts what it carries over."""
 
@@ -131,6 +116,7 @@ class Pupil(TableAgent):
 
     def __init__(self, context: AgentContext) -> None:
         super().__init__(context)
+        self.optimal_policy = context.optimal_policy
         self.asking = np.random.default_rng(0)
         self.shown: list[tuple[int, Transition]] = []
         self.seen: list[Observation] = []
@@ -176,8 +162,7 @@ AGENTS.update(
     imaginer=AgentEntry(make="bench_fakes:RulesImaginer", needs_encoder=False),
     failing=AgentEntry(make="bench_fakes:FailingAgent", needs_encoder=False),
     pupil=AgentEntry(make="bench_fakes:Pupil", needs_encoder=False),
-    nosy=AgentEntry(make="bench_fakes:NosyAgent", needs_encoder=False),
-    nosy_privileged=AgentEntry(make="bench_fakes:NosyAgent", needs_encoder=False, privileged=True),
+    pupil_privileged=AgentEntry(make="bench_fakes:Pupil", needs_encoder=False, privileged=True),
 )
 
 if __name__ == "__main__":

@@ -78,13 +78,6 @@ def test_real_frames_are_shown_unaltered_and_upright() -> None:
     np.testing.assert_array_equal(shown, compared.start_frame)
 
 
-def test_transitions_are_marked_by_row_gray_ones_too() -> None:
-    images = list(np.random.default_rng(0).integers(0, 255, (2, 32, 32), dtype=np.uint8))
-    sheet = filmstrips.transition_sheet(["one", "two"], [("real", images, None), ("imagined", images, [True, True])])
-    assert colored(sheet) == [True, False]
-    assert colored(filmstrips.transition_sheet(["one", "two"], [("real", images, None)])) == [False, False]
-
-
 def test_changes_are_named_and_judged_by_the_rules() -> None:
     assert changes(START, ASKS_RIGHT, PICK_PLACE) == "left object picked, gesture right"
     assert changes(ASKS_RIGHT, ASKS_RIGHT, PICK_PLACE) == "nothing changes"

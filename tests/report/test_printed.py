@@ -2,22 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
-import pytest
-
-from imagine_bench.report.page import flat, number
-
-
-@pytest.mark.parametrize(
-    ("value", "digits", "text"),
-    [
-        (9.999, 3, "10.0"), (1234.5, 3, "1234"), (0.004, 2, "4.0e\u221203"), (0.0, 3, "0.000"),
-        (-3.14159, 3, "\u22123.14"), (123456.0, 3, "1.23e+05"), (math.nan, 3, "–"),
-    ],
-)  # fmt: skip
-def test_numbers_show_what_there_is(value: float, digits: int, text: str) -> None:
-    assert number(value, digits) == text
+from imagine_bench.report.page import flat
 
 
 def test_lists_of_sessions_are_rows_not_python() -> None:

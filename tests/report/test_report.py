@@ -17,12 +17,10 @@ from report_pages import check_page, without_images
 from imagine_bench import reference, statistics
 from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.registry import AGENTS, AgentEntry
 from imagine_bench.report import bench_page, write_report
 from imagine_bench.report.bench import shown, verdict
 from imagine_bench.report.data import DIFFERENCE, GAIN, SCORE, agent_title, collect
-from imagine_bench.report.page import DASH, Page, Table, estimate, percent, signed_percent, texts
-from imagine_bench.statistics import Estimate
+from imagine_bench.report.page import DASH, Page, Table, percent, signed_percent, texts
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 
@@ -230,26 +228,4 @@ def test_how_it_was_made_is_complete_and_escaped(result: BenchResult, page: Page
     assert html.escape("a <processor> & more") in written["index.html"]
 
 
-def test_the_same_result_gives_the_same_page(result: BenchResult, page: Page) -> None:
-    again = bench_page(result)
-    assert text_of(again) == text_of(page)
-    first, second = (next(each for section in one.sections for each in section.images) for one in (page, again))
-    assert first.png == second.png
-
-
-def test_a_dash_is_explained_only_where_there_is_one() -> None:
-    found = Table.of("t", [{"a": "x", "b": "1"}], "Numbers.", "not measured")
-    assert found.remark == "Numbers."
-    assert dataclasses.replace(found, rows=[["x", DASH]]).remark == "Numbers. –: not measured."
-    assert estimate(Estimate(0.613, 0.55, 0.672)) == "61.3 [55.0, 67.2]"
-    assert found.text.splitlines() == ["a  b", "----", "x  1"]
-
-
 # Agents -----------------------------------------------------------------------------------------------
-
-
-def test_titles_are_those_of_the_registry_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert agent_title("dqn") == "DQN" and agent_title("of_another_time") == "of another time"
-    for title, words in (("", "my agent"), ("Mine", "Mine")):
-        monkeypatch.setitem(AGENTS, "my_agent", AgentEntry(make="x:make", title=title))
-        assert agent_title("my_agent") == words

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import bench_fakes
+import numpy as np
 import pytest
 from imagine_bench.tasks.macro_env import MacroEnv
 from small_runs import do, final_arrays, run_observed, same_but_for_time, small
@@ -68,15 +69,13 @@ def test_a_run_counts_what_happens(tmp_path: Path) -> None:
 
 
 def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
-    seen = bench_fakes.NosyAgent.seen
-    seen.clear()
-    do(tmp_path / "plain", "nosy", agents=("nosy",))
-    assert len(seen) > 20 and all(value is None for value in seen)
-    seen.clear()
-    do(tmp_path / "privileged", "nosy_privileged", agents=("nosy_privileged",))
-    optimal_policy, *macrostates = seen
-    assert callable(optimal_policy)
-    assert all(macrostate.shape == (4,) for macrostate in macrostates)
+    bench_fakes.Pupil.made.clear()
+    for name in ("pupil", "pupil_privileged"):
+        do(tmp_path / name, name, agents=(name,))
+    plain, privileged = bench_fakes.Pupil.made
+    assert len(plain.seen) > 20 and all(observation.macrostate is None for observation in plain.seen)
+    assert plain.optimal_policy is None and callable(privileged.optimal_policy)
+    assert all(np.shape(observation.macrostate) == (4,) for observation in privileged.seen)
 
 
 def test_an_agent_that_does_not_learn_is_tested_once(tmp_path: Path) -> None:

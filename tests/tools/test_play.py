@@ -72,37 +72,6 @@ def test_keys_do_what_the_environment_does():
     plain.close()
 
 
-def test_a_key_that_stays_down_acts_once():
-    game = game_of(execution="kinematic")
-    game.reset()
-    shown = [game.unwrapped.get_state().macrostate]
-    for key in (0, 2):  # the first is held since before the episode
-        for _ in range(10):
-            game.step(key)
-            shown.append(game.unwrapped.get_state().macrostate)
-        game.step(WAIT)
-    assert len(set(shown[:11])) == 1 and len(set(shown[11:])) == 1 and shown[0] != shown[-1]
-    game.close()
-
-
-def test_success_is_counted_beside_chance_and_optimum():
-    game, spec = game_of(execution="kinematic"), registry.task("arrow_puzzle")
-    assert game.summary() == "No episode was finished; chance 4.6%, optimum 100.0%."
-    for solve in (True, False, True):
-        _, info = game.reset()
-        terminated = False
-        while not terminated:
-            macrostate = tuple(info["macrostate"].tolist())
-            wanted = spec.rules.optimal_action(macrostate)
-            bad = [a for a in range(6) if (end := spec.rules.outcomes(macrostate, a)[0]).terminated and not end.success]
-            seen, images = until_done(game, wanted if solve or not bad else bad[0])
-            *_, terminated, _, info = seen[-1]
-        assert len(images) > 50  # the end stands still
-        assert info["success"] == (solve or not bad)
-    assert game.summary().startswith("Solved 2 of 3 episodes (66.7%, 95 % interval 20.8% to 93.9%); chance 4.6%")
-    game.close()
-
-
 def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
     asked = []
 
@@ -168,7 +137,8 @@ def test_keyboard_events_play_the_task(keyboard, capsys):
         keys, macrostate = keys + KEYS[action], rules.outcomes(macrostate, action)[0].macrostate
     keyboard(keys)
     assert main(["play", "arrow_puzzle", "--execution", "kinematic", "--seed", "5"]) == 0
-    assert "Solved 1 of 1 episodes (100.0%" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Solved 1 of 1 episodes (100.0%, 95 % interval 20.7% to 100.0%); chance 4.6%, optimum 100.0%." in said
     assert sys.modules["matplotlib"].get_backend().lower() == "agg"
     twin.close()
 
