@@ -167,12 +167,10 @@ def test_python_versions_agree() -> None:
     assert f'readonly versions="{" ".join(_PYTHONS)}"' in (_TOP / ".ci/setup.sh").read_text()
 
 
-def test_the_container_does_what_a_newcomer_does() -> None:
-    """Its steps are the README's two commands on a bare Debian; no builder of images runs here."""
+def test_the_container_installs_what_drawing_needs() -> None:
+    """On a bare Debian; no builder of images runs here."""
     steps = (_TOP / ".ci/Dockerfile").read_text()
     gl_packages = re.search(r'gl_packages="([^"]+)"', (_TOP / ".ci/setup.sh").read_text())
     assert gl_packages is not None
     (installs,) = re.findall(r"apt-get install (.*)", steps)
     assert {"make", "git", *gl_packages[1].split()} <= set(installs.split())
-    python = re.search(r"^FROM python:(3\.\d+)-slim$", steps, re.MULTILINE)
-    assert python is not None and python[1] in _PYTHONS
