@@ -104,7 +104,6 @@ def test_an_agent_says_what_it_reads_and_expects(name: str) -> None:
     [
         ("docs/results/arrow_puzzle_hard-thesis", "holds kept results and no agents; give a bench's own folder"),
         ("docs/results/toy_regression-thesis", "in which no agent acts"),
-        ("docs", "There is no docs/protocol.json"),
     ],
 )
 def test_folders_without_agents_are_named(

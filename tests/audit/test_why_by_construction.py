@@ -101,14 +101,15 @@ def test_a_course_is_what_was_seen_before_each_action(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_asked_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = {"dataset": "", "after": (), "shows_frames_alone": True}
-    for known, words in (
-        ({"dataset": "some"}, "in a dataset or an earlier task"),
-        ({"after": ("arrow_puzzle",)}, "in a dataset or an earlier task"),
-        ({"shows_frames_alone": False}, "saw more than frames"),
-    ):
-        spec = SimpleNamespace(protocol=SimpleNamespace(**{**usual, **known}))
-        trained: Any = SimpleNamespace(spec=spec, task=registry.task("arrows:cubes=2"))
+    cases: tuple[tuple[str, dict[str, Any], str], ...] = (
+        ("arrows:cubes=2,gesture=first", {}, "hide something, or are old"),
+        ("arrow_puzzle", {"dataset": "some-1@0123456789ab"}, "in a dataset or an earlier task"),
+        ("arrow_puzzle", {"after": ("arrow_puzzle_hard",)}, "in a dataset or an earlier task"),
+        ("arrow_puzzle", {"observation": "state", "agents": ("random",)}, "saw more than frames"),
+    )
+    for task, changes, words in cases:
+        spec = SimpleNamespace(protocol=protocol(task, "smoke", **{"agents": ("factored:given",), **changes}))
+        trained: Any = SimpleNamespace(spec=spec, task=registry.task(task))
         with pytest.raises(InvalidValueError, match=words):
             why.causes_of(trained)
     monkeypatch.setattr(observers, "MOST_STATES", 31)
@@ -169,9 +170,3 @@ def test_unlucky_is_what_an_optimal_policy_fails_with_the_same_draws(task: str, 
     env.close()
     assert {test for test in whole if found.causes[test] == "unlucky"} == missed
     assert 3 < len(missed) < len(whole) - 5
-
-
-def test_what_frames_hide_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    for task in ("arrows:cubes=2,gesture=first", "arrows:cubes=2,lag=1"):
-        with pytest.raises(InvalidValueError, match="hide something, or are old"):
-            asked(tmp_path, "bad", task, evaluation_episodes=2, budgets=(1,))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import sys
-
 import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
@@ -16,14 +13,6 @@ WORK = 9 + 2 * 5
 """Of a learner: training episodes, and tests at two budgets."""
 PROTOCOL = small(agents=("table", "random"), seeds=(0, 1, 2))
 SPECS = [FakeRunSpec(protocol=PROTOCOL, agent=agent, seed=seed) for agent in PROTOCOL.agents for seed in PROTOCOL.seeds]
-
-
-class Terminal(io.StringIO):
-    """Somewhere to write that says a person watches."""
-
-    def isatty(self) -> bool:
-        """Always."""
-        return True
 
 
 def far(seed: int, done: int, phase: Phase = "training", detail: str | None = None) -> Progress:
@@ -46,14 +35,3 @@ def test_time_left_counts_neither_what_was_done_before_nor_what_a_failed_run_lac
     said, line = capsys.readouterr().err.splitlines()
     assert said == "table seed 1 failed: RuntimeError: it broke"
     assert line.startswith("1 of 6 runs done, 10:00:00 gone, 34:00:00 left")
-
-
-def test_a_terminal_has_one_bar_that_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    with ProgressBar(SPECS) as show:
-        show(far(0, WORK, "done"))
-        assert "26 % |" in terminal.getvalue() and "1 of 6 runs done" in terminal.getvalue()
-        show(far(1, 0, "failed", "it broke"))
-    assert "table seed 1 failed: it broke\n" in terminal.getvalue()
-    assert terminal.getvalue().endswith("\r") and not terminal.getvalue().split("\r")[-2].strip()

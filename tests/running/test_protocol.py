@@ -3,7 +3,6 @@
 import dataclasses
 
 import pytest
-from fake_results import bench_result
 
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES
@@ -13,14 +12,6 @@ from imagine_bench.running.control import plan_control
 
 BUNDLED = [name for name in TASKS if name != "arrow_puzzle_easy"]
 """Tasks whose encoders are bundled."""
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_survives_json_with_its_hash(preset):
-    for name in TASKS:
-        original = protocol(name, preset)
-        copy = Protocol.from_dict(original.as_dict())
-        assert copy == original and copy.hash == original.hash
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -42,10 +33,6 @@ def test_photo_has_latents_and_says_that_it_has_no_codes(name):
 def test_quick_finds_encoders_at_every_appearance(name, appearance):
     wanted, paths = plan_control(name, "quick", appearance=appearance)
     assert set(paths) == {"latents", "codes"} and wanted.codes is not None
-
-
-def test_seeds_in_any_order_are_one_bench():
-    assert protocol("arrow_puzzle", seeds=(1, 0)) == protocol("arrow_puzzle", seeds=(0, 1))
 
 
 def test_any_change_changes_the_hash():
@@ -116,27 +103,13 @@ def test_agents_of_a_file_that_are_no_names_are_refused():
             UnknownNameError,
             "No preset 'fast'.* Known: smoke, quick, thesis, full, ",
         ),
-        ({"agents": ("dqnn",)}, UnknownNameError, r"No agent 'dqnn'. Did you mean 'dqn'\?"),
-        ({"appearance": "milld"}, UnknownNameError, r"No appearance 'milld'. Did you mean 'mild'\?"),
-        ({"execution": "real"}, UnknownNameError, "Known: physics, kinematic"),
         ({"budgets": (100, 100)}, InvalidValueError, r"budgets \(100, 100\) must be .* ascending"),
         ({"seeds": (999, 1000)}, InvalidValueError, "mix tuning seeds .from 1000 on"),
         ({"seeds": (2**24,)}, InvalidValueError, "must be one or more different integers from 0 to 16777215"),
         ({"after_episodes": 50}, InvalidValueError, "after_episodes is 50, but no task comes before"),
-        ({"evaluation_episodes": 0}, InvalidValueError, "evaluation_episodes is 0"),
     ],
 )
 def test_bad_fields_say_what_is_allowed(changes, error, message):
     fields = {"task": "arrow_puzzle", **changes}
     with pytest.raises(error, match=message):
         protocol(fields.pop("task"), fields.pop("preset", "quick"), **fields)
-
-
-def test_a_bench_result_refuses_missing_and_mismatched_runs(tmp_path):
-    whole = bench_result(tmp_path)
-    first, *others = whole.runs
-    with pytest.raises(ArtefactError, match=r"should hold the runs .* and holds .*Run the same bench command again"):
-        dataclasses.replace(whole, runs=tuple(others))
-    short = dataclasses.replace(first, checkpoints=first.checkpoints[:-1])
-    with pytest.raises(ArtefactError, match=r"has budgets .*, the protocol says"):
-        dataclasses.replace(whole, runs=(short, *others))

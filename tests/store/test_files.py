@@ -13,14 +13,8 @@ import pytest
 
 from imagine_bench.errors import BusyError, SetupError
 from imagine_bench.store.files import (
-    first_difference,
     lock,
     make_folder,
-    read_json,
-    table_rows,
-    table_text,
-    with_null,
-    write_bytes,
     write_json,
 )
 
@@ -39,7 +33,6 @@ with lock(Path(sys.argv[1]), "The folder"):
     [
         (errno.ENOSPC, "the disk is full; free some space and run the same command again"),
         (errno.EACCES, "you may not write there; choose another folder"),
-        (errno.EROFS, "that file system is read-only"),
     ],
 )
 def test_a_refusal_is_one_sentence_and_keeps_the_old_file(
@@ -83,32 +76,3 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path: Path) ->
         child.wait()
     with lock(path, "The folder"):
         assert str(os.getpid()) in (tmp_path / ".lock.holder").read_text()
-
-
-@pytest.mark.parametrize(
-    ("then", "now", "found"),
-    [
-        ({"a": 1, "b": {"c": [1, 2]}}, {"a": 1, "b": {"c": [1, 2]}}, None),
-        ({"a": 1, "b": {"c": 2, "d": 3}}, {"a": 1, "b": {"c": 2, "d": 4}}, ("b.d", 3, 4)),
-        ({"b": 1}, {"a": 2, "b": 1}, ("a", None, 2)),
-        ({"b": {"c": 1}}, {"b": 5}, ("b", {"c": 1}, 5)),
-    ],
-)
-def test_the_first_difference_is_named(then: object, now: object, found: object) -> None:
-    assert first_difference(then, now) == found
-
-
-def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
-    for path, words in ((tmp_path / "missing" / "a", "No such file"), (tmp_path / ("x" * 300), "name too long")):
-        with pytest.raises(SetupError, match=words):
-            write_bytes(path, b"x")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_rows_and_json_come_back(tmp_path: Path) -> None:
-    rows = [{"a": 1, "b": "x, y"}, {"a": 0.1, "c": 2}]
-    assert table_text(rows) == 'a,b,c\n1,"x, y",\n0.1,,2\n'
-    assert table_rows(table_text(rows), ("b",)) == rows
-    write_json(tmp_path / "a.json", {"x": [1, 2.5, "ü"]})
-    assert read_json(tmp_path / "a.json", "a test") == {"x": [1, 2.5, "ü"]}
-    assert with_null({"x": [float("nan"), 1.0]}) == {"x": [None, 1.0]}

@@ -19,16 +19,6 @@ from imagine_bench.store.results import BenchResult
 OLDER = Path(__file__).parent / "of_abcb05c"
 
 
-def test_a_finished_bench_is_read(tmp_path: Path) -> None:
-    shutil.copytree(OLDER / "whole", tmp_path / "whole")
-    result = load_bench(tmp_path / "whole")
-    assert isinstance(result, BenchResult)
-    (run,) = result.runs
-    assert [row.solved for row in run.checkpoints] == ["00000", "00000"]
-    assert run.checkpoints[1].kept is not None and run.checkpoints[1].beliefs is not None
-    assert run.training_starts is not None and run.training_starts.shape == (9, 4)
-
-
 def test_a_killed_bench_is_read_and_ends_in_the_bits_of_a_whole_one(tmp_path: Path) -> None:
     protocol = read_protocol(OLDER / "whole")
     assert protocol == small() and protocol.hash == "c12d19f8f687"

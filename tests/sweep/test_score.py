@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from imagine_bench import statistics
-from imagine_bench.errors import InvalidValueError
 from imagine_bench.store.results import OpenLoop
 from imagine_bench.sweep.score import Scale, auroc, score
 
@@ -52,11 +51,6 @@ def test_a_level_without_values_is_left_out():
     rows[:, 1] = math.nan
     assert score(rows, SCALES).value == pytest.approx(0.4)
     assert math.isnan(score(np.full((2, 2), math.nan), SCALES).value)
-
-
-def test_a_level_in_which_nothing_can_be_learned_is_refused():
-    with pytest.raises(InvalidValueError, match="nothing can be learned"):
-        Scale(chance=0.5, optimum=0.5)
 
 
 def _open_loop(auroc_by_depth, judged):

@@ -65,9 +65,6 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
     write_page(tmp_path / "out", study_page(STUDY, lines))
     rows = list(csv.DictReader((tmp_path / "out" / "seeds.csv").read_text().splitlines()))
     assert len(rows) == 3 * 2 * 2 and {row["seed"] for row in rows} == {"1000", "1001"}
-    made = json.loads((tmp_path / "out" / "study.json").read_text())
-    assert [variant["name"] for variant in made["study"]["variants"]] == ["table", "mild", "imaginer"]
-    assert made["versions"] and made["machine"]
     right = dataclasses.replace(lines[1], imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]))
     page = study_page(STUDY, [lines[0], right])
     assert [row[-2] for row in page.sections[0].tables[0].rows] == ["–", "–", "20.0", "30.0"], "means of seeds"
@@ -144,11 +141,9 @@ def test_settings_in_a_file_may_be_nested(tmp_path: Path) -> None:
     ("old", "new", "sentence"),
     [
         ("budgets = [2]", "budgets = 2", "budgets was given 2; it takes tuple"),
-        ("budgets = [2]", "", "missing 1 required keyword-only argument: 'budgets'. Give name, question, budgets, "),
         ("budgets = [2]", "budgets = [", "is no study: TOMLDecodeError"),
         ("test_appearance", "looks", "No field that a variant may change 'looks'"),
         ('preset = "smoke"', 'name = "a/b"', "a name is 1 to 60 letters"),
-        ('agent = "table"', 'agent = 5', "agent was given 5; it takes str"),
         ('[[variants]]', '[[variant]]', "KeyError: 'variants'"),
     ],
 )  # fmt: skip
@@ -164,7 +159,6 @@ def test_a_file_that_is_no_study_says_why(
 
 def test_chosen_variants_bring_what_they_are_compared_with() -> None:
     assert [variant.name for variant in STUDY.only(("imaginer",)).variants] == ["table", "mild", "imaginer"]
-    assert [variant.name for variant in STUDY.only(("mild",)).variants] == ["table", "mild"]
     assert STUDY.only(()) == STUDY
     with pytest.raises(UnknownNameError, match="No variant 'milld'"):
         STUDY.only(("milld",))

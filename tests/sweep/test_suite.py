@@ -13,7 +13,6 @@ import pytest
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.exact.splits import split_of
 from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
@@ -98,8 +97,6 @@ def test_a_failing_agent_costs_the_others_nothing(tmp_path):
     assert ["failing seed 1 in arrows: this agent breaks on purpose" in each for each in found.failures] == [True]
     assert np.isnan(found.score(suite.experiments[0], "failing").value)
     assert found.score(suite.experiments[0], "oracle").value == 1.0
-    summary = suite_page(found).summary
-    assert "–" in summary and "breaks on purpose" in summary
 
 
 def test_the_page_shows_every_score_and_the_hash(result):
@@ -134,13 +131,6 @@ def test_every_level_is_a_world_in_which_something_can_be_learned():
             assert registry.task_name(level.task) == level.task
             if (split := level.protocol.get("split")) is not None:
                 assert split_of(registry.task(level.task).rules, split).test
-
-
-def test_names_that_do_not_exist_are_named():
-    with pytest.raises(UnknownNameError, match="No experiment 'memry'"):
-        LADDER.only(["memry"])
-    with pytest.raises(InvalidValueError, match="each name once"):
-        dataclasses.replace(TINY, experiments=TINY.experiments * 2)
 
 
 def test_who_cannot_carry_over_starts_anew():
