@@ -10,6 +10,7 @@ import pytest
 import torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.settings import WorldModelSettings
+from imagine_bench.agents.imagination.uncertainty import decompose
 from imagine_bench.agents.imagination.world_model import EnvironmentModel, log_cosh
 from imagine_bench.agents.replay import Batch
 from plain_torch import PlainWorldModel
@@ -64,6 +65,23 @@ def test_losses_compare_what_is_predicted() -> None:
         functional.binary_cross_entropy(p_terminated, batch.terminated),
     ]
     torch.testing.assert_close(losses(model, batch, draws(2)).detach(), torch.stack(expected), rtol=1e-4, atol=1e-5)
+
+
+def test_it_learns_a_small_deterministic_chain_and_members_disagree_beyond_it() -> None:
+    model = make(learning_rate=5e-3, dropout=0.0, members=3, sigma_floor=0.1)
+    generator = draws(1)
+    for _ in range(150):
+        model.update(chain_batch(64, generator), draws(2))
+    test = chain_batch(100, draws(3))
+    known = model.predict(test.z, test.action, None)
+    reward, p_terminated = model.predict_outcome(test.z, test.action, test.next_z)
+    assert (mdn.mean(mdn.average(known, 3)) - test.next_z).abs().max() < 0.25  # states are 0.67 apart and more
+    assert (reward - test.reward).abs().max() < 0.15
+    assert ((p_terminated > 0.5).float() == test.terminated).all()
+    assert test.terminated.sum() > 5, "the end of the chain must be among the tests"
+    unknown = model.predict(4.0 + test.z, test.action, None)
+    epistemic = [decompose(samples).epistemic.sum(dim=-1).mean() for samples in (known, unknown)]
+    assert epistemic[1] > 20.0 * epistemic[0]
 
 
 def test_a_predicted_change_is_added_to_where_it_began() -> None:
