@@ -20,6 +20,7 @@ from imagine_bench.cli.benches import Bench
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.protocols.data import ProtocolData, digest
 from imagine_bench.registry import TASKS
+from imagine_bench.registry.entries import label_today
 from imagine_bench.running.bench import plan, read_protocol
 from imagine_bench.running.control import resolved_settings
 
@@ -93,10 +94,12 @@ def test_the_command_leaves_a_bench_of_the_same_shape(folder: Path, tmp_path: Pa
     if "--after" in words(folder):
         small += ["--after-episodes", "1"]
     assert main(["bench", *words(folder), *small]) == 0
-    (made,) = tmp_path.glob("*/results.csv")
+    (made,) = tmp_path.rglob("report/results.csv")
     new = table(str(made))
     assert fixed_columns(new) == fixed_columns(kept)
-    assert [row["agent"] for row in new] == list(dict.fromkeys(row["agent"] for row in kept))
+    assert list(dict.fromkeys(row["agent"] for row in new)) == list(
+        dict.fromkeys(label_today(row["agent"]) for row in kept)
+    )
 
 
 def fixed_columns(rows: list[dict[str, str]]) -> list[str]:
@@ -106,5 +109,5 @@ def fixed_columns(rows: list[dict[str, str]]) -> list[str]:
     """
     gone = re.compile("crps|pooled_|transform_distance")
     names = [name for name in rows[0] if not gone.match(name)]
-    last = "solved" if "solved" in names else "auroc_nll"
+    last = "success_rate" if "success_rate" in names else "auroc_nll"
     return names[: names.index(last) + 1]
