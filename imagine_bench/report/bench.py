@@ -7,7 +7,7 @@ lists them in the order of the page.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -74,6 +74,7 @@ def bench_page(result: BenchResult) -> Page:
         f"protocol {result.protocol_hash}"
     )
     answers = verdict(data)
+    solved = _scores(data, protocol.budgets)
     return Page(
         title=f"{data.spec.title}: does imagination save real experience?",
         subtitle=subtitle,
@@ -82,7 +83,7 @@ def bench_page(result: BenchResult) -> Page:
         answers=answers,
         sections=[section for make in SECTIONS if (section := make(data)) is not None],
         files=files,
-        summary="\n\n".join([f"{data.spec.title}: {subtitle}", _scores(data).text, "\n".join(answers)]),
+        summary="\n\n".join([f"{data.spec.title}: {subtitle}", solved.text, "\n".join(answers)]),
         facts=made(result, {agent: agent_title(agent) for agent in protocol.agents}),
     )
 
@@ -158,17 +159,17 @@ def success(data: ReportData) -> Section:
         "the thesis, with standard deviations."
     )
     image = figures.image("success", lambda: success_figure(data), caption)
-    tables = [_scores(data), _seeds(data)]
+    budgets = set(data.result.protocol.budgets).union(*data.thesis.values())
+    tables = [_scores(data, sorted(budgets)), _seeds(data)]
     return Section("Success against real experience", images=[image], tables=tables)
 
 
-def _scores(data: ReportData) -> Table:
-    """Ours, the thesis' below it, and the exact ends of the scale."""
-    budgets = sorted(set(data.result.protocol.budgets).union(*data.thesis.values()))
+def _scores(data: ReportData, budgets: Sequence[int]) -> Table:
+    """Ours at these budgets, the thesis' below it where it has any of them, and the exact ends of the scale."""
     rows: list[tuple[str, Mapping[int, str]]] = []
     for agent in data.result.protocol.agents:
         rows.append((agent_title(agent), {each["episodes"]: estimated(each, SCORE) for each in data.of(agent)}))
-        if data.thesis[agent]:
+        if not data.thesis[agent].keys().isdisjoint(budgets):
             cells = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
             rows.append((f"{agent_title(agent)}, thesis", cells))
     rows.append(("chance level", dict.fromkeys(budgets, percent(data.facts.chance_level))))
@@ -176,7 +177,7 @@ def _scores(data: ReportData) -> Table:
     header = ["solved (%) after", *(f"{budget:,}" for budget in budgets)]
     lines = [[title, *(cells.get(budget, DASH) for budget in budgets)] for title, cells in rows]
     caption = "Columns: real training episodes."
-    if any(data.thesis.values()):
+    if any(title.endswith(", thesis") for title, _ in rows):
         caption += f" Thesis: {reference.success_source(str(data.spec.reference))}."
     return Table("scores", header, lines, caption, "not tested")
 
