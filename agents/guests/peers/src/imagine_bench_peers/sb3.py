@@ -60,7 +60,8 @@ class LibraryAgent:
         steps = max(episodes * self._steps_an_episode(horizon), explores)  # on_episode ends training before
         if explores:
             keywords["exploration_fraction"] = explores / steps  # exploration depends on the step alone
-        world = self._experience(env)
+        scale = self.settings.reward_scale
+        world = gymnasium.wrappers.TransformReward(self._experience(env), lambda reward: scale * float(reward))
         named = isinstance(world.observation_space, gymnasium.spaces.Dict)
         policy = "MultiInputPolicy" if named else "CnnPolicy" if self._encoder is None else "MlpPolicy"
         self._model = self._algorithm(policy, world, seed=self._seed, device=self._device, **keywords)
