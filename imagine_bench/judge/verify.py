@@ -1,29 +1,33 @@
-"""Verification: every kept test episode is played again, and all that follows from them is computed anew.
+"""Verification: every kept episode, of training and of tests, is played again, and all that follows is computed anew.
 
-What a replay cannot show is not vouched for: CPU times, diagnostics, what observers measured, pictures, and that the
-agents would choose these actions again.
+What a replay cannot show, :data:`UNSHOWN` says; training again (:mod:`imagine_bench.running.retraining`) shows more.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+import hashlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.environments import Env
-from imagine_bench.errors import ArtefactError
+from imagine_bench.errors import ArtefactError, UnknownNameError, brief, plain
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import digest
+from imagine_bench.registry.entries import AgentEntry
 from imagine_bench.running.bench import counted
 from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts, replay
-from imagine_bench.running.run_state import environments
+from imagine_bench.running.run_state import Counters, CountVisits, environments
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
-from imagine_bench.store import run_folder
+from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
-from imagine_bench.store.results import Checkpoint
+from imagine_bench.store.results import Checkpoint, KeptEpisodes, RunResult
+from imagine_bench.values import Json
 
 _CLAIMS = {
     "starts": "start",
@@ -31,8 +35,21 @@ _CLAIMS = {
     "success": "success",
     "faults": "number of faults",
     "fingerprints": "fingerprint",
+    "sim_times_s": "simulated time in seconds",
 }
-"""What is kept of a test episode beside its actions, and what it is called."""
+"""What is kept of an episode beside its actions, and what it is called."""
+_SAME_TIME = 0.05
+"""Share by which simulated times may differ: kinds of CPU differ by a step of physics."""
+_OF_DATASET = re.compile("-([0-9]+)@")
+"""The number of its episodes in a dataset's identity."""
+
+UNSHOWN = (
+    "that an agent chose the macro-actions that are kept as its own (another's, or an oracle's, play again as well)",
+    "that runs were not chosen: a seed that failed may have been left out everywhere",
+    "CPU seconds, diagnostics, and what observers measured",
+    "pictures and recordings",
+)
+"""What playing episodes again cannot show of any bench."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,10 +59,13 @@ class Verdict:
     what: str
     complaint: str = ""  # empty where all holds
     episodes: int = 0  # played again
+    unshown: tuple[str, ...] = ()  # what is not kept, so that it cannot be shown
 
     def __str__(self) -> str:
-        holds = f"holds; {self.episodes:,} test episodes played again" if self.episodes else "holds"
-        return f"{self.what}: {self.complaint or holds}"
+        if self.complaint:
+            return f"{self.what}: {self.complaint}"
+        played = f"; {self.episodes:,} episodes played again" if self.episodes else ""
+        return f"{self.what}: holds{played}{''.join(f'; not shown: {each}' for each in self.unshown)}"
 
 
 def verify_runs(folder: Path) -> list[Verdict]:
@@ -66,77 +86,273 @@ def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
     """As :func:`verify_runs`, in environments of the bench's protocol."""
     protocol = read_control(folder)
     found: list[Verdict] = []
+    owners: dict[tuple[str, str, str], int] = {}
+    results: dict[str, RunResult] = {}
     runs = [(agent, seed) for seed in protocol.seeds for agent in protocol.agents]
     for agent, seed in counted(runs, "runs", total=len(runs)):
         name = f"{agent} seed {seed}"
-        run = BenchStore(folder, protocol).run_folder(agent, seed)
+        check = _RunCheck(BenchStore(folder, protocol).run_folder(agent, seed), protocol, agent, seed, replays)
         try:
-            run_folder.require_run_of(run, protocol, agent, seed)
-            found.append(Verdict(what=name, episodes=_verify_run(run, protocol, seed, replays)))
+            results[agent] = check.load()
+            episodes, unshown = check.play()
+            check.require_own(owners)
+            found.append(Verdict(what=name, episodes=episodes, unshown=tuple(unshown)))
         except ArtefactError as error:
-            found.append(Verdict(what=name, complaint=str(error)))
+            found.append(Verdict(what=name, complaint=brief_lines(error)))
+        except Exception as error:  # whoever forges a file can write anything
+            why = f"its parts do not fit together ({type(error).__name__}: {brief_lines(error)})."
+            found.append(Verdict(what=name, complaint=why))
+    if not any(each.complaint for each in found):
+        found += _of_protocol(protocol, results)
     return found
 
 
+def brief_lines(error: Exception) -> str:
+    """What an error says, on one line."""
+    return " ".join(plain(error).split())
+
+
 def cost(found: Sequence[Verdict], cpu_s: float) -> str:
-    """What playing test episodes again cost, in a sentence."""
-    return f"{sum(each.episodes for each in found):,} test episodes; checked in {cpu_s:,.1f} CPU s."
+    """What playing episodes again cost, in a sentence."""
+    return f"{sum(each.episodes for each in found):,} episodes; checked in {cpu_s:,.1f} CPU s."
 
 
 class Replays:
-    """Episodes begun and played again in the protocol's own environments, each test once."""
+    """Episodes played again in the protocol's own environments, each test once."""
 
     def __init__(self, env: Env, test_env: Env) -> None:
-        self._env = env
+        self.training_env = env
         self._play_test = functools.cache(functools.partial(replay, test_env))
 
     def start(self, seed: int) -> list[int]:
         """Where a training episode begins."""
-        return replay(self._env, seed, [])[0].start
+        return replay(self.training_env, seed, [])[0].start
 
     def test(self, seed: int, actions: Sequence[int]) -> tuple[EpisodeRecord, bool]:
         """A test episode, and whether the actions are all of it."""
         return self._play_test(seed, tuple(actions))
 
 
-def _verify_run(folder: Path, protocol: Protocol, seed: int, replays: Replays) -> int:
-    """How many test episodes were played again. ArtefactError says in one sentence what does not hold."""
-    if not run_folder.is_done(folder):
-        raise ArtefactError("it is not finished.")
-    run = run_folder.load_run(folder)
-    rows = run.checkpoints
-    starts = [] if run.training_starts is None else run.training_starts.tolist()
-    if tuple(row.episodes for row in rows) != protocol.budgets:
-        raise ArtefactError(f"it was not tested after {protocol.budgets} episodes, as its protocol says.")
-    for episode, start in enumerate(starts, start=len(run.training_success) - len(starts)):
-        if start != (found := replays.start(episode_seed("training", seed, episode))):
-            raise ArtefactError(f"training episode {episode} of seed {seed} starts at {found}, and {start} was kept.")
-    purpose = evaluation_split(seed)
-    return sum(_verify_test(row, protocol.evaluation_episodes, purpose, replays) for row in rows)
+@dataclasses.dataclass
+class _RunCheck:
+    """One run that is verified. ArtefactError says in one sentence what does not hold."""
+
+    folder: Path
+    protocol: Protocol
+    agent: str
+    seed: int
+    replays: Replays
+
+    def load(self) -> RunResult:
+        """Read the run, and compare what needs no replay."""
+        run_folder.require_run_of(self.folder, self.protocol, self.agent, self.seed)
+        if not run_folder.is_done(self.folder):
+            raise ArtefactError("it is not finished.")
+        self.run = run = run_folder.load_run(self.folder)
+        self.is_older = run_folder.read_config(self.folder)["format"] == run_folder.WITHOUT_TRAINING
+        self.entry = _entry_of(self.agent)
+        if tuple(row.episodes for row in run.checkpoints) != self.protocol.budgets:
+            raise ArtefactError(f"it was not tested after {self.protocol.budgets} episodes, as its protocol says.")
+        learns = len(run.training_success) > 0 if self.entry is None else self.entry.learns
+        self.trained = self.protocol.budgets[-1] if learns else 0
+        if not len(run.training_success) == len(run.training_length) == self.trained:
+            raise ArtefactError(f"it does not keep {self.trained} training episodes, as its protocol says.")
+        for row in run.checkpoints:
+            steps = int(run.training_length[: row.episodes].sum())
+            if row.env_steps != steps:
+                where = f"after {row.episodes:,} episodes"
+                raise ArtefactError(f"{where}: env_steps is {steps}, and {brief(row.env_steps)} was kept.")
+        return run
+
+    def play(self) -> tuple[int, list[str]]:
+        """Play all episodes again. Returns how many these were, and what of the run is not kept."""
+        count = self.protocol.evaluation_episodes
+        purpose = evaluation_split(self.seed)
+        trained = self._play_training()
+        for row in self.run.checkpoints:
+            _verify_test(row, count, purpose, self.replays)
+            if row.kept is not None and row.kept.sim_times_s is None and not self.is_older:
+                raise ArtefactError(f"after {row.episodes:,} episodes it keeps no simulated times.")
+        return trained + count * len(self.run.checkpoints), self._unshown()
+
+    def _play_training(self) -> int:
+        kept = self.run.training
+        starts = [] if self.run.training_starts is None else self.run.training_starts.tolist()
+        if kept is None:
+            if not self.is_older:
+                raise ArtefactError("it keeps no training episodes, as a run of its format does.")
+            count = 0
+        else:
+            count = len(kept.lengths)
+        first = self.trained - len(starts) if self.is_older else min(_of_dataset(self.protocol), self.trained)
+        for episode, start in enumerate(starts[: len(starts) - count], start=first):
+            if start != (found := self.replays.start(episode_seed("training", self.seed, episode))):
+                where = f"training episode {episode} of seed {self.seed}"
+                raise ArtefactError(f"{where} starts at {found}, and {brief(start)} was kept.")
+        if kept is not None:
+            self._compare_training(kept, first + len(starts) - count)
+        return count
+
+    def _compare_training(self, kept: KeptEpisodes, first: int) -> None:
+        """Play the kept training episodes, of which the first is number ``first`` of the run, and compare."""
+        again = Counters(episode=first)
+        env = CountVisits(self.replays.training_env, again)
+        _require_whole(kept, len(kept.lengths), "in training")
+        may_leave = self.entry is None or self.entry.external_training_loop
+        for number in range(len(kept.lengths)):
+            seed = episode_seed("training", self.seed, first + number)
+            played, ends = replay(env, seed, kept.actions_of(number))
+            if ends:
+                again.add_episode(played.success, len(played.actions))
+            elif not may_leave:
+                where = f"training episode {first + number}"
+                raise ArtefactError(f"{where}: its actions do not end an episode, or go on after its end.")
+        if again.episode != self.trained:
+            raise ArtefactError(f"it keeps {again.episode} whole training episodes, not {self.trained}.")
+        _compare(kept, again.training.kept(), "training episode", first)
+        claims = {"success": self.run.training_success, "length": self.run.training_length}
+        for name, claimed in claims.items():
+            if claimed[first:].tolist() != getattr(again, name):
+                raise ArtefactError(f"the {name} of a training episode is not that of its macro-actions.")
+        tried = run_folder.tried_pairs(again.tried)
+        if not self.is_older and sorted(tried) != sorted([] if self.run.tried is None else self.run.tried.tolist()):
+            raise ArtefactError("which macro-actions were tried where does not follow from its training episodes.")
+
+    def _unshown(self) -> list[str]:
+        """What this run does not keep."""
+        protocol = self.protocol
+        unshown = []
+        if self.is_older:
+            unshown.append(
+                f"its {self.trained:,} training episodes and its execution, which versions of before 2026-11-28 did "
+                "not keep: env_steps, budgets and successes in training are claims"
+            )
+        if self.trained and protocol.dataset is not None:
+            unshown.append(f"the training episodes that are those of the dataset {protocol.dataset}")
+        if self.trained and protocol.after:
+            unshown.append(f"its training on {', '.join(protocol.after)} before")
+        if self.entry is None:
+            unshown.append("whether it learns, for no package here offers it")
+        return unshown
+
+    def require_own(self, owners: dict[tuple[str, str, str], int]) -> None:
+        """Compare what no two seeds of a learner share with that of the seeds before, which ``owners`` holds."""
+        if not self.trained:
+            return
+        for name, mark in self._marks().items():
+            owner = owners.setdefault((self.agent, name, mark), self.seed)
+            if owner != self.seed:
+                raise ArtefactError(f"its {name} are those of seed {owner}, and no two seeds of a learner share them.")
+
+    def _marks(self) -> dict[str, str]:
+        """What no two seeds of a learner share, by name."""
+        run = self.run
+        snapshot = run_folder.load_newest(self.folder / run_folder.CHECKPOINTS)
+        weights = {} if snapshot is None else {name: a.tobytes() for name, a in snapshot.agent.arrays.items() if a.size}
+        marks = {"weights": repr(sorted(weights.items()))} if weights else {}
+        if run.training is not None and len(run.training.actions):
+            marks["training episodes"] = repr((run.training.lengths.tolist(), run.training.actions.tolist()))
+        for row in run.checkpoints:
+            if row.train_cpu_s:
+                marks[f"CPU seconds after {row.episodes:,} episodes"] = repr(row.train_cpu_s)
+            if row.kept is not None and _has_own_failures(row.kept, self.protocol):
+                marks[f"tests after {row.episodes:,} episodes"] = repr(row.kept.actions.tolist())
+        return {name: hashlib.sha256(mark.encode()).hexdigest() for name, mark in marks.items()}
 
 
-def _verify_test(row: Checkpoint, count: int, purpose: Purpose, replays: Replays) -> int:
+def _entry_of(agent: str) -> AgentEntry | None:
+    """What is registered of an agent; None where its package is not here."""
+    try:
+        return registry.agent_entry(agent)
+    except UnknownNameError:
+        return None
+
+
+def _of_dataset(protocol: Protocol) -> int:
+    """The episodes of the dataset that comes first in training."""
+    found = _OF_DATASET.search(protocol.dataset or "")
+    return int(found[1]) if found else 0
+
+
+def _has_own_failures(kept: KeptEpisodes, protocol: Protocol) -> bool:
+    """Whether a test failed in more ways than two seeds have in common.
+
+    Learners that know nothing may repeat one macro-action or two, and where chance decides, equal plans fail alike.
+    """
+    rules = protocol.spec(testing=True).rules
+    failed = [set(kept.actions_of(test)) for test in np.flatnonzero(~kept.success).tolist()]
+    starts = {tuple(start) for start in kept.starts.tolist()}
+    has_chance = any(len(rules.outcomes(start, action)) > 1 for start in starts for action in range(rules.n_actions))
+    return len(failed) < len(kept.success) and len(set().union(*failed)) > 2 and not has_chance
+
+
+def _of_protocol(protocol: Protocol, results: Mapping[str, RunResult]) -> Iterator[Verdict]:
+    """A verdict on what runs of a protocol have in common, where there is something to say."""
+    settings: dict[str, Json] = {}
+    silent = []
+    for agent, run in results.items():
+        entry = _entry_of(agent)
+        if not len(run.training_success):
+            continue
+        has_settings = entry is None or bool(entry.settings)
+        settings[agent] = dict(run.settings) if has_settings else {}
+        if has_settings and not run.settings:
+            silent.append(agent)
+    encoder_names = [used for used in (protocol.encoder, protocol.codes) if used is not None]
+    unshown = [f"what encoder {used} is, which is not here" for used in encoder_names if encoders.find(used) is None]
+    complaint = ""
+    if silent:
+        unshown.append(f"what settings {', '.join(silent)} had")
+    elif settings and not protocol.settings_digest:
+        unshown.append("that settings are those that were planned, of which the protocol has no digest")
+    elif settings and digest(settings) != protocol.settings_digest:
+        complaint = f"its settings_digest is {protocol.settings_digest}, and that of its runs is {digest(settings)}."
+    if complaint or unshown:
+        yield Verdict(what="protocol", complaint=complaint, unshown=tuple(unshown))
+
+
+def _verify_test(row: Checkpoint, count: int, purpose: Purpose, replays: Replays) -> None:
+    """Raise ArtefactError where a row, or one of its ``count`` test episodes, is not what its macro-actions give."""
     where = f"after {row.episodes:,} episodes"
     kept = row.kept
     again = EvaluationCounts()
     if kept is None:
         raise ArtefactError("it keeps no test episodes, as no run of before 2026-11-24 does.")
-    sizes = {len(kept.lengths), *(len(getattr(kept, name)) for name in _CLAIMS)}
-    if sizes != {count} or kept.lengths.sum() != len(kept.actions):
-        raise ArtefactError(f"{where} it does not keep {count} whole test episodes.")
+    _require_whole(kept, count, where)
     for test in range(count):
         played, ends = replays.test(episode_seed(purpose, 0, test), kept.actions_of(test))
         if not ends:
             raise ArtefactError(f"{where}, test {test}: its actions do not end an episode, or go on after its end.")
         again.add(played)
-    for name, word in _CLAIMS.items():
-        claimed = getattr(kept, name)
-        replayed = getattr(again.kept(), name)
-        wrong = np.flatnonzero((claimed != replayed).reshape(count, -1).any(axis=1))
-        if len(wrong):
-            test = int(wrong[0])
-            raise ArtefactError(f"{where}, test {test}: the {word} is {replayed[test]}, and {claimed[test]} was kept.")
+    _compare(kept, again.kept(), f"{where}, test")
     for name, value in again.figures().items():
         if getattr(row, name) != value:
-            raise ArtefactError(f"{where}: {name} is {value} by the test episodes, and {getattr(row, name)} was kept.")
-    return count
+            claimed = brief(getattr(row, name))
+            raise ArtefactError(f"{where}: {name} is {brief(value)} by the test episodes, and {claimed} was kept.")
+
+
+def _require_whole(kept: KeptEpisodes, count: int, where: str) -> None:
+    claims = [getattr(kept, name) for name in _CLAIMS]
+    sizes = {len(kept.lengths), *(len(claim) for claim in claims if claim is not None)}
+    is_natural = kept.lengths.ndim == kept.actions.ndim == 1 and not (kept.lengths < 0).any()
+    if sizes != {count} or not is_natural or kept.lengths.sum() != len(kept.actions):
+        raise ArtefactError(f"{where} it does not keep {count} whole episodes.")
+
+
+def _compare(kept: KeptEpisodes, again: KeptEpisodes, what: str, first: int = 0) -> None:
+    """Raise ArtefactError for the first of all episodes that is not as it was kept; ``first`` is its number."""
+    count = len(kept.lengths)
+    for name, word in _CLAIMS.items():
+        claimed = getattr(kept, name)
+        replayed = getattr(again, name)
+        if claimed is None:
+            continue
+        if claimed.shape != replayed.shape:
+            raise ArtefactError(f"{what}s have {word} of shape {replayed.shape}, and {claimed.shape} was kept.")
+        differs = claimed != replayed
+        if name == "sim_times_s":
+            differs = ~np.isclose(claimed, replayed, rtol=_SAME_TIME)
+        if count and differs.any():
+            number = int(differs.reshape(count, -1).any(axis=1).argmax())
+            found = f"the {word} is {replayed[number]}, and {claimed[number]} was kept"
+            raise ArtefactError(f"{what} {first + number}: {found}.")

@@ -13,7 +13,7 @@ import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import SupportsFloat, TypedDict
+from typing import Self, SupportsFloat, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +33,12 @@ from imagine_bench.store.results import KeptEpisodes
 Options = dict[str, State] | None
 """Of ``reset``: the macrostate where an episode begins, if it is given."""
 _INTEGERS = ("starts", "lengths", "actions", "faults", "fingerprints")
-"""Fields of :class:`EvaluationCounts` that are integers of :class:`.KeptEpisodes`."""
+"""Fields of :class:`EpisodeLog` that are integers of :class:`.KeptEpisodes`."""
 
 
 @dataclass
 class EpisodeRecord:
-    """What is kept of a test episode, while it is played; see :class:`.KeptEpisodes`."""
+    """What is kept of an episode, while it is played; see :class:`.KeptEpisodes`."""
 
     start: list[int]
     fingerprint: int
@@ -46,6 +46,7 @@ class EpisodeRecord:
     total: float = 0.0
     faults: int = 0
     success: bool = False
+    sim_time_s: float = 0.0
 
     @classmethod
     def begun(cls, env: Env, info: Info) -> EpisodeRecord:
@@ -59,6 +60,7 @@ class EpisodeRecord:
         self.total += reward
         self.faults += bool(info["fault"])
         self.success = bool(info["is_success"])
+        self.sim_time_s += float(info.get("sim_time_s", 0.0))
         happened = np.array([*info["macrostate"], reward], dtype=np.float64)
         self.fingerprint = zlib.crc32(happened.tobytes(), self.fingerprint)
 
@@ -75,8 +77,8 @@ class TestFigures(TypedDict):
 
 
 @dataclass
-class EvaluationCounts:
-    """Test episodes, in their order, as :class:`.KeptEpisodes` has them; a checkpoint may carry them half way."""
+class EpisodeLog:
+    """Episodes that are over, in their order, as :class:`.KeptEpisodes` has them."""
 
     starts: list[list[int]] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)
@@ -85,12 +87,18 @@ class EvaluationCounts:
     solved: str = ""  #: ``1`` for each that ended in success, ``0`` for each other
     faults: list[int] = field(default_factory=list)
     fingerprints: list[int] = field(default_factory=list)
-    cpu_s: float = 0.0  #: CPU seconds spent
-    diagnostics: dict[str, float] = field(default_factory=dict)  #: The agent's own means at the moment the test began
+    sim_times_s: list[float] = field(default_factory=list)  #: Fewer where an earlier version began
+
+    @classmethod
+    def of(cls, kept: KeptEpisodes) -> Self:
+        """The inverse of :meth:`kept`."""
+        lists = {name: getattr(kept, name).tolist() for name in (*_INTEGERS, "returns")}
+        sim_times_s = [] if kept.sim_times_s is None else kept.sim_times_s.tolist()
+        return cls(**lists, sim_times_s=sim_times_s, solved=_digits(kept.success))
 
     @property
     def episodes(self) -> int:
-        """Test episodes done."""
+        """Episodes done."""
         return len(self.solved)
 
     @property
@@ -107,6 +115,30 @@ class EvaluationCounts:
         self.solved += "1" if played.success else "0"
         self.faults.append(played.faults)
         self.fingerprints.append(played.fingerprint)
+        self.sim_times_s.append(played.sim_time_s)
+
+    def kept(self) -> KeptEpisodes:
+        """All of them as arrays."""
+        counts = {name: np.array(getattr(self, name), dtype=np.int64) for name in _INTEGERS}
+        is_whole = len(self.sim_times_s) == self.episodes
+        return KeptEpisodes(
+            **counts,
+            returns=np.array(self.returns, dtype=np.float64),
+            success=np.array([each == "1" for each in self.solved], dtype=np.bool_),
+            sim_times_s=np.array(self.sim_times_s, dtype=np.float64) if is_whole else None,
+        )
+
+
+def _digits(success: NDArray[np.bool_]) -> str:
+    return "".join("1" if each else "0" for each in success)
+
+
+@dataclass
+class EvaluationCounts(EpisodeLog):
+    """Test episodes; a checkpoint may carry them half way."""
+
+    cpu_s: float = 0.0  #: CPU seconds spent
+    diagnostics: dict[str, float] = field(default_factory=dict)  #: The agent's own means at the moment the test began
 
     def figures(self) -> TestFigures:
         """The fields of a :class:`.Checkpoint` that follow from the episodes."""
@@ -118,12 +150,6 @@ class EvaluationCounts:
             "mean_length": len(self.actions) / self.episodes,
             "faults": sum(self.faults),
         }
-
-    def kept(self) -> KeptEpisodes:
-        """All of them as arrays."""
-        counts = {name: np.array(getattr(self, name), dtype=np.int64) for name in _INTEGERS}
-        success = np.array([each == "1" for each in self.solved])
-        return KeptEpisodes(**counts, returns=np.array(self.returns, dtype=np.float64), success=success)
 
 
 def play(

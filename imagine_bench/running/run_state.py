@@ -23,7 +23,14 @@ from imagine_bench.interfaces.capabilities import ExternalTrainer, QueryingAgent
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import OnProgress, Phase, Progress, RunSpec
-from imagine_bench.running.evaluation import EvaluationCounts, Teacher, demonstrator, start_from
+from imagine_bench.running.evaluation import (
+    EpisodeLog,
+    EpisodeRecord,
+    EvaluationCounts,
+    Teacher,
+    demonstrator,
+    start_from,
+)
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.files import reading
 from imagine_bench.store.results import Checkpoint
@@ -46,10 +53,12 @@ class Counters:
     success: list[bool] = field(default_factory=list)  #: Whether each training episode succeeded
     length: list[int] = field(default_factory=list)  #: Macro-actions of each training episode
     queries: list[int] = field(default_factory=list)  #: Oracle queries in each training episode
-    starts: list[list[int]] = field(default_factory=list)  #: Where training episodes began, but those of a dataset
+    #: Where training episodes began that a version of before 2026-11-28 played, which kept nothing else of them
+    starts: list[list[int]] = field(default_factory=list)
     #: The episode in which each macro-action was first tried in a macrostate, by both, separated by blanks
     tried: dict[str, int] = field(default_factory=dict)
     test: EvaluationCounts | None = None  #: The test that is going on, if one is
+    training: EpisodeLog = field(default_factory=EpisodeLog)  #: The training episodes, but those of a dataset
 
     def add_episode(self, success: bool, length: int, queries: int = 0) -> None:
         """Count a training episode of so many macro-actions, and queries in it."""
@@ -65,35 +74,51 @@ class Counters:
 
     def snapshot(self, agent: AgentState) -> Snapshot:
         """Everything, with the agent's state, as a checkpoint."""
-        values, arrays = pack(self)
+        values, arrays = pack({name: value for name, value in vars(self).items() if name != run_folder.TRAINING})
+        arrays |= run_folder.training_arrays(self.training.kept())
         return Snapshot(episode=self.episode, agent=agent, arrays=arrays, values=values)
 
     @classmethod
     def of(cls, snapshot: Snapshot) -> Counters:
         """The inverse of :meth:`snapshot`."""
-        return unpack(cls, snapshot.values, snapshot.arrays)
+        kept = run_folder.training_of(snapshot)
+        others = {
+            name: array for name, array in snapshot.arrays.items() if not name.startswith(f"{run_folder.TRAINING}/")
+        }
+        counters: Counters = unpack(cls, snapshot.values, others)
+        counters.training = EpisodeLog() if kept is None else EpisodeLog.of(kept)
+        return counters
 
 
 class CountVisits(Wrapper):
-    """Counts where training episodes start and which macro-actions are tried where; the agent is told nothing."""
+    """Keeps training episodes, and counts which macro-actions are tried where; the agent is told nothing."""
 
     def __init__(self, env: Env, counters: Counters) -> None:
         super().__init__(env)
         self._counters = counters
         self._at = list[int]()
+        self._episode: EpisodeRecord | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
-        """As the environment's."""
+        """As the environment's; an episode that was left before its end is kept as far as it came."""
+        if self._episode is not None:
+            self._counters.training.add(self._episode)
         seen, info = self.env.reset(seed=seed, options=options)
-        self._at = np.asarray(info["macrostate"]).tolist()
-        self._counters.starts.append(self._at)
+        self._episode = EpisodeRecord.begun(self.env, info)
+        self._at = self._episode.start
         return seen, info
 
     def step(self, action: Action) -> tuple[Observed, SupportsFloat, bool, bool, Info]:
         """As the environment's."""
         after = self.env.step(action)
+        _, reward, terminated, truncated, info = after
         self._counters.try_out(self._at, int(action))
-        self._at = np.asarray(after[4]["macrostate"]).tolist()
+        self._at = np.asarray(info["macrostate"]).tolist()
+        if self._episode is not None:
+            self._episode.add(int(action), float(reward), info)
+            if terminated or truncated:
+                self._counters.training.add(self._episode)
+                self._episode = None
         return after
 
 

@@ -78,7 +78,7 @@ class PolicyTable:
 
 @dataclass(frozen=True, kw_only=True)
 class KeptEpisodes:
-    """K test episodes as they were played, N macro-actions in all, so that anyone can play them again."""
+    """K episodes as they were played, N macro-actions in all, so that anyone can play them again."""
 
     starts: NDArray[np.int64]  #: Where each began. Shape (K, M).
     lengths: NDArray[np.int64]  #: Its macro-actions. Shape (K,).
@@ -88,6 +88,8 @@ class KeptEpisodes:
     faults: NDArray[np.int64]  #: Its macro-actions whose physics disagreed with the rules. Shape (K,).
     #: CRC-32 of the environment's generator at its start and of every macrostate and reward that followed. Shape (K,).
     fingerprints: NDArray[np.int64]
+    #: Its simulated seconds, 0 in kinematic execution. Shape (K,). None in results of before 2026-11-28.
+    sim_times_s: NDArray[np.float64] | None = None
 
     def actions_of(self, episode: int) -> list[int]:
         """The macro-actions of one episode."""
@@ -148,6 +150,9 @@ class RunResult(OneRun):
     training_length: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     #: Where the training episodes began that were played. Shape (played, M). None in results of before 2026-11-24.
     training_starts: NDArray[np.int16] | None = None
+    #: The training episodes that were played: all but a dataset's, those of a resumed run from when this version took
+    #: it up. None in results of before 2026-11-28.
+    training: KeptEpisodes | None = None
     #: Macrostate, macro-action and the first episode in which it was tried there. Shape (pairs, M + 2). None likewise.
     tried: NDArray[np.int32] | None = None
     imagined: tuple[ComparedRollout, ...] = ()  #: Example rollouts at the last budget, for agents that imagine

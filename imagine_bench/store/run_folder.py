@@ -51,7 +51,7 @@ from imagine_bench.store.files import (
     write_json,
     writing,
 )
-from imagine_bench.store.results import Checkpoint, ComparedRollout, RunResult
+from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RunResult
 from imagine_bench.values import Json
 
 _SNAPSHOT = "imagine_bench checkpoint 2"
@@ -60,6 +60,8 @@ _PARTIAL = ".partial_"
 _AGENT = "agent.safetensors"
 _RUNNER = "runner.safetensors"
 _STATE = "state.json"
+TRAINING = "training"
+"""The group of a checkpoint's arrays that holds the training episodes."""
 
 
 def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
@@ -109,6 +111,25 @@ def unpack(kind: Any, values: Any, arrays: Mapping[str, Array]) -> Any:
         each = [None] * len(parts) if values is None else values
         return origin(unpack(arguments[0], part, parts.get(str(index), {})) for index, part in enumerate(each))
     return values
+
+
+def training_arrays(kept: KeptEpisodes) -> Arrays:
+    """A run's training episodes as arrays of its checkpoint, integers in the smallest type that holds them."""
+    arrays = {}
+    for name, array in pack(kept, TRAINING)[1].items():
+        is_natural = array.dtype.kind == "i" and array.size > 0 and array.min() >= 0
+        arrays[name] = array.astype(np.min_scalar_type(array.max())) if is_natural else array
+    return arrays
+
+
+def training_of(snapshot: Snapshot) -> KeptEpisodes | None:
+    """The training episodes that a checkpoint holds, or None: an earlier version kept none."""
+    arrays = grouped(snapshot.arrays).get(TRAINING)
+    if arrays is None:
+        return None
+    wide = {name: array.astype(np.int64) if array.dtype.kind == "u" else array for name, array in arrays.items()}
+    kept: KeptEpisodes = unpack(KeptEpisodes, None, wide)
+    return kept
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +237,9 @@ def _unpacked(path: Path, digests: Mapping[str, str]) -> Arrays:
     return arrays
 
 
-FORMAT = "imagine_bench run 2"
+FORMAT = "imagine_bench run 3"
+WITHOUT_TRAINING = "imagine_bench run 2"
+"""The format of runs that a version of before 2026-11-28 began, which kept no training episodes."""
 CHECKPOINTS = "checkpoints"
 """The folder of a run's checkpoints, below its own."""
 _DONE = "DONE"
@@ -269,8 +292,9 @@ def check_config(folder: Path, spec: RunSpec[ProtocolData], learner: object) -> 
         SetupError: It cannot be written.
     """
     settings = getattr(learner, "settings", None)
+    is_new = not (folder / _CONFIG).exists()
     config = {
-        "format": FORMAT,
+        "format": FORMAT if is_new else read_config(folder)["format"],
         "protocol": spec.protocol.as_dict(),
         "protocol_hash": spec.protocol.hash,
         "agent": spec.protocol.written_name(spec.agent),
@@ -278,7 +302,7 @@ def check_config(folder: Path, spec: RunSpec[ProtocolData], learner: object) -> 
         "settings": {} if settings is None else dataclasses.asdict(settings),
     }
     now = json.loads(json.dumps(config))
-    if not (folder / _CONFIG).exists():
+    if is_new:
         write_json(folder / _CONFIG, sealed(now))
     _require_same(
         folder,
@@ -302,7 +326,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """Return what was run: protocol, agent, seed, settings. Raises ArtefactError: it is missing or damaged."""
     path = folder / _CONFIG
     values = read_sealed(path, "a run's configuration; give a run's folder, .../<agent>/seed_<n>")
-    if values.get("format") != FORMAT:
+    if values.get("format") not in (FORMAT, WITHOUT_TRAINING):
         raise ArtefactError(f"{path} was not written as {FORMAT!r}. It was left untouched.")
     return values
 
@@ -350,7 +374,7 @@ def mark_done(folder: Path, names: Sequence[str]) -> None:
     """
     recorded = [_RECORDING] if recording_path(folder).is_file() else []
     digests = {name: sha256(folder / name) for name in [*names, *recorded]}
-    write_json(folder / _DONE, sealed({"format": FORMAT, "sha256": digests}))
+    write_json(folder / _DONE, sealed({"format": read_config(folder)["format"], "sha256": digests}))
 
 
 def require_done(folder: Path) -> dict[str, Any]:
@@ -397,6 +421,11 @@ def load_so_far(folder: Path) -> RunResult | None:
     return load_run(folder) if is_done(folder) else _result(folder)
 
 
+def tried_pairs(tried: Mapping[str, int]) -> list[list[int]]:
+    """Macrostate, macro-action and episode of each pair, of which a checkpoint keeps the former two as a text."""
+    return [[*map(int, pair.split()), episode] for pair, episode in tried.items()]
+
+
 def _result(folder: Path) -> RunResult | None:
     """What the newest checkpoint of a run holds, without what is kept at its end; None before the first."""
     snapshot = load_newest(folder / CHECKPOINTS, agent=False)
@@ -406,9 +435,14 @@ def _result(folder: Path) -> RunResult | None:
     with reading(folder / CHECKPOINTS, "a run's checkpoint"):
         values = snapshot.values
         rows = unpack(tuple[Checkpoint, ...], values["rows"], grouped(snapshot.arrays).get("rows", {}))
-        starts = values.get("starts")
+        training = training_of(snapshot)
+        starts = values.get("starts")  # those that an earlier version began
+        if starts is not None and training is None:
+            starts = starts[: snapshot.episode]  # a library began one more at its end
+        elif training is not None:
+            starts = [*(starts or []), *training.starts.tolist()]
         tried = values.get("tried")
-        pairs = None if tried is None else [[*map(int, pair.split()), episode] for pair, episode in tried.items()]
+        pairs = None if tried is None else tried_pairs(tried)
         return RunResult(
             agent=agent_label(config["agent"], config["protocol"]),
             seed=config["seed"],
@@ -416,8 +450,8 @@ def _result(folder: Path) -> RunResult | None:
             settings=config["settings"],
             training_success=np.array(values["success"], dtype=np.bool_),
             training_length=np.array(values["length"], dtype=np.int64),
-            # a library begins one more at its end
-            training_starts=None if starts is None else np.array(starts[: snapshot.episode], dtype=np.int16),
+            training_starts=None if starts is None else np.array(starts, dtype=np.int16),
+            training=training,
             tried=None if pairs is None else np.array(pairs, dtype=np.int32),
             folder=folder,
         )

@@ -249,7 +249,7 @@ class _WatchedAgent:
         for name in sorted(arrays):
             found.update(f"{name} {arrays[name].shape}".encode())
             found.update(arrays[name].tobytes())
-        lived = (counters.success, counters.length, counters.queries, counters.starts, counters.tried)
+        lived = (counters.success, counters.length, counters.queries, counters.training, counters.tried)
         found.update(repr(lived).encode())
         return _Left(self._shown.hexdigest(), found.hexdigest())
 
