@@ -60,6 +60,21 @@ def test_a_hash_stands_for_the_content_alone() -> None:
         assert dataclasses.replace(episodes, **{name: changed}).hash != episodes.hash
 
 
+def test_success_is_told_at_the_end_alone_and_lost_where_an_episode_is_cut(tmp_path: Path) -> None:
+    episodes = collected()[0]
+    ends = np.cumsum(episodes.lengths)
+    assert (episodes.success & (episodes.lengths > 1)).any()
+    for count in range(1, ends[-1] + 1):
+        cut = episodes.first(count)
+        whole = np.isin(np.cumsum(cut.lengths), ends)
+        assert np.array_equal(cut.success, episodes.success[: len(cut)] & whole)
+    written(tmp_path / "set", "minari")
+    (data,) = (tmp_path / "set").glob("*/data")
+    for index, episode in enumerate(minari.MinariDataset(data)):
+        success = np.asarray(episode.infos["is_success"])
+        assert success[-1] == episodes.success[index] and not success[:-1].any()
+
+
 # --- Minari ----------------------------------------------------------------------------------------------------------
 
 

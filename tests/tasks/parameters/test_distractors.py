@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.parameters import distractors
@@ -84,3 +85,26 @@ def test_neither_rules_nor_physics_notice(id_):
 def test_encoders_of_distracted_worlds_are_others():
     names = [registry.task(f"arrows{said}").encoder for said in ("", ":distractors=1", ":distractors=2,gesture=first")]
     assert names == ["arrow_puzzle", "arrow_puzzle_distractors1", "arrow_puzzle_hidden_distractors2"]
+
+
+def test_balls_are_anywhere_on_the_screen_equally_often():
+    """Also at its edge: nine cells of equal size hold equal shares, and so does a rim of 2 mm."""
+    spec = mujoco.MjSpec()
+    distractors.add_distractors(spec, 4)
+    model = spec.compile()
+    data, rng, what = mujoco.MjData(model), np.random.default_rng(0), distractors.Distraction(model, 4)
+    what.place(data, rng)
+    middles_m = []
+    for _ in range(6000):
+        what.vary(data, rng)
+        middles_m.append(data.mocap_pos[:, :2].copy())
+    low_m, high_m = (
+        np.array(distractors.LOW_M) + distractors.RADIUS_M,
+        np.array(distractors.HIGH_M) - distractors.RADIUS_M,
+    )
+    share = (np.concatenate(middles_m) - low_m) / (high_m - low_m)
+    assert share.min() >= 0.0 and share.max() <= 1.0
+    cells = np.histogram2d(*share.T, bins=3, range=[(0, 1), (0, 1)])[0] / len(share)
+    assert cells == pytest.approx(1 / 9, abs=0.02)
+    rim = np.minimum(share, 1.0 - share) < 0.002 / (high_m - low_m)
+    assert rim.mean(axis=0) == pytest.approx(0.004 / (high_m - low_m), rel=0.25)
