@@ -8,7 +8,6 @@ One camera draws all lanes, in the thread that calls.
 from __future__ import annotations
 
 import operator
-import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from imagine_bench.arrays import Info, Observed
+from imagine_bench.cores import usable_cores
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
 from imagine_bench.interfaces import Floats, Frame
 
@@ -87,7 +87,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
     ) -> None:
         name = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         self.autoreset_mode = _MODES[require_known("autoreset mode", name, _MODES)]
-        threads = _cores() if threads is None else threads
+        threads = usable_cores() if threads is None else threads
         _require_count("num_envs", len(lanes))
         _require_count("threads", threads)
         self.envs = tuple(lanes)
@@ -294,11 +294,6 @@ def _rows(infos: Info, lanes: list[int]) -> Info:
 def _require_count(name: str, value: object) -> None:
     if not isinstance(value, (int, np.integer)) or value < 1:
         raise InvalidValueError(f"{name} is {brief(value)}; give an integer from 1 on.")
-
-
-def _cores() -> int:
-    """Those that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def make(

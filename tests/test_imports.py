@@ -66,6 +66,7 @@ GROUND = {
     "arrays",
     "assets",
     "appearance",
+    "cores",
     "environments",
     "errors",
     "interfaces",

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
+from imagine_bench.cores import usable_cores
 from imagine_bench.errors import SetupError
 from imagine_bench.values import Json
 from imagine_bench.version import PACKAGE_FOLDER, __version__
@@ -124,11 +125,6 @@ def _cpu_model() -> str:
     lines = known.read_text().splitlines() if known.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else _output("sysctl", "-n", "machdep.cpu.brand_string") or platform.machine()
-
-
-def usable_cores() -> int:
-    """Cores this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def gl_renderer() -> str:

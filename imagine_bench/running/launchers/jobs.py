@@ -16,22 +16,21 @@ from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from typing import Generic, TypeVar
 from unittest import mock
 
 from imagine_bench import registry
+from imagine_bench.cores import ONE_THREAD, usable_cores
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known
-from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, Progress
-from imagine_bench.registry.machine import usable_cores
+from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress
 from imagine_bench.running.bench import task_type
 from imagine_bench.store.files import make_folder, writing
 
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
-)
-"""Small networks are slower on two threads than on one, and bits repeat only at a fixed count."""
-
 _POLL_S = 0.5
 _PATIENCE_S = 5.0
+_KILLED = "-9: it was killed, such as for lack of memory"
+Item = TypeVar("Item")
+News = TypeVar("News")
 
 
 LAUNCHERS = {
@@ -117,93 +116,128 @@ class LocalPool:
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job, ``workers`` at a time, in order; see :class:`Launcher`."""
-        waiting = list(jobs)[::-1]
-        running: list[_Child] = []
         failures: list[Failure] = []
-        try:
-            while waiting or running:
-                while waiting and len(running) < self._workers:
-                    running.append(_Child(waiting.pop()))
-                wait([source for child in running for source in child.sources], timeout=_POLL_S)
-                for child in running:
-                    child.forward(on_progress)
-                for child in [child for child in running if child.ended]:
-                    running.remove(child)
-                    if child.failure is not None:
-                        failures.append(child.failure)
-                        on_progress(child.failure.progress)
-        finally:
-            for child in running:  # all at once, so that a second interrupt meanwhile finds none at work
-                child.process.terminate()
-            for child in running:
-                child.stop()
+
+        def ended(job: Job, reason: str) -> None:
+            if reason:
+                failures.append(Failure(job=job, reason=reason))
+                on_progress(failures[-1].progress)
+
+        work_through(carry_out, jobs, workers=self._workers, on_news=on_progress, on_end=ended, fresh=True)
         return tuple(failures)
 
 
-class _Child:
-    """A job in a process of its own."""
+def work_through(
+    function: Callable[[Item, Callable[[News], None]], str],
+    items: Sequence[Item],
+    *,
+    workers: int,
+    on_news: Callable[[News], None],
+    on_end: Callable[[Item, str], None],
+    fresh: bool = False,
+) -> None:
+    """Carry out every item in one of so many processes of this machine, in order; none outlives this process.
 
-    def __init__(self, job: Job) -> None:
-        self._job = job
-        self._reason: str | None = None
+    Args:
+        function: Carries out an item and returns why that failed, or an empty text. What it tells its second argument
+            reaches ``on_news``.
+        items: What is to be done.
+        workers: Processes at a time, at least 1.
+        on_news: Told here what is told there.
+        on_end: Told of each item why it failed, or an empty text; a process that dies costs its item alone.
+        fresh: Whether each item has a process of its own; else a process carries out one after another.
+    """
+    waiting = list(items)[::-1]
+    idle: list[_Worker[Item, News]] = []
+    busy: list[_Worker[Item, News]] = []
+    try:
+        while waiting or busy:
+            while waiting and len(busy) < workers:
+                worker = idle.pop() if idle else _Worker(function)
+                busy.append(worker)
+                worker.begin(waiting.pop())
+            wait([source for worker in busy for source in worker.sources], timeout=_POLL_S)
+            for worker in busy:
+                worker.forward(on_news)
+            for worker in [worker for worker in busy if worker.ended is not None]:
+                busy.remove(worker)
+                item, why = worker.take()
+                if fresh or not worker.process.is_alive():
+                    worker.stop()
+                else:
+                    idle.append(worker)
+                on_end(item, why)
+    finally:
+        for worker in [*busy, *idle]:  # all at once, so that a second interrupt meanwhile finds none at work
+            worker.process.terminate()
+        for worker in [*busy, *idle]:
+            worker.stop()
+
+
+class _Worker(Generic[Item, News]):
+    """A process that carries out items, one at a time."""
+
+    def __init__(self, function: Callable[[Item, Callable[[News], None]], str]) -> None:
         context = multiprocessing.get_context("spawn")  # a fork would inherit GL contexts and threads
-        self._receiver, sender = context.Pipe(duplex=False)
-        name = f"{job.spec.agent}/{job.folder.name}"
-        self.process: BaseProcess = context.Process(target=_work, args=(job, sender), name=name, daemon=True)
+        self._pipe, theirs = context.Pipe()
+        self.process: BaseProcess = context.Process(target=_work, args=(function, theirs), daemon=True)
         with mock.patch.dict(os.environ, ONE_THREAD):
             self.process.start()
-        sender.close()
+        theirs.close()
+        self._item: Item
+        self.ended: str | None = None
+        """Why the item failed or an empty text, once that is known."""
 
     @property
     def sources(self) -> list[Connection | int]:
         """What to wait for."""
-        return [self.process.sentinel] if self._receiver.closed else [self._receiver, self.process.sentinel]
+        return [self._pipe, self.process.sentinel]
 
-    @property
-    def ended(self) -> bool:
-        """Whether the process is gone and everything it sent was read."""
-        return self._receiver.closed and not self.process.is_alive()
+    def begin(self, item: Item) -> None:
+        """Hand over an item."""
+        self._item = item
+        with suppress(OSError):  # it is dead, which is seen below
+            self._pipe.send(item)
 
-    @property
-    def failure(self) -> Failure | None:
-        """Why the job of this ended process failed, if it did; one that said nothing died with the process."""
-        code = self.process.exitcode
-        death = f"its process ended early with exit code {code} (-9: it was killed, such as for lack of memory)"
-        reason = death if self._reason is None else self._reason
-        return Failure(job=self._job, reason=reason) if reason else None
-
-    def forward(self, on_progress: OnProgress) -> None:
+    def forward(self, on_news: Callable[[News], None]) -> None:
         """Read what the process has sent so far."""
-        while (message := self._next()) is not None:
-            if isinstance(message, Progress):
-                on_progress(message)
+        while self.ended is None and self._pipe.poll():
+            try:
+                ends, message = self._pipe.recv()
+            except (EOFError, ConnectionError):
+                self.process.join(_PATIENCE_S)
+                self.ended = f"its process ended early with exit code {self.process.exitcode} ({_KILLED})"
+                return
+            if ends:
+                self.ended = message
             else:
-                self._reason = message
+                on_news(message)
 
-    def _next(self) -> Progress | str | None:
-        """What it sent next, or None for now; after the last message the process is gone."""
-        try:
-            return self._receiver.recv() if not self._receiver.closed and self._receiver.poll() else None
-        except (EOFError, OSError):
-            self._receiver.close()
-            self.process.join(_PATIENCE_S)
-            return None
+    def take(self) -> tuple[Item, str]:
+        """The item that has ended, and why it failed or an empty text."""
+        ended = self.ended or ""
+        self.ended = None
+        return self._item, ended
 
     def stop(self) -> None:
         """End the process: its newest checkpoint is whole at any moment."""
+        self._pipe.close()  # one that has ended its items ends by itself then
+        self.process.join(_PATIENCE_S)
         self.process.terminate()
         self.process.join(_PATIENCE_S)
         if self.process.is_alive():
             self.process.kill()
             self.process.join()
-        self._receiver.close()
 
 
-def _work(job: Job, sender: Connection) -> None:
-    """The life of a worker process: its run, and why it failed or an empty string, told to the parent."""
+def _work(function: Callable[[Item, Callable[[News], None]], str], pipe: Connection) -> None:
+    """The life of a worker process: items, of each what it tells, and why it failed or an empty text."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all: the parent ends its workers in order
     threading.Thread(target=_die_with_parent, daemon=True).start()
-    sender.send(carry_out(job, sender.send))
+    with suppress(EOFError):  # the parent has nothing more
+        while True:
+            item = pipe.recv()
+            pipe.send((True, function(item, lambda news: pipe.send((False, news)))))
 
 
 def _die_with_parent() -> None:

@@ -14,9 +14,10 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from imagine_bench.cores import ONE_THREAD
 from imagine_bench.errors import BusyError, SetupError, lacking
 from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
-from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out, run_job
+from imagine_bench.running.launchers.jobs import absolute, carry_out, run_job
 
 if TYPE_CHECKING:
     from ray import ObjectRef

@@ -16,9 +16,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from imagine_bench.cores import ONE_THREAD
 from imagine_bench.errors import lacking
 from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
-from imagine_bench.running.launchers.jobs import ONE_THREAD, absolute, carry_out
+from imagine_bench.running.launchers.jobs import absolute, carry_out
 from imagine_bench.store.files import make_folder, write_bytes
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -14,8 +15,9 @@ import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
 
+from imagine_bench.cores import usable_cores
 from imagine_bench.protocols.data import Job, Progress
-from imagine_bench.running.launchers.jobs import LocalPool
+from imagine_bench.running.launchers.jobs import LocalPool, at_a_time, work_through
 from imagine_bench.store import run_folder
 
 _HERE = Path(__file__).parents[2] / "fakes"
@@ -108,3 +110,59 @@ def test_kill_9_of_the_parent_leaves_no_orphan(busy_bench: subprocess.Popen[str]
     busy_bench.kill()
     busy_bench.communicate(timeout=60)
     assert psutil.wait_procs(children, timeout=30)[1] == []
+
+
+def _carried(item: int, tell: Callable[[int], None]) -> str:
+    """Tell the process and carry out an item, but for one at which the process dies."""
+    tell(os.getpid())
+    if item == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return f"{item} fails" if item == 2 else ""
+
+
+def test_a_worker_that_dies_costs_one_item_and_others_go_on_in_one_process() -> None:
+    workers: list[int] = []
+    ends: list[tuple[int, str]] = []
+    work_through(_carried, range(5), workers=1, on_news=workers.append, on_end=lambda *end: ends.append(end))
+    assert [item for item, _ in ends] == [0, 1, 2, 3, 4], "in order, each once"
+    assert [bool(why) for _, why in ends] == [False, True, True, False, False]
+    assert "exit code -9" in ends[1][1] and ends[2][1] == "2 fails"
+    assert len(set(workers)) == 2, "only a death costs a process"
+    assert psutil.wait_procs([child for child in psutil.Process().children() if child.pid in workers], 10)[1] == []
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "cores"),
+    [
+        ("0::/a/b", {"a/cpu.max": "100000 100000", "a/b/cpu.max": "max 100000"}, 1),
+        ("0::/", {"cpu.max": "max 100000"}, None),
+        ("0::/", {"cpu.max": "50000 100000"}, 1),
+        ("0::/gone", {"cpu.max": "150000 100000"}, 2),
+        (
+            "3:cpu,cpuacct:/x",
+            {"cpu,cpuacct/x/cpu.cfs_quota_us": "100000", "cpu,cpuacct/x/cpu.cfs_period_us": "100000"},
+            1,
+        ),
+        ("3:cpu:/of/the/host", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, None),
+        ("3:cpuset:/\n\nnonsense", {"cpuset/cpu.max": "1 100000", "cpu.max": "nothing"}, None),
+        ("0::/", {"cpu.max": "1 0"}, None),
+    ],
+)
+def test_a_quota_bounds_the_cores_counted(
+    tmp_path: Path, groups: str, files: dict[str, str], cores: int | None
+) -> None:
+    for name, text in {"proc/self/cgroup": groups, **{f"sys/fs/cgroup/{n}": t for n, t in files.items()}}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(f"{text}\n")
+    unbounded = usable_cores(tmp_path / "none")
+    assert usable_cores(tmp_path) == min(unbounded, cores or unbounded)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system knows no affinity")
+def test_affinity_bounds_the_cores_counted() -> None:
+    given = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(given)})
+    try:
+        assert at_a_time(None) == usable_cores() == 1
+    finally:
+        os.sched_setaffinity(0, given)
