@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from importlib.metadata import version
@@ -13,10 +15,12 @@ from pathlib import Path
 
 import bench_fakes  # noqa: F401 - registers the fakes
 import pytest
+import torch
+from imagine_bench.agents.encoders.perception import prepare_torch
 from small_runs import Inline
 
-from imagine_bench import errors
-from imagine_bench.cli import main
+from imagine_bench import cli, errors
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 from imagine_bench.running.bench import task_types
@@ -24,6 +28,9 @@ from imagine_bench.running.launchers.jobs import LAUNCHERS
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.encoders import bundled
 from imagine_bench.sweep.grid import GRIDS
+
+DRAWING = {"MUJOCO_GL", "LP_NUM_THREADS", "PYOPENGL_PLATFORM"}
+"""What MuJoCo, PyOpenGL and Mesa read as long as the process draws (docs/reference/api.md)."""
 
 
 def bench_words(out: Path, *more: str) -> list[str]:
@@ -112,6 +119,30 @@ def test_a_task_is_the_first_word_or_an_option(capsys: pytest.CaptureFixture[str
             assert main([command[0], *task, *command[1:]]) == 2
             said.add(capsys.readouterr().err)
         assert len(said) == 1 and "No task 'nowhere'" in said.pop()
+
+
+def test_a_command_called_from_python_leaves_the_process_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MPLBACKEND", "module://a_notebooks_own")
+
+    def process() -> tuple[object, ...]:
+        denormal = torch.tensor(1e-323, dtype=torch.float64).item()
+        handlers = [signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)]
+        settings = [torch.get_num_threads(), torch.backends.cudnn.deterministic, denormal, torch.get_default_dtype()]
+        environment = {name: value for name, value in os.environ.items() if name not in DRAWING}
+        return environment, list(sys.path), handlers, settings
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    before = process()
+    with pytest.raises(SystemExit, match="2"):  # once the agent is made, and torch prepared for it
+        cli.main(bench_words(tmp_path, *"--agents dqn --encoder pick_place-clean".split()))
+    assert "reads frames as 'small_rgb'" in capsys.readouterr().err
+    after = process()
+    prepare_torch("cpu")
+    assert process() != after == before
+    torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize("word", ["--help", "describe"])

@@ -137,7 +137,7 @@ class Without(PathFinder):
         return None if name.partition(".")[0] in {sorted(EXTRAS)} else super().find_spec(name, *rest)
 sys.meta_path = [Without if finder is PathFinder else finder for finder in sys.meta_path]
 import gymnasium, imagine_bench
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 env = gymnasium.make("imagine_bench/PickPlace-v0", execution="kinematic")
 env.reset(seed=0)
 env.step(0)

@@ -17,6 +17,10 @@ _CACHED = 64
 """Frames kept: those of the episodes that a learner with memory looks back at."""
 
 
+_OURS = (1, True, True)
+_replaced: list[tuple[int, bool, bool]] = []
+
+
 class Perception:
     """Encodes single frames; a frame that is both the end of one transition and the start of the next costs once."""
 
@@ -52,11 +56,36 @@ def prepare_torch(device: str) -> torch.device:
     require_known("device", device, DEVICES)
     if device == "cuda" and not torch.cuda.is_available():
         raise SetupError("Device 'cuda' was asked for, but torch finds no NVIDIA GPU here; use device 'cpu'.")
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
-    torch.backends.cudnn.deterministic = True
+    found = _settings()
+    if found != _OURS:
+        _replaced.append(found)
+        _set_up(*_OURS)
     keep_freed_memory()
     return torch.device(device)
+
+
+def keep_torch() -> None:
+    """Let what :func:`prepare_torch` has changed so far stay."""
+    _replaced.clear()
+
+
+def restore_torch() -> None:
+    """Undo what :func:`prepare_torch` has changed since :func:`keep_torch`."""
+    if _replaced:
+        _set_up(*_replaced[0])
+    _replaced.clear()
+
+
+def _settings() -> tuple[int, bool, bool]:
+    """Threads, whether denormals become 0, and whether convolutions repeat: torch's for the whole process."""
+    flushed = torch.tensor(1e-323, dtype=torch.float64).item() == 0.0
+    return torch.get_num_threads(), flushed, torch.backends.cudnn.deterministic
+
+
+def _set_up(threads: int, flush: bool, deterministic: bool) -> None:
+    torch.set_num_threads(threads)
+    torch.set_flush_denormal(flush)
+    torch.backends.cudnn.deterministic = deterministic
 
 
 def load_perception(context: AgentContext) -> Perception:

@@ -55,4 +55,4 @@ AGENTS["own_agent"] = AgentEntry(make="own_agent:OwnAgent", needs_encoder=False,
 BENCH = "bench --task pick_place --preset smoke --execution kinematic --agents random own_agent --budgets 100 500"
 
 if __name__ == "__main__":
-    sys.exit(main([*BENCH.split(), *sys.argv[1:]]))
+    main([*BENCH.split(), *sys.argv[1:]])

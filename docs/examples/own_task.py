@@ -93,4 +93,4 @@ register_env(TASKS["corridor"])
 BENCH = "bench --task corridor --preset smoke --agents random oracle dqn"
 
 if __name__ == "__main__":  # dqn's encoder is trained on first use, in a minute
-    sys.exit(main([*BENCH.split(), *sys.argv[1:]]))
+    main([*BENCH.split(), *sys.argv[1:]])

@@ -64,4 +64,4 @@ WORLD_MODELS["own_model"] = WorldModelEntry(make="own_world_model:OwnModel", tit
 JUDGE = "judge --task pick_place --models copy own_model exact --sizes 30 300"
 
 if __name__ == "__main__":
-    sys.exit(main([*JUDGE.split(), *sys.argv[1:]]))
+    main([*JUDGE.split(), *sys.argv[1:]])

@@ -8,13 +8,14 @@ import shlex
 import sys
 import unicodedata
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, redirect_stderr, suppress
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from tyro.conf import subcommand
 
+from imagine_bench import registry
 from imagine_bench.cli.benches import Bench, Judge, Plan, Report, Sweep, Verify
 from imagine_bench.cli.options import require_values
 from imagine_bench.cli.tools import (
@@ -53,6 +54,7 @@ Command = (
 
 
 _LONGEST_WORD = 1000
+_SETS_UP_TORCH = "imagine_bench.agents.encoders.perception"
 FORMER = {
     "film": ("play", "--film"),
     "list": ("describe",),
@@ -138,20 +140,50 @@ def _with_task_first(words: list[str]) -> list[str]:
     return [command, *tasks, *others]
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Carry out a command line and return its exit code: 0, 1 (a run or check failed), 2 (bad input), 130 (Ctrl-C)."""
+def main(words: Sequence[str] | None = None) -> None:
+    """Carry out a command line, as :func:`exit_code`; without words that of this process.
+
+    Raises:
+        SystemExit: It failed. A script that does not catch this ends with the exit code.
+    """
+    if words is None:  # this process is ours
+        os.environ["MPLBACKEND"] = "agg"  # figures go to files, and the backend that is set may be of another machine
+    code = exit_code(sys.argv[1:] if words is None else words)
+    if code:
+        sys.exit(code)
+
+
+def exit_code(words: Sequence[str]) -> int:
+    """Carry out a command line and return its exit code: 0, 1 (a run or check failed), 2 (bad input), 130 (Ctrl-C).
+
+    Raises:
+        SystemExit: The words are no command, or ask for help.
+        SetupError: It is called by a module that a command is importing.
+    """
+    registry.refuse_while_loading()
+    with ExitStack() as scope:
+        _of_torch("keep_torch")
+        scope.callback(_of_torch, "restore_torch")
+        if sys.stderr is None:
+            scope.enter_context(redirect_stderr(scope.enter_context(Path(os.devnull).open("w"))))
+        return _carried_out(list(words))
+
+
+def _of_torch(function: str) -> None:
+    """Call what scopes torch's settings, which hold for the whole process, if they may have been changed."""
+    if _SETS_UP_TORCH in sys.modules:
+        registry.load(f"{_SETS_UP_TORCH}:{function}")()
+
+
+def _carried_out(words: list[str]) -> int:
     command: Command | None = None
-    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a window system's backend would fail only at the end
-    if sys.stderr is None:
-        sys.stderr = Path(os.devnull).open("w")
     try:
         if sys.stdout is None:
             raise SetupError("Standard output is closed; open it, or send it to a file or /dev/null.")
-        given = sys.argv[1:] if words is None else list(words)
-        if given == ["--version"]:
+        if words == ["--version"]:
             print(f"imagine-bench {__version__}")
             return 0
-        command = parsed(given)
+        command = parsed(words)
         command()
         sys.stdout.flush()
     except ImagineBenchError as error:

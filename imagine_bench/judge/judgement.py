@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 from tqdm import tqdm
@@ -23,6 +24,7 @@ from tqdm import tqdm
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Arrays
+from imagine_bench.cores import ONE_THREAD
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import State, TaskSpec
@@ -36,6 +38,7 @@ from imagine_bench.judge.scores import after_the_end_scores, by_depth, one_step_
 from imagine_bench.judge.truth import Distribution, shares
 from imagine_bench.registry.entries import file_name
 from imagine_bench.registry.machine import describe_environment
+from imagine_bench.registry.scripts import register, registered, script_left_out
 from imagine_bench.rules import states_of
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
@@ -183,9 +186,10 @@ def _carried_out(
     if workers == 1:
         yield from zip(cells, map(carry, cells), strict=True)
         return
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        yield from zip(cells, pool.map(carry, cells), strict=True)
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), register, (registered(),)) as pool:
+        with mock.patch.dict(os.environ, ONE_THREAD), script_left_out():  # the processes start here
+            done = pool.map(carry, cells)
+        yield from zip(cells, done, strict=True)
 
 
 def carry_out(judgement: Judgement, folder: Path, cell: ModelFit) -> str:

@@ -4,25 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib
-from collections.abc import Container, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Container, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
 
-from imagine_bench.errors import (
-    EXTRAS,
-    ImagineBenchError,
-    InvalidValueError,
-    SetupError,
-    brief,
-    lacking,
-    plain,
-    require_known,
-)
+from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.interfaces.regression import RegressionSpec, Regressor, RegressorContext
@@ -47,6 +36,7 @@ from imagine_bench.registry.entries import (
     parse_options,
     read_mapping,
 )
+from imagine_bench.registry.loading import fault, guests_faults, load, refuse_while_loading
 from imagine_bench.values import Setting
 
 __all__ = [
@@ -61,6 +51,8 @@ __all__ = [
     "RegressorEntry",
     "TaskEntry",
     "WorldModelEntry",
+    "load",
+    "refuse_while_loading",
 ]
 
 TASK_GROUP = "imagine_bench.tasks"
@@ -102,21 +94,6 @@ def describe_group(group: str, *, what: str, kind: type, own: Container[str]) ->
         own: The names that are this suite's.
     """
     _GROUPS[group] = _Group(what, kind, (own,))
-
-
-def load(target: str) -> Any:
-    """The object that ``"module:attr"`` names, or the module that ``"module"`` names.
-
-    SetupError if it needs an extra of this package that is not installed.
-    """
-    module, _, attribute = target.partition(":")
-    try:
-        found = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name not in EXTRAS:
-            raise
-        raise lacking(error.name) from error
-    return getattr(found, attribute) if attribute else found
 
 
 def tasks() -> dict[str, TaskEntry]:
@@ -170,10 +147,9 @@ def offers(group: str) -> Mapping[str, Any]:
             found.setdefault(f"{package}:{point.name}", SetupError(f"{offer}, a name that is taken; give it another."))
             continue
         try:
-            entry = point.load()
+            entry = load(f"{point.module}:{point.attr or ''}")
         except Exception as error:  # whatever a package does wrong, it is one sentence and costs nobody else anything
-            why = f"{type(error).__name__}: {plain(error)}".partition("\n")[0]
-            entry = SetupError(f"{offer}, which cannot be loaded ({why}); mend or uninstall the package.")
+            entry = SetupError(f"{offer}, which cannot be loaded ({fault(error)}); mend or uninstall the package.")
         if not isinstance(entry, kind | SetupError):
             entry = SetupError(
                 f"{offer}, which is {brief(entry)} and no {kind.__name__}; mend or uninstall the package."
@@ -235,7 +211,7 @@ def task_entry(name: str) -> TaskEntry:
         entry: TaskEntry = offered(name, TASKS, TASK_GROUP)
     else:
         line: TaskEntry = offered(base, TASKS, TASK_GROUP)
-        with _guests_faults(f"Task {name}", line.spec):
+        with guests_faults(f"Task {name}", line.spec):
             options = {**line.options, **_options(base, line, said)}
             spec: TaskSpec = load(line.spec)(**options)
             horizon = line.horizon and spec.horizon
@@ -334,23 +310,9 @@ def settings(agent: str, hyperparameters: str, overrides: Mapping[str, Setting],
         InvalidValueError: A value of the wrong type or out of its range.
     """
     entry = agent_entry(agent)
-    with _guests_faults(f"Agent {agent}, its settings", entry.settings):
+    with guests_faults(f"Agent {agent}, its settings", entry.settings):
         given = own_settings(agent, overrides)
         return load(entry.settings).resolve(hyperparameters, given, group) if entry.settings else None
-
-
-@contextmanager
-def _guests_faults(what: str, target: str) -> Iterator[None]:
-    """Whatever code of another package does wrong is one sentence; of this suite's own a traceback says more."""
-    try:
-        yield
-    except ImagineBenchError:
-        raise
-    except Exception as error:
-        if target.startswith("imagine_bench."):
-            raise
-        why = f"{type(error).__name__}: {plain(error)}".partition("\n")[0]
-        raise SetupError(f"{what} ({target}) cannot be used ({why}); mend or uninstall its package.") from error
 
 
 def task(name: str) -> TaskSpec:
@@ -362,7 +324,7 @@ def task(name: str) -> TaskSpec:
     """
     entry = task_entry(name)
     known = tasks()
-    with _guests_faults(f"Task {name}", entry.spec):
+    with guests_faults(f"Task {name}", entry.spec):
         loaded = load(entry.spec)
         spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
         if not isinstance(spec, TaskSpec):
@@ -392,7 +354,7 @@ def make_agent(name: str, context: AgentContext) -> Agent:
 
 
 def _made(what: str, target: str, *given: Any) -> Any:
-    with _guests_faults(what, target):
+    with guests_faults(what, target):
         return load(target)(*given)
 
 

@@ -277,7 +277,7 @@ def certificate_of(task: str, split: str | None) -> Certificate | None:
     """Return the exact facts of a task from the starts that tests have; None for a package's whose rules fail."""
     try:
         return certificate(spec_of(task, split, testing=True))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if registry.is_own(task):
             raise
         print(f"Note: {task} has no certificate ({type(error).__name__}: {plain(error)}).")

@@ -69,7 +69,7 @@ def _require_sound(wanted: Protocol) -> None:
         for what, frame in frames.items():
             if (frame.shape, frame.dtype) != ((64, 64, 3), np.uint8):
                 raise InvalidValueError(f"{what} gives frames of {frame.dtype} and shape {frame.shape}")
-    except Exception as error:  # whatever a guest does wrong is one sentence
+    except (Exception, SystemExit) as error:  # whatever a guest does wrong is one sentence
         why = " ".join(plain(error).split()).rstrip(".")
         more = f"'imagine-bench check --task {wanted.task}' says more"
         raise InvalidValueError(f"Task {wanted.task} cannot be run: {why}. {more}.") from error

@@ -68,7 +68,7 @@ def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
         if features.ndim != 2 or len(features) != len(frames) or not np.isfinite(features).all():
             wanted = f"it must give finite numbers of shape ({len(frames)}, Z)"
             raise ValueError(f"{len(frames)} frames have latents of shape {features.shape}; {wanted}")
-    except Exception as error:  # whatever a package does wrong is one sentence
+    except (Exception, SystemExit) as error:  # whatever a package does wrong is one sentence
         raise InvalidValueError(
             f"The encoder {name} ({entry.make}) failed: {type(error).__name__}: {error}."
         ) from error

@@ -56,7 +56,7 @@ def report(checks: Checks) -> int:
             check()
         except NotOffered as why:
             print(f"none   {what}: {why}")
-        except Exception as error:  # whatever a guest does wrong is a finding
+        except (Exception, SystemExit) as error:  # whatever a guest does wrong is a finding
             failed += 1
             print(f"wrong  {what}: {' '.join(plain(error).split()) or type(error).__name__}")
         else:

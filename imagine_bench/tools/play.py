@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import io
 import string
-import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any, SupportsFloat
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -207,11 +207,9 @@ def play(
     spec = registry.task(task)
     chosen |= {name: value for name, value in (("execution", execution), ("appearance", appearance)) if value}
     registry.load("imagine_bench.tasks.rendering.window:open_display")(seen=True)
-    with warnings.catch_warnings():  # it wants matplotlib to open windows, too
+    with warnings.catch_warnings(), mock.patch("matplotlib.use"):  # it would let matplotlib open windows, too
         warnings.simplefilter("ignore")
         from gymnasium.utils.play import play as keyboard  # noqa: PLC0415 - an extra
-    if "matplotlib" in sys.modules:
-        sys.modules["matplotlib"].use("agg")
     env = gymnasium.make(spec.env_id, disable_env_checker=True, **chosen)
     keys: dict[str, Action] = dict(zip(KEYS, range(spec.n_actions), strict=False))
     with closing(KeyboardGame(env, spec, imaginer, seed)) as game:

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from imagine_bench.adapters.tracking import track
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 
 ROWS = (

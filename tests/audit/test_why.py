@@ -11,7 +11,7 @@ from report_pages import without_images
 from small_runs import Inline, small
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread

@@ -8,7 +8,7 @@ import pytest
 from guest_packages import Guests
 from small_runs import Inline
 
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.running.bench import bench, plan
 

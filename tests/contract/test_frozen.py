@@ -19,7 +19,7 @@ from guest_packages import Guests
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge import judgement
 from imagine_bench.running.bench import bench, plan

@@ -16,7 +16,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.registry.builtin import guests
 
 ROOT = Path(__file__).parents[2]

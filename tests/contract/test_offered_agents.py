@@ -10,7 +10,7 @@ import pytest
 from guest_packages import Guests
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import SetupError
 from imagine_bench.registry.machine import versions
 from imagine_bench.store.bench_folder import newest_bench

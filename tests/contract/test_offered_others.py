@@ -14,7 +14,7 @@ from imagine_bench.agents.encoders.encoder import Encoder
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.registry.machine import versions

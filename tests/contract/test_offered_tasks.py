@@ -14,7 +14,7 @@ from imagine_bench.agents.encoders import recipes
 from small_runs import Inline
 
 from imagine_bench import registry, rules
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.report import summary_table
 from imagine_bench.running.bench import bench, plan

@@ -11,7 +11,7 @@ from bench_fakes import TableAgent
 from small_runs import Inline, collected, do
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation

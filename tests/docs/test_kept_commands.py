@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 from doc_cells import KEPT, RESULTS, table
 
-from imagine_bench.cli import main, parsed
+from imagine_bench.cli import exit_code as main
+from imagine_bench.cli import parsed
 from imagine_bench.cli.benches import Bench
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.protocols.data import ProtocolData, digest

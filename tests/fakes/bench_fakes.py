@@ -1,11 +1,10 @@
 """Agents whose every move is known, for the tests of the bench; run as a script it is the command line with them.
 
-Worker processes import this module too: as the main module of the script, or because a spec of theirs is pickled here.
+Worker processes import this module too, for an agent of theirs or because a spec of theirs is pickled here.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -166,4 +165,4 @@ AGENTS.update(
 )
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

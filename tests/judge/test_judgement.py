@@ -23,7 +23,7 @@ from recordings import contents, times
 from small_runs import Inline, small
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown

@@ -13,7 +13,7 @@ from imagine_bench.agents.regressors import settings as regressor_settings
 from recordings import contents, times
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.cli.observers import observers_of
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces.regression import SCORES

@@ -13,7 +13,7 @@ from bench_fakes import Pupil
 from small_runs import collected, final_arrays, measured, run_observed, written
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.data import OnProgress, RunSpec

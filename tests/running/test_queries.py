@@ -12,7 +12,7 @@ from imagine_bench.tasks.arrows.rules import ArrowRules
 from small_runs import final_arrays, measured, run_observed, small
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.interfaces.capabilities import Label

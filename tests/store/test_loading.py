@@ -15,7 +15,7 @@ import pytest
 from fake_results import bench_result
 from small_runs import Inline, small
 
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import summary_table, write_report

@@ -23,7 +23,7 @@ import pytest
 from small_runs import Inline, do, final_arrays, same_but_for_time, small
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, load_bench, plan

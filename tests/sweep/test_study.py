@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.values import true_model

@@ -13,7 +13,7 @@ from imagine_bench.tasks.arrows.rules import ArrowRules
 from imagine_bench.tasks.macro_env import MacroEnv
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.interfaces import AgentState
 from imagine_bench.testing.contract import Checks, checks, report
 

@@ -11,7 +11,7 @@ import pytest
 from imagine_bench.agents.world_models.limits import Copy
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces.model import Imagined
 from imagine_bench.testing.contract import checks

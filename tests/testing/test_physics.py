@@ -5,7 +5,7 @@ import json
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.testing import physics
 from imagine_bench.testing.physics import (

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import SetupError
 from imagine_bench.registry import machine as environment
 from imagine_bench.tools import doctor

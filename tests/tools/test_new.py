@@ -12,7 +12,7 @@ from guest_packages import Guests
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.rules import facts
 from imagine_bench.running.bench import bench, plan
 

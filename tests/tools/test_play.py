@@ -15,7 +15,7 @@ from PIL import Image, ImageSequence
 from worlds import draw_quickly
 
 from imagine_bench import registry
-from imagine_bench.cli import main
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.tools import play as module
 from imagine_bench.tools.play import KEYS, KeyboardGame, film, play

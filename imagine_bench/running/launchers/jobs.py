@@ -23,6 +23,7 @@ from imagine_bench import registry
 from imagine_bench.cores import ONE_THREAD, usable_cores
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known
 from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress
+from imagine_bench.registry.scripts import Registered, register, registered, script_left_out
 from imagine_bench.running.bench import task_type
 from imagine_bench.store.files import make_folder, writing
 
@@ -84,7 +85,7 @@ def carry_out(job: Job, on_progress: OnProgress, run: Callable[[Job, OnProgress]
         _log(job, f"{job.spec.agent} seed {job.spec.seed} begins or goes on")
         run(job, on_progress)
         _log(job, "done")
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         with suppress(SetupError):
             _log(job, traceback.format_exc())
         return str(error) if isinstance(error, ImagineBenchError) else f"{type(error).__name__}: {error}"
@@ -180,8 +181,8 @@ class _Worker(Generic[Item, News]):
     def __init__(self, function: Callable[[Item, Callable[[News], None]], str]) -> None:
         context = multiprocessing.get_context("spawn")  # a fork would inherit GL contexts and threads
         self._pipe, theirs = context.Pipe()
-        self.process: BaseProcess = context.Process(target=_work, args=(function, theirs), daemon=True)
-        with mock.patch.dict(os.environ, ONE_THREAD):
+        self.process: BaseProcess = context.Process(target=_work, args=(function, theirs, registered()), daemon=True)
+        with mock.patch.dict(os.environ, ONE_THREAD), script_left_out():
             self.process.start()
         theirs.close()
         self._item: Item
@@ -230,10 +231,11 @@ class _Worker(Generic[Item, News]):
             self.process.join()
 
 
-def _work(function: Callable[[Item, Callable[[News], None]], str], pipe: Connection) -> None:
+def _work(function: Callable[[Item, Callable[[News], None]], str], pipe: Connection, there: Registered) -> None:
     """The life of a worker process: items, of each what it tells, and why it failed or an empty text."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all: the parent ends its workers in order
     threading.Thread(target=_die_with_parent, daemon=True).start()
+    register(there)
     with suppress(EOFError):  # the parent has nothing more
         while True:
             item = pipe.recv()

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from imagine_bench.cores import ONE_THREAD
 from imagine_bench.errors import BusyError, SetupError, lacking
 from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
+from imagine_bench.registry.scripts import Registered, register, registered
 from imagine_bench.running.launchers.jobs import absolute, carry_out, run_job
 
 if TYPE_CHECKING:
@@ -89,7 +90,8 @@ def _launch(ray: ModuleType, jobs: Sequence[Job], on_progress: OnProgress) -> tu
         max_retries=_LOST,
         runtime_env={"env_vars": ONE_THREAD},
     )(_work)
-    running = {work.remote(absolute(job), board): job for job in jobs}
+    there = registered()
+    running = {work.remote(absolute(job), board, there): job for job in jobs}
     failures = []
     while running:
         ended, _ = ray.wait(list(running), timeout=_POLL_S)
@@ -131,8 +133,9 @@ class _Board:
         return news
 
 
-def _work(job: Job, board: ActorHandle) -> str:
+def _work(job: Job, board: ActorHandle, there: Registered) -> str:
     """A run. Returns why it failed, or an empty string."""
+    register(there)
     return carry_out(job, board.put.remote, _run_when_free)
 
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from imagine_bench.cores import ONE_THREAD
 from imagine_bench.errors import lacking
 from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
+from imagine_bench.registry.scripts import Registered, register, registered
 from imagine_bench.running.launchers.jobs import absolute, carry_out
 from imagine_bench.store.files import make_folder, write_bytes
 
@@ -81,14 +82,18 @@ class SlurmCluster:
             gpus_per_node=int(job.spec.protocol.device == "cuda"),
             slurm_setup=[f"export {name}={value}" for name, value in ONE_THREAD.items()],
         )  # fmt: skip
-        return executor.submit(_Work(), job)
+        return executor.submit(_Work(registered()), job)
 
 
 class _Work:
     """What a node does with a job; submitit asks it what to queue when the job must stop."""
 
+    def __init__(self, there: Registered) -> None:
+        self._there = there
+
     def __call__(self, job: Job) -> str:
         os.environ.update(ONE_THREAD)
+        register(self._there)
         return carry_out(job, lambda progress: _tell(job, progress))
 
     def checkpoint(self, job: Job) -> submitit.helpers.DelayedSubmission:

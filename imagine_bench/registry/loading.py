@@ -1,0 +1,82 @@
+"""Objects by ``"module:attr"``, and what went wrong where the code of another package cannot be loaded."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from operator import attrgetter
+from types import ModuleType
+from typing import Any
+
+from imagine_bench.errors import EXTRAS, ImagineBenchError, SetupError, lacking, plain
+
+_LOADING: ContextVar[str] = ContextVar("_LOADING", default="")
+
+
+def load(target: str) -> Any:
+    """The object that ``"module:attr"`` names, or the module that ``"module"`` names.
+
+    Raises:
+        SetupError: It needs an extra of this package that is not installed.
+        ImportError: Its import ends Python, as ``sys.exit`` does.
+        AttributeError: The module has no such object; the message says where a folder is taken for the module.
+    """
+    module, _, attribute = target.partition(":")
+    before = _LOADING.set(module)
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        raise lacking(error.name) from error
+    except (Exception, KeyboardInterrupt):
+        raise
+    except BaseException as error:  # such as SystemExit, which nobody above would take for a failure
+        raise ImportError(f"it ends Python when it is imported: {error!r}") from error
+    finally:
+        _LOADING.reset(before)
+    try:
+        return attrgetter(attribute)(found) if attribute else found
+    except AttributeError as error:
+        raise AttributeError(f"module {module} has no attribute {attribute!r}{_hidden(found)}") from error
+
+
+def _hidden(module: ModuleType) -> str:
+    """What to say of a module that is only a folder, without code, or of a worker's ``__main__``."""
+    if module.__name__ == "__main__":
+        return ": worker processes cannot import a notebook or standard input; write the code to a file and name that"
+    if getattr(module, "__file__", None) is not None:
+        return ""
+    folder = next(iter(module.__path__))
+    return f", as the folder {folder} hides it: start Python in another folder, or rename or move that one"
+
+
+def refuse_while_loading() -> None:
+    """Raise SetupError if :func:`load` imports a module at the moment, whose import begins a command."""
+    module = _LOADING.get()
+    if module:
+        raise SetupError(
+            f"{module} runs a command when it is imported, and worker processes import it. Write the line "
+            "'if __name__ == \"__main__\":' above the call."
+        )
+
+
+def fault(error: BaseException) -> str:
+    """What went wrong in the code of another package, on one line."""
+    return f"{type(error).__name__}: {plain(error)}".partition("\n")[0]
+
+
+@contextmanager
+def guests_faults(what: str, target: str) -> Iterator[None]:
+    """Whatever code of another package does wrong is one sentence; of this suite's own a traceback says more."""
+    try:
+        yield
+    except ImagineBenchError:
+        raise
+    except (Exception, SystemExit) as error:
+        if target.startswith("imagine_bench."):
+            raise
+        why = fault(error)
+        raise SetupError(f"{what} ({target}) cannot be used ({why}); mend or uninstall its package.") from error
