@@ -7,6 +7,7 @@ import importlib.util
 import re
 import reprlib
 from collections.abc import Iterable
+from typing import Self
 
 _LONGEST = 200
 _SHORT = reprlib.Repr()
@@ -48,9 +49,22 @@ class UnknownNameError(ImagineBenchError, ValueError):
     def __str__(self) -> str:
         kind, given, names = self.args
         word = str(given) if isinstance(given, str | int | float | None) else brief(given)
-        closest = difflib.get_close_matches(word, names, n=1, cutoff=0.4) if len(word) <= _LONGEST else []
-        hint = f" Did you mean {closest[0]!r}?" if closest else ""
-        return f"No {kind} {brief(word)}.{hint} Known: {', '.join(names) or 'none'}."
+        return f"No {kind} {brief(word)}.{_nearest(word, names)}"
+
+
+def _nearest(word: str, names: list[str]) -> str:
+    closest = difflib.get_close_matches(word, names, n=1, cutoff=0.4) if len(word) <= _LONGEST else []
+    hint = f" Did you mean {closest[0]!r}?" if closest else ""
+    return f"{hint} Known: {', '.join(names) or 'none'}."
+
+
+class UnknownKeywordError(ImagineBenchError, TypeError):
+    """A keyword argument that a function does not take: a TypeError in Python's words, by which libraries know it."""
+
+    @classmethod
+    def of(cls, name: str, known: Iterable[str]) -> Self:
+        """The error for a keyword argument that is none of the known ones."""
+        return cls(f"Got an unexpected keyword argument {name!r}.{_nearest(name, list(known))}")
 
 
 class InvalidValueError(ImagineBenchError, ValueError):

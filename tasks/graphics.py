@@ -22,7 +22,8 @@ def choose_platform() -> None:
     """Choose headless EGL on Linux, unless the user chose already.
 
     With a display too: a window system's connection survives neither a fork nor a second thread. Software GL draws on
-    the calling thread: 64x64 pixels gain nothing from more, and threads do not survive a fork.
+    the calling thread: 64x64 pixels gain nothing from more, and threads do not survive a fork. SDL, which opens
+    windows, shall not draw by OpenGL: no thread may draw by EGL and by GLX, and X11 would end the process.
 
     Raises:
         SetupError: ``MUJOCO_GL`` names no platform, or one whose library is missing.
@@ -36,6 +37,7 @@ def choose_platform() -> None:
         raise SetupError("MUJOCO_GL is 'osmesa', but libOSMesa is not installed; install it or unset MUJOCO_GL.")
     os.environ["MUJOCO_GL"] = chosen or "egl"
     os.environ.setdefault("LP_NUM_THREADS", "0")
+    os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
     _load_triton()
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import SupportsIndex
 
 import gymnasium
 import numpy as np
@@ -27,6 +29,8 @@ from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import AGENT_CAMERA, HUMAN_CAMERA
 from .world import World, WorldState
 
+Step = tuple[float, bool, bool, Info]
+"""Reward, whether the episode has terminated, whether the simulation blew up, and info."""
 _BUILT = PhysicsSettings()
 _WINDOW_HZ = 25.0  # images a second of a window
 
@@ -46,6 +50,24 @@ _EPISODE = ("begun", "latest", "_people", "_steps", "_observations", "_observed"
 """Attributes that say where an episode stands: latest macro-action, and what lag keeps back."""
 
 
+def require_integer(name: str, given: SupportsIndex, low: int) -> int:
+    """An integer from ``low`` on, also one of numpy. Raises InvalidValueError: it is none."""
+    with contextlib.suppress(TypeError):
+        number = operator.index(given)
+        if number >= low:
+            return number
+    raise InvalidValueError(f"{name} is {brief(given)}; give an integer from {low} on.")
+
+
+def options_of(options: Info | None) -> Info:
+    """Options of a reset, copied. Raises InvalidValueError: they are no mapping."""
+    if options is not None and not isinstance(options, Mapping):
+        raise InvalidValueError(
+            f"Reset options {brief(options)} are no mapping; give {{'macrostate': ...}} or nothing."
+        )
+    return dict(options or {})
+
+
 class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
     """Macro-actions on a real scene, seen by the wrist camera.
 
@@ -58,7 +80,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
 
     Starting State: one of the rules' start states, equally likely, or ``reset(options={"macrostate": ...})``.
 
-    Episode End: terminated where the rules say so; truncation is the registered time limit.
+    Episode End: terminated where the rules say so; truncation is the registered time limit, or a simulation that blew
+    up: then the reward is 0, observation and macrostate are those before, and ``fault_reason`` says what happened.
 
     Info: ``macrostate`` and what the observation shows of it, ``shown``, late, or -1 where hidden (int64, (M,)),
     ``is_success``, ``success``, ``legal``, ``fault`` and ``fault_reason`` (empty where there is none), ``sim_time_s``
@@ -159,7 +182,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
 
         Raises:
             UnknownNameError: An unknown option.
-            InvalidValueError: Not a macrostate of this task.
+            InvalidValueError: A seed that is no integer from 0 on, or not a macrostate of this task.
         """
         info = self.restart(seed=seed, options=options)
         self._show()
@@ -167,8 +190,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
 
     def restart(self, *, seed: int | None = None, options: Info | None = None) -> Info:
         """As :meth:`reset`, without an observation."""
-        super().reset(seed=seed)
-        start = self._start({} if options is None else options)
+        super().reset(seed=None if seed is None else require_integer("seed", seed, 0))
+        start = self._start(options_of(options))
         self.begun = True
         self.latest = None
         self._steps = 0
@@ -185,17 +208,17 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
 
         Raises:
             InvalidValueError: No such action, or no episode was begun.
-            DivergedError: The simulation blew up; the episode is over.
         """
-        reward, terminated, info = self.act(action)
+        reward, terminated, blew_up, info = self.act(action)
         self._show()
-        return self.observe([self])[0], reward, terminated, False, info
+        seen = copy.deepcopy(self._observations[0]) if blew_up else self.observe([self])[0]
+        return seen, reward, terminated, blew_up, info
 
-    def act(self, action: np.int64 | int) -> tuple[float, bool, Info]:
+    def act(self, action: np.int64 | int) -> Step:
         """As :meth:`step`, without an observation. Nothing is drawn, so any thread may call it.
 
         Returns:
-            Reward, whether the episode has terminated, and info.
+            Reward, whether the episode has terminated, whether the simulation blew up, and info.
         """
         if not self.begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
@@ -209,9 +232,13 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             self.world.draw_placement_noise(self.np_random)
         fault = None
         if self.execution == "physics":
+            standing = self.world.get_state()
             self._people = self._mocap()
             self.world.executor.capture_motion_hz = self.capture_motion_hz
-            self.latest = self.world.execute(chosen, intended.macrostate)
+            try:
+                self.latest = self.world.execute(chosen, intended.macrostate)
+            except DivergedError as error:
+                return self._blown_up(standing, str(error))
             fault = self.latest.fault
         else:
             self.world.set_outcome(chosen, intended.macrostate)
@@ -224,7 +251,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             outcome = self._rules.judge(start, chosen, reading.macrostate)
             fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
         info = self._info(success=outcome.success, legal=outcome.success or not outcome.terminated, fault=fault)
-        return float(outcome.reward), outcome.terminated, info
+        return float(outcome.reward), outcome.terminated, False, info
 
     def observe(self, envs: Sequence[MacroEnv]) -> list[Observed]:
         """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
@@ -234,11 +261,6 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             env._observations = delivered(env._observations, observation, env._lag)
             due.append(copy.deepcopy(env._observations[0]) if env._lag else observation)
         return due
-
-    def diverged(self, error: DivergedError) -> Info:
-        """The info of a macro-action whose simulation blew up; the episode is over, its macrostate the one before."""
-        self.latest = None
-        return self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=str(error))
 
     def render(self) -> Frame | None:
         """The scene as ``camera`` sees it, for ``"rgb_array"``; else None. Shape (height, width, 3)."""
@@ -307,10 +329,6 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         self._observed = delivered(self._observed, self.world.observed(macrostate), self._lag)
 
     def _start(self, options: Info) -> State:
-        if not isinstance(options, Mapping):
-            raise InvalidValueError(
-                f"Reset options {brief(options)} are no mapping; give {{'macrostate': ...}} or nothing."
-            )
         for key in options:
             require_known("reset option", key, ("macrostate",))
         if "macrostate" not in options:
@@ -329,12 +347,18 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         if isinstance(action, (int, np.integer)) and 0 <= action < self._n_actions:
             return int(action)
         with contextlib.suppress(Exception):  # as of a macrostate
-            chosen = np.asarray(action).item()
+            (chosen,) = np.asanyarray(action).ravel().tolist()
             if chosen in range(self._n_actions):
                 return int(chosen)
         raise InvalidValueError(
             f"Action {brief(action)} does not exist; give an integer from 0 to {self._n_actions - 1}."
         )
+
+    def _blown_up(self, standing: WorldState, why: str) -> Step:
+        """What :meth:`act` returns of a simulation that blew up: the scene stands as before, the episode is over."""
+        self.world.set_state(standing)
+        self.latest = None
+        return 0.0, False, True, self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=why)
 
     def _intended(self, start: State, action: int) -> Outcome:
         """The rules' outcome, drawn where they leave a choice."""

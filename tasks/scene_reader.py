@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from numbers import Real
 
 import mujoco
 import numpy as np
@@ -109,7 +110,7 @@ class FilmedScene:
 
     @capture_motion_hz.setter
     def capture_motion_hz(self, rate_hz: float) -> None:
-        if not isinstance(rate_hz, (int, float)) or not 0 <= rate_hz <= MAX_MOTION_HZ:
+        if not isinstance(rate_hz, Real) or not 0 <= rate_hz <= MAX_MOTION_HZ:
             raise InvalidValueError(f"Motion cannot be captured at {brief(rate_hz)} Hz; give 0 to {MAX_MOTION_HZ}.")
         self._capture_motion_hz = float(rate_hz)
 

@@ -7,7 +7,7 @@ One camera draws all lanes, in the thread that calls.
 
 from __future__ import annotations
 
-import operator
+import functools
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -21,40 +21,24 @@ from numpy.typing import NDArray
 
 from imagine_bench.arrays import Info, Observed
 from imagine_bench.cores import usable_cores
-from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
+from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import Floats, Frame
 
-from .macro_env import MacroEnv
+from .macro_env import MacroEnv, Step, options_of, require_integer
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
 Batch = tuple[Observed, Floats, NDArray[np.bool_], NDArray[np.bool_], Info]
-
-
-class _Step(NamedTuple):
-    """What became of a lane's macro-action."""
-
-    reward: float
-    terminated: bool
-    info: Info
-    diverged: bool = False
 
 
 class _Acting(NamedTuple):
     """A lane in the middle of a macro-action, or of the reset that takes its place."""
 
     begun_s: float  #: when it began, on the clock that all lanes share
-    step: Future[_Step] | None  #: what becomes of it; None for a reset
+    step: Future[Step] | None  #: what becomes of it; None for a reset
 
     def due_s(self) -> float:
         """When it ends on that clock; waits until it has been simulated."""
-        return self.begun_s if self.step is None else self.begun_s + float(self.step.result().info["sim_time_s"])
-
-
-def _act(env: MacroEnv, action: int) -> _Step:
-    try:
-        return _Step(*env.act(action))
-    except DivergedError as error:
-        return _Step(0.0, False, env.diverged(error), diverged=True)
+        return self.begun_s if self.step is None else self.begun_s + float(self.step.result()[-1]["sim_time_s"])
 
 
 class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]):
@@ -74,7 +58,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
 
     Raises:
         UnknownNameError: Another mode.
-        InvalidValueError: No lanes or threads.
+        InvalidValueError: No lanes or threads, a limit below 1, or a lane that is no environment of this suite.
     """
 
     def __init__(
@@ -87,11 +71,18 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
     ) -> None:
         name = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         self.autoreset_mode = _MODES[require_known("autoreset mode", name, _MODES)]
-        threads = usable_cores() if threads is None else threads
-        _require_count("num_envs", len(lanes))
-        _require_count("threads", threads)
         self.envs = tuple(lanes)
-        self.num_envs = len(lanes)
+        self.num_envs = require_integer("num_envs", len(self.envs), 1)
+        for lane in self.envs:
+            if not isinstance(lane, MacroEnv):
+                raise InvalidValueError(
+                    f"{brief(lane)} is no environment that this suite can run in one process with others; give "
+                    "gymnasium.make_vec the id of the single environment."
+                )
+        lanes = self.envs
+        self._n_threads = require_integer("threads", usable_cores() if threads is None else threads, 1)
+        if max_episode_steps is not None:
+            max_episode_steps = require_integer("max_episode_steps", max_episode_steps, 1)
         self._horizon = max_episode_steps
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1, "autoreset_mode": self.autoreset_mode}
         mode = lanes[0].render_mode
@@ -100,7 +91,6 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         self.single_action_space = lanes[0].action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._threads = ThreadPoolExecutor(threads, "simulation")
         self._seen: list[Observed | None] = [None] * self.num_envs
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
         self._over = np.ones(self.num_envs, dtype=np.bool_)
@@ -123,7 +113,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
             InvalidValueError: Seeds or mask of another length or type, or a macrostate that is none.
             UnknownNameError: An unknown option.
         """
-        options = dict(options or {})
+        options = options_of(options)
         chosen = self._masked(options.pop("reset_mask", None))
         seeds = self._seeds(seed)
         for lane in chosen:
@@ -149,7 +139,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
     def close_extras(self, **kwargs: object) -> None:
         """Free threads and OpenGL contexts."""
         del kwargs
-        self._threads.shutdown()
+        self._pool.shutdown()
         for lane in self.envs:
             lane.close()
 
@@ -167,14 +157,12 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
                 without autoreset; nothing has moved then.
         """
         lanes = self._named(ids)
-        if len(actions) != len(lanes):
-            raise InvalidValueError(f"{len(actions)} actions are given for {len(lanes)} lanes; give one for each.")
+        given = _one_each("Actions", actions, len(lanes))
         for lane in lanes:
             if lane in self._acting:
                 raise InvalidValueError(f"Lane {lane} is acting; receive it first.")
             if self._seen[lane] is None or (self._over[lane] and self.autoreset_mode == AutoresetMode.DISABLED):
                 raise InvalidValueError(f"Lane {lane} has no episode to go on with; reset it first.")
-        given = actions.tolist() if isinstance(actions, np.ndarray) else actions
         chosen = [self.envs[lane].checked(action) for lane, action in zip(lanes, given, strict=True)]
         for lane, action in zip(lanes, chosen, strict=True):
             step = None if self._over[lane] else self._begin(self.envs[lane], action)
@@ -189,7 +177,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         Raises:
             InvalidValueError: Not so many lanes are acting.
         """
-        n = len(self._acting) if n is None else n
+        n = len(self._acting) if n is None else require_integer("n", n, 1)
         if not 1 <= n <= len(self._acting):
             raise InvalidValueError(f"{brief(n)} lanes cannot be received: {len(self._acting)} are acting.")
         due_s = {lane: acting.due_s() for lane, acting in self._acting.items()}
@@ -202,6 +190,20 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
 
     # --- details -------------------------------------------------------------------------------------------------
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What is copied and pickled: all but the threads, of which a copy has its own.
+
+        Raises:
+            InvalidValueError: A lane is acting.
+        """
+        if self._acting:
+            raise InvalidValueError(f"Lanes {sorted(self._acting)} are acting; receive them before you copy or pickle.")
+        return {name: value for name, value in vars(self).items() if name != "_pool"}
+
+    @functools.cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(self._n_threads, "simulation")
+
     def _received(self, lanes: list[int]) -> Batch:
         """Observations, rewards and ends of these lanes in this order; infos of all, masked."""
         rewards = np.zeros(len(lanes))
@@ -211,11 +213,11 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         for row, lane in enumerate(lanes):
             pending = self._acting.pop(lane).step
             if pending is not None:
-                rewards[row], terminated[row], acted[lane], diverged = pending.result()
+                rewards[row], terminated[row], blew_up, acted[lane] = pending.result()
                 self._elapsed[lane] += 1
-                truncated[row] = diverged or (self._horizon is not None and self._elapsed[lane] >= self._horizon)
+                truncated[row] = blew_up or (self._horizon is not None and self._elapsed[lane] >= self._horizon)
         self._over[lanes] = terminated | truncated
-        self._look([lane for lane in acted if self.envs[lane].begun])  # not those that diverged
+        self._look([lane for lane in acted if self.envs[lane].begun])  # not those that blew up
         infos = Info()
         again = [lane for lane in lanes if lane not in acted]
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
@@ -228,13 +230,13 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         infos = self._restart(again, [None] * self.num_envs, {}, infos)
         return self._stacked(lanes), rewards, terminated, truncated, infos
 
-    def _begin(self, env: MacroEnv, action: int) -> Future[_Step]:
+    def _begin(self, env: MacroEnv, action: int) -> Future[Step]:
         """Begin a macro-action on another thread; a kinematic one is done here and now."""
         if self._simulates:
             env.world.executor.capture_motion_hz = env.capture_motion_hz  # made here: one thread at a time may compile
-            return self._threads.submit(_act, env, action)
-        done = Future[_Step]()
-        done.set_result(_act(env, action))
+            return self._pool.submit(env.act, action)
+        done = Future[Step]()
+        done.set_result(env.act(action))
         return done
 
     def _restart(self, lanes: list[int], seeds: Sequence[int | None], options: Info, infos: Info) -> Info:
@@ -261,7 +263,9 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         return stacked
 
     def _named(self, ids: Sequence[int] | None) -> list[int]:
-        lanes = list(range(self.num_envs)) if ids is None else [operator.index(each) for each in ids]
+        if ids is None:
+            return list(range(self.num_envs))
+        lanes = [require_integer("A lane", each, 0) for each in _listed(ids)]
         if not lanes or len(set(lanes)) < len(lanes) or not 0 <= min(lanes) <= max(lanes) < self.num_envs:
             raise InvalidValueError(f"Lanes {brief(ids)}: give different integers from 0 to {self.num_envs - 1}.")
         return lanes
@@ -279,11 +283,13 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         return lanes
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None or isinstance(seed, (int, np.integer)):
-            return [None if seed is None else int(seed) + lane for lane in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise InvalidValueError(f"{len(seed)} seeds are given for {self.num_envs} lanes; give one for each.")
-        return list(seed)
+        if seed is None:
+            return [None] * self.num_envs
+        if not isinstance(seed, (Sequence, np.ndarray)):
+            first = require_integer("seed", seed, 0)
+            return [first + lane for lane in range(self.num_envs)]
+        seeds = _one_each("Seeds", seed, self.num_envs)
+        return [None if each is None else require_integer("seed", each, 0) for each in seeds]
 
 
 def _rows(infos: Info, lanes: list[int]) -> Info:
@@ -291,9 +297,20 @@ def _rows(infos: Info, lanes: list[int]) -> Info:
     return {key: _rows(value, lanes) if isinstance(value, dict) else value[lanes] for key, value in infos.items()}
 
 
-def _require_count(name: str, value: object) -> None:
-    if not isinstance(value, (int, np.integer)) or value < 1:
-        raise InvalidValueError(f"{name} is {brief(value)}; give an integer from 1 on.")
+_Values = NDArray[np.int64] | Sequence[int | None]
+
+
+def _listed(given: _Values) -> list[Any]:
+    """A sequence or an array as a list, which is empty where it is something else."""
+    values = given.tolist() if hasattr(given, "tolist") else given
+    return list(values) if isinstance(values, Sequence) else []
+
+
+def _one_each(what: str, given: _Values, n_lanes: int) -> list[Any]:
+    values = _listed(given)
+    if len(values) != n_lanes:
+        raise InvalidValueError(f"{what} {brief(given)}: give a sequence of {n_lanes}, one for each lane.")
+    return values
 
 
 def make(
@@ -318,16 +335,9 @@ def make(
     Raises:
         InvalidValueError: A number out of range, or a constructor of something else.
     """
-    _require_count("num_envs", num_envs)
     creator = load_env_creator(env)
-    lanes: list[Any] = [creator(**options) for _ in range(int(num_envs))]
+    lanes: list[Any] = [creator(**options) for _ in range(require_integer("num_envs", num_envs, 1))]
     if isinstance(lanes[0], TimeLimit):  # one that limits itself
-        max_episode_steps = max_episode_steps or lanes[0]._max_episode_steps
+        max_episode_steps = lanes[0]._max_episode_steps if max_episode_steps is None else max_episode_steps
         lanes = [lane.unwrapped for lane in lanes]
-    for lane in lanes:
-        if not isinstance(lane, MacroEnv):
-            raise InvalidValueError(
-                f"{env} makes {brief(lane)}, which this suite cannot run in one process with others; "
-                "give gymnasium.make_vec the id of the single environment."
-            )
     return MacroVectorEnv(lanes, max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode, threads=threads)

@@ -54,7 +54,6 @@ class EpistemicFilter:
                 )
         self.settings = settings.imagination
         self.active = active
-        self._reduce = REDUCTIONS[self.settings.reduction]
         self.threshold = self.settings.threshold
 
     def reset(self) -> None:
@@ -63,7 +62,7 @@ class EpistemicFilter:
 
     def score(self, variances: Tensor) -> Tensor:
         """Reduce variances (..., Z) to one number each; one that overflowed is infinite. Shape (...)."""
-        return self._reduce(variances).nan_to_num(nan=torch.inf, posinf=torch.inf)
+        return REDUCTIONS[self.settings.reduction](variances).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def passes(self, uncertainty: Tensor, p_terminated: Tensor, reward_std: Tensor | None) -> Tensor:
         """Which of N transitions pass where the filter is active. Shape (N,), bool.

@@ -1,11 +1,14 @@
 """Our vector environments as Stable-Baselines3's ``VecEnv``; extra ``peers``.
 
-The same to the bit as its ``DummyVecEnv`` of single environments, but simulated on all cores::
+The same to the bit as its ``DummyVecEnv`` of single environments, but simulated on all cores. ``VecMonitor`` counts the
+episodes, without which the library logs no ``ep_rew_mean``::
 
     from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecMonitor
     from imagine_bench.adapters.sb3 import as_sb3
 
-    PPO("CnnPolicy", as_sb3("imagine_bench/ArrowPuzzle-vector-v0", num_envs=8)).learn(10_000)
+    env = VecMonitor(as_sb3("imagine_bench/ArrowPuzzle-vector-v0", num_envs=8))
+    PPO("CnnPolicy", env).learn(10_000)
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ def as_sb3(env: Lanes | str, **kwargs: Any) -> Sb3VecEnv:
 class Sb3VecEnv(DummyVecEnv):
     """A Gymnasium vector environment behind ``VecEnv``; made by :func:`as_sb3`.
 
-    Seeds and options are taken by the next ``reset``. ``VecMonitor`` around it counts episodes. Attributes and methods
+    Seeds and options are taken by the next ``reset``. Attributes and methods
     are those of the lanes, ``env.envs``; a vector environment without lanes of its own has none.
     """
 

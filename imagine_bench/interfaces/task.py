@@ -66,7 +66,7 @@ class PhysicsSettings:
         for name in given:
             if name not in cls.__annotations__:
                 raise UnknownNameError("physics setting", name, cls.__annotations__)
-        return cls(**given)
+        return cls(**{name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()})
 
 
 class Sight(Protocol):

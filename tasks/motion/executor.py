@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
@@ -30,6 +32,9 @@ _ARM_AT_REST_RAD = 0.02
 """An arm that ends further off its observation pose, in any joint, is a fault."""
 _RUNAWAY_RAD_S = 200.0
 """Nothing in the scene moves so fast (rad/s or m/s) unless the simulation has exploded."""
+MAX_SAVED = 10
+"""So many starts of simulations that blew up are kept in the temporary folder, of all processes together."""
+_SAVED = "imagine_bench_diverged_"
 _STATE = mujoco.mjtState
 _MOCAP = _STATE.mjSTATE_MOCAP_POS.value | _STATE.mjSTATE_MOCAP_QUAT.value
 _KEPT = _STATE.mjSTATE_QPOS.value | _MOCAP
@@ -196,13 +201,21 @@ class MacroExecutor:
         return states[:, self._qpos_column : self._qpos_column + self.model.nq]
 
     def _divergence(self, start: Floats, control: Floats) -> DivergedError:
-        """Save a start and its controls (N, C) to be looked into."""
-        handle, path = tempfile.mkstemp(prefix="imagine_bench_diverged_", suffix=".npz")
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, start_state=start, control=control[:, : self.model.nu])
+        """Save a start and its controls (N, C) to be looked into; the newest few are kept."""
+        try:
+            handle, path = tempfile.mkstemp(prefix=_SAVED, suffix=".npz")
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, start_state=start, control=control[:, : self.model.nu])
+            where = f"were saved in {path}"
+        except OSError as error:
+            where = f"could not be saved ({error})"
+        with contextlib.suppress(OSError):  # another process may delete them, and may own them
+            saved = sorted(Path(tempfile.gettempdir()).glob(f"{_SAVED}*.npz"), key=os.path.getmtime)
+            for oldest in saved[:-MAX_SAVED]:
+                oldest.unlink()
         return DivergedError(
             "The simulation of a macro-action diverged (NaN, infinity or runaway speed); "
-            f"its start state and controls were saved in {path}."
+            f"its start state and controls {where}."
         )
 
     def opening_m(self, qpos: Floats) -> Floats:

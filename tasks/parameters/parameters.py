@@ -12,11 +12,12 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from numbers import Integral, Real
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 
-from imagine_bench.errors import InvalidValueError, UnknownNameError, brief
+from imagine_bench.errors import InvalidValueError, UnknownKeywordError, brief
 from imagine_bench.interfaces import Outcome, Rules, Sight, State
 from imagine_bench.rules import optimal_policy, tabulate
 from imagine_bench.values import Setting
@@ -26,6 +27,11 @@ HIDDEN = -1
 _Seen = TypeVar("_Seen")
 
 
+def _never(macrostate: State) -> bool:
+    """No macrostate's gesture is always shown."""
+    return False
+
+
 @dataclass(frozen=True, kw_only=True)
 class GestureObservation:
     """Frames of macrostates whose last coordinate, the gesture, may be hidden.
@@ -33,12 +39,13 @@ class GestureObservation:
     Args:
         gesture: ``"always"``, ``"first"``, or the probability that a frame shows it.
         lag: Macro-actions that a frame is old.
-        always_shown: Macrostates whose gesture no frame hides.
+        always_shown: Whether no frame hides the gesture of a macrostate; a function that a module defines,
+            so that it can be pickled.
     """
 
     gesture: str | float
     lag: int
-    always_shown: Callable[[State], bool] = lambda macrostate: False
+    always_shown: Callable[[State], bool]
 
     def seen(self, macrostate: State, step: int) -> tuple[tuple[float, State], ...]:
         """What a frame taken after ``step`` macro-actions may show, as :meth:`.Sight.seen`."""
@@ -105,7 +112,7 @@ class WorldParameters:
     def _in_range(self, name: str, low: float, high: float) -> float:
         value = getattr(self, name)
         kind = type(low)
-        right = isinstance(value, int if kind is int else (int, float)) and not isinstance(value, bool)
+        right = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
         if not right or not low <= value <= high:
             words = f"an integer from {low} to {high}" if kind is int else f"a number from {low:g} to {high:g}"
             also = f", or {' or '.join(GESTURES)}" if name == "gesture" else ""
@@ -149,14 +156,14 @@ class WorldParameters:
         """The world that keyword arguments say, taken out of them.
 
         Raises:
-            UnknownNameError: An argument that is neither a parameter nor one of the others.
+            UnknownKeywordError: An argument that is neither a parameter nor one of the others.
             InvalidValueError: A parameter given twice, by both of its names.
         """
         spellings = cls.spellings()
         given: dict[str, Any] = {}
         for name in list(options):
             if name not in (*spellings, *others):
-                raise UnknownNameError("keyword argument", name, (*spellings, *others))
+                raise UnknownKeywordError.of(name, (*spellings, *others))
             if name not in spellings:
                 continue
             if spellings[name] in given:
@@ -170,9 +177,7 @@ class WorldParameters:
         hidden = "" if self.gesture in ("always", 1.0) else "_hidden"
         return hidden + (f"_distractors{self.distractors}" if self.distractors else "")
 
-    def observation_model(
-        self, always_shown: Callable[[State], bool] = lambda macrostate: False
-    ) -> GestureObservation | None:
+    def observation_model(self, always_shown: Callable[[State], bool] = _never) -> GestureObservation | None:
         """What frames show; None where that is all, at once. For macrostates ``always_shown`` nothing is hidden."""
         if self.gesture in ("always", 1.0) and not self.lag:
             return None

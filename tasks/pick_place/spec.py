@@ -9,7 +9,7 @@ import functools
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from imagine_bench.interfaces import PerformanceTargets, TaskSpec
+from imagine_bench.interfaces import PerformanceTargets, State, TaskSpec
 from imagine_bench.rules import facts
 from imagine_bench.values import Setting
 
@@ -83,6 +83,11 @@ def spec_of(**world: Setting) -> TaskSpec:
     return _spec(PickPlace.taken_from(world))
 
 
+def _is_handed_over(macrostate: State) -> bool:
+    """Whether an object lies in the palm, which is then seen."""
+    return HANDED_OVER in macrostate[:N_OBJECTS]
+
+
 @functools.cache
 def _spec(world: PickPlace) -> TaskSpec:
     if world == PickPlace():
@@ -94,7 +99,7 @@ def _spec(world: PickPlace) -> TaskSpec:
         title=f"{SPEC.title} ({world.words})",
         env_id=f"imagine_bench/PickPlace-{world.hash}-v0",
         encoder=SPEC.encoder + world.encoder_suffix,
-        sight=world.observation_model(lambda state: HANDED_OVER in state[:N_OBJECTS]),  # a palm that carries is seen
+        sight=world.observation_model(always_shown=_is_handed_over),
         rules=rules,
         facts=functools.partial(facts, rules, HORIZON),
         render_macrostates=functools.partial(specs.render_macrostates, rules),

@@ -54,9 +54,8 @@ class PickWorld(World):
         self._finger_qpos = columns.qpos[-2:]
         self._finger_ctrl = columns.ctrl[-2:]
         self._hand, self._palm = (int(self.model.body(name).mocapid[0]) for name in ("hand", "palm"))
-        self._tcp_m = self.data.site_xpos[model.site(TCP_SITE).id]
-        self._palm_m = self.data.mocap_pos[self._palm]
-        self._tcp_at_rest_m = tuple(self._tcp_m.tolist())
+        self._tcp = model.site(TCP_SITE).id
+        self._tcp_at_rest_m = tuple(self.data.site_xpos[self._tcp].tolist())
 
     @functools.cached_property
     def executor(self) -> CarryExecutor:
@@ -160,9 +159,10 @@ class PickWorld(World):
         spec = OBJECTS[index]
         name = self._names[index]
         position_m = pose[:3]
-        palm_m = self._palm_m.tolist()
+        palm_m = self.data.mocap_pos[self._palm].tolist()
+        tcp_m = self.data.site_xpos[self._tcp].tolist()
         in_the_air = position_m[2] > TABLE_HEIGHT_M + _IN_THE_AIR_M
-        if in_the_air and math.dist(position_m, self._tcp_m.tolist()) < MAX_OFF_GRIP_M:
+        if in_the_air and math.dist(position_m, tcp_m) < MAX_OFF_GRIP_M:
             return PICKED, None
         in_palm = math.dist(position_m[:2], palm_m[:2]) < PALM_REACH_M
         if in_palm and abs(position_m[2] - palm_m[2] - spec.grip_height_m) < MAX_LIFT_OFF_M:

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import copy
 import ctypes
 import functools
@@ -39,8 +40,6 @@ _MISSING_GL = (
     "No OpenGL for headless rendering ({reason}): on Debian or Ubuntu install it with "
     "'apt-get install libegl1 libgl1-mesa-dri', elsewhere set MUJOCO_GL to a platform that works.{chosen}"
 )
-_CHOICES = ("MUJOCO_GL", "MUJOCO_EGL_DEVICE_ID", "PYOPENGL_PLATFORM")
-"""Variables by which a user, or a cluster's profile, decides how to draw."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,10 +75,17 @@ def new_gl_context(width: int, height: int) -> Any:
 
 
 def _missing_gl(error: Exception) -> SetupError:
-    reason = str(error).strip().splitlines()
-    set_now = [f"{name}={os.environ[name]}" for name in _CHOICES if os.environ.get(name)]
-    chosen = f" Set now, and perhaps the cause: {', '.join(set_now)}." if set_now else ""
-    return SetupError(_MISSING_GL.format(reason=reason[0] if reason else type(error).__name__, chosen=chosen))
+    reason, *_ = str(error).strip().splitlines() or [type(error).__name__]
+    pyopengl = os.environ.get("PYOPENGL_PLATFORM") or "egl"
+    if _is_egl() and pyopengl.lower() != "egl":
+        return SetupError(f"PYOPENGL_PLATFORM is {pyopengl!r}, but frames are drawn by EGL; unset it.")
+    device = os.environ.get("MUJOCO_EGL_DEVICE_ID")
+    if device is not None and "mujoco.egl" in sys.modules:  # EGL is there, for that module loads it
+        words = "unset it, or give the number of a device that works"
+        return SetupError(f"MUJOCO_EGL_DEVICE_ID is {device!r}, a device that draws nothing ({reason}); {words}.")
+    platform = os.environ.get("MUJOCO_GL", "egl")
+    chosen = "" if platform == "egl" else f" MUJOCO_GL is {platform!r} now, which may be the cause."
+    return SetupError(_MISSING_GL.format(reason=reason, chosen=chosen))
 
 
 def gl_renderer() -> str:
@@ -174,10 +180,12 @@ class _Canvas:
             self.gl.make_current()
 
     def close(self) -> None:
-        """Free everything."""
-        self.make_current()
-        self.mjr.free()
-        self.gl.free()
+        """Free everything; nothing is left to be freed where other code has ended the display."""
+        with contextlib.suppress(Exception):  # of PyOpenGL, whose class is known only after the platform is chosen
+            self.make_current()
+            self.mjr.free()
+            self.gl.free()
+        self.gl._context = None  # its destructor would try again
 
 
 def _drawn_as(model: mujoco.MjModel) -> bytes:
@@ -201,7 +209,28 @@ class _Canvases:
         self._canvases: dict[tuple[bytes, View, int | None], _Canvas] = {}
         self._others: list[_Canvas] = []
 
-    def find(self, scene: bytes, model: mujoco.MjModel, view: View, known: _Canvas | None) -> _Canvas:
+    def current(self, scene: bytes, model: mujoco.MjModel, view: View, known: _Canvas | None) -> _Canvas:
+        """The context of a scene and a view, current in this thread.
+
+        Other code may end the display of EGL, as a window of SDL without a desktop does when it closes, and all
+        contexts with it. Then a display and a context are made anew.
+        """
+        try:
+            canvas = self._found(scene, model, view, known)
+            canvas.make_current()
+        except Exception as error:  # of PyOpenGL
+            if isinstance(error, SetupError) or not _is_egl():
+                raise
+            from mujoco import egl  # noqa: PLC0415  (after the platform is chosen)
+
+            self.leave()
+            egl.EGL_DISPLAY = None
+            _close_at_exit.cache_clear()  # the end is to come before that of the new display
+            canvas = self._found(scene, model, view, None)
+            canvas.make_current()
+        return canvas
+
+    def _found(self, scene: bytes, model: mujoco.MjModel, view: View, known: _Canvas | None) -> _Canvas:
         """The context of a scene and a view, made if there is none, or if one that is not the known one is damaged."""
         is_main = threading.current_thread() is threading.main_thread()
         thread = None if _is_egl() and not is_main else threading.get_ident()
@@ -301,9 +330,8 @@ class Renderer:
         """
         drawn = []
         with _canvases.lock:
-            canvas = _canvases.find(self._drawn_as, self._model, self.view, self._canvas)
+            canvas = _canvases.current(self._drawn_as, self._model, self.view, self._canvas)
             self._canvas = canvas
-            canvas.make_current()
             for scene in scenes:
                 mujoco.mjv_updateScene(*scene, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
                 drawn.append(canvas.draw(self._scene)[::-1].copy())

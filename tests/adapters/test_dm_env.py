@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import subprocess
 import sys
 import unittest
@@ -96,6 +98,21 @@ def test_physics_shows_the_scene_and_cannot_change_it():
     with pytest.raises(InvalidValueError, match="no MuJoCo scene"):
         _ = other.physics
     other.close()
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_plays_on_and_shows_its_own_scene(copied):
+    env = as_dm_env("imagine_bench/PickPlace-v0", seed=1, execution="kinematic", appearance="strong")
+    env.reset()
+    env.step(0)
+    assert env.physics.data.time > 0
+    twin = copied(env)
+    for action in (1, 2, 3, 0, 1):
+        np.testing.assert_equal(tuple(env.step(action)), tuple(twin.step(action)))
+        np.testing.assert_array_equal(env.physics.data.qpos, twin.physics.data.qpos)
+        np.testing.assert_array_equal(env.physics.model.light_diffuse, twin.physics.model.light_diffuse)
+    env.close()
+    twin.close()
 
 
 def test_motion_turns_the_cube_before_the_reward():

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import NormalizeObservation
 from same_values import assert_same
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from imagine_bench import registry
+from imagine_bench.adapters.cleanrl import as_cleanrl
 from imagine_bench.adapters.sb3 import as_sb3
 from imagine_bench.errors import InvalidValueError
 
@@ -68,6 +74,35 @@ def test_options_attributes_methods_and_images_are_the_lanes():
     assert_same(ours.render(), theirs.render())
     ours.close()
     theirs.close()
+
+
+def test_a_monitor_counts_the_episodes_that_a_library_logs():
+    env = VecMonitor(as_sb3(ARROWS, num_envs=2, observation="state", **KINEMATIC))
+    model = PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1).learn(64)
+    returns = [episode["r"] for episode in model.ep_info_buffer]
+    assert model.logger.name_to_value["rollout/ep_rew_mean"] == pytest.approx(np.mean(returns), abs=10)
+    assert all(round(each) == each for each in returns) and len(returns) > 5
+    env.close()
+
+
+@pytest.mark.parametrize("adapted", [as_sb3, as_cleanrl])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies_of_adapted_lanes_play_on(copied, adapted):
+    env = adapted(ARROWS, num_envs=2, **KINEMATIC)
+    env.reset()
+    twin = copied(env)
+    for action in (0, 0, 0, 0):
+        *expected, _ = env.step(np.full(2, action))
+        *found, _ = twin.step(np.full(2, action))
+        assert_same(found, expected)
+    env.close()
+    twin.close()
+
+
+def test_gymnasiums_normalisation_takes_lanes_that_reset_at_the_next_step():
+    env = NormalizeObservation(gymnasium.make_vec(ARROWS, num_envs=2, autoreset_mode="NextStep", **KINEMATIC))
+    assert env.reset(seed=0)[0].shape == (2, 64, 64, 3)
+    env.close()
 
 
 def test_what_cannot_be_is_one_clear_error():

@@ -6,7 +6,7 @@ import gymnasium
 import pytest
 import torch
 from torchrl.data import Unbounded
-from torchrl.envs import GymWrapper, check_env_specs, default_info_dict_reader
+from torchrl.envs import GymEnv, GymWrapper, check_env_specs, default_info_dict_reader
 
 from imagine_bench import registry
 
@@ -34,4 +34,11 @@ def test_a_rollout_with_infos_is_our_episodes():
         assert walked[step]["next", "terminated"].item() == outcome.terminated
         ended += outcome.terminated
     assert ended > 5
+    env.close()
+
+
+def test_an_id_alone_makes_the_environment():
+    """TorchRL first asks for a keyword that we do not know, and takes a TypeError alone for an answer."""
+    env = GymEnv(ARROWS, **KINEMATIC)
+    assert env.rollout(3, break_when_any_done=False).batch_size == (3,)
     env.close()

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import pickle
+import shutil
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from same_values import assert_same
 from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
@@ -143,7 +148,13 @@ def test_a_state_goes_on_to_the_same_bits(task, execution, appearance):
 
 
 @pytest.mark.parametrize(
-    ("task", "context"), [*((task, "fork") for task in WORLDS), (WORLDS[0], "spawn")], ids=lambda each: each
+    ("task", "context"),
+    [
+        *((task, "fork") for task in WORLDS),
+        (WORLDS[0], "spawn"),
+        pytest.param(WORLDS[1], "forkserver", marks=pytest.mark.slow),
+    ],
+    ids=lambda each: each,
 )
 def test_async_vector_envs_match_single_ones(task, context):
     """Other processes draw the same, also after this one has drawn: nothing of its OpenGL is used by them."""
@@ -164,15 +175,76 @@ def test_async_vector_envs_match_single_ones(task, context):
     single.close()
 
 
+def pickled(env):
+    return pickle.loads(pickle.dumps(env))
+
+
+def assert_copies_play_on(task, **options):
+    """Copies made in the middle of an episode take ten steps as the original does, through ends and starts."""
+    spec = registry.task(task)
+    env = gymnasium.make(spec.env_id, **options)
+    twins = []
+    _, info = env.reset(seed=3)
+    for step in range(12):
+        state = tuple(info["macrostate"].tolist())
+        action = 0 if spec.rules.is_terminal(state) else spec.rules.optimal_action(state)
+        *after, info = env.step(action)
+        for twin in twins:
+            assert_same([*after, info], list(twin.step(action)), f"{task}, step {step}")
+        if after[2] or after[3]:
+            began = env.reset()
+            info = began[1]
+            for twin in twins:
+                assert_same(list(began), list(twin.reset()), f"{task}, start after step {step}")
+        if step == 1:
+            twins = [copy.deepcopy(env), pickled(env)]
+    for each in (env, *twins):
+        each.close()
+
+
+COMMON = ("lag=2", "gesture=first", "gesture=0.5", "slip=0.3", "goal_change=0.3", "distractors=3")
+OF_ARROWS = ("cubes=5", "goal=clockwise", "forbid=neighbours", "coupling=neighbour", "shuffle=3", "horizon=4")
+NAMES = (
+    *registry.TASKS,
+    *(f"pick_place:{each}" for each in COMMON),
+    *(f"arrows:{each}" for each in (*COMMON, *OF_ARROWS)),
+)
+ALL_PARTS = {"observation": "frame,state,proprio", "appearance": "strong", "size": 32}
+FEW = ("pick_place:gesture=0.5", "arrow_puzzle")
+SLOW = tuple(pytest.param(each, marks=pytest.mark.slow) for each in NAMES if each not in FEW)
+
+
+def test_every_parameter_of_a_task_is_copied():
+    for task, values in (("pick_place", COMMON), ("arrows", (*COMMON, *OF_ARROWS))):
+        fields = dataclasses.fields(registry.load(registry.TASKS[task].world))
+        assert {each.name for each in fields} == {each.partition("=")[0] for each in values}
+
+
+@pytest.mark.parametrize("task", NAMES)
+def test_copies_and_pickles_play_on_to_the_bit(task):
+    assert_copies_play_on(task, execution="kinematic", **ALL_PARTS)
+
+
+@pytest.mark.parametrize(
+    "task", [each if each in FEW else pytest.param(each, marks=pytest.mark.slow) for each in NAMES]
+)
+def test_copies_and_pickles_play_on_in_physics(task):
+    """With a planner that errs, and the motion kept."""
+    assert_copies_play_on(task, execution="physics", physics={"plan_error_mm": 1.0}, motion_hz=5.0, **ALL_PARTS)
+
+
+@pytest.mark.parametrize("appearance", ["clean", "photo", {"light": 0.5}])
 @pytest.mark.parametrize("task", WORLDS)
-def test_a_pickled_environment_goes_on_alike(task):
-    env = make(task, execution="kinematic", appearance="strong", observation="frame,state", size=48)
-    env.reset(seed=1)
-    twin = pickle.loads(pickle.dumps(env))
-    for action in (0, 3, env.action_space.n - 1):
-        np.testing.assert_equal(env.step(action), twin.step(action))
-    env.close()
-    twin.close()
+def test_copies_and_pickles_play_on_at_any_appearance(task, appearance):
+    assert_copies_play_on(task, execution="kinematic", appearance=appearance, observation="frame")
+
+
+def test_copies_and_pickles_of_guests_play_on(guests, tmp_path):
+    guests.new("task", "lights_out")
+    frozen = Path(__file__).parent / "frozen" / "five_cubes"
+    guests.add(Path(shutil.copytree(frozen, tmp_path / "five_cubes")))
+    for task in ("lights_out", "five_cubes", "five_cubes_covered"):
+        assert_copies_play_on(task)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

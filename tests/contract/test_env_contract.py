@@ -15,7 +15,7 @@ from worlds import WORLDS
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
-from imagine_bench.errors import DivergedError, ImagineBenchError, InvalidValueError
+from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces import EXECUTIONS, SceneReader
 from imagine_bench.testing.contract import checks, report
 
@@ -256,16 +256,26 @@ def test_a_wrong_macrostate_is_refused(kinematic, given):
     assert len(str(caught.value)) < 500
 
 
-def test_only_a_reset_begins_an_episode_also_where_a_simulation_blew_up(monkeypatch, tmp_path):
+@pytest.mark.parametrize("task", ["arrow_puzzle", "arrows:lag=2"])
+def test_a_simulation_that_blows_up_truncates_and_only_a_reset_begins_an_episode(task, monkeypatch, tmp_path):
+    """The scene stands as before: what it shows and where it is holds no NaN."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)  # MuJoCo's own log
-    env = make().unwrapped
+    env = gymnasium.make(registry.task(task).env_id)
+    scene = env.unwrapped
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
-        env.step(0)
-    env.reset(seed=0)
-    env.world.data.joint("cube_2_joint").qpos[0] = 1e11
-    with pytest.raises(DivergedError):
-        env.step(0)
+        scene.step(0)
+    seen, start = env.reset(seed=0)
+    joint = scene.world.data.joint("cube_2_joint")
+    joint.qpos[0] += 1e11
+    after, reward, terminated, truncated, info = env.step(0)
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    assert "diverged" in info["fault_reason"]
+    assert np.array_equal(after, seen)
+    assert np.array_equal(info["macrostate"], start["macrostate"])
+    check_info({**info, "fault_reason": ""} | {"fault": np.bool_(False)}, registry.task(task), after_step=False)
+    joint.qpos[0] -= 1e11
+    assert np.isfinite(scene.data.qpos).all() and np.isfinite(scene.motion().poses_in_world).all()
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
         env.step(0)
     env.reset(seed=0)
@@ -273,15 +283,36 @@ def test_only_a_reset_begins_an_episode_also_where_a_simulation_blew_up(monkeypa
     env.close()
 
 
+@pytest.mark.parametrize("env_id", [entry.env_id for entry in registry.TASKS.values()])
+def test_an_unknown_keyword_is_a_type_error_as_pythons_own(env_id):
+    for make_any, known_as in ((gymnasium.make, env_id), (gymnasium.make_vec, registry.vector_id(env_id))):
+        with pytest.raises(TypeError, match=r"unexpected keyword argument 'apearance'.* mean 'appearance'\?"):
+            make_any(known_as, apearance="mild")
+
+
 def test_wrong_actions_and_reset_options_are_refused(kinematic):
-    for action in (6, -1, 1.5, "left", None, np.array([1, 2])):
+    for action in (6, -1, 1.5, "left", None, np.array([1, 2]), {0: 1}, np.ma.masked):
         with pytest.raises(InvalidValueError, match="does not exist; give an integer from 0 to 5"):
             kinematic.step(action)
     with pytest.raises(ImagineBenchError, match=r"No reset option 'macrostat'\. Did you mean 'macrostate'\?"):
         kinematic.reset(options={"macrostat": (0, 1, 2, 0)})
-    for options in ("abc", [1]):
+    for seed in (1.5, -1, "a", [1], {}, np.float64(3)):
+        with pytest.raises(InvalidValueError, match=r"seed is .*; give an integer from 0 on"):
+            kinematic.reset(seed=seed)
+    for options in ("abc", [1], 0, ""):
         with pytest.raises(ImagineBenchError, match="are no mapping; give"):
             kinematic.reset(options=options)
+
+
+def test_numbers_of_numpy_are_numbers():
+    made_of = {"cubes": np.int64(2), "lag": np.int32(0), "slip": np.float32(0), "horizon": np.uint8(9)}
+    seen_by = {"width": np.int64(32), "height": np.int16(24), "size": np.uint8(40), "motion_hz": np.float32(5)}
+    physics = {"pad_friction": np.float32(1), "object_mass": np.int64(1)}
+    env = make("arrows", physics=physics, appearance={"light": np.float32(0.5)}, **made_of, **seen_by)
+    first, _ = env.reset(seed=3)
+    for seed in (np.int64(3), np.uint8(3), np.array(3)):
+        assert np.array_equal(env.reset(seed=seed)[0], first)
+    env.close()
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import functools
+import pickle
 import subprocess
 import sys
 import tempfile
@@ -14,10 +16,12 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from same_values import assert_same
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench.interfaces import EXECUTIONS
 
 KINEMATIC = {"execution": "kinematic"}
 MODES = tuple(AutoresetMode)
@@ -130,40 +134,75 @@ def test_each_lane_goes_its_own_pace_as_if_alone_and_the_first_in_simulated_time
     assert not [each.name for each in threading.enumerate() if each.name.startswith("simulation")]
 
 
+def blown_up(env, actions):
+    """A step in which lane 1 blows up; its reason, which names a file, as whether there is one."""
+    env.envs[1].unwrapped.world.data.joint("cube_2_joint").qpos[0] = 1e11
+    *step, infos = env.step(actions)
+    of_lane = infos.get("final_info", infos)
+    of_lane["fault_reason"] = np.array(["diverged" in str(reason) for reason in of_lane["fault_reason"]])
+    return [*step, infos]
+
+
 @pytest.mark.parametrize("mode", MODES)
-def test_a_lane_that_blows_up_is_its_own_fault(mode, monkeypatch, tmp_path):
+def test_a_lane_that_blows_up_is_its_own_fault_and_ends_as_a_single_environment(mode, monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)  # MuJoCo's own log
     sync, vector = make_sync(mode), make(autoreset_mode=mode)
+    first, action = quiet_plan(registry.task("arrow_puzzle").rules, START, 2, np.random.default_rng(0))
     for env in (sync, vector):
         env.reset(seed=0, options={"macrostate": START})
-    first, action = quiet_plan(registry.task("arrow_puzzle").rules, START, 2, np.random.default_rng(0))
-    before = [env.step(np.full(3, first))[0] for env in (sync, vector)][1]
-    healthy = sync.step(np.full(3, action))
-    state_before = np.array(vector.envs[1].get_state().macrostate)
-    vector.envs[1].world.data.joint("cube_2_joint").qpos[0] = 1e11
-    frames, rewards, terminated, truncated, infos = vector.step(np.full(3, action))
+        before = env.step(np.full(3, first))[0]
+    expected, found = (blown_up(env, np.full(3, action)) for env in (sync, vector))
+    assert_same(found, expected)
+    frames, rewards, terminated, truncated, infos = found
     assert truncated.tolist() == [False, True, False] and not terminated[1] and rewards[1] == 0.0
     last, seen = (infos["final_info"], infos["final_obs"][1]) if mode == AutoresetMode.SAME_STEP else (infos, frames[1])
-    assert "diverged" in last["fault_reason"][1] and last["sim_time_s"][1] == 0.0
-    assert last["macrostate"][1].tolist() == state_before.tolist()
+    assert last["fault_reason"].tolist() == [False, True, False] and last["sim_time_s"][1] == 0.0
     assert np.array_equal(seen, before[1])
-    for lane in (0, 2):
-        assert np.array_equal(frames[lane], healthy[0][lane]) and rewards[lane] == healthy[1][lane]
     if mode == AutoresetMode.DISABLED:
         with pytest.raises(InvalidValueError, match="Lane 1 has no episode to go on with; reset it first"):
             vector.step(np.zeros(3, dtype=int))
-        vector.reset(options={"reset_mask": truncated})
-    *_, infos = vector.step(np.full(3, first))
-    assert not infos["fault"][1]
+        for env in (sync, vector):
+            env.reset(options={"reset_mask": truncated})
+    for each in zip(*(env.step(np.full(3, first)) for env in (sync, vector)), strict=True):
+        assert_same(*each)
     sync.close()
     vector.close()
+
+
+def pickled(env):
+    return pickle.loads(pickle.dumps(env))
+
+
+@pytest.mark.parametrize("execution", EXECUTIONS)
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickled])
+def test_copies_play_on_and_none_is_made_of_acting_lanes(copied, execution):
+    vector = make("pick_place", n=2, execution=execution)
+    vector.reset(seed=0)
+    vector.step(np.array([0, 1]))
+    twin = copied(RecordEpisodeStatistics(vector)).env
+    for action in range(4):
+        for each in zip(*(env.step(np.full(2, action)) for env in (vector, twin)), strict=True):
+            assert_same(*each)
+    vector.send([0], [1])
+    with pytest.raises(InvalidValueError, match=r"Lanes \[1\] are acting; receive them before you copy or pickle"):
+        copied(vector)
+    vector.close()
+    twin.close()
+
+
+NO_LANES = (3, {0: 1}, "a", [0.5], [None], [-1], ())
+NO_ACTIONS = (None, 3, {0: 1, 1: 1, 2: 1}, [0, 1], [0, 1, None], np.array(3), {0, 1, 2}, np.ma.masked_all(3, int))
+NO_SEEDS = (1.5, -1, "a", {0: 1}, [1, 2], [1, 2, 3.5], [1, 2, -3])
 
 
 def test_what_cannot_be_done_moves_nothing():
     for options, message in (
         ({"n": 0}, "num_envs is 0; give an integer from 1 on"),
         ({"threads": 0}, "threads is 0; give an integer from 1 on"),
+        ({"threads": 1.5}, r"threads is 1\.5; give an integer from 1 on"),
+        ({"max_episode_steps": "x"}, "max_episode_steps is 'x'; give an integer from 1 on"),
+        ({"max_episode_steps": -1}, "max_episode_steps is -1; give an integer from 1 on"),
         ({"autoreset_mode": "same_step"}, r"No autoreset mode 'same_step'\. Did you mean 'SameStep'\?"),
     ):
         with pytest.raises(ImagineBenchError, match=message):
@@ -179,8 +218,18 @@ def test_what_cannot_be_done_moves_nothing():
         (lambda: vector.step(np.array([0, 1, 6])), "Action 6 does not exist; give an integer from 0 to 5"),
         (lambda: vector.send([0, 0], [1, 1]), "give different integers from 0 to 2"),
         (lambda: vector.send([0], [3]), r"Lanes \[3\]: give different integers from 0 to 2"),
+        *((lambda ids=ids: vector.send([0], ids), "Lanes .*: give different integers|A lane is") for ids in NO_LANES),
         (vector.recv, "0 lanes cannot be received: 0 are acting"),
-        (lambda: vector.reset(seed=[1, 2]), "2 seeds are given for 3 lanes"),
+        (lambda: vector.recv("x"), "n is 'x'; give an integer from 1 on"),
+        *(
+            (lambda each=each: vector.step(each), r"Actions .*: give a sequence of 3|Action .*not exist")
+            for each in NO_ACTIONS
+        ),
+        *(
+            (lambda seed=seed: vector.reset(seed=seed), "give an integer from 0 on|give a sequence of 3")
+            for seed in NO_SEEDS
+        ),
+        *((lambda given=given: vector.reset(options=given), "are no mapping; give") for given in ("abc", [1], 3)),
         (lambda: vector.reset(options={"reset_mask": np.zeros(3, bool)}), "in which one at least is True"),
         (lambda: vector.reset(options={"reset_mask": np.ones(3)}), r"give a bool array of shape \(3,\)"),
     ):
@@ -190,6 +239,15 @@ def test_what_cannot_be_done_moves_nothing():
     vector.send([0], [1])
     with pytest.raises(InvalidValueError, match="Lane 1 is acting; receive it first"):
         vector.step(np.zeros(3, dtype=int))
+    vector.close()
+
+
+@pytest.mark.parametrize("seed", [np.int64(7), np.uint8(7), [np.int32(7), None, 8], np.array([7, 8, 9])])
+@pytest.mark.parametrize("actions", [(0, 1, 2), [np.int8(0), np.uint64(1), 2], np.array([0, 1, 2], np.uint8), range(3)])
+def test_numbers_of_numpy_are_numbers(seed, actions):
+    vector = make(threads=np.int64(1), max_episode_steps=np.int64(3), **KINEMATIC)
+    expected = [vector.reset(seed=[7, 8, 9])[0][0], vector.step([0, 1, 2])[0][0]]
+    assert_same([vector.reset(seed=seed)[0][0], vector.step(actions)[0][0]], expected)
     vector.close()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -51,11 +52,13 @@ def own_camera(model):
     return Renderer(model, agent_camera_view(62))
 
 
-def run_script(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
+needs_xvfb = pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="needs Xvfb")
 
+
+def run_script(script: str, *before: str, **environment: str) -> subprocess.CompletedProcess[str]:
     kept = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY")}
     return subprocess.run(
-        [sys.executable, "-W", "error::ResourceWarning", "-c", textwrap.dedent(script)],
+        [*before, sys.executable, "-W", "error::ResourceWarning", "-c", textwrap.dedent(script)],
         capture_output=True, text=True, timeout=120, env=kept | environment, check=False,
     )  # fmt: skip
 
@@ -165,6 +168,42 @@ def test_a_headless_script_draws_and_exits_in_silence(before, after):
     assert done.returncode == 0
     assert done.stdout.strip() == "True"
     assert done.stderr == ""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="headless EGL is a Linux matter")
+@pytest.mark.parametrize("desktop", [False, pytest.param(True, marks=needs_xvfb)])
+def test_a_window_of_gymnasium_s_ends_no_environment_s_drawing(desktop):
+    """SDL without a desktop ends EGL where it closes; on X11 it would draw by GLX in the thread that draws by EGL."""
+    pytest.importorskip("pygame")
+    before = """
+    import gymnasium, imagine_bench
+    from gymnasium.wrappers import HumanRendering
+    make = lambda **options: gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", **options)
+    other = make()
+    shown = HumanRendering(make(render_mode="rgb_array"))
+    other.reset(seed=0)
+    shown.reset(seed=0)
+    shown.step(0)
+    """
+    after = "frame = other.step(1)[0]; shown.close(); frame = other.step(0)[0]"
+    command = ["xvfb-run", "-a"] if desktop else []
+    done = run_script(_FRAME.format(before=before, after=after), *command, XDG_RUNTIME_DIR="/tmp")
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="headless EGL is a Linux matter")
+@pytest.mark.parametrize(
+    ("variable", "value", "sentence"),
+    [
+        *(("MUJOCO_EGL_DEVICE_ID", value, "a device that draws nothing") for value in ("99", "abc", "-1", "")),
+        ("PYOPENGL_PLATFORM", "glx", "but frames are drawn by EGL; unset it"),
+    ],
+)
+def test_a_variable_that_keeps_egl_from_drawing_is_named_and_no_library(variable, value, sentence):
+    draw = "from imagine_bench.tasks.rendering import gl_renderer\ntry:\n    gl_renderer()\nexcept Exception as error:"
+    done = run_script(f"{draw}\n    print(error)", **{variable: value})
+    assert done.stdout.startswith(f"{variable} is {value!r}, {sentence}")
+    assert "install" not in done.stdout
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="triton is a Linux matter")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +16,7 @@ from fake_latents import CODES, built, frame, live
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination.agent import ImaginingAgent
 from imagine_bench.agents.imagination.vector_env import ImaginedVectorEnv, imagined_env
+from same_values import assert_same
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
@@ -105,6 +108,17 @@ def test_a_learned_world_is_the_same_by_seed(trained: ImaginingAgent) -> None:
 
     first, onward, again = (walk(seed) for seed in (3, None, 3))
     assert first == again != onward
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_of_a_learned_world_goes_on_alike(trained: ImaginingAgent, copied: Callable[[Any], Any]) -> None:
+    env = imagined_env(trained, num_envs=5, horizon=3)
+    env.reset(seed=3)
+    env.step(np.array([0, 1, 2, 0, 1]))
+    twin = copied(env)
+    for _ in range(10):
+        actions = np.array([0, 1, 2, 0, 1])
+        assert_same(list(env.step(actions)), list(twin.step(actions)))
 
 
 def test_a_trained_agent_gives_its_world_and_starts(trained: ImaginingAgent) -> None:

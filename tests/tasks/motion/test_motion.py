@@ -1,6 +1,7 @@
 """Macro-actions in contact: turns do what the rules say, by contact, within the robot's limits, bit for bit."""
 
 import math
+import os
 import re
 import tempfile
 
@@ -8,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene, layout
+from imagine_bench.tasks.motion.executor import MAX_SAVED
 from imagine_bench.tasks.motion.ik import ArmModel
 from imagine_bench.tasks.motion.orientation import Sensing
 from imagine_bench.tasks.motion.turn import TurnExecutor
@@ -169,14 +171,24 @@ def test_what_the_robot_cannot_do_is_a_fault(turner, quat, position, message):
 
 
 def test_exploded_physics_is_reported_with_its_start(turner, tmp_path, monkeypatch):
+    """In one file of a bounded number, or without one where none can be written."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)  # MuJoCo's own log
+    for index in range(MAX_SAVED + 3):
+        old = tmp_path / f"imagine_bench_diverged_{index}.npz"
+        old.touch()
+        os.utime(old, (index, index))
     model, data = turner.model, turner.data
     place(model, data, (0, 0, 0))
     data.qpos[cube_slice(model, 2)] = [1e11, 0, 0, 1, 0, 0, 0]
     with pytest.raises(DivergedError, match="its start state and controls were saved in"):
         turner.turn(cube=0, clockwise=True)
-    (saved,) = tmp_path.glob("imagine_bench_diverged_*.npz")
-    with np.load(saved) as contents:
+    saved = sorted(tmp_path.glob("imagine_bench_diverged_*.npz"), key=os.path.getmtime)
+    assert len(saved) == MAX_SAVED and saved[0].stem.endswith("_4")
+    with np.load(saved[-1]) as contents:
         assert contents["start_state"].max() == 1e11
         assert contents["control"].shape[1] == model.nu
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    data.qpos[cube_slice(model, 2)] = [1e11, 0, 0, 1, 0, 0, 0]
+    with pytest.raises(DivergedError, match="its start state and controls could not be saved"):
+        turner.turn(cube=0, clockwise=True)
