@@ -66,7 +66,7 @@ plan: ready  ## Let the best imagining agent of the newest bench plan from one f
 judge: ready  ## Judge world models against the exact truth of TASK; MODELS may name another package's
 	@$(BIN)/imagine-bench judge $(options)
 
-verify: ready  ## Play every test episode of the newest bench again and say whether its tables follow from them
+verify: ready  ## Play every episode of the newest bench again and say whether its tables follow from them
 	@$(BIN)/imagine-bench verify $(options)
 
 why: ready  ## Give every failed test episode of the newest bench the one cause that it has

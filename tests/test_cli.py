@@ -76,7 +76,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
         ("sweep --name smoke", "smoke is a study of one task; give a task as the first word."),
         ("report a --task arrow_puzzle", "Both a and --task arrow_puzzle were given; leave one of them"),
         ("report robot_ik --out HERE", "There is no bench of robot_ik below"),
-        ("verify --encoder x", "--encoder goes with --causes"),
+        ("verify --encoder x", "--encoder goes with --causes or --train"),
         ("report HERE", "protocol.json, a bench's protocol."),
         ("view --out HERE", "There is no recording below"),
         ("view HERE/x.rrd", "No recording"),

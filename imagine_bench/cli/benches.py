@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ import tyro
 
 from imagine_bench import registry
 from imagine_bench.adapters.tracking import track
+from imagine_bench.cli.observers import Observed
 from imagine_bench.cli.options import (
     Count,
     Counts,
@@ -36,7 +38,7 @@ from imagine_bench.judge.verify import cost
 from imagine_bench.protocols.data import Encoders, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, load_so_far, plan
-from imagine_bench.running.launchers.jobs import at_a_time
+from imagine_bench.running.launchers.jobs import at_a_time, launcher
 from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.results import BenchResult
@@ -323,32 +325,61 @@ class Judge:
 
 @dataclass(frozen=True, kw_only=True)
 class Verify(OfBench):
-    """Play every test episode of a bench again, and say in a line a run whether its tables follow from them.
+    """Play every episode of a bench again, and say in a line a run whether its tables follow from them.
 
-    With --causes, every failed test episode gets the one cause that it has instead; the report then shows them.
+    With --train, runs are trained again, too. With --causes, every failed test episode gets the one cause that it has
+    instead; the report then shows them.
     """
 
+    train: Count = None
+    """Runs of each agent, drawn at random, that are trained again; what they give is compared to the bit."""
+    nonce: Word = None
+    """With --train: what decides which; give one only to repeat a draw."""
+    workers: Count = None
+    """With --train: processes at a time; one a core by default."""
+    dataset: File = None
+    """With --train: the folder of the dataset that the runs learned from, if they did."""
     causes: bool = False
     """Find the causes of failures: play, swap truth in for each part of the agent, report."""
     encoder: EncoderWord = None
-    """With --causes: the encoder the runs saw through, where it is not bundled."""
+    """With --train or --causes: the encoder the runs saw through, where it is not bundled."""
 
     def __call__(self) -> None:
         """Play and compare."""
         from imagine_bench.report import audits  # noqa: PLC0415 - matplotlib loads slowly
 
         given, task = self.meant()
+        self._require_fitting()
         if self.causes:
             print(audits.why_report(given, root=self.out, task=task, encoder=self.encoder))
             return
-        if self.encoder is not None:
-            raise InvalidValueError("--encoder goes with --causes; replaying episodes needs none.")
         folder = audits.chosen(given, self.out, task)
+        again = None
+        if self.train is not None:
+            again = audits.Retraining(
+                runs=self.train,
+                nonce=self.nonce or secrets.token_hex(8),
+                launcher=Observed(launcher("local", self.workers)),
+                encoder=self.encoder,
+                dataset=self.dataset,
+            )
         begun_s = time.process_time()
-        verdicts = audits.verify(folder)
-        print(*verdicts, cost(verdicts, time.process_time() - begun_s), sep="\n")
+        verdicts = audits.verify(folder, again)
+        print(*verdicts, audits.what_is_shown(folder, again), sep="\n")
+        print(cost(verdicts, time.process_time() - begun_s))
         if any(verdict.complaint for verdict in verdicts):
             sys.exit(1)
+
+    def _require_fitting(self) -> None:
+        """Raise InvalidValueError for options that do not go together."""
+        needs_train = {name: getattr(self, name) for name in ("nonce", "workers", "dataset")}
+        for name, value in needs_train.items():
+            if value is not None and self.train is None:
+                raise InvalidValueError(f"--{name} goes with --train; leave it out, or give --train 1.")
+        if self.encoder is not None and self.train is None and not self.causes:
+            raise InvalidValueError("--encoder goes with --causes or --train; replaying episodes needs none.")
+        if self.train is not None and (self.causes or self.train < 1):
+            raise InvalidValueError(f"--train {self.train} needs at least 1, and goes without --causes.")
 
 
 _PAGES = {

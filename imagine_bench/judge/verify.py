@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,6 +23,7 @@ from imagine_bench.protocols.data import digest
 from imagine_bench.registry.entries import AgentEntry
 from imagine_bench.running.bench import counted
 from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts, replay
+from imagine_bench.running.retraining import Repeat
 from imagine_bench.running.run_state import Counters, CountVisits, environments
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import encoders, run_folder
@@ -60,12 +62,19 @@ class Verdict:
     complaint: str = ""  # empty where all holds
     episodes: int = 0  # played again
     unshown: tuple[str, ...] = ()  # what is not kept, so that it cannot be shown
+    holds: str = "holds"  # what is said where all does
 
     def __str__(self) -> str:
         if self.complaint:
             return f"{self.what}: {self.complaint}"
         played = f"; {self.episodes:,} episodes played again" if self.episodes else ""
-        return f"{self.what}: holds{played}{''.join(f'; not shown: {each}' for each in self.unshown)}"
+        return f"{self.what}: {self.holds}{played}{''.join(f'; not shown: {each}' for each in self.unshown)}"
+
+    @classmethod
+    def of(cls, repeat: Repeat) -> Verdict:
+        """That on a run which was trained again."""
+        name = f"{repeat.agent} seed {repeat.seed}, trained again"
+        return cls(what=name, complaint=brief_lines(repeat.complaint), holds=repeat.remark)
 
 
 def verify_runs(folder: Path) -> list[Verdict]:
@@ -100,16 +109,20 @@ def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
         except ArtefactError as error:
             found.append(Verdict(what=name, complaint=brief_lines(error)))
         except Exception as error:  # whoever forges a file can write anything
-            why = f"its parts do not fit together ({type(error).__name__}: {brief_lines(error)})."
-            found.append(Verdict(what=name, complaint=why))
+            found.append(Verdict(what=name, complaint=does_not_fit(error)))
     if not any(each.complaint for each in found):
         found += _of_protocol(protocol, results)
     return found
 
 
-def brief_lines(error: Exception) -> str:
+def brief_lines(error: object) -> str:
     """What an error says, on one line."""
     return " ".join(plain(error).split())
+
+
+def does_not_fit(error: Exception) -> str:
+    """A complaint of what nobody foresaw in a file that somebody changed and sealed again."""
+    return f"its parts do not fit together ({type(error).__name__}: {brief_lines(error)})."
 
 
 def cost(found: Sequence[Verdict], cpu_s: float) -> str:
@@ -162,28 +175,28 @@ class _RunCheck:
             if row.env_steps != steps:
                 where = f"after {row.episodes:,} episodes"
                 raise ArtefactError(f"{where}: env_steps is {steps}, and {brief(row.env_steps)} was kept.")
+        spent_s = [0.0, *(row.train_cpu_s for row in run.checkpoints)]
+        tests_s = [row.eval_cpu_s for row in run.checkpoints]
+        if spent_s != sorted(spent_s) or not all(0.0 <= each < math.inf for each in (spent_s[-1], *tests_s)):
+            raise ArtefactError(f"its CPU seconds are {brief(spent_s[1:])} of training and {brief(tests_s)} of tests.")
         return run
 
     def play(self) -> tuple[int, list[str]]:
         """Play all episodes again. Returns how many these were, and what of the run is not kept."""
         count = self.protocol.evaluation_episodes
         purpose = evaluation_split(self.seed)
+        kept = [self.run.training, *(row.kept for row in self.run.checkpoints)]
+        if not self.is_older and any(each is None or each.sim_times_s is None for each in kept):
+            raise ArtefactError("it does not keep all episodes of training and tests, as a run of its format does.")
         trained = self._play_training()
         for row in self.run.checkpoints:
             _verify_test(row, count, purpose, self.replays)
-            if row.kept is not None and row.kept.sim_times_s is None and not self.is_older:
-                raise ArtefactError(f"after {row.episodes:,} episodes it keeps no simulated times.")
         return trained + count * len(self.run.checkpoints), self._unshown()
 
     def _play_training(self) -> int:
         kept = self.run.training
         starts = [] if self.run.training_starts is None else self.run.training_starts.tolist()
-        if kept is None:
-            if not self.is_older:
-                raise ArtefactError("it keeps no training episodes, as a run of its format does.")
-            count = 0
-        else:
-            count = len(kept.lengths)
+        count = 0 if kept is None else len(kept.lengths)
         first = self.trained - len(starts) if self.is_older else min(_of_dataset(self.protocol), self.trained)
         for episode, start in enumerate(starts[: len(starts) - count], start=first):
             if start != (found := self.replays.start(episode_seed("training", self.seed, episode))):
@@ -255,7 +268,7 @@ class _RunCheck:
         for row in run.checkpoints:
             if row.train_cpu_s:
                 marks[f"CPU seconds after {row.episodes:,} episodes"] = repr(row.train_cpu_s)
-            if row.kept is not None and _has_own_failures(row.kept, self.protocol):
+            if row.kept is not None and has_own_failures(row.kept, self.protocol):
                 marks[f"tests after {row.episodes:,} episodes"] = repr(row.kept.actions.tolist())
         return {name: hashlib.sha256(mark.encode()).hexdigest() for name, mark in marks.items()}
 
@@ -274,7 +287,7 @@ def _of_dataset(protocol: Protocol) -> int:
     return int(found[1]) if found else 0
 
 
-def _has_own_failures(kept: KeptEpisodes, protocol: Protocol) -> bool:
+def has_own_failures(kept: KeptEpisodes, protocol: Protocol) -> bool:
     """Whether a test failed in more ways than two seeds have in common.
 
     Learners that know nothing may repeat one macro-action or two, and where chance decides, equal plans fail alike.

@@ -12,17 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference, registry, statistics
-from imagine_bench.errors import InvalidValueError, brief
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.causes import causes_of
 from imagine_bench.judge.plans import PlanResult, make_plans, require_threshold
-from imagine_bench.judge.verify import Verdict, verify_runs
+from imagine_bench.judge.verify import UNSHOWN, Verdict, does_not_fit, verify_runs
+from imagine_bench.protocols.data import Launcher
 from imagine_bench.recording.filmstrips import filmstrip, png
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.report.bench import bench_page
 from imagine_bench.report.page import DASH, Table, percent, texts, write_page
 from imagine_bench.report.sections import HEAD, causes_table
 from imagine_bench.running.bench import counted, load_bench, task_type
+from imagine_bench.running.retraining import chance_to_find, drawn, train_again
 from imagine_bench.running.trained import (
     best_run,
     learners,
@@ -30,7 +32,7 @@ from imagine_bench.running.trained import (
     protocol_of_agents,
     require_control,
 )
-from imagine_bench.store.bench_folder import newest_bench, require_either
+from imagine_bench.store.bench_folder import newest_bench, read_control, require_either
 from imagine_bench.store.files import (
     csv_text,
     lock,
@@ -53,7 +55,7 @@ _COUNTS = {
     "steps_as_imagined": "that led where imagined",
     "faults": "faults of the physics",
 }
-_CELL = re.compile(r"<t[dh][^>]*>(.*?)</t[dh]>")
+_CELL = re.compile(r"<t[dh][^<>]*>([^<]*(?:<(?!/?t[dhr])[^<]*)*)")
 _LINE = re.compile("^.*$", re.MULTILINE)
 
 
@@ -242,20 +244,68 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
 # Verification ------------------------------------------------------------------------------------------------------
 
 
-def verify(folder: Path) -> list[Verdict]:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Retraining:
+    """How runs of a bench are trained again."""
+
+    runs: int  #: Of each agent, at least 1
+    nonce: str  #: Decides which: a new one a check, or that of a check that is repeated
+    launcher: Launcher
+    encoder: str | None = None  #: As of :func:`imagine_bench.running.trained.load_trained`
+    dataset: Path | None = None  #: The folder of the protocol's dataset, if it has one
+
+
+def verify(folder: Path, retraining: Retraining | None = None) -> list[Verdict]:
     """Play a bench's runs again: one verdict a run and, where all runs hold, one on the tables of its report.
+
+    Where these hold, too, some runs are trained again if they shall be: one more verdict each.
 
     Raises:
         ArtefactError: It is no bench of agents with folders of their own, or its protocol is damaged.
+        InvalidValueError: Fewer than one run of each agent is to be trained again.
     """
-    return with_report(folder, verify_runs(folder))
+    found = with_report(folder, verify_runs(folder))
+    if retraining is None or any(each.complaint for each in found):
+        return found
+    wanted = drawn(read_control(folder), retraining.runs, retraining.nonce)
+    repeats = train_again(
+        folder, wanted, launcher=retraining.launcher, encoder=retraining.encoder, dataset=retraining.dataset
+    )
+    return [*found, *(Verdict.of(repeat) for repeat in repeats)]
+
+
+def what_is_shown(folder: Path, retraining: Retraining | None = None) -> str:
+    """What a verdict does not show, and how likely runs that are trained again find forged ones, as text."""
+    protocol = read_control(folder)
+    lines = [f"Not shown: {each}." for each in UNSHOWN]
+    if retraining is None:
+        return "\n".join([*lines, "Training again, verify --train 1, shows whether a run of each agent repeats."])
+    count = len(protocol.seeds)
+    trained = min(retraining.runs, count)
+    chances = (
+        f"{forged} of {count} forged: {percent(chance_to_find(count, forged, trained))} %" for forged in _few(count)
+    )
+    lines[0] = f"{lines[0][:-1]}, but in the runs that were trained again."
+    how = f"Trained again: {trained} of each agent's {count} runs, drawn by --nonce {retraining.nonce}."
+    return "\n".join([*lines, how, f"Chance that a draw finds a forged run of an agent: {'; '.join(chances)}."])
+
+
+def _few(count: int) -> list[int]:
+    """Some numbers up to ``count``."""
+    return sorted({1, 2, (count + 1) // 2, count} & {*range(1, count + 1)})
 
 
 def with_report(folder: Path, runs: list[Verdict]) -> list[Verdict]:
     """The verdicts on the runs of a bench and, where all hold, one on its report."""
     if any(each.complaint for each in runs) or not (folder / "report").is_dir():
         return runs
-    return [*runs, Verdict(what="report", complaint=_report_complaint(folder))]
+    try:
+        complaint = _report_complaint(folder)
+    except ArtefactError as error:
+        complaint = str(error)
+    except Exception as error:  # as of a run
+        complaint = does_not_fit(error)
+    return [*runs, Verdict(what="report", complaint=complaint)]
 
 
 def _report_complaint(folder: Path) -> str:

@@ -67,7 +67,7 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
             f"{folder} is of an agent that sees {protocol.observation} at {protocol.observation_size} pixels, and it "
             "would be asked with 64 x 64 frames alone; give the run of one that sees these."
         )
-    spec = RunSpec(protocol=protocol, agent=name, seed=seed, encoder=_encoder(protocol, name, encoder))
+    spec = RunSpec(protocol=protocol, agent=name, seed=seed, encoder=encoder_of_run(protocol, name, encoder))
     snapshot = load_newest(folder / run_folder.CHECKPOINTS)
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
@@ -125,7 +125,7 @@ def best_run(result: Result) -> RunResult:
     return max(runs, key=lambda run: [test.success_rate for test in reversed(run.checkpoints)])
 
 
-def _encoder(protocol: Protocol, agent: str, given: str | None) -> Path | None:
+def encoder_of_run(protocol: Protocol, agent: str, given: str | None) -> Path | None:
     """The encoder that an agent saw through; ``given`` may be that of the bench's agents of the other kind."""
     entry = registry.agent_entry(agent)
     used = protocol.encoder_of(entry.encoder_kind)

@@ -13,8 +13,10 @@ arrays, and :func:`unpack` reads it back to the bit: the types of a dataclass's 
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import hashlib
+import io
 import json
 import re
 import shutil
@@ -34,6 +36,7 @@ from imagine_bench.interfaces import AgentState
 from imagine_bench.protocols.data import ProtocolData, RunSpec
 from imagine_bench.registry.entries import agent_label
 from imagine_bench.store.files import (
+    csv_text,
     first_difference,
     grouped,
     lock,
@@ -400,8 +403,14 @@ def load_run(folder: Path) -> RunResult:
     result = _result(folder)
     if result is None:
         raise ArtefactError(f"{folder} has no checkpoint, which holds its results; delete {folder} to run it anew.")
-    is_older = (folder / "measured.npz").exists()  # its table may have fewer columns
-    if not is_older and (folder / _METRICS).read_text() != _metrics(result.checkpoints):
+    table = _metrics(result.checkpoints)
+    with reading(folder / _METRICS, "the table of a run"):
+        kept = (folder / _METRICS).read_text()
+    if (folder / "measured.npz").exists():  # an older run's table may have fewer columns
+        columns = kept.partition("\n")[0].split(",")
+        rows = csv.DictReader(io.StringIO(table))
+        table = csv_text([columns, *([row.get(name, "") for name in columns] for row in rows)])
+    if kept != table:
         raise ArtefactError(f"{folder / _METRICS} says something else than its checkpoint. It was left untouched.")
     rollouts = grouped(read_arrays(folder / _IMAGINED))
     recording = recording_path(folder)

@@ -137,16 +137,48 @@ def surplus(lengthen: bool) -> Forge:
     return forge
 
 
-def training_start(bench: Path, rng: np.random.Generator) -> None:
-    run = one_run(bench, rng)
-    result = load_run(run)
-    assert result.training_starts is not None
-    starts = result.training_starts.tolist()
-    if starts:
-        starts[rng.integers(len(starts))][0] += 1
-        rewrite(run, result.checkpoints, starts=starts)
-    else:
-        metric("successes")(bench, rng)
+def change_checkpoint(run: Path, change: Callable[[dict[str, Any], Arrays], None]) -> None:
+    """Change the values and arrays of a run's checkpoint, and bring all digests up to date."""
+    snapshot = load_newest(run / "checkpoints")
+    assert snapshot is not None
+    values = json.loads(json.dumps(snapshot.values))
+    arrays = {name: array.copy() for name, array in snapshot.arrays.items()}
+    change(values, arrays)
+    save_snapshot(run / "checkpoints", dataclasses.replace(snapshot, arrays=arrays, values=values))
+    mend(run)
+
+
+def learner(bench: Path, rng: np.random.Generator) -> Path:
+    return rng.choice(sorted(path.parent for path in bench.glob("table/seed_*/DONE")))  # type: ignore[arg-type]
+
+
+def in_training(name: str) -> Forge:
+    """One more somewhere in an array of the training episodes, or another number in a list of them."""
+
+    def forge(bench: Path, rng: np.random.Generator) -> None:
+        def change(values: dict[str, Any], arrays: Arrays) -> None:
+            if name in values:
+                index = int(rng.integers(len(values[name])))
+                values[name][index] = 1 - values[name][index]
+            else:
+                array = arrays[name]
+                index = int(rng.integers(array.size))
+                array.flat[index] = not array.flat[index] if array.dtype == bool else (array.flat[index] + 1) % 6
+
+        change_checkpoint(learner(bench, rng), change)
+
+    return forge
+
+
+def without_training(bench: Path, rng: np.random.Generator) -> None:
+    """One array of the training episodes is deleted, or all are, where the format says that they are kept."""
+
+    def change(values: dict[str, Any], arrays: Arrays) -> None:
+        names = [name for name in arrays if name.startswith("training/")]
+        for name in names if rng.random() < 0.5 else [str(rng.choice(names))]:
+            del arrays[name]
+
+    change_checkpoint(learner(bench, rng), change)
 
 
 def seed(bench: Path, rng: np.random.Generator) -> None:
@@ -196,9 +228,14 @@ FORGERIES: dict[str, Forge] = {
     "action": another("actions", 6), "start": another("starts", 4), "return": another("returns", 50),
     "success": another("success", 2), "faults": another("faults", 9), "fingerprint": another("fingerprints", 2**31),
     "exchanged starts": exchange("starts"), "exchanged outcomes": exchange("returns"),
-    "length": in_episodes("lengths", shift_length), "training start": training_start, "seed": seed, "table": table,
+    "length": in_episodes("lengths", shift_length), "seed": seed, "table": table,
     "damage": damage, "surplus": surplus(lengthen=False),
     "after the end": surplus(lengthen=True), "budget": metric("episodes"), "successes": metric("successes"),
     "mean return": metric("mean_return"), "mean length": metric("mean_length"), "sum of faults": metric("faults"),
-    "table of a run": metric("mean_length", everywhere=False),
+    "table of a run": metric("mean_length", everywhere=False), "training steps": metric("env_steps"),
+    "training start": in_training("training/starts"), "training action": in_training("training/actions"),
+    "training success": in_training("success"), "kept training success": in_training("training/success"),
+    "training length": in_training("length"), "training fault": in_training("training/faults"),
+    "training return": in_training("training/returns"), "simulated time": in_training("training/sim_times_s"),
+    "training deleted": without_training,
 }  # fmt: skip
