@@ -51,7 +51,8 @@ def drawn(protocol: Protocol, count: int, nonce: str) -> list[tuple[str, int]]:
     runs = []
     for agent in protocol.agents:
         root = int.from_bytes(hashlib.sha256(f"{nonce} {protocol.hash} {agent}".encode()).digest())
-        chosen = np.random.default_rng(root).permutation(protocol.seeds)[:count]
+        rng = np.random.default_rng(root)
+        chosen = rng.permutation(protocol.seeds)[:count]
         runs += [(agent, int(seed)) for seed in sorted(chosen)]
     return runs
 
