@@ -292,6 +292,8 @@ class Judge:
     """How much frames vary: a level, or factors such as light=0.5,camera=0.2."""
     policy: str = "random"
     """Who collects the data: random, uniform, oracle or mixed."""
+    order: int = 0
+    """Seed of the order in which models are asked."""
     encoder: EncoderWord = None
     """What models see through that read what it gives, latents or codes; by default the task's own."""
     workers: Count = None
@@ -314,6 +316,7 @@ class Judge:
             samples=self.samples,
             appearance=self.appearance,
             policy=self.policy,
+            order=self.order,
             encoder=self.encoder,
         )
         folder, failed = judge(judgement, self.out, workers=workers)

@@ -2,45 +2,44 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import hashlib
+import inspect
 import json
 import math
-import multiprocessing
-import os
-import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
-from unittest import mock
 
 import numpy as np
-from tqdm import tqdm
 
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Arrays
-from imagine_bench.cores import ONE_THREAD
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
-from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import State, TaskSpec
-from imagine_bench.interfaces.model import WorldModel
+from imagine_bench.interfaces.episodes import content_hash
+from imagine_bench.interfaces.model import WorldModel, require_imagined
 from imagine_bench.judge import questions
 from imagine_bench.judge.change import Streams, change_detection_delay, counterfactual_error, streams_of
-from imagine_bench.judge.models import TrainedModel, make, model_entry, one_name, runs_of
+from imagine_bench.judge.models import JudgedModel, model_entry, one_name, opened, runs_of
 from imagine_bench.judge.predictions import ImageReader, Predictions, RenderedFrameIndex, call, evaluate
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.scores import after_the_end_scores, by_depth, one_step_scores, ranking_scores
 from imagine_bench.judge.truth import Distribution, shares
 from imagine_bench.registry.entries import file_name
 from imagine_bench.registry.machine import describe_environment
-from imagine_bench.registry.scripts import register, registered, script_left_out
 from imagine_bench.rules import states_of
+from imagine_bench.running.bench import Counted
 from imagine_bench.running.collect import collect, policy_of
+from imagine_bench.running.isolation import why_open
+from imagine_bench.running.launchers.jobs import work_through
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import (
@@ -50,6 +49,7 @@ from imagine_bench.store.files import (
     read_sealed,
     reading,
     sealed,
+    sha256,
     with_null,
     write_arrays,
     write_bytes,
@@ -58,10 +58,11 @@ from imagine_bench.store.files import (
 
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8
-_FORMAT = 3
+_FORMAT = 4  # 3 asked every model in the order of the macrostates
 _AFTER = 6  # transitions after the end whose images are kept
 _PATIENCE_S = 1_800.0  # seconds that a process waits while another makes the data or the reader
 _READ = 1_000  # frames that the reader is measured on
+_READER_FILE = "reader.safetensors"
 _READER = "imagine_bench.agents.world_models.reader"
 Costs = dict[str, str | float]
 
@@ -79,9 +80,10 @@ class Judgement:
     policy: str = "random"  #: Who collects the data, as :data:`.running.collect.POLICIES`
     #: A bundled name or a file, for the models that read what it gives; the others see through the task's own
     encoder: str | None = None
+    order: int = 0  #: Seed of the order in which models are asked
 
     def __post_init__(self) -> None:
-        if not self.models or not self.seeds or min(self.seeds) < 0:
+        if not self.models or not self.seeds or min(self.order, *self.seeds) < 0:
             raise InvalidValueError("There is nothing to judge; give at least one model and one seed of at least 0.")
         if len(set(self.seeds)) < len(self.seeds):
             raise InvalidValueError(f"seeds is {brief(self.seeds)}; give each seed once.")
@@ -119,6 +121,7 @@ class Judgement:
     def folder_name(self) -> str:
         """Where it is kept: the same for all that can be compared."""
         same: tuple[int | str, ...] = (_FORMAT, self.task, self.appearance, self.policy, self.samples, self.sizes[-1])
+        same += (self.order,)
         if self.encoder is not None:
             same += (encoders.identity(encoders.resolve(registry.task(self.task), self.appearance, self.encoder)),)
         digest = hashlib.sha256(json.dumps(same).encode()).hexdigest()[:8]
@@ -150,9 +153,15 @@ class AskedWorld:
     spec: TaskSpec
     index: RenderedFrameIndex
     reader: ImageReader
+    reader_digest: str  # of the reader's file
     asked: dict[str, EvalSet]  # "one_step", "rollouts", "ranked" and, where there is such, "after" the end
     counterfactuals: tuple[EvalSet, ...]
     streams: dict[str, Streams] | None  # None where not all of the world is asked about
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """Of the frames that are asked about: who has not rendered them cannot tell their order from its seed."""
+        return content_hash({name: each.frames for name, each in self.asked.items()})
 
 
 def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list[str]]:
@@ -167,39 +176,37 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
     prepare(judgement, folder)
     cells = judgement.cells
     waiting = [cell for cell in cells if not (folder / cell.file).exists()]
+    if waiting and why_open():
+        print(f"Note: models are judged in processes that this system cannot close off ({why_open()}).")
     failed: dict[str, None] = {}
-    with tqdm(total=len(cells), initial=len(cells) - len(waiting), unit="fit", disable=None) as bar:
-        for cell, why in _carried_out(judgement, folder, waiting, workers):
-            bar.set_postfix_str(f"{cell.model}, {cell.transitions:,}")
-            bar.update()
+    with Counted("fits judged", total=len(waiting)) as counted:
+
+        def ended(cell: ModelFit, why: str) -> None:
+            counted.step()
             if why:
-                failed[why] = None
-    write_json(folder / "judgement.json", {**dataclasses.asdict(judgement), **describe_environment()})
+                failed[why if why.endswith(".") else f"World model {cell.model}: {why}."] = None
+
+        carry = functools.partial(carry_out, judgement, folder)
+        if workers == 1:
+            for cell in waiting:
+                ended(cell, carry(cell))
+        else:
+            work_through(carry, waiting, workers=workers, on_news=print, on_end=ended)
+    facts = {"closed_off": why_open() or True, **describe_environment()}
+    write_json(folder / "judgement.json", {**dataclasses.asdict(judgement), **facts})
     return folder, list(failed)
 
 
-def _carried_out(
-    judgement: Judgement, folder: Path, cells: Sequence[ModelFit], workers: int
-) -> Iterator[tuple[ModelFit, str]]:
-    """Each cell as it is done, and why it failed or an empty text."""
-    carry = functools.partial(carry_out, judgement, folder)
-    if workers == 1:
-        yield from zip(cells, map(carry, cells), strict=True)
-        return
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), register, (registered(),)) as pool:
-        with mock.patch.dict(os.environ, ONE_THREAD), script_left_out():  # the processes start here
-            done = pool.map(carry, cells)
-        yield from zip(cells, done, strict=True)
-
-
-def carry_out(judgement: Judgement, folder: Path, cell: ModelFit) -> str:
-    """Fit one model, question it and keep the scores; why that failed, or an empty text."""
+def carry_out(judgement: Judgement, folder: Path, cell: ModelFit, tell: Callable[[str], None] = print) -> str:
+    """Fit one model, question it and keep the scores; why that failed, or an empty text. It has nothing to ``tell``."""
+    del tell
     try:
         found, images = judge_cell(judgement, folder, cell)
     except ImagineBenchError as error:
         return str(error)
     if cell.transitions == judgement.sizes[-1]:
         write_arrays(folder / cell.images, images)
+        found["images"] = content_hash(images)
     write_json(folder / cell.file, sealed(with_null(found)))
     return ""
 
@@ -211,23 +218,43 @@ def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict
         ImagineBenchError: It cannot be made, or fails.
     """
     world = prepare(judgement, folder)
-    asked = world.asked
     seeds = SeedTree(cell.seed).child("judge", judgement.task, cell.transitions)
     name = str(runs_of(cell.model).get(cell.seed, cell.model))
-    model, cost = make(name, world.spec, world.index, judgement.appearance, seeds, judgement.encoder)
-    if isinstance(model, TrainedModel):  # its data and the cost of its training are its bench's to say
-        seen = model.visited
+    log = folder / f"{cell.file.removesuffix('.json')}.log"
+    given = (name, world.spec, world.index, judgement.appearance, seeds, judgement.encoder)
+    try:
+        with opened(*given, folder=folder, log=log) as judged:
+            return _judged(judgement, folder, cell, world, judged, seeds)
+    finally:
+        if log.exists() and not log.stat().st_size:
+            log.unlink()
+
+
+def _judged(
+    judgement: Judgement, folder: Path, cell: ModelFit, world: AskedWorld, judged: JudgedModel, seeds: SeedTree
+) -> tuple[dict[str, Any], Arrays]:
+    asked = world.asked
+    if judged.visited is not None:  # its data and the cost of its training are its bench's to say
+        seen = judged.visited
         learned: Costs = {"data": "", "fit_s": math.nan, "parameters": math.nan}
     else:
-        seen, learned = _fit(model, cell, data_of(judgement, folder, cell.seed), seeds.child("fit").generator())
+        seen, learned = _fit(judged, cell, data_of(judgement, folder, cell.seed), seeds.child("fit").generator())
+    order = SeedTree(judgement.order).child("judge", judgement.task, "order", world.digest)
 
     def ask(questions: EvalSet, name: str) -> Predictions:
-        rng = seeds.child(name).generator()
         return evaluate(
-            model, cell.model, questions, samples=judgement.samples, reader=world.reader, index=world.index, rng=rng
+            judged.model,
+            cell.model,
+            questions,
+            samples=judgement.samples,
+            reader=world.reader,
+            index=world.index,
+            rng=seeds.child(name).generator(),
+            order=order.child(name).generator(),
+            cpu_clock=judged.cpu_s,
         )
 
-    answers = {name: ask(each, name) for name, each in asked.items()}
+    answers = ask_together(ask, asked)
     again = [ask(each, "counterfactuals") for each in world.counterfactuals]
     scores = one_step_scores(world.spec, asked["one_step"], answers["one_step"], seen)
     futures = [answers["rollouts"].distribution(0, step) for step in range(questions.DEPTH)]
@@ -246,20 +273,21 @@ def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict
             "imagined": [_named(world.spec, each) for each in futures],
         },
         "imagine_s_per_1000": 1000.0 * cpu_s / sum(each.steps for each in answers.values()),
-        **cost,
+        **judged.cost,
+        "reader": world.reader_digest,
     }
-    return found, _images(model, world, scores["worst"], seeds.child("pictures").generator())
+    return found, _images(cell.model, judged.model, world, scores["worst"], seeds.child("pictures").generator())
 
 
 def _fit(
-    model: WorldModel, cell: ModelFit, dataset: Dataset, rng: np.random.Generator
+    judged: JudgedModel, cell: ModelFit, dataset: Dataset, rng: np.random.Generator
 ) -> tuple[set[tuple[State, int]], Costs]:
     """Fit a model: what it has seen then, and the data's hash, CPU seconds and parameters."""
     episodes = dataset.episodes.first(cell.transitions)
-    begun_s = time.process_time()
-    call(cell.model, "fit", model.fit, episodes, rng)
-    fit_s = time.process_time() - begun_s
-    parameters = int(call(cell.model, "parameters", model.parameters))
+    begun_s = judged.cpu_s()
+    call(cell.model, "fit", judged.model.fit, copy.deepcopy(episodes), rng)  # models of this process must not change it
+    fit_s = judged.cpu_s() - begun_s
+    parameters = int(call(cell.model, "parameters", judged.model.parameters))
     learned: Costs = {"data": dataset.episodes.hash, "fit_s": fit_s, "parameters": parameters}
     return visited(dataset, cell.transitions), learned
 
@@ -304,6 +332,27 @@ def visited(dataset: Dataset, transitions: int) -> set[tuple[State, int]]:
     return set(zip(map(tuple, macrostates.tolist()), dataset.episodes.actions[:transitions].tolist(), strict=True))
 
 
+def ask_together(ask: Callable[[EvalSet, str], Predictions], sets: Mapping[str, EvalSet]) -> dict[str, Predictions]:
+    """The predictions of sets of questions; those with one kind of history are asked as one, shuffled together."""
+    kinds: dict[tuple[tuple[int, ...], ...], list[str]] = {}
+    for name, each in sets.items():
+        kinds.setdefault((each.frames.shape[1:], each.actions.shape[1:]), []).append(name)
+    found = {}
+    for names in kinds.values():
+        parts = [sets[name] for name in names]
+        together = EvalSet(
+            states=tuple(state for part in parts for state in part.states),
+            frames=np.concatenate([part.frames for part in parts]),
+            actions=np.concatenate([part.actions for part in parts]),
+            truth=tuple(steps for part in parts for steps in part.truth),
+        )
+        predictions = ask(together, names[0])
+        ends = np.cumsum([len(part.states) for part in parts])
+        for name, part, end in zip(names, parts, ends.tolist(), strict=True):
+            found[name] = predictions.of_rows(end - len(part.states), end)
+    return found
+
+
 @functools.lru_cache(maxsize=2)
 def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
     """Questions and reader, made once in each process."""
@@ -313,20 +362,43 @@ def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
     there = {name: each for name, each in asked.items() if each is not None}
     again = questions.counterfactuals(spec, index.render)
     reader = _reader(spec, judgement.appearance, folder)
-    return AskedWorld(spec, index, reader, there, again, streams_of(spec, there["one_step"]))
+    file = folder / _READER_FILE
+    digest = sha256(file)[:12] if file.exists() else ""
+    return AskedWorld(spec, index, reader, digest, there, again, streams_of(spec, there["one_step"]))
 
 
 def _reader(spec: TaskSpec, appearance: str, folder: Path) -> ImageReader:
-    """The reader of a folder, trained and measured where there is none."""
-    path = folder / "reader.safetensors"
+    """The reader of a folder; where there is none, that of the world from the user's cache."""
+    path = folder / _READER_FILE
     code = registry.load(_READER)
     with _making(folder):
         if not path.exists():
-            reader = code.train_reader(spec, appearance)
-            write_json(folder / "reader.json", reader_errors(reader, spec, appearance))
-            write_bytes(path, reader.content())
+            content, errors = _reader_of_world(spec, appearance, code)
+            write_json(folder / "reader.json", errors)
+            write_bytes(path, content)
     with reading(path, "the judge's reader; remove it, and the same command trains a new one"):
         return code.load_reader(spec, path)
+
+
+def _reader_of_world(spec: TaskSpec, appearance: str, code: ModuleType) -> tuple[bytes, dict[str, float]]:
+    """The reader of a world as a file, and its errors; trained and measured where the cache has none."""
+    states = states_of(spec.rules)
+    looks = spec.render_macrostates(np.array(states[:8]), appearance, np.random.default_rng(0)).tobytes()
+    made_of = (spec.id, appearance, states, inspect.getsource(code))
+    name = hashlib.sha256(repr(made_of).encode() + looks).hexdigest()[:12]
+    path = make_folder(encoders.cache_folder() / "readers" / name) / _READER_FILE
+    card = path.with_name("reader.json")
+    with _making(path.parent):
+        if not card.exists():
+            print(f"The reader of images of {spec.id} is trained into {path.parent}, once: about a minute.", flush=True)
+            reader = code.train_reader(spec, appearance)
+            write_bytes(path, reader.content())
+            found = {"sha256": sha256(path), "errors": reader_errors(reader, spec, appearance)}
+            write_json(card, sealed(found))
+        facts = read_sealed(card, "a reader's card")
+        if sha256(path) != facts["sha256"]:
+            raise ArtefactError(f"{path} is damaged; remove {path.parent}, and the same command trains it anew.")
+        return path.read_bytes(), facts["errors"]
 
 
 def reader_errors(reader: ImageReader, spec: TaskSpec, appearance: str) -> dict[str, float]:
@@ -355,7 +427,7 @@ def reader_errors(reader: ImageReader, spec: TaskSpec, appearance: str) -> dict[
     return found
 
 
-def _images(model: WorldModel, world: AskedWorld, worst: list[int], rng: np.random.Generator) -> Arrays:
+def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], rng: np.random.Generator) -> Arrays:
     """Transitions and a rollout, imagined once more in one future each: before, likeliest real outcome, imagined.
 
     ``right`` says whether what is imagined, as read, may happen.
@@ -365,9 +437,12 @@ def _images(model: WorldModel, world: AskedWorld, worst: list[int], rng: np.rand
         some = np.linspace(0, len(world.asked["after"].states) - 1, _AFTER).astype(int)
         chosen["after"] = ("after", sorted(set(some.tolist())))
     found: Arrays = {}
-    for name, (kind, rows) in chosen.items():
+    for what, (kind, rows) in chosen.items():
         asked = world.asked[kind]
-        imagined = model.imagine(asked.frames[rows], asked.actions[rows], 1, rng).pictures
+        own = np.random.default_rng(int(rng.integers(2**63)))
+        answer = call(name, "imagine", model.imagine, asked.frames[rows], asked.actions[rows], 1, own)
+        depth = asked.asked.shape[1]
+        imagined = require_imagined(answer, name=name, rows=len(rows), depth=depth, samples=1).pictures
         read = world.index.read(imagined, world.reader)[:, 0].tolist()
         truth = [[shares(outcomes) for outcomes in asked.truth[row]] for row in rows]
         real = [[world.index.frame(max(each, key=each.__getitem__)) for each in steps] for steps in truth]
@@ -375,18 +450,25 @@ def _images(model: WorldModel, world: AskedWorld, worst: list[int], rng: np.rand
         for row, step in np.ndindex(*right.shape):
             right[row, step] = tuple(read[row][step]) in truth[row][step]
         images = imagined[:, 0] if imagined.dtype == np.uint8 else (np.asarray(imagined[:, 0]) * 255.0).round()
-        found[f"{name}_before"] = asked.frames[rows, -1]
-        found[f"{name}_actions"] = asked.asked[rows]
-        found[f"{name}_imagined"] = images.astype(np.uint8)
-        found[f"{name}_real"] = np.array(real)
-        found[f"{name}_right"] = right
+        found[f"{what}_before"] = asked.frames[rows, -1]
+        found[f"{what}_actions"] = asked.asked[rows]
+        found[f"{what}_imagined"] = images.astype(np.uint8)
+        found[f"{what}_real"] = np.array(real)
+        found[f"{what}_right"] = right
     return found
 
 
 def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
     """Every cell of a judgement that is kept. Raises ArtefactError: one is damaged."""
     cells = sorted(judgement.cells, key=lambda cell: judgement.models.index(cell.model))
-    return [read_sealed(folder / cell.file, "a judged cell") for cell in cells if (folder / cell.file).exists()]
+    found = [read_sealed(folder / cell.file, "a judged cell") for cell in cells if (folder / cell.file).exists()]
+    readers = {cell.get("reader", "") for cell in found}
+    if len(readers) > 1:
+        raise ArtefactError(
+            f"Cells in {folder} were read by different readers ({', '.join(sorted(readers))}) and cannot be compared; "
+            "give another folder with --out."
+        )
+    return found
 
 
 def shown(folder: Path, judgement: Judgement) -> dict[str, dict[str, Any]]:
@@ -400,5 +482,8 @@ def shown(folder: Path, judgement: Judgement) -> dict[str, dict[str, Any]]:
         model = cell["model"]
         images = folder / ModelFit(model, cell["seed"], cell["transitions"]).images
         if model not in found and images.exists():
-            found[model] = read_arrays(images) | cell
+            arrays = read_arrays(images)
+            if cell.get("images", content_hash(arrays)) != content_hash(arrays):
+                raise ArtefactError(f"{images} is damaged: it is not as it was written. It was left untouched.")
+            found[model] = arrays | cell
     return found

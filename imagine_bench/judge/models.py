@@ -5,20 +5,27 @@ What an agent says its own images show counts for nothing when it is judged: the
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.arrays import Ints
+from imagine_bench.arrays import Arrays, Ints
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, Floats, Frame, State, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel
+from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined
 from imagine_bench.judge.predictions import RenderedFrameIndex
 from imagine_bench.registry.entries import WorldModelEntry, entrant
-from imagine_bench.running.trained import Trained, load_trained
+from imagine_bench.registry.scripts import importable
+from imagine_bench.running.isolation import Isolated
+from imagine_bench.running.trained import KeptAgent, agent_of, imaginer_of, read_agent
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import read_json, read_sealed
@@ -26,6 +33,7 @@ from imagine_bench.store.run_folder import load_run
 
 __path__: list[str] = []  # the old path imagine_bench.judge.models.outcomes is looked for below this module
 _CONFIG = "config.json"
+_TASKS = "imagine_bench.tasks"
 _MOST = 0.5  # share of its futures that a filter keeps of a step that counts as kept
 
 
@@ -71,17 +79,125 @@ class AgentModel:
         return 0
 
 
-class TrainedModel(AgentModel):
-    """An agent that imagines, as its run left it."""
+class ServedModel:
+    """A world model as :class:`.running.isolation.Isolated` serves it: its methods return arrays by name."""
 
-    def __init__(self, trained: Trained) -> None:
-        super().__init__(trained.imaginer)
-        tried = load_run(trained.folder).tried
-        if tried is None:
-            raise ArtefactError(f"{trained.folder} was written by a version that kept no experience; run it anew.")
-        self.visited: set[tuple[State, int]] = {(tuple(row[:-2]), row[-2]) for row in tried.tolist()}
-        """Every macrostate and macro-action of its training."""
-        self.cost = _encoder_cost(trained.spec.encoder)
+    def __init__(self, name: str, model: WorldModel) -> None:
+        self._name = name
+        self._model = model
+
+    def fit(self, dataset: Episodes, rng: np.random.Generator) -> Arrays:
+        """Nothing."""
+        self._model.fit(dataset, rng)
+        return {}
+
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Arrays:
+        """What the model imagines; InvalidValueError where it is not what it must be."""
+        found = self._model.imagine(frames, actions, samples, rng)
+        depth = actions.shape[1] - frames.shape[1] + 1
+        require_imagined(found, name=self._name, rows=len(frames), depth=depth, samples=samples)
+        offered = {field.name: getattr(found, field.name) for field in fields(Imagined)}
+        return {name: np.ascontiguousarray(array) for name, array in offered.items() if array is not None}
+
+    def parameters(self) -> Arrays:
+        """Their number."""
+        return {"parameters": np.array(int(self._model.parameters()))}
+
+
+def serve_model(name: str, make: str, context: AgentContext) -> ServedModel:
+    """A registered world model."""
+    return ServedModel(name, registry.made(f"World model {name}", make, context))
+
+
+def serve_agent(name: str, kept: KeptAgent) -> ServedModel:
+    """The agent of a run. Raises InvalidValueError: it does not imagine."""
+    return ServedModel(name, AgentModel(imaginer_of(agent_of(kept), kept)))
+
+
+class IsolatedModel:
+    """A world model in a process of its own."""
+
+    def __init__(self, process: Isolated) -> None:
+        self._process = process
+
+    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
+        """As of the model."""
+        self._process.call("fit", dataset, rng)
+
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
+        """As of the model; how far ``rng`` was drawn from there is not known here."""
+        return Imagined(**self._process.call("imagine", frames, actions, samples, rng))
+
+    def parameters(self) -> int:
+        """As of the model."""
+        return int(self._process.call("parameters")["parameters"])
+
+
+@dataclass(frozen=True)
+class JudgedModel:
+    """A world model, ready to be fitted and asked."""
+
+    model: WorldModel
+    cost: dict[str, str | int]  # spent beforehand: the encoder's name and frames
+    visited: set[tuple[State, int]] | None  # what a trained agent has experienced; None for a model that learns here
+    cpu_s: Callable[[], float]  # CPU seconds so far of the process that it is in
+
+
+@contextmanager
+def opened(
+    name: str,
+    spec: TaskSpec,
+    index: RenderedFrameIndex,
+    appearance: str,
+    seeds: SeedTree,
+    encoder: str | None = None,
+    *,
+    folder: Path,
+    log: Path,
+) -> Iterator[JudgedModel]:
+    """A new model, or a trained agent, in a process of its own; a privileged one in this process.
+
+    What is printed there is added to ``log``. ``folder`` is the judgement's, which is hidden from models as its
+    neighbours are.
+
+    Raises:
+        ImagineBenchError: It cannot be made.
+    """
+    run = Path(name)
+    entry = model_entry(name)
+    visited = None
+    given: tuple[str | AgentContext | KeptAgent, ...]
+    if run in runs_of(name).values():
+        kept = read_agent(run)
+        _require_task(kept, spec.id)
+        visited = _visited(run)
+        cost = _encoder_cost(kept.spec.encoder)
+        target, given = "serve_agent", (name, kept)
+    elif not entry.privileged:
+        context, cost = _context(name, spec, appearance, seeds, encoder)
+        target, given = "serve_model", (name, importable(entry.make), context)
+    if entry.privileged:
+        model, cost = make(name, spec, index, appearance, seeds, encoder)
+        yield JudgedModel(model, cost, visited, time.process_time)
+        return
+    hidden = [place.parent for place in folder.parent.glob("*/.lock")]
+    closed = closed_modules(spec.id, entry.make)
+    tasks = find_spec(_TASKS)
+    if tasks is not None:
+        hidden += map(Path, tasks.submodule_search_locations or ())
+    with Isolated(f"{__name__}:{target}", *given, log=log, forbidden=closed, hidden=hidden) as process:
+        yield JudgedModel(IsolatedModel(process), cost, visited, lambda: process.cpu_s)
+
+
+def closed_modules(task: str, make: str) -> list[str]:
+    """Modules that tell the truth about a task and that its models cannot import, this suite's tasks first.
+
+    A model of the package that also offers the task, ``make`` its ``"module:attr"``, can import that package.
+    """
+    entry = registry.task_entry(task)
+    others = {target.partition(":")[0] for target in (entry.spec, entry.env)}
+    package = make.partition(":")[0].partition(".")[0]
+    return [_TASKS, *sorted(module for module in others if module.partition(".")[0] not in (package, __package__))]
 
 
 def runs_of(model: str) -> dict[int, Path]:
@@ -103,10 +219,11 @@ def model_entry(model: str) -> WorldModelEntry:
         return registry.world_model_entry(model)
     seed, folder = next(iter(runs.items()))
     agent = read_sealed(folder / _CONFIG, "a run's configuration")["agent"]
-    title = registry.agent_entry(agent).title or agent
+    entry = registry.agent_entry(agent)
+    title = entry.title or agent
     if folder == Path(model):
         title = f"{title}, seed {seed}"
-    return WorldModelEntry(make=f"{__name__}:load_model", title=title)
+    return WorldModelEntry(make=entry.make, title=title, privileged=entry.privileged)
 
 
 def one_name(model: str) -> str:
@@ -114,29 +231,43 @@ def one_name(model: str) -> str:
     return str(Path(model).resolve()) if runs_of(model) else str(entrant(model))
 
 
-def load_model(folder: Path, task: str) -> TrainedModel:
-    """The agent of a run's folder.
+def _require_task(kept: KeptAgent, task: str) -> None:
+    """Raise InvalidValueError for a run of an agent that learned another task."""
+    learned = kept.spec.protocol.task
+    if registry.task(learned).id != task:
+        raise InvalidValueError(f"{kept.folder} learned {learned}, not {task}; give a run of {task}.")
 
-    Raises:
-        InvalidValueError: It does not imagine, or learned another task.
-        ArtefactError: It cannot be taken up again.
-    """
-    trained = load_trained(folder)
-    if trained.task.id != task:
-        raise InvalidValueError(f"{folder} learned {trained.task.id}, not {task}; give a run of {task}.")
-    return TrainedModel(trained)
+
+def _visited(run: Path) -> set[tuple[State, int]]:
+    """Every macrostate and macro-action of a run's training."""
+    tried = load_run(run).tried
+    if tried is None:
+        raise ArtefactError(f"{run} was written by a version that kept no experience; run it anew.")
+    return {(tuple(row[:-2]), row[-2]) for row in tried.tolist()}
 
 
 def make(
     name: str, spec: TaskSpec, index: RenderedFrameIndex, appearance: str, seeds: SeedTree, encoder: str | None = None
 ) -> tuple[WorldModel, dict[str, str | int]]:
-    """A new model, or a trained agent, and what was spent on it beforehand: the encoder's name and frames."""
+    """A new model, or a trained agent, in this process, and what was spent on it beforehand.
+
+    That is the encoder's name and frames.
+    """
     if Path(name) in runs_of(name).values():
-        trained = load_model(Path(name), spec.id)
-        return trained, trained.cost
-    entry = registry.world_model_entry(name)
-    if entry.privileged:
+        kept = read_agent(Path(name))
+        _require_task(kept, spec.id)
+        return AgentModel(imaginer_of(agent_of(kept), kept)), _encoder_cost(kept.spec.encoder)
+    if registry.world_model_entry(name).privileged:
         return registry.make_world_model(name, spec, index), _encoder_cost(None)
+    context, cost = _context(name, spec, appearance, seeds, encoder)
+    return registry.make_world_model(name, context), cost
+
+
+def _context(
+    name: str, spec: TaskSpec, appearance: str, seeds: SeedTree, encoder: str | None
+) -> tuple[AgentContext, dict[str, str | int]]:
+    """What a registered model is made from, and what was spent on that."""
+    entry = registry.world_model_entry(name)
     path = None if entry.encoder_kind is None else _encoder(spec, appearance, entry.encoder_kind, encoder)
     context = AgentContext(
         n_actions=spec.n_actions,
@@ -146,7 +277,7 @@ def make(
         config_group=spec.config_group,
         overrides=entrant(name).settings,
     )
-    return registry.make_world_model(name, context), _encoder_cost(path)
+    return context, _encoder_cost(path)
 
 
 def _encoder(spec: TaskSpec, appearance: str, kind: str, given: str | None) -> Path:

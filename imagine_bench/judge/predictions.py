@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ParamSpec, Protocol, TypeVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from imagine_bench.interfaces import Floats, Frame, State, TaskSpec
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.truth import Distribution, added_up
+from imagine_bench.running.isolation import GuestError
 from imagine_bench.seeding import SeedTree
 
 _AT_ONCE = 96  # questions handed to a model at a time, to bound memory
@@ -86,6 +87,19 @@ class Predictions:
     cpu_s: float  #: CPU seconds of imagining, reading apart
     steps: int  #: Macro-actions imagined, N D of each future
 
+    def of_rows(self, first: int, end: int) -> Predictions:
+        """Those of some questions, in a row."""
+        rows = slice(first, end)
+        share = (end - first) / len(self.states)
+        return replace(
+            self,
+            states=self.states[rows],
+            weights=self.weights[rows],
+            offered={name: array[rows] for name, array in self.offered.items()},
+            cpu_s=share * self.cpu_s,
+            steps=round(share * self.steps),
+        )
+
     def of_one_step(self, name: str) -> Floats | None:
         """What the model offers of the first macro-action, by name, if it does. Shape (N, S) or (N,)."""
         return self.offered[name][..., 0] if name in self.offered else None
@@ -109,28 +123,40 @@ def evaluate(
     reader: ImageReader,
     index: RenderedFrameIndex,
     rng: np.random.Generator,
+    order: np.random.Generator | None = None,
+    cpu_clock: Callable[[], float] = time.process_time,
 ) -> Predictions:
     """Run a model and classify its images.
 
-    An image that equals a rendered frame gets that frame's macrostate; the reader classifies the rest.
+    An image that equals a rendered frame gets that frame's macrostate; the reader classifies the rest. A model is
+    handed copies, so that it cannot change what others are asked. ``order`` shuffles the questions; without it they
+    are asked in their own order. ``cpu_clock`` is that of the process in which the model is.
 
     Raises:
         InvalidValueError: The model fails, or hands in what it must not; the message names model and method.
     """
     answers: list[Imagined] = []
     cpu_s = 0.0
+    shuffled = np.arange(len(questions.frames))
+    if order is not None:
+        order.shuffle(shuffled)
+    places = np.argsort(shuffled)
     for at in range(0, len(questions.frames), _AT_ONCE):
-        frames = questions.frames[at : at + _AT_ONCE]
-        begun_s = time.process_time()
-        imagined = call(name, "imagine", model.imagine, frames, questions.actions[at : at + _AT_ONCE], samples, rng)
-        cpu_s += time.process_time() - begun_s
+        rows = shuffled[at : at + _AT_ONCE]
+        frames = questions.frames[rows]
+        own = np.random.default_rng(int(rng.integers(2**63)))  # a model elsewhere cannot draw on from the same
+        begun_s = cpu_clock()
+        imagined = call(name, "imagine", model.imagine, frames, questions.actions[rows], samples, own)
+        cpu_s += cpu_clock() - begun_s
         depth = questions.asked.shape[1]
         answers.append(require_imagined(imagined, name=name, rows=len(frames), depth=depth, samples=samples))
     given = {name: [getattr(each, name) for each in answers] for name in _OFFERED}
     return Predictions(
-        states=_joined([index.read(each.pictures, reader) for each in answers], -1),
-        weights=_joined([weights_of(each) for each in answers]),
-        offered={name: _joined(parts) for name, parts in given.items() if all(part is not None for part in parts)},
+        states=_joined([index.read(each.pictures, reader) for each in answers], -1)[places],
+        weights=_joined([weights_of(each) for each in answers])[places],
+        offered={
+            name: _joined(parts)[places] for name, parts in given.items() if all(part is not None for part in parts)
+        },
         cpu_s=cpu_s,
         steps=sum(int(np.prod(each.pictures.shape[:3])) for each in answers),
     )
@@ -140,8 +166,12 @@ def call(name: str, method: str, function: Callable[P, T], *arguments: P.args, *
     """What a model's method returns; InvalidValueError, naming both, where it raises."""
     try:
         return function(*arguments, **named)
+    except GuestError as error:
+        raise InvalidValueError(f"World model {name}: {method}() failed ({error}).") from error
     except ImagineBenchError as error:
-        raise InvalidValueError(f"World model {name}: {method}() failed: {error}") from error
+        said = f"World model {name}: {method}()"
+        known = str(error).startswith(said)
+        raise InvalidValueError(str(error) if known else f"{said} failed: {error}") from error
     except Exception as error:  # whatever a model does wrong is one sentence
         why = f"{type(error).__name__}: {plain(error)}".partition("\n")[0]
         raise InvalidValueError(f"World model {name}: {method}() failed ({why}).") from error

@@ -32,7 +32,7 @@ def record_judgement(folder: Path, judgement: Judgement) -> Path | None:
     for model, each in found.items():
         name = file_name(model)
         strips[name] = (each["futures_imagined"][0], each["futures"]["imagined"])
-        titles[name] = model_entry(model).title
+        titles[name] = model_entry(model).label
     columns = [
         rrb.Vertical(
             rrb.Spatial2DView(origin=f"/{name}/frame", name=title),

@@ -350,10 +350,11 @@ def task(name: str) -> TaskSpec:
 
 def make_agent(name: str, context: AgentContext) -> Agent:
     """A new agent by its registered name. Raises SetupError: that of a package cannot be made."""
-    return _made(f"Agent {name}", agent_entry(name).make, context)
+    return made(f"Agent {name}", agent_entry(name).make, context)
 
 
-def _made(what: str, target: str, *given: Any) -> Any:
+def made(what: str, target: str, *given: Any) -> Any:
+    """What a package's target makes; ``what`` it is. Raises as :func:`make_agent`."""
     with guests_faults(what, target):
         return load(target)(*given)
 
@@ -395,9 +396,9 @@ def world_model_entry(name: str) -> WorldModelEntry:
 
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
     """A new regressor by its registered name. Raises as :func:`make_agent`."""
-    return _made(f"Regressor {name}", regressor_entry(name).make, context)
+    return made(f"Regressor {name}", regressor_entry(name).make, context)
 
 
 def make_world_model(name: str, *given: Any) -> WorldModel:
     """A new world model by its registered name, from what its entry says. Raises as :func:`make_agent`."""
-    return _made(f"World model {name}", world_model_entry(name).make, *given)
+    return made(f"World model {name}", world_model_entry(name).make, *given)

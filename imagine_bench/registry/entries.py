@@ -88,6 +88,11 @@ class WorldModelEntry:
     by_default: bool = True  #: Whether it is judged where no models are named; slow ones are not
     settings: str = ""  #: As of :class:`AgentEntry`, read from ``context.overrides``; empty: there are none to give
 
+    @property
+    def label(self) -> str:
+        """The title for tables, figures and recordings: it says so of a privileged model."""
+        return f"{plain(self.title)} (privileged)" if self.privileged else plain(self.title)
+
 
 class Entrant(NamedTuple):
     """An agent and the settings that it alone has in a bench."""

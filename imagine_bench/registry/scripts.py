@@ -29,6 +29,12 @@ def register(there: Registered) -> None:
         table.update(entries)
 
 
+def importable(target: str) -> str:
+    """A ``"module:attr"``, with the name of the script's module for ``__main__``."""
+    found: str = _loadable(target, f"{_script()}:")
+    return found
+
+
 def _loadable(entry: Any, script: str) -> Any:
     """An entry, with the name of the script's module for ``__main__``."""
     if isinstance(entry, str):

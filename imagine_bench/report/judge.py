@@ -152,6 +152,7 @@ def _csv(found: Judged) -> str:
     rows: list[dict[str, Any]] = []
     for cell in itertools.chain.from_iterable(found.cells.values()):
         rows.append({name: cell[name] for name in ("model", "transitions", "seed")})
+        rows[-1]["privileged"] = str(model_entry(cell["model"]).privileged).lower()
         for name in COLUMNS:
             value = score(cell, name)
             rows[-1][name] = "" if math.isnan(value) else f"{value:.6g}"
@@ -173,7 +174,7 @@ def _number(value: float) -> str:
 
 
 def _title(model: str) -> str:
-    return model_entry(model).title
+    return model_entry(model).label
 
 
 def _scores(found: Judged, table: str, names: Collection[str]) -> Table:

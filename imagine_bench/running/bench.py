@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -114,10 +114,40 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         return f"{tqdm.format_interval(gone_s)} gone{left}"
 
 
-def counted(items: Iterable[Item], what: str, *, total: int) -> Iterable[Item]:
-    """The items; on a terminal a bar shows how many of ``total`` are done. ``what`` is what they are called."""
-    counting: Iterable[Item] = tqdm(items, desc=what, total=total, leave=False, disable=None)
-    return counting
+class Counted(AbstractContextManager["Counted"]):
+    """Shows how many of ``total`` are done: on a terminal as a bar, elsewhere as a line now and then."""
+
+    def __init__(self, what: str, *, total: int) -> None:
+        self._what = what
+        self._total = total
+        self._done = 0
+        self._began_s = time.monotonic()
+        self._shown_s = self._began_s
+        self._bar = tqdm(desc=what, total=total, leave=False, disable=not sys.stderr.isatty())
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+
+    def step(self) -> None:
+        """One more is done."""
+        self._bar.update()
+        self._done += 1
+        now_s = time.monotonic()
+        if self._bar.disable and now_s - self._shown_s > _LINE_EVERY_S:
+            self._shown_s = now_s
+            gone_s = now_s - self._began_s
+            left_s = gone_s * (self._total - self._done) / self._done
+            times = f"{tqdm.format_interval(gone_s)} gone, {tqdm.format_interval(left_s)} left"
+            with suppress(OSError):  # nobody reads the screen any more
+                print(f"{self._what}: {self._done} of {self._total}, {times}", file=sys.stderr, flush=True)
+
+
+def counted(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:
+    """The items, counted as :class:`Counted` shows it; ``what`` is what they are called."""
+    with Counted(what, total=total) as counting:
+        for item in items:
+            yield item
+            counting.step()
 
 
 def _sentence(progress: Progress, work: int) -> str:

@@ -60,7 +60,7 @@ class Limits:
     memory: int = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 3 // 4  #: Bytes of its data (on Linux)
 
 
-class GuestError(Exception):
+class GuestError(InvalidValueError):
     """What a guest raised, in its words."""
 
 
@@ -106,8 +106,9 @@ class Isolated:
             )
         self._pipe = Connection(ours.detach())
         folders = [str(folder.resolve()) for folder in hidden if folder.is_dir()]
+        closes = not why_open() if closed is None else closed
         try:
-            self._pipe.send((sys.path, folders if closed or not why_open() else None, tuple(forbidden), limits.memory))
+            self._pipe.send((sys.path, folders if closes else None, tuple(forbidden), limits.memory))
             self.call("", make, *given)
         except BaseException:
             self.close()
@@ -162,13 +163,13 @@ class Isolated:
     def _end(self, gone_s: float) -> str:
         """Why there is no answer after so many seconds."""
         if gone_s >= self._limits.call_s:
-            return f"it was stopped after {self._limits.call_s:,.0f} s, the limit of a call"
+            return f"it was stopped after {self._limits.call_s:,.0f} s, the limit of a call."
         try:
             code = self._process.wait(_PATIENCE_S)
         except subprocess.TimeoutExpired:
-            return "it sent what is no answer"
+            return "it sent what is no answer."
         how = "was killed, such as for lack of memory" if code == _KILLED else f"ended itself with exit code {code}"
-        return f"its process {how}"
+        return f"its process {how}."
 
 
 @functools.cache
@@ -177,7 +178,8 @@ def why_open() -> str:
     if sys.platform != "linux":
         return f"{sys.platform} has no namespaces"
     words = [sys.executable, "-P", "-c", f"from {__name__} import close_off; close_off(())"]
-    tried = subprocess.run(words, capture_output=True, text=True, check=False)
+    alone = {**os.environ, **ONE_THREAD}  # only a process of one thread can be closed off
+    tried = subprocess.run(words, capture_output=True, text=True, check=False, env=alone)
     return "" if tried.returncode == 0 else tried.stderr.strip().rpartition("\n")[2] or "it cannot be tried"
 
 

@@ -6,14 +6,16 @@ import dataclasses
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import Agent, TaskSpec
+from imagine_bench.interfaces import Agent, AgentContext, AgentState, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import Result, RunSpec
 from imagine_bench.registry.entries import agent_label, entrant
+from imagine_bench.registry.scripts import importable
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
 from imagine_bench.store.files import reading
@@ -35,15 +37,50 @@ class Trained:
     @property
     def imaginer(self) -> Imaginer:
         """The same agent, as one that imagines. Raises InvalidValueError: it does not imagine."""
-        if not isinstance(self.agent, Imaginer):
-            raise InvalidValueError(
-                f"The agent {self.spec.agent!r} of {self.folder} does not imagine; give the run of one that does."
-            )
-        return self.agent
+        return imaginer_of(self.agent, self)
+
+
+class KeptAgent(NamedTuple):
+    """What the agent of a run is made from again, with the settings it ran with, and its last checkpoint."""
+
+    make: str  #: ``"module:attr"`` of what makes it
+    context: AgentContext
+    state: AgentState
+    spec: RunSpec[Protocol]  #: What its run was
+    episodes: int  #: As of :class:`Trained`
+    folder: Path  #: Its run's folder
+
+
+def agent_of(kept: KeptAgent) -> Agent:
+    """The agent, restored. Raises ArtefactError: the checkpoint does not fit this version."""
+    name = kept.spec.agent
+    agent: Agent = registry.made(f"Agent {name}", kept.make, kept.context)
+    with reading(kept.folder / run_folder.CHECKPOINTS, f"a checkpoint of {name!r}"):
+        agent.restore(kept.state)
+    if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run
+        while agent.train_in_model():
+            pass
+    return agent
+
+
+def imaginer_of(agent: Agent, of: KeptAgent | Trained) -> Imaginer:
+    """The agent of a run, as one that imagines. Raises InvalidValueError: it does not imagine."""
+    if not isinstance(agent, Imaginer):
+        raise InvalidValueError(
+            f"The agent {of.spec.agent!r} of {of.folder} does not imagine; give the run of one that does."
+        )
+    return agent
 
 
 def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
-    """Build the agent of a run with the settings it ran with, and restore its last checkpoint.
+    """Build the agent of a run. Arguments and errors are those of :func:`read_agent`."""
+    kept = read_agent(folder, encoder=encoder)
+    task = registry.task(kept.spec.protocol.task)
+    return Trained(agent=agent_of(kept), spec=kept.spec, task=task, episodes=kept.episodes, folder=folder)
+
+
+def read_agent(folder: Path, *, encoder: str | None = None) -> KeptAgent:
+    """Read what the agent of a run is made from.
 
     ``folder`` is such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``; ``encoder`` is a bundled name or a
     path, where the run used an encoder that is not bundled.
@@ -72,13 +109,10 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
     as_it_ran = registry.own_settings(entrant(name).agent, settings)  # whatever presets say by now
-    agent = registry.make_agent(name, dataclasses.replace(context_of(spec), overrides=as_it_ran))
-    with reading(folder / run_folder.CHECKPOINTS, f"a checkpoint of {name!r}"):
-        agent.restore(snapshot.agent)
-    if isinstance(agent, ModelOnlyTrainer):  # as before every test; there is nothing left to do in a finished run
-        while agent.train_in_model():
-            pass
-    return Trained(agent=agent, spec=spec, task=registry.task(protocol.task), episodes=snapshot.episode, folder=folder)
+    context = dataclasses.replace(context_of(spec), overrides=as_it_ran)
+    return KeptAgent(
+        importable(registry.agent_entry(name).make), context, snapshot.agent, spec, snapshot.episode, folder
+    )
 
 
 def require_control(task: str, what: str) -> None:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import dataclasses
 import io
 import json
 import re
+import shutil
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 from doc_cells import ROOT
 from fake_reader import BlindReader
@@ -27,11 +31,12 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
-from imagine_bench.judge.models import load_model, make, model_entry
+from imagine_bench.judge.models import JudgedModel, make, model_entry, opened
 from imagine_bench.judge.predictions import RenderedFrameIndex
 from imagine_bench.report.judge import judgement_report
 from imagine_bench.running import bench as benches
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store.files import make_folder, read_arrays, read_sealed, sealed, write_arrays, write_json
 
 _PYPROJECT = """
 [project]
@@ -42,8 +47,69 @@ nearest = "their_models:ENTRY"
 raises = "their_models:RAISES"
 late = "their_models:LATE"
 unmade = "their_models:UNMADE"
+spy = "their_models:SPY"
+exits = "their_models:EXITS"
+dies = "their_models:DIES"
+cheat = "their_models:CHEAT"
 """
 _MORE = """
+import gc, os, sys
+from imagine_bench.agents.world_models.limits import Exact
+
+class Spy(Nearest):
+    def imagine(self, frames, actions, samples, rng):
+        given = Imagined(pictures=frames[:, None, -1:].copy(), probabilities=np.ones((len(frames), 1, 1)))
+        held, frame = gc.get_objects(), sys._getframe()
+        while frame is not None:
+            held += frame.f_locals.values()
+            frame = frame.f_back
+        kinds = {type(each).__name__ for each in held}
+        found = kinds & {"EvalSet", "AskedWorld", "TaskSpec", "RenderedFrameIndex", "PickPlaceRules"}
+        try:
+            import imagine_bench.tasks.pick_place.rules
+            found.add("rules")
+        except ModuleNotFoundError:
+            pass
+        if found:
+            raise RuntimeError(f"it found {sorted(found)}")
+        frames[...] = 0
+        actions[...] = 0
+        depth = actions.shape[1] - frames.shape[1] + 1
+        pictures = np.broadcast_to(given.pictures, (len(frames), 1, depth, 64, 64, 3))
+        return Imagined(pictures=pictures, probabilities=np.ones((len(frames), 1, depth)))
+
+class Exits(Nearest):
+    def fit(self, dataset, rng):
+        print("its last words")
+        sys.exit(0)
+
+class Dies(Nearest):
+    def imagine(self, frames, actions, samples, rng):
+        os._exit(0)
+
+class Cheat(Exact):
+    def fit(self, dataset, rng):
+        dataset.frames[...] = 0
+
+    def imagine(self, frames, actions, samples, rng):
+        found = super().imagine(frames, actions, samples, rng)
+        frames[...] = 0
+        return found
+
+def spy(context):
+    return Spy()
+
+def exits(context):
+    return Exits()
+
+def dies(context):
+    return Dies()
+
+SPY = WorldModelEntry(make="their_models:spy", title="spy")
+EXITS = WorldModelEntry(make="their_models:exits", title="exits")
+DIES = WorldModelEntry(make="their_models:dies", title="dies")
+CHEAT = WorldModelEntry(make="their_models:Cheat", title="cheat", privileged=True)
+
 class Raises(Nearest):
     def fit(self, dataset, rng):
         raise RuntimeError("out of luck")
@@ -69,6 +135,7 @@ LATE = WorldModelEntry(make="their_models:late", title="late")
 """
 
 
+_MODELS = ("nearest", "spy", "cheat", "raises", "late", "unmade", "exits", "dies", "copy", "exact")
 _OWN_READER = judgement._reader
 
 
@@ -111,7 +178,7 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Said]:
         guests.add(folder)
         world = ["judge", "--task", "pick_place", "--out", str(root), "--workers", "1"]
         data = ["--sizes", "20", "60", "--seeds", "1000", "--samples", "2"]
-        status = main([*world, *data, "--models", "nearest", "raises", "late", "unmade", "copy", "exact"])
+        status = main([*world, *data, "--models", *_MODELS])
         (made,) = (path.parent for path in root.glob("*/judgement.json"))
         yield Said(made, status, out.getvalue(), err.getvalue())
         guests.forget()
@@ -126,7 +193,48 @@ def test_what_models_do_wrong_is_a_sentence_each(said: Said) -> None:
     assert "World model raises: fit() failed (RuntimeError: out of luck)." in said.err
     assert "World model late: imagine() failed (KeyError: 'depth')." in said.err
     assert "World model unmade (their_models:unmade) cannot be used (AttributeError: " in said.err
-    assert not list(said.folder.glob("raises-*"))
+    assert "World model exits: fit() failed (SystemExit: 0)." in said.err
+    assert "World model dies: imagine() failed: its process ended itself with exit code 0." in said.err
+    assert "Traceback" not in said.err
+    assert not list(said.folder.glob("raises-*.json"))
+    assert [path.read_text() for path in sorted(said.folder.glob("*.log"))] == ["its last words\n"] * 2
+
+
+def test_a_model_finds_no_truth_and_changes_nothing_for_the_next(said: Said) -> None:
+    """The spy says, too, that nothing changes; it and *cheat* spoil all that they are handed."""
+    scores = {
+        (cell["model"], cell["transitions"]): cell for cell in kept(said.folder, _of("spy", "cheat", "copy", "exact"))
+    }
+    for one, other in (("spy", "copy"), ("cheat", "exact")):
+        for name in ("total_variation", "tv_by_depth", "after_the_end", "value_loss", "data"):
+            assert scores[one, 60][name] == scores[other, 60][name], (one, name)
+
+
+def test_privileged_models_are_marked_wherever_they_stand(said: Said) -> None:
+    report = said.folder / "report"
+    rows = list(csv.DictReader((report / "scores.csv").read_text().splitlines()))
+    marked = {row["model"] for row in rows if row["privileged"] == "true"}
+    assert marked == {"exact", "cheat"} < {row["model"] for row in rows}
+    page = (report / "index.html").read_text()
+    recording = (said.folder / "judgement.rrd").read_bytes().decode("latin1")
+    for text in (said.out, page, recording):
+        assert "cheat (privileged)" in text and "exact (privileged)" in text
+        assert "frame (privileged)" not in text
+
+
+def test_each_cell_names_its_reader_and_is_not_compared_with_those_of_another(said: Said, tmp_path: Path) -> None:
+    folder = tmp_path / said.folder.name
+    shutil.copytree(said.folder, folder)
+    cell = folder / ModelFit("copy", 1000, 60).file
+    found = {**read_sealed(cell, "a cell"), "reader": "0123456789ab"}
+    write_json(cell, sealed(found))
+    with pytest.raises(ArtefactError, match=r"read by different readers \(, 0123456789ab\) and cannot be compared"):
+        kept(folder, _of("copy", "exact"))
+    assert kept(folder, _of("exact"))
+    images = folder / ModelFit("exact", 1000, 60).images
+    write_arrays(images, {name: np.zeros_like(array) for name, array in read_arrays(images).items()})
+    with pytest.raises(ArtefactError, match="is damaged: it is not as it was written"):
+        shown(folder, _of("exact"))
 
 
 def test_a_model_of_theirs_is_judged(said: Said) -> None:
@@ -208,13 +316,22 @@ def test_the_folder_of_an_agent_stands_for_all_its_runs(runs: dict[str, Path], t
     assert list(shown(folder, one)) == [agent]
 
 
-def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path]) -> None:
+def _open(run: Path, task: str, folder: Path) -> AbstractContextManager[JudgedModel]:
+    spec = registry.task(task)
+    index = RenderedFrameIndex(spec, "clean")
+    return opened(str(run), spec, index, "clean", SeedTree(0), folder=folder, log=folder / "log")
+
+
+def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Path) -> None:
     assert model_entry(str(runs["table"])).title == "table, seed 0"
-    with pytest.raises(InvalidValueError, match="does not imagine"):
-        load_model(runs["table"], "arrow_puzzle")
-    with pytest.raises(InvalidValueError, match="learned arrow_puzzle, not pick_place"):
-        load_model(runs["imaginer"], "pick_place")
-    visited = load_model(runs["imaginer"], "arrow_puzzle").visited
+    with pytest.raises(InvalidValueError, match="does not imagine"), _open(runs["table"], "arrow_puzzle", tmp_path):
+        pass
+    words = "learned arrow_puzzle, not pick_place"
+    with pytest.raises(InvalidValueError, match=words), _open(runs["imaginer"], "pick_place", tmp_path):
+        pass
+    with _open(runs["imaginer"], "arrow_puzzle", tmp_path) as judged:
+        visited = judged.visited
+    assert visited is not None
     assert 0 < len(visited) <= 2 * 20, "what it experienced is what the bench counted"
     assert all(len(state) == 4 and 0 <= action < 6 for state, action in visited)
     twice = (str(runs["imaginer"]), str(runs["imaginer"] / ".." / "seed_0"))
@@ -252,7 +369,9 @@ def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> No
     assert judged.folder_name != dataclasses.replace(judged, encoder=None).folder_name
 
 
-def test_two_judges_at_once_train_one_reader_and_see_it_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_judges_at_once_train_one_reader_of_a_world_and_see_it_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spec, trained = registry.task("pick_place"), []
 
     class Slow(BlindReader):
@@ -264,13 +383,22 @@ def test_two_judges_at_once_train_one_reader_and_see_it_whole(tmp_path: Path, mo
         time.sleep(0.2)
         return Slow(4)
 
-    code = SimpleNamespace(train_reader=train, load_reader=lambda spec, path: path.read_bytes())
+    code = ModuleType("reader")
+    vars(code).update(__file__=__file__, train_reader=train, load_reader=lambda spec, path: path.read_bytes())
     monkeypatch.setattr(registry, "load", lambda name: code)
     monkeypatch.setattr(judgement, "reader_errors", lambda *_: {})
-    with ThreadPoolExecutor(2) as pool:
-        jobs = [pool.submit(_OWN_READER, spec, "clean", tmp_path) for _ in range(2)]
-    assert [job.result() for job in jobs] == [b"whole", b"whole"]
-    assert len(trained) == 1
+    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
+    folders = [tmp_path / name for name in ("one", "one", "other")]
+    for folder in folders:
+        folder.mkdir(exist_ok=True)
+    with ThreadPoolExecutor(3) as pool:
+        jobs = [pool.submit(_OWN_READER, spec, "clean", folder) for folder in folders]
+    assert [job.result() for job in jobs] == [b"whole"] * 3
+    assert len(trained) == 1, "the reader of a world serves every folder"
+    (cached,) = (tmp_path / "cache").rglob("reader.safetensors")
+    cached.write_bytes(b"other")
+    with pytest.raises(ArtefactError, match=r"reader\.safetensors is damaged; remove .* trains it anew"):
+        _OWN_READER(spec, "clean", make_folder(tmp_path / "third"))
 
 
 def test_a_half_written_reader_is_one_sentence(tmp_path: Path) -> None:
