@@ -129,6 +129,18 @@ def test_motion_turns_the_cube_before_the_reward():
     env.close()
 
 
+def test_a_reset_in_the_middle_of_a_motion_shows_no_more_of_it():
+    env = as_dm_env(ARROWS, seed=0, motion_hz=4)
+    env.reset()
+    assert env.step(0).mid()
+    assert env.reset().first()
+    step = env.step(1)
+    while step.reward == 0.0:  # no first step, whose reward is None
+        step = env.step(1)
+    assert not step.first() and step.reward in (-5.0, -1.0, 50.0)
+    env.close()
+
+
 def test_viewer_runs_and_the_scene_moves():
     from dm_control.viewer import application, runtime
 

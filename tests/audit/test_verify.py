@@ -76,6 +76,18 @@ def test_every_kind_of_forgery_is_found(finished: Path, tmp_path: Path) -> None:
     assert not missed
 
 
+@pytest.mark.parametrize("name", ["index.html", "summary.csv", "results.csv"])
+def test_a_part_of_a_report_that_is_missing_or_cut_short_is_found(finished: Path, tmp_path: Path, name: str) -> None:
+    folder = tmp_path / finished.name
+    shutil.copytree(finished, folder)
+    assert [each.complaint for each in with_report(folder, [])] == [""]
+    path = folder / "report" / name
+    path.write_text(path.read_text()[: len(path.read_text()) // 2])
+    assert with_report(folder, [])[0].complaint.startswith(f"{name} has ")
+    path.unlink()
+    assert with_report(folder, [])[0].complaint.startswith(f"{name} has ")
+
+
 @pytest.mark.parametrize(
     ("task", "changes"),
     [

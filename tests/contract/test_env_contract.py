@@ -8,8 +8,12 @@ import tempfile
 import warnings
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
+from imagine_bench.tasks.arrows.rules import Arrows
+from imagine_bench.tasks.arrows.world import ArrowWorld
+from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
 from worlds import WORLDS
 
@@ -157,6 +161,7 @@ def test_views_draw_no_random_number():
     first, again = env.render(), env.render()
     assert first.shape == (60, 80, 3) and np.array_equal(first, again) and not np.shares_memory(first, again)
     assert env.human_view(64, 48).std() > 20, "the whole scene"
+    assert [env.human_view(*size).shape for size in ((32, 24), (64, 48))] == [(24, 32, 3), (48, 64, 3)]
     env.shapes()
     env.motion()
     assert env.np_random.bit_generator.state == before
@@ -198,6 +203,24 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
     *_, info = env.step(0)
     env.close()
     assert info["fault_reason"] == "cube 2 was pushed 6 mm while cube 0 was turned"
+
+
+def test_a_cube_that_slips_and_is_shoved_along_is_a_fault(monkeypatch):
+    """It should have stayed, so that it counts among those that must not move."""
+    world = ArrowWorld(appearance("clean"), Arrows(cubes=2, forbid="none", slip=0.2))
+    world.place((1, 3, 0), np.random.default_rng(0))
+    turn = world.executor.turn
+    for shove_m in (0.0, 0.006):
+
+        def clumsy(shove_m=shove_m, **arguments):
+            result = turn(**arguments)
+            world.data.joint("cube_0_joint").qpos[0] += shove_m
+            return result
+
+        monkeypatch.setattr(world.executor, "turn", clumsy)
+        fault = world.execute(0, (1, 3, 0)).fault
+        assert (fault or "").startswith("cube 0 was pushed 6 mm" if shove_m else "")
+        assert bool(fault) == bool(shove_m)
 
 
 # --- bad input ---------------------------------------------------------------------------------------------------
@@ -345,6 +368,10 @@ def test_shapes_and_motion_describe_the_scene():
         assert shape.faces is None or shape.faces.max() < len(shape.vertices)
         assert (*shape.rgba.shape, *shape.pose_in_body.shape) == (4, 7)
     assert still.poses_in_world.shape == (1, len(still.body_names), 7)
+    for name, pose in zip(still.body_names, still.poses_in_world[0], strict=True):
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, pose[3:])
+        np.testing.assert_allclose(matrix, env.data.body(name).xmat, atol=1e-9)
     env.capture_motion_hz = 20.0
     *_, info = env.step(2)
     motion = env.motion()

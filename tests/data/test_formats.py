@@ -148,6 +148,9 @@ def test_the_layout_is_lerobots(tmp_path: Path) -> None:
             steps.start, steps.stop, steps.stop - steps.start,
         )  # fmt: skip
         assert row["stats/next.reward/min"] == [episodes.rewards[steps].min()]
+        shown = episodes.frames[before[steps]] / 255
+        assert row["stats/observation.image/count"] == row["stats/next.reward/count"] == [len(shown)]
+        assert np.allclose(np.ravel(row["stats/observation.image/mean"]), shown.mean(axis=(0, 1, 2)))
     assert np.array_equal(table["next.done"].to_numpy(), np.diff(table["episode_index"].to_numpy(), append=99) > 0)
     assert table["timestamp"].to_pylist() == table["frame_index"].to_pylist()
     tasks = pq.read_table(folder / "meta/tasks.parquet")

@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 from machines import Wheels, spec_of
+from scipy import stats
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate, certificate_rows
@@ -81,6 +82,16 @@ def test_a_learner_that_is_done_has_seen_what_it_needs(dials):
     assert min(run.transitions for run in runs) >= 24 * 0.7
     again = learn(full, graph, 12, np.random.default_rng(0))
     assert again == runs[0]
+
+
+def test_the_cost_of_learning_is_the_mean_of_learners_with_its_standard_error():
+    rules = Wheels(n=2)
+    cost, full = certificate(spec_of(rules, 8)).floor, machine(rules)
+    runs = [learn(full, factor_graph(full), 8, np.random.default_rng(seed)) for seed in range(cost.learners)]
+    needed = [run.transitions for run in runs]
+    assert cost.transitions == pytest.approx(np.mean(needed))
+    assert cost.standard_error == pytest.approx(stats.sem(needed)) and cost.standard_error > 0.0
+    assert cost.episodes == pytest.approx(np.mean([run.episodes for run in runs]))
 
 
 def test_a_world_without_a_plan_says_so():

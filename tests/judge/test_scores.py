@@ -187,3 +187,20 @@ def test_rewards_are_judged_as_outcomes() -> None:
     wrong = [not any(reward == 5.0 for _, reward in steps[0].values()) for steps in world.one_step.truth]
     assert scores["reward_ece"] == pytest.approx(np.mean(wrong))
     assert scores["reward_brier"] == pytest.approx(2.0 * np.mean(wrong))
+
+
+def test_noise_is_told_apart_where_most_of_the_world_is_certain() -> None:
+    """By an uncertainty that is 1 where several macrostates may follow, and 0 elsewhere."""
+    world = judged_world("pick_place")
+    rules = world.spec.rules
+
+    class Knowing(Exact):
+        def imagine(self, frames: Frame, actions: NDArray[np.int64], *given: Any) -> Imagined:
+            found = super().imagine(frames, actions, *given)
+            pairs = zip([self.renderer.shows(frame) for frame in frames[:, -1]], actions[:, 0].tolist(), strict=True)
+            noisy = np.array([len(rules.outcomes(*pair)) > 1 for pair in pairs], dtype=np.float64)
+            return dataclasses.replace(found, aleatoric=np.repeat(noisy[:, None], found.pictures.shape[2], axis=1))
+
+    random = [len(steps[0]) > 1 for steps in world.one_step.truth]
+    assert 0.0 < np.mean(random) < 0.5
+    assert world.scores(Knowing(world.spec, world.index))["auroc_noisy"] == 1.0

@@ -55,6 +55,15 @@ def test_all_parts_are_of_one_moment_of_the_same_walk(task, execution):
     whole.close()
 
 
+def test_people_see_no_photograph():
+    """Its fragments, light and noise are of the agent's camera alone."""
+    env = make(observation="frame,human", appearance="photo", **KINEMATIC)
+    parts, _ = env.reset(seed=3)
+    np.testing.assert_array_equal(parts["human"], env.unwrapped.human_view(64, 64))
+    np.testing.assert_array_equal(parts["frame"], env.unwrapped.agent_view())
+    env.close()
+
+
 def test_a_gripper_that_holds_is_felt():
     env = make("pick_place", observation="proprio")
     empty, _ = env.reset(seed=0, options={"macrostate": (0, 0, 0, 2)})

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene
 from imagine_bench.tasks.motion.ik import ArmIK, ArmModel
+from imagine_bench.tasks.motion.orientation import Sensing
 from imagine_bench.tasks.pick_place.scene import compile_pick_scene
 from imagine_bench.tasks.scenes.constants import HOME_QPOS_RAD, TABLE_HEIGHT_M
 
@@ -90,6 +91,20 @@ def test_errors_of_the_planner_are_drawn_in_both_executions():
     kinematic = make("arrow_puzzle", physics={"plan_error_mm": 5.0, "plan_error_deg": 2.0}, execution="kinematic")
     both = make("arrow_puzzle", physics={"plan_error_mm": 5.0, "plan_error_deg": 2.0})
     assert played(kinematic, 2) == played(both, 2)  # so both walk alike afterwards
+
+
+def test_errors_of_the_planner_point_everywhere():
+    """As far as said, in each quadrant equally often, and to both sides about the vertical."""
+    sensing, rng = Sensing(settings=PhysicsSettings(plan_error_mm=5.0, plan_error_deg=2.0)), np.random.default_rng(0)
+    drawn = []
+    for _ in range(2000):
+        sensing.draw(rng)
+        drawn.append([*sensing.aside_m, sensing.turned_rad])
+    x_m, y_m, turned_rad = np.transpose(drawn)
+    np.testing.assert_allclose(np.hypot(x_m, y_m), 0.005)
+    np.testing.assert_allclose(np.abs(np.degrees(turned_rad)), 2.0)
+    octants = np.unique([x_m > 0, y_m > 0, turned_rad > 0], axis=1, return_counts=True)[1] / 2000
+    assert octants == pytest.approx([1 / 8] * 8, abs=0.03)
 
 
 @pytest.mark.parametrize(("task", "body"), [("arrow_puzzle", "cube_1"), ("pick_place", "car")])

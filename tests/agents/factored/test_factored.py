@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts, success
-from imagine_bench.agents.factored.agent import FactoredAgent
+from imagine_bench.agents.factored.agent import ACCEPTED, FactoredAgent
 from imagine_bench.agents.factored.factors import CodeTransition
 from imagine_bench.agents.factored.model import FactoredModel, Moves, Results
 from imagine_bench.agents.factored.planner import TIE, Planner
@@ -176,6 +176,25 @@ def test_imagined_rollouts_go_and_end_as_in_the_world(trained: FactoredAgent) ->
         assert rollout.rewards[index] == pytest.approx(reward, abs=1.6)
         assert ended == (index == 3) == (rollout.p_terminated[index] > 0.5)
     assert (greedy.p_terminated > 0.5).tolist() == [False] * (len(greedy.p_terminated) - 1) + [True]
+
+
+def test_what_follows_from_what_is_unknown_is_not_accepted_either() -> None:
+    learner, rng, known_again = agent(), np.random.default_rng(0), 0
+    live(learner, range(3), rng)
+    for code in starts():
+        rollout = learner.imagine(frame(code), actions=rng.integers(ACTIONS, size=6), depth=6, rng=rng)
+        unknown = rollout.epistemic > ACCEPTED
+        first = int(unknown.argmax()) if unknown.any() else len(unknown)
+        assert rollout.accepted.tolist() == [True] * first + [False] * (len(unknown) - first)
+        known_again += not unknown[first:].all()
+    assert known_again > 0, "after the first rejection something known is imagined"
+
+
+def test_what_surprised_it_is_known_at_once() -> None:
+    learner = agent()
+    for number, code in enumerate([(0, 1, 0), (1, 0, 0), (0, 1, 1)]):  # which bring -1, -5 and 10
+        learner.observe(fake_codes.transition(code, 1), episode=0)
+        assert learner.diagnostics()["model/outcomes"] == learner.learned == number + 1
 
 
 def test_what_draws_it_can_be_read_and_changes_nothing() -> None:

@@ -65,12 +65,11 @@ def test_model_only_training_gathers_and_weighs_uncertainty() -> None:
 def test_an_imagined_environment_gathers_uncertainty(accumulates: bool) -> None:
     imagination, _ = make(filtered=True, model=CountingModel(change=unsure), threshold=0.35, accumulates=accumulates)
     env = ImaginedVectorEnv(imagination, np.zeros((1, 2), np.float32), num_envs=2, horizon=10)
-    depth = 3 if accumulates else 10
-    for seed in range(2):  # a new episode has gathered nothing
+    episode = [True] * 3 + [False] if accumulates else [True] * 10
+    for seed in range(2):  # a new episode has gathered nothing, whether by a reset or after an end
         env.reset(seed=seed)
-        accepted = [env.step(np.zeros(2, np.int64))[4]["accepted"].all() for _ in range(depth + 1)]
-        assert all(accepted[:depth])
-        assert accepted[depth] != accumulates
+        accepted = [env.step(np.zeros(2, np.int64))[4]["accepted"].all() for _ in range(2 * len(episode))]
+        assert accepted == 2 * episode
 
 
 def test_an_environment_that_cannot_weigh_by_confidence_refuses_it() -> None:

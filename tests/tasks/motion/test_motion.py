@@ -127,6 +127,18 @@ def turned_deg(turner, model, change=None):
     return -math.degrees(poses(model, data)[1, 3]), result.fault
 
 
+def test_two_motions_of_one_macro_action_have_one_clock(turner):
+    place(turner.model, turner.data, (0, 0, 0))
+    turner.capture_motion_hz = 10.0
+    first, second = (turner.turn(cube=cube, clockwise=True) for cube in (0, 1))
+    turner.capture_motion_hz = 0.0
+    both = first.then(second)
+    assert both.sim_time_s == first.sim_time_s + second.sim_time_s
+    assert both.motion.time_s[0] == 0.0 and both.motion.time_s[-1] == pytest.approx(both.sim_time_s)
+    assert (np.diff(both.motion.time_s) >= 0.0).all()
+    assert len(both.motion.time_s) == len(both.motion.qpos) == len(first.motion.qpos) + len(second.motion.qpos)
+
+
 def test_only_contact_turns_the_cube(turner):
     """No weld, no teleport: fingertips that pass through the cube leave it alone, and the robot feels it holds none."""
 

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.rules import MAX_CUBES
 from imagine_bench.tasks.arrows.scene import layout
-from imagine_bench.tasks.motion.ik import ArmIK, ArmModel, pointing_down
+from imagine_bench.tasks.motion.ik import ArmIK, ArmModel, Reach, pointing_down
 from imagine_bench.tasks.motion.trajectory import (
+    EFFORT_SHARE,
     PEAK_ACCELERATION,
     PEAK_SPEED,
     SPEED_SHARE,
     Waypoint,
     minimum_jerk,
     plan,
+    shortest_duration_s,
 )
 from imagine_bench.tasks.scenes.constants import CUBE_EDGE_M, HOME_QPOS_RAD, TABLE_HEIGHT_M, TIMESTEP_S
 
@@ -47,6 +49,19 @@ def test_ik_reaches_with_the_tool_straight_down(arm, ik, slot, height_m):
     assert math.atan2(frame[1, 0], frame[0, 0]) == pytest.approx(math.pi / 4, abs=math.radians(0.2))
     assert (arm.model.jnt_range[:, 0] <= solution.qpos_rad).all()
     assert (solution.qpos_rad <= arm.model.jnt_range[:, 1]).all()
+
+
+def test_the_error_of_a_reach_is_the_larger_one_of_its_two_places(arm, ik):
+    home = np.array(HOME_QPOS_RAD)
+    near, lift_m, larger = Reach(at_qpos_rad=home, above_qpos_rad=home, error_m=0.0), np.array([0, 0, 0.07]), set()
+    for slot in SLOTS_XY_M:
+        place_m = np.array([*slot, CUBE_Z_M])
+        found = ik.reach(place_m, 0.3, lift_m[2], near)
+        at_m, above_m = (arm.tcp_in_base(each)[0] for each in (found.at_qpos_rad, found.above_qpos_rad))
+        errors_m = [np.linalg.norm(at_m - place_m), np.linalg.norm(above_m - place_m - lift_m)]
+        assert found.error_m == pytest.approx(max(errors_m), abs=1e-9)
+        larger.add(int(np.argmax(errors_m)))
+    assert larger == {0, 1}
 
 
 def test_steps_are_mink_s_to_the_bit(ik):
@@ -85,6 +100,21 @@ def random_plan(arm, rng):
     waypoints = [Waypoint(str(index), stop, 0.03) for index, stop in enumerate(stops)]
     start = np.array(HOME_QPOS_RAD)
     return plan(arm, start_qpos_rad=start, start_opening_m=0.02, waypoints=waypoints, timestep_s=TIMESTEP_S), waypoints
+
+
+def test_a_motion_is_as_short_as_speed_and_effort_allow(arm):
+    """At its peaks: one of the limits is met, and none is exceeded, whichever is the tighter one."""
+    rng, tight = np.random.default_rng(0), set()
+    inertia = arm.inertia(np.array(HOME_QPOS_RAD))
+    for size_rad in np.geomspace(1e-3, 1.0, 30):
+        delta_rad = size_rad * rng.uniform(-1, 1, 7)
+        duration_s = shortest_duration_s(arm, delta_rad, inertia)
+        speed = PEAK_SPEED * np.abs(delta_rad) / duration_s / arm.speed_limit_rad_s
+        effort = PEAK_ACCELERATION * np.abs(inertia @ delta_rad) / duration_s**2 / arm.effort_limit_nm
+        shares = [speed.max() / SPEED_SHARE, effort.max() / EFFORT_SHARE]
+        assert max(shares) == pytest.approx(1.0)
+        tight.add(int(np.argmax(shares)))
+    assert tight == {0, 1}
 
 
 def test_plans_keep_speed_limits_and_use_them(arm):

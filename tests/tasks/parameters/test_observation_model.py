@@ -116,6 +116,15 @@ def test_lag_shows_the_frame_of_so_many_macro_actions_ago(id_):
         np.testing.assert_array_equal(macrostate, now[step][1])
 
 
+def test_who_writes_into_a_late_frame_changes_none_that_comes_after():
+    env, other = (make(IDS[0], lag=2) for _ in range(2))
+    frames = [each.reset(seed=1)[0] for each in (env, other)]
+    for action in (0, 1, 0, 1):
+        frames[0][:] = 0
+        frames = [each.step(action)[0] for each in (env, other)]
+        np.testing.assert_array_equal(*frames)
+
+
 @pytest.mark.parametrize(
     ("id_", "options"),
     [(IDS[0], {"gesture": 0.5, "lag": 2, "fickle": 0.4, "appearance": "photo"}), (IDS[1], {"appearance": "strong"})],

@@ -104,6 +104,20 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
 
+def test_a_ball_is_picked_alike_however_it_has_rolled(world):
+    """It has no heading, so that the commands are the same to the bit."""
+    world.executor.capture_motion_hz = 20.0
+    commands = []
+    for angle_deg in (0, 40):
+        world.place((0, 0, 0, 0), rng())
+        turn(world, 0, 2, angle_deg)
+        result = world.executor.pick(index=0)
+        assert result.fault is None
+        commands.append(result.motion.ctrl)
+    world.executor.capture_motion_hz = 0.0
+    np.testing.assert_array_equal(*commands)
+
+
 def slippery_tips(model):
     tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
     model.geom_friction[tips] = (0.02, 0.001, 0.0001)
@@ -172,6 +186,20 @@ def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
     *_, info = env.step(0)
     assert not info["fault"] and np.abs(data.qpos - lies).max() < 1e-5, "what is done then changes nothing"
     env.close()
+
+
+@pytest.mark.parametrize(("state", "action"), [((1, 0, 0, OPEN_PALM), HAND_OVER), ((0, 1, 0, 2), 1)])
+def test_a_gripper_that_has_let_go_is_open_in_both_executions(state, action):
+    """Of a handover and of what was put back: as wide as where nothing was ever held."""
+    for execution in ("kinematic", "physics"):
+        env = gymnasium.make(SPEC.env_id, execution=execution, observation="proprio").unwrapped
+        empty, _ = env.reset(seed=0, options={"macrostate": (0, 0, 0, 2)})
+        held, _ = env.reset(seed=0, options={"macrostate": state})
+        assert (held[7:9] < empty[7:9] - 0.002).all()
+        after, *_, info = env.step(action)
+        assert not info["fault"] and info["macrostate"][: len(OBJECTS)].max() != 1
+        np.testing.assert_allclose(after[7:9], empty[7:9], atol=1e-3)
+        env.close()
 
 
 # --- what the camera sees ----------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import gymnasium
 import numpy as np
@@ -104,5 +105,23 @@ def test_a_factor_varies_what_it_says_and_by_as_much_as_it_says(factor):
     assert (np.ptp(hands, axis=0).max() > 0) == (factor == "hand")
     if factor == "hand":
         assert np.ptp(hands, axis=0) / 2 == pytest.approx(level.hand_offset_m, rel=0.1)
+    if factor == "camera":
+        assert 0.9 * level.camera_offset_m < reach[4].max() <= level.camera_offset_m * (1 + 1e-9)
+        angle_rad = math.sqrt(3) * level.camera_angle_rad  # about three axes at once
+        assert 0.2 * angle_rad < 2 * math.asin(reach[5].max()) <= angle_rad, "nothing adds up from frame to frame"
     if factor == "light":
         assert reach[1].max() == pytest.approx(level.light_fraction * usual[1].max(), rel=0.05)
+
+
+def test_each_channel_of_a_color_varies_for_itself():
+    env = make(appearance={"colors": 1.0})
+    usual = looks_of(make().model)[3][:, :3]
+    rng, tints = np.random.default_rng(0), []
+    for _ in range(300):
+        env.world.vary(rng)
+        now = looks_of(env.model)[3][:, :3]
+        varied = (now != usual).any(axis=1) & (usual > 0.1).all(axis=1) & (usual < 0.9).all(axis=1)
+        tints.append((now / np.maximum(usual, 1e-9))[varied])
+    channels = np.concatenate([tint for tint in tints if len(tint)]).T
+    assert np.abs(np.corrcoef(channels) - np.eye(3)).max() < 0.2
+    assert np.abs(channels - 1.0).max() == pytest.approx(between("", {"colors": 1.0}).color_fraction, rel=0.05)

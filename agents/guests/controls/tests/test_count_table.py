@@ -5,10 +5,12 @@ from __future__ import annotations
 import fake_codes
 import numpy as np
 import pytest
+from fake_pictures import played
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.count_table import CodeCountTableAgent
 from imagine_bench_controls.tabular.counts import CountTable
-from imagine_bench_controls.tabular.settings import HYPERPARAMETERS
+from imagine_bench_controls.tabular.own import OwnCountTableAgent
+from imagine_bench_controls.tabular.settings import HYPERPARAMETERS, OWN
 
 from imagine_bench import registry, rules
 from imagine_bench.interfaces import Observation
@@ -85,3 +87,15 @@ def test_directed_exploration_ends_in_greedy_actions() -> None:
         values = learner.q_values(seen)
         assert values[learner.act(seen, explore=True)] == pytest.approx(values.max())
     assert fake_codes.success(learner) == 1.0
+
+
+def test_every_transition_is_counted_once_however_often_it_sees_anew() -> None:
+    learner = OwnCountTableAgent(fake_codes.ACTIONS, OWN.resolve("fast", {}, "chapter_5"), SeedTree(0))
+    lived, sights = 0, set()
+    for episode in range(8):
+        for transition in played(None, np.random.default_rng(episode)):
+            learner.observe(transition, episode=episode)
+            lived += 1
+            assert learner.table.arrays()["count"].sum() == lived
+            sights.add(learner.diagnostics()["perception/looked_at"])
+    assert len(sights) > 2

@@ -7,6 +7,7 @@ from typing import Any
 import fake_codes
 import numpy as np
 import pytest
+from agent_states import same
 from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
 from imagine_bench_controls.tabular.counts import CountTable
@@ -123,3 +124,13 @@ def test_each_reading_sees_its_own_state_alone() -> None:
     assert CODES(shown) == CODES(Observation(frame=shown.frame)) == np.ravel_multi_index((2, 1, 0), (3, 3, 2))
     with pytest.raises(InvalidValueError, match=r"reads the true state, of at most 10 .* was shown none"):
         read_macrostate(Observation(frame=shown.frame))
+
+
+def test_what_is_learned_after_a_restore_leaves_the_snapshot_as_it_was() -> None:
+    learner, resumed, again = agent(5), agent(5, seed=7), agent(5, seed=9)
+    live(learner, 40)
+    saved = learner.state()
+    resumed.restore(saved)
+    live(resumed, 40, seed=2)
+    again.restore(saved)
+    assert same(again.state(), learner.state()) and not same(resumed.state(), learner.state())

@@ -9,7 +9,7 @@ import pytest
 import torch
 from agent_states import same
 from fake_latents import ACTIONS, LATENTS, FakeEncoder, built, frame, transition, with_own_settings
-from imagine_bench_controls.memory import drqn, imagination
+from imagine_bench_controls.memory import drqn, imagination, readout
 from imagine_bench_controls.memory.agent import RememberingAgent
 from imagine_bench_controls.memory.sequences import START, Recurrence, SequenceMemory
 
@@ -198,6 +198,26 @@ def test_a_new_task_keeps_dynamics_and_recurrence_which_the_model_s_updates_trai
     assert len(agent.real) == 0
     recall(agent, range(1), np.random.default_rng(1))
     assert not kept("recurrence")
+
+
+class _Sign:
+    """Reads the sign of a latent of one dimension."""
+
+    device = torch.device("cpu")
+
+    def read_macrostate(self, z: torch.Tensor) -> np.ndarray:
+        return (z > 0.0).long().numpy()
+
+
+@pytest.mark.parametrize("lengths", [[6], [3, 9]])
+def test_a_read_out_is_fitted_on_every_episode_the_newest_too(lengths: list[int]) -> None:
+    """Of T + 1 dimensions in T steps a ridge regression finds every label: those of the newest episode, too."""
+    memory, network, truth = filled(64, lengths, burn_in=0)
+    found = readout.fit(memory, network, _Sign(), (2,))  # type: ignore[arg-type]
+    assert found.sizes == (2,), "something was seen"
+    newest = truth[-1][:-1]
+    read = [int(found(state[1:])[0]) for state in newest]
+    assert np.mean(np.array(read) == (newest[:, 0] > 0.0).numpy()) > 0.7
 
 
 class CueEncoder(FakeEncoder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +18,7 @@ from imagine_bench_controls.settings import SWAPPING
 from imagine_bench_controls.swaps import SwappingDQN
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext
+from imagine_bench.interfaces import AgentContext, Observation
 from imagine_bench.seeding import SeedTree
 
 CPU = torch.device("cpu")
@@ -85,6 +86,15 @@ def test_a_swap_by_hand() -> None:
     assert read(found.next_z) == [(1, 0, 1), (1, 2, 0), (1, 2, 0), (1, 2, 0)]
     assert found.reward.tolist() == [10.0, -1.0, -1.0, -1.0] and found.terminated.tolist() == [1.0, 0.0, 0.0, 0.0]
     assert read(batch.z) == [(0, 2, 0)] * 4, "the real batch is as it was"
+
+
+def test_a_factor_that_an_action_ever_changed_is_touched_for_good() -> None:
+    learner = agent()
+    for code in ((0, 1, 0), (1, 2, 1)):
+        for then in ((0, 2, 0), code):  # the second factor, and nothing
+            moved = fake_codes.transition(code, 1)
+            learner.observe(replace(moved, next_observation=Observation(frame=fake_codes.frame(then))), episode=0)
+    assert learner.touched.tolist() == [[False] * 3, [True] * 3, [False] * 3, [False] * 3]
 
 
 def test_an_outcome_that_differs_is_unknown_for_good() -> None:
