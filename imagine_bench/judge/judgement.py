@@ -263,7 +263,7 @@ def _judged(
         **cell._asdict(),
         **learned,
         **scores,
-        "tv_by_depth": by_depth(asked["rollouts"], answers["rollouts"]),
+        **by_depth(asked["rollouts"], answers["rollouts"]),
         **ranking_scores(world.spec, asked["ranked"], answers["ranked"]),
         **after_the_end_scores(asked.get("after"), answers.get("after"), answers["one_step"]),
         **change_detection_delay(world.streams, answers["one_step"]),

@@ -83,6 +83,8 @@ class Predictions:
 
     states: Ints  #: Shape (N, S, D, M); -1 where an image shows nothing of this world.
     weights: Floats  #: Probability of each image at its depth. Shape (N, S, D).
+    #: Futures that were drawn for each question, all equally likely; 0 where the model gives probabilities. Shape (N,).
+    drawn: Ints
     offered: Arrays  #: What else the model offers, by its name in :class:`.Imagined`. Shapes (N, S, D) or (N, D).
     cpu_s: float  #: CPU seconds of imagining, reading apart
     steps: int  #: Macro-actions imagined, N D of each future
@@ -95,6 +97,7 @@ class Predictions:
             self,
             states=self.states[rows],
             weights=self.weights[rows],
+            drawn=self.drawn[rows],
             offered={name: array[rows] for name, array in self.offered.items()},
             cpu_s=share * self.cpu_s,
             steps=round(share * self.steps),
@@ -150,10 +153,12 @@ def evaluate(
         cpu_s += cpu_clock() - begun_s
         depth = questions.asked.shape[1]
         answers.append(require_imagined(imagined, name=name, rows=len(frames), depth=depth, samples=samples))
+    drawn = [0 if each.probabilities is not None else each.pictures.shape[1] for each in answers]
     given = {name: [getattr(each, name) for each in answers] for name in _OFFERED}
     return Predictions(
         states=_joined([index.read(each.pictures, reader) for each in answers], -1)[places],
         weights=_joined([weights_of(each) for each in answers])[places],
+        drawn=np.repeat(drawn, [len(each.pictures) for each in answers])[places],
         offered={
             name: _joined(parts)[places] for name, parts in given.items() if all(part is not None for part in parts)
         },

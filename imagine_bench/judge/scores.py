@@ -2,6 +2,10 @@
 
 The names of scores are columns of kept files and stay as they are there. NaN stands for what a model does not offer,
 and where there is nothing to tell apart.
+
+A model that draws futures is charged for their number by every score of probabilities: by total variation, calibration
+errors and Brier scores. Two columns make it comparable with a model that gives probabilities: the total variation that
+a perfect sampler would have, and :func:`.truth.squared_distance`, which is free of it.
 """
 
 from __future__ import annotations
@@ -23,7 +27,9 @@ from imagine_bench.judge.truth import (
     hallucinated_modes,
     missed_modes,
     p_ended,
+    sampling_noise_floor,
     shares,
+    squared_distance,
     total_variation,
 )
 from imagine_bench.judge.values import Model, rows_of, true_model, values_of_planning
@@ -39,14 +45,24 @@ Pairs = Sequence[tuple[Mapping[Value, float], Mapping[Value, float]]]
 """Exact and imagined probabilities of each question."""
 
 
-def by_depth(questions: EvalSet, predictions: Predictions) -> list[float]:
-    """Mean total variation to the exact distribution, by depth."""
-    away = np.zeros(questions.asked.shape)
+def by_depth(questions: EvalSet, predictions: Predictions) -> dict[str, list[float]]:
+    """Mean distances to the exact distribution, by depth.
+
+    Returns:
+        ``tv_by_depth``, the total variation; ``perfect_by_depth``, that of a perfect sampler with as many futures;
+        ``unbiased_by_depth``, the squared distance. D numbers each.
+    """
+    away, perfect, squared = np.zeros((3, *questions.asked.shape))
     for row, steps in enumerate(questions.truth):
+        drawn = int(predictions.drawn[row])
         for step, outcomes in enumerate(steps):
-            away[row, step] = total_variation(shares(outcomes), predictions.distribution(row, step))
-    found: list[float] = away.mean(axis=0).tolist()
-    return found
+            exact = shares(outcomes)
+            imagined = predictions.distribution(row, step)
+            away[row, step] = total_variation(exact, imagined)
+            perfect[row, step] = sampling_noise_floor(exact, drawn)
+            squared[row, step] = squared_distance(exact, imagined, drawn)
+    found = {"tv_by_depth": away, "perfect_by_depth": perfect, "unbiased_by_depth": squared}
+    return {name: values.mean(axis=0).tolist() for name, values in found.items()}
 
 
 def one_step_scores(
@@ -56,8 +72,11 @@ def one_step_scores(
     pairs = [(shares(steps[0]), predictions.distribution(row, 0)) for row, steps in enumerate(questions.truth)]
     away = np.array([total_variation(*pair) for pair in pairs])
     seen = np.array([pair in visited for pair in questions.pairs])
+    distances = by_depth(questions, predictions)
     return {
         "total_variation": float(away.mean()),
+        "perfect_sampler": distances["perfect_by_depth"][0],
+        "unbiased": distances["unbiased_by_depth"][0],
         "missed": float(np.mean([missed_modes(*pair) for pair in pairs])),
         "invented": float(np.mean([hallucinated_modes(*pair) for pair in pairs])),
         "nothing": float(np.mean([sum(p for state, p in each.items() if state[0] < 0) for _, each in pairs])),
@@ -78,7 +97,7 @@ def after_the_end_scores(asked: EvalSet | None, predictions: Predictions | None,
     found = dict.fromkeys(("after_the_end", "auroc_after_the_end"), math.nan)
     if asked is None or predictions is None:
         return found
-    found["after_the_end"] = by_depth(asked, predictions)[0]
+    found["after_the_end"] = by_depth(asked, predictions)["tv_by_depth"][0]
     known = before.of_one_step("epistemic")
     unknown = predictions.of_one_step("epistemic")
     if known is not None and unknown is not None:
@@ -88,19 +107,29 @@ def after_the_end_scores(asked: EvalSet | None, predictions: Predictions | None,
 
 
 def ranking_scores(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> Scores:
-    """Mean regret: the exact return of the best of each start's sequences, less that of the one ranked first."""
+    """Mean regret: the exact return of the best of each start's sequences, less that of the one ranked first.
+
+    ``regret`` ranks by the model's own rewards, ``regret_ruled`` by the rules' rewards for what the model imagines. The
+    latter is NaN for a model that gives probabilities of several images: it does not say which of them follow which.
+    """
     exact = np.array([sum(map(expected_reward, steps)) for steps in questions.truth]).reshape(-1, RANKED)
-    rewards, _ = _rewards_and_ends(questions, predictions, spec.rules)
-    imagined = (predictions.weights * rewards).sum(axis=(1, 2)).reshape(-1, RANKED)
-    first = (imagined >= imagined.max(axis=1, keepdims=True) - _TIE).argmax(axis=1)
-    return {"regret": float((exact.max(axis=1) - exact[np.arange(len(exact)), first]).mean())}
+
+    def regret(rewards: Floats) -> float:
+        imagined = (predictions.weights * rewards).sum(axis=(1, 2)).reshape(-1, RANKED)
+        first = (imagined >= imagined.max(axis=1, keepdims=True) - _TIE).argmax(axis=1)
+        return float((exact.max(axis=1) - exact[np.arange(len(exact)), first]).mean())
+
+    own = predictions.offered.get("rewards")
+    found = {"regret": math.nan if own is None else regret(own), "regret_ruled": math.nan}
+    if predictions.drawn.all() or predictions.weights.shape[1] == 1:
+        found["regret_ruled"] = regret(_ruled(questions, predictions, spec.rules)[0])
+    return found
 
 
-def _rewards_and_ends(questions: EvalSet, predictions: Predictions, rules: Rules) -> tuple[Floats, Floats]:
-    """Rewards, and probabilities that the episode is over, of imagined futures. Each of shape (N, S, D).
+def _ruled(questions: EvalSet, predictions: Predictions, rules: Rules) -> tuple[Floats, Floats]:
+    """Rewards, and whether the episode is over, that the rules give for imagined futures. Each of shape (N, S, D).
 
-    What a model does not offer is what the rules give for what it imagines; an unreadable image earns nothing and ends
-    the episode.
+    An unreadable image earns nothing and ends the episode.
     """
     rewards = np.zeros(predictions.weights.shape)
     over = np.ones(rewards.shape)
@@ -117,50 +146,69 @@ def _rewards_and_ends(questions: EvalSet, predictions: Predictions, rules: Rules
                     break
                 over[row, slot, step] = 0.0
                 state = reached
-    offered = predictions.offered
-    return offered.get("rewards", rewards), offered.get("p_ended", over)
+    return rewards, over
 
 
-def imagined_model(questions: EvalSet, predictions: Predictions, rules: Rules) -> Model:
-    """What a model expects of every macro-action in the macrostates of :func:`.questions.one_step`."""
+def imagined_models(questions: EvalSet, predictions: Predictions, rules: Rules) -> dict[str, Model]:
+    """What a model expects of every macro-action in the macrostates of :func:`.questions.one_step`.
+
+    Returns:
+        ``ruled``, with the rules' rewards and ends for what it imagines; and ``own``, with those that it predicts,
+        where it predicts both.
+    """
     states = questions.macrostates
     shape = (len(states), rules.n_actions, -1)
-    rewards, over = (each[:, :, 0].astype(np.float64) for each in _rewards_and_ends(questions, predictions, rules))
     weights = predictions.weights[:, :, 0] / FRAMES
-    following = rows_of(predictions.states[:, :, 0], states)
-    expected = (weights * rewards).reshape(shape).cumsum(axis=2)[:, :, -1]
-    return Model(following.reshape(shape), (weights * (1.0 - over)).reshape(shape), expected)
+    following = rows_of(predictions.states[:, :, 0], states).reshape(shape)
+
+    def model(rewards: Floats, over: Floats) -> Model:
+        continues = (weights * (1.0 - over)).reshape(shape)
+        return Model(following, continues, (weights * rewards).reshape(shape).cumsum(axis=2)[:, :, -1])
+
+    rewards, over = _ruled(questions, predictions, rules)
+    found = {"ruled": model(rewards[:, :, 0], over[:, :, 0])}
+    own_rewards = predictions.of_one_step("rewards")
+    own_over = predictions.of_one_step("p_ended")
+    if own_rewards is not None and own_over is not None:
+        found["own"] = model(own_rewards.astype(np.float64), own_over.astype(np.float64))
+    return found
 
 
 def _costs(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dict[str, float | list[float]]:
     """Value losses, in the mean, the worst and by start, and what abstaining gains; NaN where not all is asked about.
 
-    A loss is V* - V of the policy that is optimal in the model. Abstaining gains what planning gains where it avoids
-    transitions, but for where all of a macrostate's would be avoided: those that the model knows least of, of
-    :data:`_AVOIDED` the best share with the truth known and 0 where none gains; or those that its own filter discards.
+    A loss is V* - V of the policy that is optimal in the model, by its own rewards and ends; NaN where it leaves them
+    out. ``value_loss_ruled`` is the mean loss with the rules' rewards and ends for what the model imagines. Abstaining
+    gains what planning gains where it avoids transitions, but for where all of a macrostate's would be avoided: those
+    that the model knows least of, of :data:`_AVOIDED` the best share with the truth known and 0 where none gains; or
+    those that its own filter discards.
     """
     states = questions.macrostates
     starts = spec.rules.start_states
-    names = ("value_loss", "worst_value_loss", "worth_of_refusing", "worth_of_filter")
-    found: dict[str, float | list[float]] = dict.fromkeys(names, math.nan)
+    names = ("value_loss", "worst_value_loss", "value_loss_ruled", "worth_of_refusing", "worth_of_filter")
+    found: dict[str, float | list[float]] = {**dict.fromkeys(names, math.nan), "value_loss_by_start": []}
     if not set(starts) <= set(states):
-        return {**found, "value_loss_by_start": []}
+        return found
     truth = true_model(spec.rules, states)
-    model = imagined_model(questions, predictions, spec.rules)
+    models = imagined_models(questions, predictions, spec.rules)
     rows = [states.index(start) for start in starts]
 
     def planned(held: Model, allowed: Bools | None = None) -> Floats:
         return values_of_planning(truth, held, spec.horizon, allowed)[rows]
 
-    usual = planned(model)
+    best = planned(truth)
+    found["value_loss_ruled"] = float(np.maximum(best - planned(models["ruled"]), 0.0).mean())
+    if "own" not in models:
+        return found
+    usual = planned(models["own"])
 
     def gain(allowed: Bools) -> float:
-        return float(planned(model, allowed).mean() - usual.mean())
+        return float(planned(models["own"], allowed).mean() - usual.mean())
 
     def by_pair(of_questions: Floats) -> Floats:
         return of_questions.reshape(len(states), -1, FRAMES).mean(axis=2).astype(np.float64)
 
-    losses = np.maximum(planned(truth) - usual, 0.0)
+    losses = np.maximum(best - usual, 0.0)
     found["value_loss"] = float(losses.mean())
     found["worst_value_loss"] = float(losses.max())
     found["value_loss_by_start"] = losses.round(6).tolist()

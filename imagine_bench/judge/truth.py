@@ -6,6 +6,7 @@ at the end.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Iterable, Mapping
 from typing import TypeVar
 
@@ -50,11 +51,44 @@ def total_variation(exact: Mapping[State, float], imagined: Mapping[State, float
     return 0.5 * sum(abs(exact.get(key, 0.0) - imagined.get(key, 0.0)) for key in {*exact, *imagined})
 
 
+def squared_distance(exact: Mapping[State, float], imagined: Mapping[State, float], drawn: int = 0) -> float:
+    """Sum over macrostates of the squared difference of two probabilities, without bias; 0 for equal ones, at most 2.
+
+    It is how much larger the expected Brier score of the model's probabilities q is than that of the exact ones p:
+    E |q - 1_X|^2 - E |p - 1_X|^2 = sum_x (q_x - p_x)^2, where X is drawn from p and 1_X is 1 at X and 0 elsewhere.
+
+    A model that gives q is charged just that. Of one that draws S independent futures only their shares f are known.
+    f_x has mean q_x and variance q_x (1 - q_x) / S, so E sum_x (f_x - p_x)^2 exceeds the sum above by
+    sum_x q_x (1 - q_x) / S; and E f_x (1 - f_x) = q_x (1 - q_x) (S - 1) / S. Hence
+
+        sum_x (f_x - p_x)^2 - sum_x f_x (1 - f_x) / (S - 1)
+
+    has the expected value sum_x (q_x - p_x)^2: 0 for a perfect sampler, whatever S. It is the U-statistic over pairs of
+    futures i and j, the mean of sum_x (1[x_i = x] - p_x) (1[x_j = x] - p_x) over all i != j. A single one may be less
+    than 0, and its mean is where futures are spread more evenly than independent ones.
+
+    Args:
+        exact: Probabilities p.
+        imagined: Probabilities q, or shares f of the futures.
+        drawn: S; 0 if the model gives probabilities. Of one future nothing is known: NaN.
+    """
+    if drawn == 1:
+        return math.nan
+    away = sum((exact.get(key, 0.0) - imagined.get(key, 0.0)) ** 2 for key in {*exact, *imagined})
+    if not drawn:
+        return away
+    return away - sum(share * (1.0 - share) for share in imagined.values()) / (drawn - 1)
+
+
 def sampling_noise_floor(exact: Mapping[State, float], count: int) -> float:
-    """Expected total variation between ``exact`` and ``count`` samples of itself: what a perfect model would show.
+    """Expected total variation between ``exact`` and ``count`` samples of itself: that of a perfect sampler.
+
+    It is 0 for a ``count`` of 0, which stands for a model that gives probabilities.
 
     Half the sum of the mean absolute deviations of binomial counts, by De Moivre's formula (Diaconis & Zabell 1991).
     """
+    if not count:
+        return 0.0
     p = np.minimum(np.array(list(exact.values())), 1.0)
     m = np.floor(count * p)
     deviation = 2.0 * (m + 1.0) * (1.0 - p) * scipy.stats.binom.pmf(m + 1.0, count, p)  # E |X - count p|

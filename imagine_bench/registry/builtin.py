@@ -145,6 +145,11 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         title="copy the last frame",
         description="Says that nothing ever changes: one end of the scale.",
     ),
+    "patches": WorldModelEntry(
+        make="imagine_bench.agents.world_models.patches:Patches",
+        title="patches and tables",
+        description="No network: patches that change, groups of their looks, tables of what followed; a plain model.",
+    ),
     "convolutional": WorldModelEntry(
         make="imagine_bench.agents.world_models.convolutional:make",
         title="convolutional",

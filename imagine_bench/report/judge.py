@@ -42,6 +42,8 @@ from imagine_bench.store.files import read_json, table_text
 QUESTIONS = {
     "Which outcomes, how likely?": {
         "total_variation": "total variation, 1 step", "tv_3": "3 steps", "tv_5": "5 steps", "tv_10": "10 steps",
+        "perfect_sampler": "perfect sampler's, 1 step", "perfect_10": "perfect sampler's, 10",
+        "unbiased": "unbiased Brier, 1 step", "unbiased_10": "unbiased Brier, 10",
         "after_the_end": "after the end", "missed": "missed outcomes", "invented": "invented", "nothing": "no picture",
         "outcome_ece": "calibration error", "outcome_brier": "Brier",
     },
@@ -50,7 +52,9 @@ QUESTIONS = {
         "end_error": "end error", "end_ece": "end calibration", "end_brier": "end Brier",
     },
     "What do mistakes cost?": {
-        "value_loss": "value loss", "worst_value_loss": "from the worst start", "regret": "regret of 1 of 5",
+        "value_loss": "value loss", "worst_value_loss": "from the worst start",
+        "value_loss_ruled": "value loss, rules' rewards", "regret": "regret of 1 of 5",
+        "regret_ruled": "regret, rules' rewards",
     },
     "Does it know?": {
         "auroc_wrong": "AUROC, wrong", "auroc_never": "never seen", "auroc_either": "either",
@@ -71,13 +75,24 @@ QUESTIONS = {
 """Scores by question: what a column of theirs is called."""
 COLUMNS = {name: words for columns in QUESTIONS.values() for name, words in columns.items()}
 _WORDS = {
-    "Which outcomes, how likely?": "Total variation to the exact distribution, 0 for equal ones and 1 for those that "
-    "share nothing, also of transitions after the end of an episode, which no data contains; missed and invented "
-    "outcomes a transition; the share of pictures that show nothing of this world.",
+    "Which outcomes, how likely?": "Total variation is the distance of the imagined from the exact distribution of "
+    "macrostates: 0 for equal ones, 1 for two that share no macrostate. A model that draws futures instead of giving "
+    "probabilities is above 0 even if it is perfect; the columns “perfect sampler's” say how far, for as many futures, "
+    "and hold 0 for a model that gives probabilities. The unbiased Brier score is free of that: the sum of squared "
+    "differences of probabilities, less what sampling adds in the mean: 0 is perfect, 2 the worst, and a perfect "
+    "sampler may be a little below 0. Compare a model that draws with one that gives probabilities by this score only; "
+    "missed and invented outcomes, calibration error and Brier score hold the sampling, too. “After the end” is the "
+    "total variation of macro-actions after an episode has ended, which no data contains. Missed and invented outcomes "
+    "are counted per transition. “No picture” is the share of images in which the reader recognizes nothing.",
     "Which rewards and ends?": "Error of the expected reward, in units of reward, and of the probability of the end. "
     "For calibration and Brier score a reward counts as the nearest that the rules give.",
-    "What do mistakes cost?": "V* - V of the policy that is optimal in the model, mean over starts, and the exact "
-    "return that the sequence ranked first of five leaves to the best. In units of reward.",
+    "What do mistakes cost?": "Value loss is V* - V: what the best policy earns from a start, less what the policy "
+    "earns that is optimal in the model; the mean over starts, in units of reward. Regret: the model ranks five "
+    "sequences of macro-actions from a start, and regret is the exact return of the best less that of the one ranked "
+    "first. Both use the rewards and ends that the model itself predicts, and are a dash where it predicts none. The "
+    "columns “rules' rewards” take rewards and ends from the rules, for the macrostates that the model imagines: they "
+    "judge all models alike. (Regret has a dash there if a model gives probabilities of several images, because it "
+    "does not say which image follows which.)",
     "Does it know?": "AUROC of the epistemic uncertainty for transitions imagined wrongly, never seen in the data, or "
     "either, and for those after the end; of the aleatoric for random ones; of the modal for several outcomes. Skill: "
     "the share of wrong ones that a filter discards, less that of right ones; the best threshold of the epistemic "
@@ -88,16 +103,21 @@ _WORDS = {
     f"probability {SLIP}, or that one also does what another does, at false alarms in {FALSE_ALARMS:.0%} of "
     f"unchanged streams of {LENGTH}; {LENGTH}: never. Counterfactuals: what it imagines of two macro-actions with the "
     "same draws that cannot both be.",
-    "What does it cost?": "On one core. What was spent on an encoder beforehand is in frames.",
+    "What does it cost?": "CPU seconds are those of one core: of fitting, and of imagining 1,000 macro-actions. Frames "
+    "beforehand are those on which the model's encoder had been trained before.",
 }
-SHORT = ("total_variation", "tv_10", "nothing", "value_loss", "auroc_wrong", "notice_slip", "counterfactual", "fit_s")
+SHORT = (
+    *("total_variation", "perfect_sampler", "unbiased", "unbiased_10", "nothing", "value_loss", "value_loss_ruled"),
+    *("auroc_wrong", "notice_slip", "counterfactual", "fit_s"),
+)
 _SHARES = {
-    *("total_variation", "tv_3", "tv_5", "tv_10", "after_the_end", "nothing"),
+    *("total_variation", "tv_3", "tv_5", "tv_10", "perfect_sampler", "perfect_10", "after_the_end", "nothing"),
     *("outcome_ece", "reward_ece", "end_error", "end_ece"),
     *("filter_keeps", "filter_error", "best_skill", "counterfactual"),
     *(name for name in COLUMNS if name.startswith("auroc")),
 }
-_WHY_DASH = "not offered by the model, or nothing to tell apart"
+_WHY_DASH = "not offered by the model, nothing to tell apart, or judged before this score existed"
+_BY_DEPTH = {"tv": "tv_by_depth", "perfect": "perfect_by_depth", "unbiased": "unbiased_by_depth"}
 Scores = Mapping[str, Any]
 """What is kept of a model that was fitted once."""
 
@@ -164,7 +184,12 @@ def _csv(found: Judged) -> str:
 
 def score(cell: Scores, name: str) -> float:
     """A score of a cell; ``tv_5`` is the total variation at depth 5. NaN where there is none."""
-    value = cell["tv_by_depth"][int(name[3:]) - 1] if name.startswith("tv_") else cell[name]
+    kind, _, depth = name.rpartition("_")
+    if kind in _BY_DEPTH and depth.isdigit():
+        values = cell.get(_BY_DEPTH[kind])
+        value = None if values is None else values[int(depth) - 1]
+    else:
+        value = cell.get(name)
     digits = 3 if name.endswith("_s") else 9  # a time of less than a millisecond is none
     return math.nan if value is None else round(float(value), digits)
 
@@ -185,27 +210,28 @@ def _scores(found: Judged, table: str, names: Collection[str]) -> Table:
         scores = (over_seeds([score(cell, name) for cell in cells], _number, share=name in _SHARES) for name in names)
         rows.append([_title(model), transitions, *scores])
     header = ["world model", "transitions", *map(COLUMNS.__getitem__, names)]
-    caption = "Interquartile means over seeds or runs, with 95 % intervals. 0 is best in every error; value loss is in "
-    return Table(table, header, rows, f"{caption}units of reward.", _WHY_DASH)
+    caption = "Interquartile means over seeds or runs, with 95 % intervals. 0 is best in every error; value loss and "
+    return Table(table, header, rows, f"{caption}regret are in units of reward.", _WHY_DASH)
 
 
 def in_short(found: Judged) -> Section:
     """The main scores, and the reader's own errors."""
     errors = {name: f"{share:.2%}" for name, share in read_json(found.folder / "reader.json", "errors").items()}
     words = (
-        "A reader that was trained apart turns imagined images into macrostates. Of real frames, it misreads some or "
-        "refuses to read them; fog, noise and blends of two frames should not be read."
+        "Imagined images are read as macrostates by a network, the reader, that was trained apart from all models. Its "
+        "own errors are in the second table: the shares of real frames that it takes for another macrostate or does "
+        "not recognize, and the shares of fog, noise and blends of two frames that it wrongly takes for a real frame."
     )
     samples = found.judgement.samples
     truth = prepare(found.judgement, found.folder).asked["rollouts"].truth
     noise = np.mean([[sampling_noise_floor(shares(each), samples) for each in steps] for steps in truth], axis=0)
-    chance = f"Drawing only {samples} futures adds at most {', '.join(map(decimals, noise))} to it, by depth."
-    reader = Table.of("reader", [errors], "What the reader of images gets wrong itself.")
-    return Section(
-        "In short",
-        [words, f"Total variation is by imagined depth. {chance}"],
-        tables=[_scores(found, "short", SHORT), reader],
+    chance = (
+        f"A perfect model that draws {samples} futures has a total variation of {', '.join(map(decimals, noise))} "
+        f"after 1 to {len(noise)} macro-actions; one that gives probabilities has 0. The unbiased Brier score is fair "
+        "to both."
     )
+    reader = Table.of("reader", [errors], "What the reader of images gets wrong itself.")
+    return Section("In short", [words, chance], tables=[_scores(found, "short", SHORT), reader])
 
 
 def question(found: Judged, title: str) -> Section:
@@ -215,8 +241,12 @@ def question(found: Judged, title: str) -> Section:
 
 
 def compared(found: Judged) -> Section:
-    """Each pair's difference in total variation at the most transitions, and a line on the two best that learned."""
-    values = {model: [score(cell, "total_variation") for cell in cells] for model, cells in found.last.items()}
+    """Each pair's difference in unbiased Brier score at the most transitions, and a line on the two best that learned.
+
+    Models whose score is not known, such as those that drew a single future, are left out.
+    """
+    every = {model: [score(cell, "unbiased") for cell in cells] for model, cells in found.last.items()}
+    values = {model: scores for model, scores in every.items() if not any(map(math.isnan, scores))}
     learned = [model for model in values if not model_entry(model).privileged]
     best = sorted(learned, key=lambda model: iqm(values[model]))[:2]
     pairs = list(itertools.combinations(values, 2))
@@ -231,9 +261,9 @@ def compared(found: Judged) -> Section:
             verdict = f"difference {estimate(each, number)}, {p_value(p)}, Holm-corrected: {better}"
             if math.isnan(p):
                 verdict = "one seed does not show which is better"
-            answers.append(f"Smallest total variation{found.after}: {', then '.join(named)}; {verdict}.")
-    header = ["model", "against", "difference of total variation", "p"]
-    caption = f"Total variation of one step{found.after}; Yuen's test over seeds, p by Holm."
+            answers.append(f"Smallest unbiased Brier score{found.after}: {', then '.join(named)}; {verdict}.")
+    header = ["model", "against", "difference of unbiased Brier score", "p"]
+    caption = f"Unbiased Brier score of one step{found.after}; Yuen's test over seeds, p by Holm."
     table = Table("differences", header, rows, caption, "one seed says nothing", "Every pair")
     return Section("Against each other", tables=[table], answers=answers)
 

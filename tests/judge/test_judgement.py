@@ -33,7 +33,8 @@ from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
 from imagine_bench.judge.models import JudgedModel, make, model_entry, opened
 from imagine_bench.judge.predictions import RenderedFrameIndex
-from imagine_bench.report.judge import judgement_report
+from imagine_bench.report.judge import COLUMNS, Judged, judgement_page, judgement_report
+from imagine_bench.report.page import DASH
 from imagine_bench.running import bench as benches
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store.files import make_folder, read_arrays, read_sealed, sealed, write_arrays, write_json
@@ -244,10 +245,28 @@ def test_a_model_of_theirs_is_judged(said: Said) -> None:
     assert {"/action", "/real/frame", "/exact/frame", "/nearest/outcomes"} <= recorded.keys()
     assert times(said.folder / "judgement.rrd", "/exact/frame", "depth") == set(range(11))
     scored = {(cell["model"], cell["transitions"]): cell for cell in kept(said.folder, _of("copy", "exact"))}
-    assert scored["exact", 60]["value_loss"] == 0.0 < scored["copy", 60]["value_loss"]
+    assert scored["exact", 60]["value_loss"] == scored["exact", 60]["value_loss_ruled"] == 0.0
+    assert scored["copy", 60]["value_loss"] is None and scored["copy", 60]["value_loss_ruled"] > 0.0
     futures = scored["exact", 60]["futures"]
     assert [pytest.approx(each) for each in futures["real"]] == futures["imagined"]
     assert scored["copy", 20]["data"] == scored["exact", 60]["data"]
+
+
+_SINCE = re.compile("perfect|unbiased|.*_ruled")  # scores that judgements before 2026-11-28 lack
+
+
+def test_scores_that_an_older_judgement_lacks_are_dashes(said: Said) -> None:
+    one = _of("copy", "exact")
+    found = Judged(said.folder, one, registry.task(one.task), {})
+    for cell in kept(said.folder, one):
+        older = {name: value for name, value in cell.items() if not _SINCE.match(name)}
+        found.cells.setdefault((cell["model"], cell["transitions"]), []).append(older)
+    page = judgement_page(found)
+    (short,) = (table for section in page.sections for table in section.tables if table.name == "short")
+    columns = dict(zip(short.header, zip(*short.rows, strict=True), strict=True))
+    lacking = {COLUMNS[name] for name in COLUMNS if _SINCE.match(name)} & columns.keys()
+    assert len(lacking) == 3 and all(set(columns[name]) == {DASH} for name in lacking)
+    assert DASH not in columns[COLUMNS["total_variation"]]
 
 
 def test_what_is_kept_is_not_judged_again(said: Said) -> None:

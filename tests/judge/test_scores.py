@@ -14,14 +14,20 @@ from judged import STILL, JudgedWorld, judged_world
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Rules, State
-from imagine_bench.interfaces.model import Imagined
+from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.questions import FRAMES
-from imagine_bench.judge.scores import after_the_end_scores, by_depth, filter_scores, one_step_scores
+from imagine_bench.judge.scores import (
+    after_the_end_scores,
+    by_depth,
+    filter_scores,
+    one_step_scores,
+    ranking_scores,
+)
 
 ERRORS = (
     *("total_variation", "missed", "invented", "nothing", "outcome_ece", "outcome_brier", "reward_error", "reward_ece"),
-    *("reward_brier", "end_error", "end_ece", "end_brier", "value_loss", "worst_value_loss"),
+    *("reward_brier", "end_error", "end_ece", "end_brier", "value_loss", "worst_value_loss", "unbiased"),
 )
 ARROWS, BOTH = "arrows:cubes=2", pytest.mark.parametrize("task", ["arrows:cubes=2", "pick_place"])
 
@@ -33,8 +39,13 @@ def test_exact_is_without_any_error(task: str) -> None:
     assert {name: scores[name] for name in ERRORS} == pytest.approx(dict.fromkeys(ERRORS, 0.0), abs=1e-12)
     assert scores["regret"] == scores["worth_of_refusing"] == 0.0
     assert math.isnan(scores["auroc_wrong"]) and math.isnan(scores["best_skill"])  # there is no error to find
-    deep = by_depth(world.rollouts, world.predictions(world.exact, world.rollouts))
-    assert deep == pytest.approx([0.0] * 10, abs=1e-12)
+    assert scores["perfect_sampler"] == scores["value_loss_ruled"] == 0.0
+    if task == ARROWS:
+        assert scores["regret_ruled"] == 0.0
+    else:
+        assert math.isnan(scores["regret_ruled"]), "of several images it does not say which follow which"
+    for deep in by_depth(world.rollouts, world.predictions(world.exact, world.rollouts)).values():
+        assert deep == pytest.approx([0.0] * 10, abs=1e-12)
     several = any(len(outcomes) > 2 for steps in world.rollouts.truth for outcomes in steps)
     assert several == (task == "pick_place"), "some of the truth is random"
 
@@ -59,7 +70,7 @@ def test_copy_scores_what_enumeration_says(task: str) -> None:
     stays = [reached(rules, state, [action]).get(state, 0.0) for state in alive for action in range(rules.n_actions)]
     assert scores["total_variation"] == pytest.approx(1.0 - np.mean(stays))
     assert math.isnan(scores["reward_error"]) and math.isnan(scores["auroc_wrong"])
-    deep = by_depth(world.rollouts, world.predictions(STILL, world.rollouts))
+    deep = by_depth(world.rollouts, world.predictions(STILL, world.rollouts))["tv_by_depth"]
     for depth in (1, 4):
         pairs = zip(world.rollouts.states, world.rollouts.asked[:, :depth].tolist(), strict=True)
         away = [1.0 - reached(rules, state, actions).get(state, 0.0) for state, actions in pairs]
@@ -79,18 +90,133 @@ def best(rules: Rules, state: State, left: int, choose: Callable[[State], list[i
     )
 
 
-def test_copy_loses_what_always_doing_the_same_loses() -> None:
-    world = judged_world(ARROWS)
+def losses(world: JudgedWorld, choose: Callable[[State], list[int]], horizon: int = 5) -> list[float]:
+    """By start: what always choosing so loses to the best."""
     rules = world.spec.rules
     every = list(range(rules.n_actions))
-    losses = [
-        best(rules, state, 5, lambda _: every) - best(rules, state, 5, lambda _: [0]) for state in rules.start_states
+    return [
+        best(rules, start, horizon, lambda _: every) - best(rules, start, horizon, choose)
+        for start in rules.start_states
     ]
-    short = dataclasses.replace(world.spec, horizon=5)
-    found = one_step_scores(short, world.one_step, world.predictions(STILL, world.one_step), set())
-    assert found["value_loss"] == pytest.approx(np.mean(losses))
-    assert found["worst_value_loss"] == pytest.approx(max(losses)) and max(losses) > 0.0
-    assert found["value_loss_by_start"] == pytest.approx(losses)
+
+
+def short(world: JudgedWorld, model: WorldModel) -> dict[str, Any]:
+    """The scores of single transitions with a horizon of 5."""
+    spec = dataclasses.replace(world.spec, horizon=5)
+    return one_step_scores(spec, world.one_step, world.predictions(model, world.one_step), set())
+
+
+def test_copy_loses_what_always_doing_the_same_loses() -> None:
+    """It predicts no rewards: its own value loss is a dash, and by the rules' rewards all macro-actions are equal."""
+    world = judged_world(ARROWS)
+    found = short(world, STILL)
+    assert found["value_loss_ruled"] == pytest.approx(np.mean(losses(world, lambda _: [0])))
+    ranked = ranking_scores(world.spec, world.ranked, world.predictions(STILL, world.ranked))
+    assert math.isnan(found["value_loss"]) and math.isnan(found["worst_value_loss"])
+    assert math.isnan(ranked["regret"]) and ranked["regret_ruled"] > 0.0
+
+
+class Changed(Exact):
+    """Exact, but for the fields that are changed."""
+
+    def __init__(self, world: JudgedWorld, **changes: float | None) -> None:
+        super().__init__(world.spec, world.index)
+        self.changes = changes
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        found = super().imagine(frames, actions, samples, rng)
+        shape = found.pictures.shape[:3]
+        given = {name: None if value is None else np.full(shape, value) for name, value in self.changes.items()}
+        return dataclasses.replace(found, **given)
+
+
+def test_a_model_that_expects_the_end_everywhere_is_charged_for_its_haste() -> None:
+    """Its own probability of an end decides its plans: it takes the largest reward at once."""
+    world = judged_world(ARROWS)
+    rules = world.spec.rules
+
+    def hasty(state: State) -> list[int]:
+        rewards = [sum(o.probability * o.reward for o in rules.outcomes(state, a)) for a in range(rules.n_actions)]
+        return [int(np.argmax(rewards))]
+
+    found = short(world, Changed(world, p_ended=1.0))
+    assert found["value_loss_by_start"] == pytest.approx(losses(world, hasty))
+    assert found["worst_value_loss"] == pytest.approx(max(losses(world, hasty)))
+    assert found["value_loss"] == pytest.approx(np.mean(losses(world, hasty))) and found["value_loss"] > 1.0
+    assert found["value_loss_ruled"] == 0.0, "it imagines the right macrostates"
+
+
+@pytest.mark.parametrize("left_out", ["rewards", "p_ended"])
+def test_what_is_left_out_is_a_dash_and_the_rules_stand_in_beside_it(left_out: str) -> None:
+    world = judged_world(ARROWS)
+    scores = world.scores(Changed(world, **{left_out: None}))
+    assert math.isnan(scores["value_loss"]) and scores["value_loss_by_start"] == []
+    assert math.isnan(scores["worth_of_refusing"])
+    assert math.isnan(scores["regret"]) == (left_out == "rewards")
+    assert scores["value_loss_ruled"] == scores["regret_ruled"] == 0.0
+
+
+class Drawing(Exact):
+    """Draws futures from other probabilities: with ``mistaken`` nothing happens, else what may happen by the rules."""
+
+    def __init__(self, world: JudgedWorld, mistaken: float = 0.0, seed: int = 0) -> None:
+        super().__init__(world.spec, world.index)
+        self.mistaken = mistaken
+        self.rng = np.random.default_rng(seed)
+
+    def probabilities(self, frames: Frame, actions: NDArray[np.int64]) -> Imagined:
+        """The same as probabilities, the last future being that nothing happens."""
+        found = super().imagine(frames, actions, 1, np.random.default_rng(0))
+        weights = np.asarray(found.probabilities) * (1.0 - self.mistaken)
+        still = np.broadcast_to(frames[:, None, -1:], (len(frames), 1, *found.pictures.shape[2:]))
+        mistakes = np.full((len(frames), 1, weights.shape[2]), self.mistaken)
+        images = np.concatenate([found.pictures, still], axis=1)
+        return Imagined(pictures=images, probabilities=np.concatenate([weights, mistakes], axis=1))
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        held = self.probabilities(frames, actions)
+        upto = np.asarray(held.probabilities).cumsum(axis=1)[:, None]  # [N, 1, F, D]
+        del rng
+        draws = self.rng.random((len(frames), samples, 1, upto.shape[3])) * upto[:, :, -1:]
+        chosen = (draws >= upto).sum(axis=2)  # [N, S, D]
+        rows, _, steps = np.ix_(*map(np.arange, chosen.shape))
+        return Imagined(pictures=held.pictures[rows, chosen, steps])
+
+
+class Giving(Drawing):
+    """The same probabilities, given."""
+
+    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+        return self.probabilities(frames, actions)
+
+
+@pytest.mark.parametrize("mistaken", [0.0, 0.3])
+def test_a_model_that_draws_is_comparable_with_one_that_gives_probabilities(mistaken: float) -> None:
+    """Without bias: total variation tells them apart, the unbiased score does not."""
+    world = judged_world("arrows:cubes=2,slip=0.2")
+    asked = world.rollouts
+    shown = asked.frames.shape[1]
+    asked = dataclasses.replace(
+        asked, actions=asked.actions[:, : shown + 2], truth=tuple(steps[:3] for steps in asked.truth)
+    )
+    drawing = [by_depth(asked, world.predictions(Drawing(world, mistaken, seed), asked, 8)) for seed in range(8)]
+    given = by_depth(asked, world.predictions(Giving(world, mistaken), asked))
+    mean = {name: np.mean([each[name] for each in drawing], axis=0) for name in given}
+    assert mean["unbiased_by_depth"] == pytest.approx(given["unbiased_by_depth"], abs=0.01)
+    assert min(mean["tv_by_depth"] - given["tv_by_depth"]) > 0.01
+    assert given["perfect_by_depth"] == [0.0] * 3
+    if not mistaken:
+        assert mean["tv_by_depth"] == pytest.approx(mean["perfect_by_depth"], abs=0.01)
+        assert given["tv_by_depth"] == pytest.approx([0.0] * 3, abs=1e-12)
+        assert mean["perfect_by_depth"][0] == pytest.approx(0.117, abs=0.001)
+
+
+def test_a_brier_score_is_a_mean_over_questions_however_many_guesses_each_has() -> None:
+    """Half of the probability on the truth, half on what cannot be: 1/4 + 1/4 a question."""
+    world = judged_world(ARROWS)
+    scores = world.scores(Giving(world, 0.5))
+    assert scores["outcome_brier"] == scores["unbiased"] == pytest.approx(0.5)
+    assert scores["total_variation"] == pytest.approx(0.5)
 
 
 def test_after_the_end_is_what_no_training_contains() -> None:

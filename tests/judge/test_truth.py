@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import numpy as np
 import pytest
 
@@ -11,6 +14,7 @@ from imagine_bench.judge.truth import (
     hallucinated_modes,
     missed_modes,
     sampling_noise_floor,
+    squared_distance,
     total_variation,
 )
 from imagine_bench.rules import advance
@@ -43,6 +47,21 @@ def test_the_sampling_floor_is_what_samples_of_the_truth_show() -> None:
     distance = 0.5 * np.abs(shares - np.array(list(THREE.values()))).sum(axis=1)
     assert sampling_noise_floor(THREE, 50) == pytest.approx(distance.mean(), rel=0.01)
     assert sampling_noise_floor({(1,): 1.0}, 50) == 0.0
+    assert sampling_noise_floor(THREE, 0) == 0.0, "a model that gives probabilities draws nothing"
+
+
+@pytest.mark.parametrize("drawn", [2, 3, 5])
+@pytest.mark.parametrize("model", [THREE, HALVES, {(1,): 0.1, (4,): 0.9}])
+def test_the_mean_squared_distance_of_all_samples_is_that_of_the_model(model: dict[State, float], drawn: int) -> None:
+    """Every sequence of futures, with its probability: unbiased for any model and number of futures."""
+    exact = squared_distance(THREE, model)
+    assert exact == pytest.approx(sum((THREE.get(key, 0.0) - model.get(key, 0.0)) ** 2 for key in THREE | model))
+    mean = 0.0
+    for futures in itertools.product(model, repeat=drawn):
+        held = {key: futures.count(key) / drawn for key in futures}
+        mean += math.prod(model[key] for key in futures) * squared_distance(THREE, held, drawn)
+    assert mean == pytest.approx(exact, abs=1e-12)
+    assert math.isnan(squared_distance(THREE, {(1,): 1.0}, drawn=1)), "one future says nothing of the others"
 
 
 class Toss:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 from imagine_bench.agents.world_models import convolutional, latent
+from imagine_bench.agents.world_models.patches import Patches
 from imagine_bench.agents.world_models.structured import StructuredModel
 
 from imagine_bench import registry
 from imagine_bench.interfaces import AgentContext
-from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.interfaces.model import Imagined, WorldModel, require_imagined
 from imagine_bench.registry.entries import entrant
 from imagine_bench.running.collect import collect, policy_of
@@ -127,3 +128,64 @@ def test_the_structured_model_knows_what_it_never_tried() -> None:
     assert much is not None and few is not None and few.mean() > much.mean() + 0.1
     found: Any = imagined(model)
     assert found.aleatoric is None  # it has no such noise, and says so
+
+
+def test_patches_finds_the_cubes_and_the_hand_and_how_many_looks_each_has() -> None:
+    model = made("patches")
+    assert isinstance(model, Patches)
+    model.fit(data(), np.random.default_rng(1))
+    assert sorted(len(patch.gray) for patch in model.patches) == [3, 4, 4, 4], "the hand, and three arrows"
+
+
+def squares(states: Sequence[Sequence[int]]) -> np.ndarray:
+    """Frames of two squares, each of one of three colors."""
+    frames = np.full((len(states), 64, 64, 3), 100, dtype=np.uint8)
+    for index, state in enumerate(states):
+        for square, color in enumerate(state):
+            frames[index, 10:30, 10 + 30 * square : 25 + 30 * square] = (20, 120, 220)[color]
+    return frames
+
+
+def walked(slip: float, episodes: int = 60) -> Episodes:
+    """Macro-actions 0 and 1 step the color of a square on, but for slips; color 2 of both is rewarded and ends."""
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(episodes):
+        states, actions = [[0, 0]], []
+        while len(actions) < 8 and states[-1] != [2, 2]:
+            actions.append(int(rng.integers(2)))
+            after = list(states[-1])
+            after[actions[-1]] = (after[actions[-1]] + (rng.random() >= slip)) % 3
+            states.append(after)
+        ends = [state == [2, 2] for state in states[1:]]
+        found.append(
+            {
+                "frames": squares(states), "actions": actions, "rewards": [5.0 * end for end in ends],
+                "terminated": ends, "truncated": [False] * (len(ends) - 1) + [not ends[-1]], "success": ends[-1],
+                "action_masks": np.ones((len(states), 3), dtype=np.int8),
+            }
+        )  # fmt: skip
+    return joined(found)
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.3])
+def test_patches_draws_what_happened_as_often_as_it_did(slip: float) -> None:
+    model = made("patches")
+    model.fit(walked(slip), np.random.default_rng(1))
+    before, stepped, ended = squares([[1, 2], [2, 2], [0, 2]])
+    found = model.imagine(before[None, None], np.array([[0]]), 400, np.random.default_rng(2))
+    moved = (found.pictures[0, :, 0] == stepped).all(axis=(1, 2, 3))
+    stayed = (found.pictures[0, :, 0] == before).all(axis=(1, 2, 3))
+    assert (moved | stayed).all() and stayed.mean() == pytest.approx(slip, abs=0.15)
+    assert found.rewards is not None and found.p_ended is not None and found.epistemic is not None
+    assert np.array_equal(found.rewards[0, :, 0], 5.0 * moved) and np.array_equal(found.p_ended[0, :, 0], moved)
+    never = model.imagine(ended[None, None], np.array([[2]]), 1, np.random.default_rng(2))
+    assert (never.pictures == ended).all() and never.epistemic is not None
+    assert never.epistemic[0, 0] == 1.0 > found.epistemic[0, 0], "no transition of this macro-action was seen"
+
+
+def test_patches_of_frames_that_never_change_are_none() -> None:
+    model = made("patches")
+    model.fit(walked(slip=1.0, episodes=3), np.random.default_rng(1))
+    found = model.imagine(squares([[0, 0]])[None], np.array([[1, 0]]), 2, np.random.default_rng(2))
+    assert (found.pictures == squares([[0, 0]])).all()
