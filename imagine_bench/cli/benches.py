@@ -39,6 +39,7 @@ from imagine_bench.protocols.data import Encoders, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, load_so_far, plan
 from imagine_bench.running.launchers.jobs import at_a_time, launcher
+from imagine_bench.running.retraining import Retraining
 from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.results import BenchResult
@@ -359,7 +360,7 @@ class Verify(OfBench):
         folder = audits.chosen(given, self.out, task)
         again = None
         if self.train is not None:
-            again = audits.Retraining(
+            again = Retraining(
                 runs=self.train,
                 nonce=self.nonce or secrets.token_hex(8),
                 launcher=Observed(launcher("local", self.workers)),

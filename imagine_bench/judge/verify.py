@@ -7,23 +7,24 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.environments import Env
-from imagine_bench.errors import ArtefactError, UnknownNameError, brief, plain
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError, brief, plain
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest
 from imagine_bench.registry.entries import AgentEntry
+from imagine_bench.rules import fewest_actions
 from imagine_bench.running.bench import counted
 from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts, replay
-from imagine_bench.running.retraining import Repeat
+from imagine_bench.running.retraining import Repeat, part_digest
 from imagine_bench.running.run_state import Counters, CountVisits, environments
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import encoders, run_folder
@@ -111,7 +112,10 @@ def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
         except Exception as error:  # whoever forges a file can write anything
             found.append(Verdict(what=name, complaint=does_not_fit(error)))
     if not any(each.complaint for each in found):
-        found += _of_protocol(protocol, results)
+        try:
+            found += _of_protocol(protocol, results)
+        except Exception as error:  # likewise
+            found.append(Verdict(what="protocol", complaint=does_not_fit(error)))
     return found
 
 
@@ -259,18 +263,17 @@ class _RunCheck:
 
     def _marks(self) -> dict[str, str]:
         """What no two seeds of a learner share, by name."""
-        run = self.run
         snapshot = run_folder.load_newest(self.folder / run_folder.CHECKPOINTS)
-        weights = {} if snapshot is None else {name: a.tobytes() for name, a in snapshot.agent.arrays.items() if a.size}
-        marks = {"weights": repr(sorted(weights.items()))} if weights else {}
-        if run.training is not None and len(run.training.actions):
-            marks["training episodes"] = repr((run.training.lengths.tolist(), run.training.actions.tolist()))
-        for row in run.checkpoints:
+        marks = {}
+        if snapshot is not None and snapshot.agent.arrays:
+            marks["weights"] = part_digest(snapshot.agent)
+        for row in self.run.checkpoints:
+            where = f"after {row.episodes:,} episodes"
             if row.train_cpu_s:
-                marks[f"CPU seconds after {row.episodes:,} episodes"] = repr(row.train_cpu_s)
+                marks[f"CPU seconds {where}"] = repr(row.train_cpu_s)
             if row.kept is not None and has_own_failures(row.kept, self.protocol):
-                marks[f"tests after {row.episodes:,} episodes"] = repr(row.kept.actions.tolist())
-        return {name: hashlib.sha256(mark.encode()).hexdigest() for name, mark in marks.items()}
+                marks[f"tests {where}"] = part_digest(row.kept.actions)
+        return marks
 
 
 def _entry_of(agent: str) -> AgentEntry | None:
@@ -288,15 +291,25 @@ def _of_dataset(protocol: Protocol) -> int:
 
 
 def has_own_failures(kept: KeptEpisodes, protocol: Protocol) -> bool:
-    """Whether a test failed in more ways than two seeds have in common.
+    """Whether tests failed in more ways than two seeds have in common.
 
-    Learners that know nothing may repeat one macro-action or two, and where chance decides, equal plans fail alike.
+    Learners that know nothing may repeat one macro-action or two. Equal plans fail alike where chance decides, where
+    frames do not show all, and where no plan is short enough.
     """
-    rules = protocol.spec(testing=True).rules
-    failed = [set(kept.actions_of(test)) for test in np.flatnonzero(~kept.success).tolist()]
+    task = protocol.spec(testing=True)
+    rules = task.rules
     starts = {tuple(start) for start in kept.starts.tolist()}
     has_chance = any(len(rules.outcomes(start, action)) > 1 for start in starts for action in range(rules.n_actions))
-    return len(failed) < len(kept.success) and len(set().union(*failed)) > 2 and not has_chance
+    if has_chance or task.sight is not None or kept.success.all() or not kept.success.any():
+        return False
+    found: set[int] = set()
+    for test in np.flatnonzero(~kept.success).tolist():
+        with suppress(InvalidValueError):  # nothing is solved from there
+            if fewest_actions(rules, tuple(kept.starts[test].tolist())) <= task.horizon:
+                found |= {*kept.actions_of(test)}
+        if len(found) > 2:
+            return True
+    return False
 
 
 def _of_protocol(protocol: Protocol, results: Mapping[str, RunResult]) -> Iterator[Verdict]:
@@ -311,8 +324,11 @@ def _of_protocol(protocol: Protocol, results: Mapping[str, RunResult]) -> Iterat
         settings[agent] = dict(run.settings) if has_settings else {}
         if has_settings and not run.settings:
             silent.append(agent)
-    encoder_names = [used for used in (protocol.encoder, protocol.codes) if used is not None]
-    unshown = [f"what encoder {used} is, which is not here" for used in encoder_names if encoders.find(used) is None]
+    read = {entry.encoder_kind for entry in map(_entry_of, results) if entry is not None and entry.needs_encoder}
+    unshown = []
+    for kind, used in (("latents", protocol.encoder), ("codes", protocol.codes)):
+        if used is not None and (kind not in read or encoders.find(used) is None):
+            unshown.append(f"what encoder {used} is: it is not here, or no agent reads it")
     complaint = ""
     if silent:
         unshown.append(f"what settings {', '.join(silent)} had")

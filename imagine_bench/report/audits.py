@@ -17,14 +17,13 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.causes import causes_of
 from imagine_bench.judge.plans import PlanResult, make_plans, require_threshold
 from imagine_bench.judge.verify import UNSHOWN, Verdict, does_not_fit, verify_runs
-from imagine_bench.protocols.data import Launcher
 from imagine_bench.recording.filmstrips import filmstrip, png
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.report.bench import bench_page
-from imagine_bench.report.page import DASH, Table, percent, texts, write_page
+from imagine_bench.report.page import DASH, Page, Table, percent, texts, write_page
 from imagine_bench.report.sections import HEAD, causes_table
 from imagine_bench.running.bench import counted, load_bench, task_type
-from imagine_bench.running.retraining import chance_to_find, drawn, train_again
+from imagine_bench.running.retraining import Retraining, chance_to_find, train_again
 from imagine_bench.running.trained import (
     best_run,
     learners,
@@ -55,8 +54,7 @@ _COUNTS = {
     "steps_as_imagined": "that led where imagined",
     "faults": "faults of the physics",
 }
-_CELL = re.compile(r"<t[dh][^<>]*>([^<]*(?:<(?!/?t[dhr])[^<]*)*)")
-_LINE = re.compile("^.*$", re.MULTILINE)
+_IMAGE = re.compile("base64,[A-Za-z0-9+/=]*")
 
 
 def chosen(given: Path | None, root: Path, task: str | None) -> Path:
@@ -244,17 +242,6 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
 # Verification ------------------------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Retraining:
-    """How runs of a bench are trained again."""
-
-    runs: int  #: Of each agent, at least 1
-    nonce: str  #: Decides which: a new one a check, or that of a check that is repeated
-    launcher: Launcher
-    encoder: str | None = None  #: As of :func:`imagine_bench.running.trained.load_trained`
-    dataset: Path | None = None  #: The folder of the protocol's dataset, if it has one
-
-
 def verify(folder: Path, retraining: Retraining | None = None) -> list[Verdict]:
     """Play a bench's runs again: one verdict a run and, where all runs hold, one on the tables of its report.
 
@@ -267,11 +254,7 @@ def verify(folder: Path, retraining: Retraining | None = None) -> list[Verdict]:
     found = with_report(folder, verify_runs(folder))
     if retraining is None or any(each.complaint for each in found):
         return found
-    wanted = drawn(read_control(folder), retraining.runs, retraining.nonce)
-    repeats = train_again(
-        folder, wanted, launcher=retraining.launcher, encoder=retraining.encoder, dataset=retraining.dataset
-    )
-    return [*found, *(Verdict.of(repeat) for repeat in repeats)]
+    return [*found, *map(Verdict.of, train_again(folder, retraining))]
 
 
 def what_is_shown(folder: Path, retraining: Retraining | None = None) -> str:
@@ -309,14 +292,21 @@ def with_report(folder: Path, runs: list[Verdict]) -> list[Verdict]:
 
 
 def _report_complaint(folder: Path) -> str:
-    """The first line of the report's tables that does not follow from the runs; empty if all do."""
-    page = bench_page(load_so_far(folder))
-    bare = dataclasses.replace(page, sections=[dataclasses.replace(each, images=()) for each in page.sections])
-    for name, text in texts(bare).items():
+    """The first line of the report that does not follow from the runs; empty if all do."""
+    for name, text in texts(blank_images(bench_page(load_so_far(folder)))).items():
         path = folder / "report" / name
         there = path.read_text() if path.is_file() else ""
-        pattern = _CELL if name == "index.html" else _LINE  # of the page, the cells of its tables
-        for has, wanted in zip_longest(pattern.findall(there), pattern.findall(text), fillvalue="nothing"):
+        both = zip_longest(_IMAGE.sub("base64,", there).splitlines(), text.splitlines(), fillvalue="nothing")
+        for has, wanted in both:
             if has != wanted:
                 return f"{name} has {brief(has)} where the runs give {brief(wanted)}."
     return ""
+
+
+def blank_images(page: Page) -> Page:
+    """The same page with images that are empty, which need not be drawn."""
+    sections = []
+    for section in page.sections:
+        images = [dataclasses.replace(image, content=b"") for image in section.images]
+        sections.append(dataclasses.replace(section, images=images))
+    return dataclasses.replace(page, sections=sections)

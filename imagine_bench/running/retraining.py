@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import comb
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,10 +27,21 @@ from imagine_bench.store.run_folder import pack
 
 SAME_SUCCESS = 0.25
 """Difference of success at a budget that is let pass where another processor or version trains again."""
-SAME_COST = (4.0, 0.5)
+SAME_COST = (4.0, 3.0)
 """Factor and CPU seconds by which the cost of training may differ, where the same processor trains again."""
 _OF_OBSERVERS = ("open_loop", "beliefs", "imagined")
 """Beginnings of the names of what only runs that are observed keep."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Retraining:
+    """How runs of a bench are trained again."""
+
+    runs: int  #: Of each agent, at least 1
+    nonce: str  #: Decides which: a new one a check, or that of a check that is repeated
+    launcher: Launcher
+    encoder: str | None = None  #: As of :func:`.trained.load_trained`
+    dataset: Path | None = None  #: The folder of the protocol's dataset, if it has one
 
 
 class Repeat(NamedTuple):
@@ -62,20 +74,18 @@ def chance_to_find(runs: int, forged: int, count: int) -> float:
     return 1.0 - comb(runs - forged, count) / comb(runs, count)
 
 
-def train_again(
-    folder: Path, wanted: Sequence[tuple[str, int]], *, launcher: Launcher, encoder: str | None, dataset: Path | None
-) -> list[Repeat]:
+def train_again(folder: Path, retraining: Retraining) -> list[Repeat]:
     """Train runs of the bench in ``folder`` again, in a folder that is then removed, and compare.
-
-    ``encoder`` is as in :func:`.trained.load_trained`, ``dataset`` the folder of the protocol's dataset, if it has one.
 
     Raises:
         ArtefactError: The bench is damaged.
+        InvalidValueError: Less than one run of each agent is asked for.
         SetupError: Nothing can be written, or there is no GL.
     """
     protocol = read_control(folder)
     kept = BenchStore(folder, protocol)
     differing = _differing(kept)
+    wanted = drawn(protocol, retraining.runs, retraining.nonce)
     found = []
     with TemporaryDirectory(prefix="imagine-bench-verify-") as scratch:
         again = BenchStore(Path(scratch), protocol)
@@ -83,12 +93,12 @@ def train_again(
         why = {}
         for run in wanted:
             try:
-                spec = _spec(protocol, *run, encoder, dataset)
+                spec = _spec(protocol, *run, retraining)
                 jobs.append(Job(spec=spec, folder=again.run_folder(*run)))
             except ImagineBenchError as error:
                 why[run] = str(error)
         with ProgressBar([job.spec for job in jobs]) as show:
-            for failure in launcher.launch(jobs, show):
+            for failure in retraining.launcher.launch(jobs, show):
                 why[failure.job.spec.agent, failure.job.spec.seed] = failure.reason
         for run in wanted:
             complaint = f"it cannot be trained again: {why[run]}" if run in why else ""
@@ -100,10 +110,11 @@ def train_again(
     return found
 
 
-def _spec(protocol: Protocol, agent: str, seed: int, encoder: str | None, dataset: Path | None) -> RunSpec[Protocol]:
+def _spec(protocol: Protocol, agent: str, seed: int, retraining: Retraining) -> RunSpec[Protocol]:
+    dataset = retraining.dataset
     if protocol.dataset is not None and dataset is None:
         raise ArtefactError(f"it learned from the dataset {protocol.dataset}; give its folder with --dataset.")
-    through = encoder_of_run(protocol, agent, encoder)
+    through = encoder_of_run(protocol, agent, retraining.encoder)
     return RunSpec(protocol=protocol, agent=agent, seed=seed, encoder=through, dataset=dataset)
 
 
@@ -136,12 +147,9 @@ def _compared(kept: RunResult, again: RunResult, differing: Sequence[str]) -> tu
     if wrong:
         return "", f"{success}; bits were not compared, for {', '.join(differing)} is said to have been another"
     factor, cpu_s = SAME_COST
-    low, high = sorted((pairs[-1][0].train_cpu_s, pairs[-1][1].train_cpu_s))
-    if not differing and high > factor * low + cpu_s:
-        times = (
-            f"{pairs[-1][0].train_cpu_s:,.1f} CPU s of training were kept, and it took {pairs[-1][1].train_cpu_s:,.1f}"
-        )
-        return f"{times}.", ""
+    was_s, is_s = (rows[-1].train_cpu_s for rows in (kept.checkpoints, again.checkpoints))
+    if not differing and max(was_s, is_s) > factor * min(was_s, is_s) + cpu_s:
+        return f"{was_s:,.1f} CPU s of training were kept, and it took {is_s:,.1f}.", ""
     return "", f"repeats to the bit in {len(before)} parts"
 
 
@@ -163,10 +171,11 @@ def _digests(run: RunResult) -> dict[str, str]:
         parts |= {f"{name} after {row.episodes:,} episodes": value for name, value in values.items()}
     parts["weights"] = None if snapshot is None else snapshot.agent.arrays
     parts["imagined rollouts"] = [*run.imagined, *run.sampled_rollouts] or None
-    return {name: _digest(part) for name, part in parts.items() if part is not None}
+    return {name: part_digest(part) for name, part in parts.items() if part is not None}
 
 
-def _digest(part: object) -> str:
+def part_digest(part: object) -> str:
+    """A digest of whatever :func:`.run_folder.pack` takes."""
     values, arrays = pack(part)
     found = hashlib.sha256(json.dumps(values, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):

@@ -15,7 +15,6 @@ import gymnasium
 import numpy as np
 import pytest
 from forger import FORGERIES, mend, rewrite
-from report_pages import without_images
 from small_runs import Inline, context, small
 
 from imagine_bench import registry
@@ -24,11 +23,11 @@ from imagine_bench.judge.verify import Replays, _verify_test, has_own_failures, 
 from imagine_bench.protocols.control import Protocol, context_of, protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.report import bench_page
-from imagine_bench.report.audits import Retraining, verify, what_is_shown, with_report
+from imagine_bench.report.audits import blank_images, verify, what_is_shown, with_report
 from imagine_bench.report.page import texts
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode, replay
-from imagine_bench.running.retraining import chance_to_find, drawn
+from imagine_bench.running.retraining import Retraining, chance_to_find, drawn
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store.files import read_sealed, sealed
@@ -42,7 +41,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     wanted = small(agents=("table", "random"), evaluation_episodes=8)
     result = bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
     (result.folder / "report").mkdir()
-    for name, text in texts(without_images(bench_page(result))).items():  # type: ignore[arg-type]
+    for name, text in texts(blank_images(bench_page(result))).items():  # type: ignore[arg-type]
         (result.folder / "report" / name).write_text(text)
     return result.folder
 
@@ -95,12 +94,18 @@ def test_a_part_of_a_report_that_is_missing_or_cut_short_is_found(finished: Path
         ("arrow_puzzle", {"test_appearance": "mild"}),
         ("arrows:cubes=2,gesture=0.5,lag=1,slip=0.2,horizon=3", {}),
         ("arrows:cubes=1,slip=0.3", {"execution": "physics"}),
+        ("arrow_puzzle", {"agents": ("table",), "appearance": "mild", "demonstrations": 2}),
+        ("arrow_puzzle", {"agents": ("table",), "split": "plan_length=2"}),
     ],
 )
 def test_benches_of_every_kind_hold(task: str, changes: dict[str, Any], tmp_path: Path) -> None:
     few = {"agents": ("random",), "evaluation_episodes": 4, "execution": "kinematic", "recorded_episodes": 0, **changes}
     folder = bench(protocol(task, "smoke", **few), {}, root=tmp_path, launcher=Inline()).folder
-    assert [str(each) for each in verify(folder)] == ["random seed 0: holds; 8 episodes played again"]
+    run, *others = verify(folder)
+    assert str(run).startswith(
+        f"{few['agents'][0]} seed 0: holds; {8 if few['agents'] == ('random',) else 28} episodes"
+    )
+    assert not any(each.complaint for each in others)
 
 
 @pytest.fixture(scope="module")
@@ -127,9 +132,8 @@ def share_weights(folder: Path) -> None:
 
 def share_cpu_seconds(folder: Path) -> None:
     one, other = (load_run(folder / "table" / seed) for seed in ("seed_0", "seed_1"))
-    first, *rest = other.checkpoints
-    first = dataclasses.replace(first, train_cpu_s=one.checkpoints[0].train_cpu_s)
-    rewrite(other.folder, [first, *rest])
+    pairs = zip(other.checkpoints, one.checkpoints, strict=True)
+    rewrite(other.folder, [dataclasses.replace(row, train_cpu_s=known.train_cpu_s) for row, known in pairs])
 
 
 @pytest.mark.parametrize(("what", "forge"), [("weights", share_weights), ("CPU seconds", share_cpu_seconds)])
@@ -183,6 +187,15 @@ def test_whatever_is_written_into_a_sealed_file_is_a_complaint_in_one_line(pair:
             _, other, *_ = with_report(folder, verdicts(folder, replays))
             assert other.complaint and "\n" not in str(other) and len(str(other)) < 2000, name
             place[name] = honest
+
+
+def test_a_sentence_of_the_report_follows_from_the_runs(finished: Path, tmp_path: Path) -> None:
+    def edit(folder: Path) -> None:
+        page = folder / "report" / "index.html"
+        page.write_text(page.read_text().replace("<li>Nothing is compared", "<li>It is compared"))
+
+    *runs, report = verify(forged(finished, tmp_path, edit))
+    assert not any(each.complaint for each in runs) and "It is compared" in report.complaint
 
 
 def test_a_page_is_compared_in_time_that_grows_with_its_length(pair: Path, tmp_path: Path) -> None:
