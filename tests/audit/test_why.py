@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from report_pages import without_images
 from small_runs import Inline, small
 
 from imagine_bench import registry
@@ -16,7 +15,7 @@ from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
 from imagine_bench.report import audits
-from imagine_bench.report.audits import verify, why_report
+from imagine_bench.report.audits import blank_images, verify, why_report
 from imagine_bench.report.page import Page, texts
 from imagine_bench.report.sections import read_causes
 from imagine_bench.rules import states_of
@@ -30,7 +29,7 @@ SPEC = registry.task("arrow_puzzle")
 
 def write_texts(folder: Path, page: Page) -> None:
     """A report without images, which are slow to draw."""
-    for name, text in texts(without_images(page)).items():
+    for name, text in texts(blank_images(page)).items():
         write_bytes(make_folder(folder) / name, text.encode())
 
 
