@@ -13,6 +13,7 @@ from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
+from imagine_bench.judge import causes
 from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
 from imagine_bench.report import audits
 from imagine_bench.report.audits import blank_images, verify, why_report
@@ -55,6 +56,19 @@ def test_the_shares_of_a_bench_sum_to_all_failures(tmp_path: Path, monkeypatch: 
         assert shares == [round(100 * mine.count(name) / len(mine), 1) for name in CAUSES]
     assert "\ntable " in said and 'id="causes"' in (folder / "report" / "index.html").read_text()
     assert not any(each.complaint for each in verify(folder)), "the report with its causes follows from the runs"
+
+
+def test_tests_in_which_nothing_failed_are_counted_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 7 tests after 4 episodes two failed, and after 9 none: the table says so, and shares are of failures."""
+    found = [
+        causes.Tested(episodes=4, tests=7, causes={1: next(iter(CAUSES)), 5: next(iter(CAUSES))}),
+        causes.Tested(episodes=9, tests=7, causes={}),
+    ]
+    monkeypatch.setattr(audits, "write_page", lambda folder, page: None)
+    monkeypatch.setattr(audits, "causes_of", lambda trained: found)
+    folder = bench(small(evaluation_episodes=1), {}, root=tmp_path, launcher=Inline()).folder
+    why_report(folder, root=tmp_path, task=None, encoder=None)
+    assert [line[1:3] for line in read_causes(folder).rows] == [["4", "2 of 7"], ["9", "0 of 7"]]
 
 
 def test_a_run_that_keeps_no_episodes_is_one_sentence(tmp_path: Path) -> None:

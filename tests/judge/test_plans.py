@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from recordings import contents
 from rerun.chunk import RrdReader
+from small_runs import Inline, small
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
@@ -22,8 +23,9 @@ from imagine_bench.judge.plans import PlanResult, carry_out, make_env, make_plan
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.recording.plans import record_plans
-from imagine_bench.report.audits import summarise, write_plans
+from imagine_bench.report.audits import plan_report, summarise, write_plans
 from imagine_bench.rules import fewest_actions
+from imagine_bench.running.bench import bench
 from imagine_bench.running.trained import Trained
 
 TASK = registry.task("arrow_puzzle")
@@ -213,3 +215,15 @@ def test_the_recording_shows_the_same_plans_and_the_arm_moves(
     steps = sum(plan.done for plan in right[:2])
     assert rows("/real/frame") == steps + 2, "the physical arm solves the same plans"
     assert rows("/scene/right_l3") > 20 * steps, "the arm must be seen moving"
+
+
+def test_plans_with_another_bound_or_number_lie_in_folders_of_their_own(tmp_path: Path) -> None:
+    """So that none overwrites the table and the films of those before."""
+    imaginer = small(agents=("imaginer",), budgets=(2,), evaluation_episodes=1)
+    folder = bench(imaginer, {}, root=tmp_path, launcher=Inline()).folder
+    for count, bound in [(1, None), (1, 0.3), (2, None)]:
+        plan_report(
+            folder, root=tmp_path, task=None, count=count, execution="kinematic", max_epistemic=bound, encoder=None
+        )
+    kept = [json.loads(path.read_text()) for path in folder.glob("imaginer/seed_0/plans/*/summary.json")]
+    assert {(each["attempted"], each["max_epistemic"]) for each in kept} == {(1, None), (1, 0.3), (2, None)}

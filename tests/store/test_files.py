@@ -11,12 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from imagine_bench.errors import BusyError, SetupError
+from imagine_bench.errors import ArtefactError, BusyError, SetupError
 from imagine_bench.store.files import (
+    first_difference,
     lock,
     make_folder,
+    read_sealed,
+    sealed,
     write_json,
 )
+from imagine_bench.values import Json
 
 _HOLD = """
 import sys, time
@@ -50,6 +54,32 @@ def test_a_refusal_is_one_sentence_and_keeps_the_old_file(
     assert str(caught.value).startswith(f"Cannot write {path}: {sentence}")
     assert json.loads(path.read_text()) == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_sealed_file_that_lost_its_seal_or_has_another_value_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    whole = sealed({"seed": 1, "rate": 0.5})
+    bare = {name: value for name, value in whole.items() if name != "seal"}
+    for changed in ({**whole, "seed": 2}, {**whole, "more": 3}, bare, {**bare, "seed": 2}, {**whole, "seal": None}):
+        write_json(path, changed)
+        with pytest.raises(ArtefactError, match="is damaged: it is not as it was written"):
+            read_sealed(path, "a file")
+    write_json(path, whole)
+    assert read_sealed(path, "a file") == {"seed": 1, "rate": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "found"),
+    [
+        ({"a": {"b": 1, "c": 2}}, {"a": {"b": 1, "c": 3}}, ("a.c", 2, 3)),
+        ({"a": 1, "b": 2}, {"a": 1}, ("b", 2, None)),
+        ({"a": 1}, {"a": 1, "b": 2}, ("b", None, 2)),
+        ({"a": {}}, {"a": {"b": [1]}}, ("a.b", None, [1])),
+        ({"a": {"b": [1]}}, {"a": {"b": [1]}}, None),
+    ],
+)
+def test_what_either_side_lacks_is_a_difference(then: Json, now: Json, found: tuple[str, Json, Json] | None) -> None:
+    assert first_difference(then, now) == found
 
 
 def test_a_file_in_the_way_of_a_folder(tmp_path: Path) -> None:

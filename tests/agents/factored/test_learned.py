@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from agent_states import same
-from fake_codes import drawn
+from fake_codes import drawn, starts
 from fake_pictures import Code, agent, picture, played, shape
 from imagine_bench.agents.factored import appearance
 from imagine_bench.agents.factored.learned import LearnedPerceptionAgent
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces import Frame, Observation
 
 
 def walk(steps: int, rng: np.random.Generator) -> tuple[list[Code], Frame]:
@@ -255,7 +255,19 @@ def test_it_can_show_how_it_learned_to_see(trained: Trained) -> None:
     assert np.array_equal(colored, mask), "gray where nothing is told apart"
 
 
-def test_what_was_done_is_remembered_with_its_frames(trained: Trained) -> None:
+def late(learner: LearnedPerceptionAgent) -> list[NDArray[np.float32]]:
+    """Values at the beginning of an episode, and when one macro-action is left."""
+    seen = Observation(frame=picture(starts()[0], np.random.default_rng(0)))
+    learner.begin_episode()
+    values = [learner.q_values(seen)]
+    for _ in range(5):
+        learner.act(seen, explore=False)
+    values.append(learner.q_values(seen))
+    learner.begin_episode()
+    return values
+
+
+def test_what_was_done_is_remembered_with_its_frames_and_how_long_episodes_are(trained: Trained) -> None:
     learner, taken = trained
     resumed = agent(seed=5)
     resumed.restore(learner.state())
@@ -265,3 +277,5 @@ def test_what_was_done_is_remembered_with_its_frames(trained: Trained) -> None:
         assert begins.sum() == EPISODES
         assert np.array_equal(actions < 0, np.roll(begins, -1)), "nothing was done in an episode's last frame"
         assert eyes.first(8)[2][-1] < 0, "what leads to a later frame is none of the first"
+    np.testing.assert_array_equal(late(resumed), late(learner))
+    assert np.abs(np.subtract(*late(learner))).max() > 1.0, "with one macro-action left, other things are worth doing"

@@ -37,6 +37,19 @@ def test_fingers_open_no_wider_than_there_is_room(seed):
     env.close()
 
 
+@pytest.mark.parametrize("clockwise", [True, False])
+def test_fingers_let_go_with_as_much_room_as_there_is_where_a_cube_is_put_down(clockwise):
+    """The next cube of its row stands 9 mm nearer, and the cube is put down 9 mm nearer to that."""
+    world = _world(cubes=6, forbid="none")
+    world.place((0,) * 6 + (0,), np.random.default_rng(0))
+    assert world.layout.slots_xy_m[1][0] == world.layout.slots_xy_m[3][0], "they stand side by side"
+    world.data.qpos[world.object_qpos[3][1]] += 0.009
+    before = world.object_poses()
+    assert world.executor.turn(cube=1, clockwise=clockwise, noise=(0.0, -0.009, 0.0)).fault is None
+    shift_m = np.linalg.norm(world.object_poses()[:, :3] - before[:, :3], axis=1)
+    assert np.delete(shift_m, 1).max() < 1e-4 and shift_m[1] > 0.008
+
+
 @pytest.mark.parametrize("action", [0, 1, 2, 3])
 def test_a_cube_that_slips_stays_though_it_was_gripped(action):
     world = _world(cubes=2, forbid="none", slip=0.2)
