@@ -7,7 +7,7 @@ One camera draws all lanes, in the thread that calls.
 
 from __future__ import annotations
 
-import functools
+import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -83,6 +83,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         self._n_threads = require_integer("threads", usable_cores() if threads is None else threads, 1)
         if max_episode_steps is not None:
             max_episode_steps = require_integer("max_episode_steps", max_episode_steps, 1)
+        self._pools: dict[int, ThreadPoolExecutor] = {}
         self._horizon = max_episode_steps
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1, "autoreset_mode": self.autoreset_mode}
         mode = lanes[0].render_mode
@@ -198,11 +199,14 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         """
         if self._acting:
             raise InvalidValueError(f"Lanes {sorted(self._acting)} are acting; receive them before you copy or pickle.")
-        return {name: value for name, value in vars(self).items() if name != "_pool"}
+        return {**vars(self), "_pools": {}}
 
-    @functools.cached_property
+    @property
     def _pool(self) -> ThreadPoolExecutor:
-        return ThreadPoolExecutor(self._n_threads, "simulation")
+        """The threads of this process; a parent's do not survive a fork."""
+        if os.getpid() not in self._pools:
+            self._pools[os.getpid()] = ThreadPoolExecutor(self._n_threads, "simulation")
+        return self._pools[os.getpid()]
 
     def _received(self, lanes: list[int]) -> Batch:
         """Observations, rewards and ends of these lanes in this order; infos of all, masked."""

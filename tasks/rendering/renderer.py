@@ -209,28 +209,7 @@ class _Canvases:
         self._canvases: dict[tuple[bytes, View, int | None], _Canvas] = {}
         self._others: list[_Canvas] = []
 
-    def current(self, scene: bytes, model: mujoco.MjModel, view: View, known: _Canvas | None) -> _Canvas:
-        """The context of a scene and a view, current in this thread.
-
-        Other code may end the display of EGL, as a window of SDL without a desktop does when it closes, and all
-        contexts with it. Then a display and a context are made anew.
-        """
-        try:
-            canvas = self._found(scene, model, view, known)
-            canvas.make_current()
-        except Exception as error:  # of PyOpenGL
-            if isinstance(error, SetupError) or not _is_egl():
-                raise
-            from mujoco import egl  # noqa: PLC0415  (after the platform is chosen)
-
-            self.leave()
-            egl.EGL_DISPLAY = None
-            _close_at_exit.cache_clear()  # the end is to come before that of the new display
-            canvas = self._found(scene, model, view, None)
-            canvas.make_current()
-        return canvas
-
-    def _found(self, scene: bytes, model: mujoco.MjModel, view: View, known: _Canvas | None) -> _Canvas:
+    def find(self, scene: bytes, model: mujoco.MjModel, view: View, known: _Canvas | None) -> _Canvas:
         """The context of a scene and a view, made if there is none, or if one that is not the known one is damaged."""
         is_main = threading.current_thread() is threading.main_thread()
         thread = None if _is_egl() and not is_main else threading.get_ident()
@@ -330,8 +309,9 @@ class Renderer:
         """
         drawn = []
         with _canvases.lock:
-            canvas = _canvases.current(self._drawn_as, self._model, self.view, self._canvas)
+            canvas = _canvases.find(self._drawn_as, self._model, self.view, self._canvas)
             self._canvas = canvas
+            canvas.make_current()
             for scene in scenes:
                 mujoco.mjv_updateScene(*scene, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
                 drawn.append(canvas.draw(self._scene)[::-1].copy())

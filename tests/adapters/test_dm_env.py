@@ -167,8 +167,11 @@ def test_viewer_runs_and_the_scene_moves():
     env.close()
 
 
-def test_open_renderers_end_quietly():
+@pytest.mark.parametrize("drawn_before", [False, True])
+def test_open_renderers_end_quietly(drawn_before):
     code = (
+        "import gymnasium, imagine_bench\n"
+        f"{drawn_before} and gymnasium.make({ARROWS!r}, execution='kinematic').reset()\n"
         "from imagine_bench.adapters.dm_env import as_dm_env\n"
         f"env = as_dm_env({ARROWS!r}, execution='kinematic')\n"
         "from dm_control import _render\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import os
 import pickle
 import subprocess
 import sys
@@ -271,6 +272,27 @@ def test_a_reset_forgets_what_a_lane_was_doing(monkeypatch):
     assert len(ended) == 2 and np.array_equal(first, again)
     assert np.array_equal(vector.step(np.array([0, 2]))[0], expected)
     vector.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a matter of forks")
+def test_a_forked_child_simulates_too():
+    """A parent's threads, idle by then, do not survive the fork."""
+    script = """
+        import os, signal, time, gymnasium, imagine_bench
+        vector = gymnasium.make_vec("imagine_bench/ArrowPuzzle-vector-v0", num_envs=2)
+        vector.reset(seed=0)
+        vector.step([0, 1])
+        time.sleep(0.2)
+        child = os.fork()
+        if not child:
+            signal.alarm(30)
+        seen = int(vector.step([2, 3])[0].sum()) % 251
+        if not child:
+            os._exit(seen)
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == seen)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"
 
 
 @pytest.mark.slow
