@@ -314,6 +314,22 @@ def has_own_failures(kept: KeptEpisodes, protocol: Protocol) -> bool:
 
 def _of_protocol(protocol: Protocol, results: Mapping[str, RunResult]) -> Iterator[Verdict]:
     """A verdict on what runs of a protocol have in common, where there is something to say."""
+    complaint, unshown = _settings(protocol, results)
+    entries = [_entry_of(agent) for agent in protocol.agents]
+    is_older = any(run.training is None for run in results.values())
+    codes = protocol.codes if protocol.codes != protocol.encoder else None  # one file may serve both kinds
+    for kind, used in (("latents", protocol.encoder), ("codes", codes)):
+        is_read = any(entry is None or (entry.needs_encoder and entry.encoder_kind == kind) for entry in entries)
+        if used is not None and not is_read and not is_older:
+            complaint = f"it names the encoder {used}, and no agent reads {kind}."
+        elif used is not None and encoders.find(used) is None:
+            unshown.append(f"what encoder {used} is, which is not here")
+    if complaint or unshown:
+        yield Verdict(what="protocol", complaint=complaint, unshown=tuple(unshown))
+
+
+def _settings(protocol: Protocol, results: Mapping[str, RunResult]) -> tuple[str, list[str]]:
+    """What is wrong with the settings of learners, or empty, and what of them is not shown."""
     settings: dict[str, Json] = {}
     silent = []
     for agent, run in results.items():
@@ -324,20 +340,14 @@ def _of_protocol(protocol: Protocol, results: Mapping[str, RunResult]) -> Iterat
         settings[agent] = dict(run.settings) if has_settings else {}
         if has_settings and not run.settings:
             silent.append(agent)
-    read = {entry.encoder_kind for entry in map(_entry_of, results) if entry is not None and entry.needs_encoder}
-    unshown = []
-    for kind, used in (("latents", protocol.encoder), ("codes", protocol.codes)):
-        if used is not None and (kind not in read or encoders.find(used) is None):
-            unshown.append(f"what encoder {used} is: it is not here, or no agent reads it")
-    complaint = ""
     if silent:
-        unshown.append(f"what settings {', '.join(silent)} had")
-    elif settings and not protocol.settings_digest:
-        unshown.append("that settings are those that were planned, of which the protocol has no digest")
-    elif settings and digest(settings) != protocol.settings_digest:
-        complaint = f"its settings_digest is {protocol.settings_digest}, and that of its runs is {digest(settings)}."
-    if complaint or unshown:
-        yield Verdict(what="protocol", complaint=complaint, unshown=tuple(unshown))
+        return "", [f"what settings {', '.join(silent)} had"]
+    if settings and not protocol.settings_digest:
+        return "", ["that settings are those that were planned, of which the protocol has no digest"]
+    found = digest(settings)
+    if settings and found != protocol.settings_digest:
+        return f"its settings_digest is {protocol.settings_digest}, and that of its runs is {found}.", []
+    return "", []
 
 
 def _verify_test(row: Checkpoint, count: int, purpose: Purpose, replays: Replays) -> None:

@@ -110,7 +110,7 @@ def resolved_settings(wanted: Protocol) -> dict[str, Json]:
 
 
 def _encoders(wanted: Protocol, given: str | None) -> Encoders:
-    """The artefact of each kind that an agent needs; a given one is there whether or not any does."""
+    """The artefact of each kind that an agent needs. Raises InvalidValueError: none reads what a given one gives."""
     entries = [registry.agent_entry(agent) for agent in wanted.agents]
     needed = {entry.encoder_kind for entry in entries if entry.needs_encoder}
     spec = registry.task(wanted.task)
@@ -118,7 +118,9 @@ def _encoders(wanted: Protocol, given: str | None) -> Encoders:
         return {kind: encoders.own(spec, wanted.appearance, kind) for kind in sorted(needed)}
     path = encoders.resolve(spec, wanted.appearance, given)
     kind = encoders.kind(path)
-    if needed and kind == "latents" and kind not in needed:
+    if not needed:
+        raise InvalidValueError(f"No agent of this bench reads what an encoder gives; leave --encoder {given} out.")
+    if kind == "latents" and kind not in needed:
         raise InvalidValueError(
             f"No agent of this bench reads the latents that encoder {path.stem!r} gives; give one made with "
             "'imagine-bench encoder --recipe codes', or leave --encoder out."

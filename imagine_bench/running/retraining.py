@@ -29,6 +29,8 @@ SAME_SUCCESS = 0.25
 """Difference of success at a budget that is let pass where another processor or version trains again."""
 SAME_COST = (4.0, 3.0)
 """Factor and CPU seconds by which the cost of training may differ, where the same processor trains again."""
+_OF_MACHINES = {"cpu", "gl_renderer", "device"}
+"""Facts on which bits depend, and which whoever trains again may not be able to choose."""
 _OF_OBSERVERS = ("open_loop", "beliefs", "imagined")
 """Beginnings of the names of what only runs that are observed keep."""
 
@@ -140,8 +142,9 @@ def _compared(kept: RunResult, again: RunResult, differing: Sequence[str]) -> tu
     pairs = list(zip(kept.checkpoints, again.checkpoints, strict=True))
     apart = max(abs(one.success_rate - other.success_rate) for one, other in pairs)
     success = f"success differs by at most {100 * apart:.0f} points at a budget"
-    if wrong and not differing:
-        return f"{wrong[0]} does not repeat; {success}.", ""
+    if wrong and not _OF_MACHINES & {*differing}:
+        remedy = f" Its {' and '.join(differing)} differ here; train it again with the same." if differing else ""
+        return f"{wrong[0]} does not repeat; {success}.{remedy}", ""
     if wrong and apart > SAME_SUCCESS:
         return f"{success}, and {100 * SAME_SUCCESS:.0f} are let pass where {', '.join(differing)} differs.", ""
     if wrong:
