@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import Job, Launcher, RunSpec
@@ -114,7 +115,7 @@ def train_again(folder: Path, retraining: Retraining) -> list[Repeat]:
 
 def _spec(protocol: Protocol, agent: str, seed: int, retraining: Retraining) -> RunSpec[Protocol]:
     dataset = retraining.dataset
-    if protocol.dataset is not None and dataset is None:
+    if protocol.dataset is not None and dataset is None and registry.agent_entry(agent).learns:
         raise ArtefactError(f"it learned from the dataset {protocol.dataset}; give its folder with --dataset.")
     through = encoder_of_run(protocol, agent, retraining.encoder)
     return RunSpec(protocol=protocol, agent=agent, seed=seed, encoder=through, dataset=dataset)

@@ -14,7 +14,7 @@ import bench_fakes
 import gymnasium
 import numpy as np
 import pytest
-from forger import FORGERIES, mend, rewrite
+from forger import FORGERIES, mend, rewrite, rewrite_protocol
 from small_runs import Inline, context, small
 
 from imagine_bench import registry
@@ -143,6 +143,21 @@ def test_two_seeds_of_a_learner_share_nothing(
     one, other, *_ = verify(forged(pair, tmp_path, forge))
     assert not one.complaint
     assert other.complaint.startswith(f"its {what}") and "those of seed 0" in other.complaint
+
+
+@pytest.mark.parametrize(
+    ("claim", "complaint"),
+    [
+        ({"execution": "physics"}, "the simulated time in seconds is"),
+        ({"settings_digest": "0123456789ab"}, "its settings_digest is 0123456789ab"),
+        ({"encoder": "other@0123456789ab"}, "it names the encoder other@0123456789ab, and no agent reads latents"),
+    ],
+)
+def test_what_a_protocol_says_follows_from_its_runs(
+    pair: Path, tmp_path: Path, claim: dict[str, str], complaint: str
+) -> None:
+    folder = rewrite_protocol(forged(pair, tmp_path, lambda folder: None), **claim)
+    assert complaint in " ".join(each.complaint for each in verify(folder))
 
 
 def test_failures_are_a_seeds_own_unless_it_knows_nothing_or_chance_decides() -> None:

@@ -181,6 +181,19 @@ def without_training(bench: Path, rng: np.random.Generator) -> None:
     change_checkpoint(learner(bench, rng), change)
 
 
+def rewrite_protocol(bench: Path, **values: Any) -> Path:
+    """Other values in every copy of a bench's protocol, and in its hash; returns where the bench lies then."""
+    protocol = json.loads((bench / "protocol.json").read_text()) | values
+    (bench / "protocol.json").write_text(json.dumps(protocol))
+    for run in sorted(path.parent for path in bench.glob("*/seed_*/DONE")):
+        config = json.loads((run / "config.json").read_text())
+        config.pop("seal")
+        config |= {"protocol": protocol, "protocol_hash": digest(protocol)}
+        (run / "config.json").write_text(json.dumps(sealed(config)))
+        mend(run)
+    return bench.rename(bench.with_name(f"smoke-{digest(protocol)}"))
+
+
 def seed(bench: Path, rng: np.random.Generator) -> None:
     """A run is of another seed, here alone or in everything that names it, the protocol and its hash included."""
     other, run = int(rng.integers(1, 99)), one_run(bench, rng)
