@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from .probe import Latents
 from .recipes import Recipe, recipe_named
 from .training import draw_frames, train_encoder
 
+_LINE_EVERY_S = 15.0  # where nobody watches a terminal
 COLUMNS = 8
 """Frames in the figure."""
 
@@ -67,11 +70,16 @@ def retrain(
     refuse_existing(path)
     unfinished = path.with_name(f".{name}.unfinished.pt")
     with tqdm(total=1.0, bar_format="{desc:10}{percentage:3.0f}% |{bar}| {elapsed}<{remaining}", disable=None) as bar:
+        shown_s = time.monotonic()
 
         def show(stage: str, done: float) -> None:
+            nonlocal shown_s
             bar.desc = stage
             bar.n = done
             bar.refresh()
+            if bar.disable and time.monotonic() - shown_s > _LINE_EVERY_S:
+                shown_s = time.monotonic()
+                print(f"{name}: {stage} {done:.0%}", file=sys.stderr, flush=True)
 
         encoder = train_encoder(
             spec,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +18,9 @@ from imagine_bench.exact.memoryless import best_without_memory
 from imagine_bench.interfaces import Floats, Rules, TaskSpec
 from imagine_bench.rules import RuleTables, evaluate, horizon_optimum, shortest_plans, tabulate
 
+_LARGE = 5_000
+_A_SECOND = 1_500
+"""Macrostates above which the facts take so long that it is said, and how many a second takes."""
 _PROVED = 1e-6  # of a success probability
 _LEARNERS = 10
 _FEWEST = 2
@@ -60,6 +64,9 @@ class Certificate:
 def certificate(spec: TaskSpec) -> Certificate:
     """Compute the certificate of a task: its rules, its horizon, and what its frames show."""
     tables = tabulate(spec.rules)
+    if len(tables.index) > _LARGE:
+        long_s = len(tables.index) / _A_SECOND
+        print(f"The exact facts of {spec.id} are computed, about {long_s:.0f} s.", file=sys.stderr, flush=True)
     full = machine(spec.rules)
     starts = tables.starts
     best = horizon_optimum(tables, spec.horizon)

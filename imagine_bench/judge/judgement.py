@@ -9,7 +9,7 @@ import hashlib
 import inspect
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,15 @@ from imagine_bench.interfaces.model import WorldModel, require_imagined
 from imagine_bench.judge import questions
 from imagine_bench.judge.change import Streams, change_detection_delay, counterfactual_error, streams_of
 from imagine_bench.judge.models import JudgedModel, model_entry, one_name, opened, runs_of
-from imagine_bench.judge.predictions import ImageReader, Predictions, RenderedFrameIndex, call, evaluate
+from imagine_bench.judge.predictions import (
+    ImageReader,
+    Predictions,
+    RenderedFrameIndex,
+    ask_together,
+    call,
+    evaluate,
+    reader_errors,
+)
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.scores import after_the_end_scores, by_depth, one_step_scores, ranking_scores
 from imagine_bench.judge.truth import Distribution, shares
@@ -61,7 +69,6 @@ SAMPLES = 8
 _FORMAT = 4  # 3 asked every model in the order of the macrostates
 _AFTER = 6  # transitions after the end whose images are kept
 _PATIENCE_S = 1_800.0  # seconds that a process waits while another makes the data or the reader
-_READ = 1_000  # frames that the reader is measured on
 _READER_FILE = "reader.safetensors"
 _READER = "imagine_bench.agents.world_models.reader"
 Costs = dict[str, str | float]
@@ -332,27 +339,6 @@ def visited(dataset: Dataset, transitions: int) -> set[tuple[State, int]]:
     return set(zip(map(tuple, macrostates.tolist()), dataset.episodes.actions[:transitions].tolist(), strict=True))
 
 
-def ask_together(ask: Callable[[EvalSet, str], Predictions], sets: Mapping[str, EvalSet]) -> dict[str, Predictions]:
-    """The predictions of sets of questions; those with one kind of history are asked as one, shuffled together."""
-    kinds: dict[tuple[tuple[int, ...], ...], list[str]] = {}
-    for name, each in sets.items():
-        kinds.setdefault((each.frames.shape[1:], each.actions.shape[1:]), []).append(name)
-    found = {}
-    for names in kinds.values():
-        parts = [sets[name] for name in names]
-        together = EvalSet(
-            states=tuple(state for part in parts for state in part.states),
-            frames=np.concatenate([part.frames for part in parts]),
-            actions=np.concatenate([part.actions for part in parts]),
-            truth=tuple(steps for part in parts for steps in part.truth),
-        )
-        predictions = ask(together, names[0])
-        ends = np.cumsum([len(part.states) for part in parts])
-        for name, part, end in zip(names, parts, ends.tolist(), strict=True):
-            found[name] = predictions.of_rows(end - len(part.states), end)
-    return found
-
-
 @functools.lru_cache(maxsize=2)
 def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
     """Questions and reader, made once in each process."""
@@ -399,32 +385,6 @@ def _reader_of_world(spec: TaskSpec, appearance: str, code: ModuleType) -> tuple
         if sha256(path) != facts["sha256"]:
             raise ArtefactError(f"{path} is damaged; remove {path.parent}, and the same command trains it anew.")
         return path.read_bytes(), facts["errors"]
-
-
-def reader_errors(reader: ImageReader, spec: TaskSpec, appearance: str) -> dict[str, float]:
-    """How often a reader is wrong on frames that it was not trained on, and how often it reads what shows nothing.
-
-    Shares of real frames: ``misread``, taken for another macrostate, and ``refused``; the others are shares taken for
-    an image of this world of black and gray fog, noise, and blends of two frames of different macrostates.
-    """
-    rng = SeedTree(1).child("encoder_probe", "judge", spec.id, appearance).generator()
-    states = np.array(states_of(spec.rules), dtype=np.int64)
-    macrostates, others = (states[rng.integers(len(states), size=_READ)] for _ in range(2))
-    frames, blended = (spec.render_macrostates(each, appearance, rng) for each in (macrostates, others))
-    differ = (macrostates != others).any(axis=1)
-    of_nothing = {
-        "black": np.zeros_like(frames[:1]),
-        "gray": np.full_like(frames[:1], 128),
-        "noise": rng.integers(0, 256, frames.shape, dtype=np.uint8),
-        "blends": ((frames[differ].astype(np.uint16) + blended[differ]) // 2).astype(np.uint8),
-    }
-    read = reader.read(frames)
-    refused = read[:, 0] < 0
-    wrong = (read != macrostates).any(axis=1) & ~refused
-    found = {"misread": float(wrong.mean()), "refused": float(refused.mean())}
-    for name, images in of_nothing.items():
-        found[f"{name}_read"] = float((reader.read(images)[:, 0] >= 0).mean())
-    return found
 
 
 def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], rng: np.random.Generator) -> Arrays:

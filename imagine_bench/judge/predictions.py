@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ParamSpec, Protocol, TypeVar
 
@@ -17,9 +17,11 @@ from imagine_bench.interfaces import Floats, Frame, State, TaskSpec
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.truth import Distribution, added_up
+from imagine_bench.rules import states_of
 from imagine_bench.running.isolation import GuestError
 from imagine_bench.seeding import SeedTree
 
+_READ = 1_000  # frames that a reader is measured on
 _AT_ONCE = 96  # questions handed to a model at a time, to bound memory
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -32,6 +34,32 @@ class ImageReader(Protocol):
 
     def read(self, pictures: Images) -> Ints:
         """Macrostates (N, M) of images (N, H, W) or (N, H, W, 3); -1 where one shows nothing of this world."""
+
+
+def reader_errors(reader: ImageReader, spec: TaskSpec, appearance: str) -> dict[str, float]:
+    """How often a reader is wrong on frames that it was not trained on, and how often it reads what shows nothing.
+
+    Shares of real frames: ``misread``, taken for another macrostate, and ``refused``; the others are shares taken for
+    an image of this world of black and gray fog, noise, and blends of two frames of different macrostates.
+    """
+    rng = SeedTree(1).child("encoder_probe", "judge", spec.id, appearance).generator()
+    states = np.array(states_of(spec.rules), dtype=np.int64)
+    macrostates, others = (states[rng.integers(len(states), size=_READ)] for _ in range(2))
+    frames, blended = (spec.render_macrostates(each, appearance, rng) for each in (macrostates, others))
+    differ = (macrostates != others).any(axis=1)
+    of_nothing = {
+        "black": np.zeros_like(frames[:1]),
+        "gray": np.full_like(frames[:1], 128),
+        "noise": rng.integers(0, 256, frames.shape, dtype=np.uint8),
+        "blends": ((frames[differ].astype(np.uint16) + blended[differ]) // 2).astype(np.uint8),
+    }
+    read = reader.read(frames)
+    refused = read[:, 0] < 0
+    wrong = (read != macrostates).any(axis=1) & ~refused
+    found = {"misread": float(wrong.mean()), "refused": float(refused.mean())}
+    for name, images in of_nothing.items():
+        found[f"{name}_read"] = float((reader.read(images)[:, 0] >= 0).mean())
+    return found
 
 
 class RenderedFrameIndex:
@@ -165,6 +193,27 @@ def evaluate(
         cpu_s=cpu_s,
         steps=sum(int(np.prod(each.pictures.shape[:3])) for each in answers),
     )
+
+
+def ask_together(ask: Callable[[EvalSet, str], Predictions], sets: Mapping[str, EvalSet]) -> dict[str, Predictions]:
+    """The predictions of sets of questions; those with one kind of history are asked as one, shuffled together."""
+    kinds: dict[tuple[tuple[int, ...], ...], list[str]] = {}
+    for name, each in sets.items():
+        kinds.setdefault((each.frames.shape[1:], each.actions.shape[1:]), []).append(name)
+    found = {}
+    for names in kinds.values():
+        parts = [sets[name] for name in names]
+        together = EvalSet(
+            states=tuple(state for part in parts for state in part.states),
+            frames=np.concatenate([part.frames for part in parts]),
+            actions=np.concatenate([part.actions for part in parts]),
+            truth=tuple(steps for part in parts for steps in part.truth),
+        )
+        predictions = ask(together, names[0])
+        ends = np.cumsum([len(part.states) for part in parts])
+        for name, part, end in zip(names, parts, ends.tolist(), strict=True):
+            found[name] = predictions.of_rows(end - len(part.states), end)
+    return found
 
 
 def call(name: str, method: str, function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:

@@ -132,7 +132,7 @@ def _once(path: Path, what: str, make: Callable[[], object]) -> None:
     make_folder(path.parent)
     with lock(path.parent / ".lock", f"The folder of encoders {path.parent}", patience_s=_PATIENCE_S):
         if not path.is_file():
-            print(f"{what} into {path.parent}, once.")
+            print(f"{what} into {path.parent}, once: up to two minutes on one core.", flush=True)
             make()
 
 

@@ -7,10 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_reader import BlindReader
+from imagine_bench.agents.world_models.limits import Exact
+from judged import JudgedWorld, judged_world, shown
 
+from imagine_bench.arrays import Ints
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Frame, State
 from imagine_bench.interfaces.episodes import joined
 from imagine_bench.interfaces.model import Imagined, require_imagined, weights_of
+from imagine_bench.judge import questions
+from imagine_bench.judge.predictions import Predictions, ask_together, evaluate
+from imagine_bench.judge.questions import EvalSet
 
 SHAPE = (3, 4, 2)
 GOOD = Imagined(
@@ -49,6 +57,51 @@ def test_what_is_wrong_is_one_sentence(changes: dict[str, Any], words: str) -> N
     with pytest.raises(InvalidValueError) as found:
         check(**changes)
     assert str(found.value).startswith("World model theirs: imagine() gave") and words in str(found.value)
+
+
+class Records(Exact):
+    """The exact model, which keeps what it is asked."""
+
+    def __init__(self, world: JudgedWorld) -> None:
+        super().__init__(world.spec, world.index)
+        self.batches: list[list[State]] = []
+
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
+        found = super().imagine(frames, actions, samples, rng)
+        self.batches.append([tuple(shown(frame, judged_world(TASK).spec).tolist()) for frame in frames[:, -1]])
+        frames[...] = 0
+        actions[...] = 0
+        return found
+
+
+TASK = "arrows:cubes=2"
+
+
+def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:
+    world = judged_world(TASK)
+    after = questions.after_the_end(world.spec, world.index.render)
+    assert after is not None
+    sets = {"one_step": world.one_step, "rollouts": world.rollouts, "after": after}
+
+    def answered(order: int | None) -> tuple[dict[str, Predictions], list[list[State]]]:
+        model = Records(world)
+        given: dict[str, Any] = {"samples": 2, "reader": BlindReader(2), "index": world.index}
+
+        def ask(asked: EvalSet, name: str) -> Predictions:
+            drawn = None if order is None else np.random.default_rng(order)
+            return evaluate(model, name, asked, rng=np.random.default_rng(0), order=drawn, **given)
+
+        return ask_together(ask, sets), model.batches
+
+    (plain, in_order), (one, shuffled), (again, repeated), (other, otherwise) = map(answered, (None, 0, 0, 1))
+    assert in_order != shuffled == repeated != otherwise
+    for name, answers in plain.items():
+        for each in (one, again, other):
+            assert np.array_equal(answers.states, each[name].states) and len(answers.states) == len(sets[name].states)
+            assert np.array_equal(answers.weights, each[name].weights)
+            assert all(np.array_equal(array, each[name].offered[key]) for key, array in answers.offered.items())
+    over = [world.spec.rules.is_terminal(state) for state in shuffled[0]]
+    assert any(over) and not all(over), "a batch does not tell that it is about what comes after an end"
 
 
 def test_the_first_transitions_are_the_same_ones() -> None:
