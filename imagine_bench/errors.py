@@ -6,6 +6,7 @@ import difflib
 import importlib.util
 import re
 import reprlib
+import unicodedata
 from collections.abc import Iterable
 from typing import Self
 
@@ -26,6 +27,13 @@ def plain(text: object) -> str:
     """A text for a terminal: its control characters as escapes, the middle of words that no reader needs left out."""
     shown = "".join(mark if mark.isprintable() or mark == "\n" else repr(mark)[1:-1] for mark in str(text))
     return re.sub(r"\S{1000,}", lambda word: f"{word[0][:80]}... ({len(word[0]):,} characters)", shown)
+
+
+def unprintable(value: object) -> bool:
+    """Whether a text, or one in a sequence, has control characters other than line breaks."""
+    if isinstance(value, str):
+        return any(unicodedata.category(mark) == "Cc" and mark != "\n" for mark in value)
+    return isinstance(value, tuple) and any(map(unprintable, value))
 
 
 class ImagineBenchError(Exception):

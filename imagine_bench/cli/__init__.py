@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shlex
 import sys
 import unicodedata
 from collections.abc import Sequence
-from contextlib import ExitStack, redirect_stderr, suppress
+from contextlib import ExitStack, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TextIO
 
 import tyro
 from tyro.conf import subcommand
@@ -169,6 +170,26 @@ def exit_code(words: Sequence[str]) -> int:
         return _carried_out(list(words))
 
 
+class _Printable(io.StringIO):
+    """An output that shows control characters as escapes: names, titles and files may be of somebody else."""
+
+    def __init__(self, output: TextIO) -> None:
+        super().__init__()
+        self._output = output
+
+    def write(self, text: str) -> int:
+        return self._output.write(plain(text))
+
+    def flush(self) -> None:
+        self._output.flush()
+
+    def fileno(self) -> int:
+        return self._output.fileno()
+
+    def isatty(self) -> bool:
+        return self._output.isatty()
+
+
 def _of_torch(function: str) -> None:
     """Call what scopes torch's settings, which hold for the whole process, if they may have been changed."""
     if _SETS_UP_TORCH in sys.modules:
@@ -184,7 +205,8 @@ def _carried_out(words: list[str]) -> int:
             print(f"imagine-bench {__version__}")
             return 0
         command = parsed(words)
-        command()
+        with redirect_stdout(_Printable(sys.stdout)):
+            command()
         sys.stdout.flush()
     except ImagineBenchError as error:
         return _say(error, error.exit_code)

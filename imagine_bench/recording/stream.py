@@ -274,7 +274,7 @@ def open_in_viewer(path: Path) -> None:
     """
     if not path.is_file():
         raise ArtefactError(f"No recording {path}; a bench leaves them in its run folders as recording.rrd.")
-    viewer = [sys.executable, "-m", "rerun", str(path)]
+    viewer = [sys.executable, "-P", "-m", "rerun", str(path)]  # -P: no rerun.py of the current folder
     if subprocess.run(viewer, capture_output=True, check=False).returncode:
         raise SetupError(
             f"No display here to open {path}, or the viewer failed; copy it to a machine with one and run "

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 
-from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known
+from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known, unprintable
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.interfaces.regression import RegressionSpec, Regressor, RegressorContext
@@ -154,6 +154,8 @@ def offers(group: str) -> Mapping[str, Any]:
             entry = SetupError(
                 f"{offer}, which is {brief(entry)} and no {kind.__name__}; mend or uninstall the package."
             )
+        if any(map(unprintable, vars(entry).values())):
+            entry = SetupError(f"{offer}, whose texts have control characters; mend or uninstall the package.")
         found[point.name] = entry
     return found
 
@@ -329,6 +331,8 @@ def task(name: str) -> TaskSpec:
         spec: TaskSpec = loaded(**entry.options) if callable(loaded) else loaded
         if not isinstance(spec, TaskSpec):
             raise TypeError(f"it is {brief(spec)} and no TaskSpec")
+    if any(map(unprintable, vars(spec).values())):
+        raise InvalidValueError(f"The texts of {entry.spec} have control characters; leave them out.")
     listed = getattr(spec.rules, "states", None)
     values = tuple(map(len, spec.macrostate_values))
     counts = tuple(1 + max(column) for column in zip(*listed, strict=True)) if listed else values

@@ -87,7 +87,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         run = (progress.bench, progress.agent, progress.seed)
         if progress.phase == "failed":  # what it lacks will not be done
             self._works[run] = self._done[run]
-            tqdm.write(f"{progress.agent} seed {progress.seed} failed: {progress.detail}", file=sys.stderr)
+            tqdm.write(plain(f"{progress.agent} seed {progress.seed} failed: {progress.detail}"), file=sys.stderr)
             return
         self._before.setdefault(run, progress.done)  # what an earlier session did took no time now
         self._done[run] = progress.done
@@ -95,7 +95,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         if ended:
             self._finished.add(run)
         shown = f"{len(self._finished)} of {len(self._works)} runs done, {self._times()}"
-        sentence = f"{shown}; {_sentence(progress, self._works[run])}"
+        sentence = plain(f"{shown}; {_sentence(progress, self._works[run])}")
         if not self._bar.disable:
             self._bar.total = sum(self._works.values())
             self._bar.n = sum(self._done.values())

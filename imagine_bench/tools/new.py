@@ -28,6 +28,7 @@ dependencies = ["imagine-bench"]
 {name} = "{name}:ENTRY"
 
 [tool.setuptools]
+package-dir = {{"" = "src"}}
 py-modules = ["{name}"]
 
 [tool.pytest.ini_options]
@@ -36,7 +37,7 @@ addopts = ["--imagine-bench-{kind}={name}"]
 
 
 def new_package(kind: str, name: str, out: Path) -> str:
-    """Write ``out/<name>/``: ``pyproject.toml``, and ``<name>.py``, which passes the checks as it is.
+    """Write ``out/<name>/``: ``pyproject.toml``, and ``src/<name>.py``, which passes the checks as it is.
 
     Returns what to do next.
 
@@ -60,7 +61,7 @@ def new_package(kind: str, name: str, out: Path) -> str:
     template = (resources.files("imagine_bench.tools") / "templates" / f"{kind}.py.j2").read_text()
     words = {"name": name, "camel": name.title().replace("_", ""), "title": name.replace("_", " ").capitalize()}
     code = jinja2.Environment(autoescape=False, keep_trailing_newline=True).from_string(template).render(**words)
-    make_folder(folder)
-    write_bytes(folder / f"{name}.py", code.encode())
+    source = make_folder(folder / "src")  # beside pyproject.toml the folder would hide the module
+    write_bytes(source / f"{name}.py", code.encode())
     write_bytes(folder / "pyproject.toml", _PYPROJECT.format(kind=kind, name=name, group=group).encode())
     return f"Wrote {folder}.\nNext: pip install -e {folder} && imagine-bench check --{kind} {name} (or pytest {folder})"

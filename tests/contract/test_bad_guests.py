@@ -79,3 +79,39 @@ def test_options_that_a_task_lacks_are_refused(
     guests.new(*_TASK)
     assert main(["bench", "--task", "lamps", "--agents", "random", *option.split()]) == 2
     assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "end", ["import sys\nsys.exit()", "raise SystemExit(0)", "raise type('Stop', (BaseException,), {})"]
+)
+def test_a_package_that_ends_python_costs_itself_alone(
+    guests: Guests, capsys: pytest.CaptureFixture[str], end: str
+) -> None:
+    guests.write("ending", end, {"imagine_bench.agents": {"ending": "ending:ENTRY"}})
+    assert main(["describe"]) == 0
+    said = capsys.readouterr().out
+    assert "oracle" in said and "arrow_puzzle" in said and "it ends Python when it is imported" in said
+    assert main(["bench", "arrow_puzzle", "--agents", "ending"]) == 2
+
+
+_RED = "\x1b[31m"
+
+
+@pytest.mark.parametrize("kind", [_TASK, _AGENT])
+def test_texts_with_control_characters_are_refused(
+    guests: Guests, capsys: pytest.CaptureFixture[str], kind: tuple[str, str]
+) -> None:
+    """They would reach terminals, pages and recordings."""
+    name = kind[1].capitalize()
+    guests.new(*kind, (f'title="{name}"', 'title="\\x1b[31m"'))
+    words = "lamps --agents random" if kind == _TASK else "arrow_puzzle --agents clumsy"
+    assert main(["bench", *words.split()]) == 2
+    said = capsys.readouterr().err
+    assert "control characters" in said and _RED not in said
+
+
+def test_no_control_character_reaches_the_terminal(guests: Guests, capsys: pytest.CaptureFixture[str]) -> None:
+    guests.write("shy", "", {"imagine_bench.agents": {f"shy{_RED}": "shy:ENTRY"}})
+    assert main(["describe"]) == 0
+    said = capsys.readouterr().out
+    assert _RED not in said and r"shy\x1b[31m" in said

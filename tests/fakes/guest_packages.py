@@ -34,7 +34,7 @@ class Guests:
         """Install a package that ``imagine-bench new`` writes, with some of its code replaced."""
         self._folder.mkdir(exist_ok=True)
         new_package(kind, name, self._folder)
-        module = self._folder / name / f"{name}.py"
+        module = self._folder / name / "src" / f"{name}.py"
         code = module.read_text()
         for old, new in changes:
             assert old in code
@@ -51,7 +51,7 @@ class Guests:
 
     def offer(self, folder: Path, offers: Offers) -> None:
         """Have an installed package offer something else."""
-        (facts,) = folder.glob("*.dist-info")
+        (facts,) = folder.rglob("*.dist-info")
         lines = []
         for group, targets in offers.items():
             lines.append(f"[{group}]")
@@ -68,11 +68,12 @@ class Guests:
         registry.offers.cache_clear()
 
     def _install(self, folder: Path, name: str, version: str, offers: Offers) -> Path:
-        facts = folder / f"{name}-{version}.dist-info"
+        source = folder / "src" if (folder / "src").is_dir() else folder
+        facts = source / f"{name}-{version}.dist-info"
         facts.mkdir()
         (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
         self._names.add(name)
-        self._patch.syspath_prepend(folder)
+        self._patch.syspath_prepend(source)
         self.offer(folder, offers)
         self.forget()
         return folder

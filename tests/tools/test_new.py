@@ -29,7 +29,7 @@ def test_a_new_package_keeps_the_contract(
 
 def test_the_new_packages_own_tests_find_a_fault(guests: Guests) -> None:
     site = guests.new("task", "my_own", ("self._state, self.np_random.bit_generator.state = state", "pass"))
-    environment = {**os.environ, "PYTHONPATH": str(site)}
+    environment = {**os.environ, "PYTHONPATH": str(site / "src")}
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     said = subprocess.run(words, capture_output=True, text=True, env=environment, cwd=site, check=False).stdout
     assert "1 failed, 6 passed" in said and "put back in the same environment, it goes on otherwise" in said
@@ -43,6 +43,20 @@ def test_the_new_agent_learns_the_new_task(guests: Guests, tmp_path: Path) -> No
     (run,) = bench(wanted, paths, root=tmp_path, launcher=Inline()).runs
     chance = facts(registry.task("my_world").rules, 8).chance_level
     assert run.checkpoints[-1].success_rate > 0.9 > 2 * chance
+
+
+def test_a_new_folder_hides_no_module_and_one_that_does_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beside the folder Python takes it for a package, where an editable install only adds a finder."""
+    assert main(["new", "agent", "my_own", "--out", str(tmp_path)]) == 0
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(AttributeError, match=f"no attribute 'ENTRY', as the folder {tmp_path / 'my_own'} hides it"):
+        registry.load("my_own:ENTRY")
+    monkeypatch.delitem(sys.modules, "my_own")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "my_own" / "src")])  # as setuptools adds it
+    assert registry.load("my_own:ENTRY").title == "My own"
+    monkeypatch.delitem(sys.modules, "my_own")
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,8 @@ from imagine_bench.store.files import make_folder, writing
 _POLL_S = 0.5
 _PATIENCE_S = 5.0
 _KILLED = "-9: it was killed, such as for lack of memory"
+_SAFE = {**ONE_THREAD, "PYTHONSAFEPATH": "1"}
+"""No module of the current folder stands for one of Python's own while a process starts."""
 Item = TypeVar("Item")
 News = TypeVar("News")
 
@@ -182,7 +184,7 @@ class _Worker(Generic[Item, News]):
         context = multiprocessing.get_context("spawn")  # a fork would inherit GL contexts and threads
         self._pipe, theirs = context.Pipe()
         self.process: BaseProcess = context.Process(target=_work, args=(function, theirs, registered()), daemon=True)
-        with mock.patch.dict(os.environ, ONE_THREAD), script_left_out():
+        with mock.patch.dict(os.environ, _SAFE), script_left_out():
             self.process.start()
         theirs.close()
         self._item: Item

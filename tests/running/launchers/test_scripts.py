@@ -46,7 +46,9 @@ def script(module: str, act: str = "return 0", *, guard: bool = True) -> str:
 
 
 def test_a_worker_needs_no_script_and_knows_what_it_registers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As of standard input: the main module has a file that is none."""
+    """As of standard input: the main module has a file that is none. No file beside it stands for one of Python's."""
+    (tmp_path / "pickle.py").write_text("raise RuntimeError('not the one of Python')")
+    monkeypatch.chdir(tmp_path)
     main = sys.modules["__main__"]
     monkeypatch.setattr(main, "__file__", "<stdin>", raising=False)
     monkeypatch.setattr(main, "__spec__", None)
