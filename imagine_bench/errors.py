@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib.util
+import operator
 import re
 import reprlib
 import unicodedata
 from collections.abc import Iterable
-from typing import Self
+from typing import Self, SupportsIndex
 
 _LONGEST = 200
 _SHORT = reprlib.Repr()
@@ -146,3 +148,12 @@ def require_known(kind: str, given: str, known: Iterable[str]) -> str:
     if not isinstance(given, str) or given not in names:
         raise UnknownNameError(kind, given, names)
     return given
+
+
+def require_integer(name: str, given: SupportsIndex, low: int) -> int:
+    """An integer from ``low`` on, also one of numpy. Raises InvalidValueError: it is none."""
+    with contextlib.suppress(TypeError):
+        number = operator.index(given)
+        if number >= low:
+            return number
+    raise InvalidValueError(f"{name} is {brief(given)}; give an integer from {low} on.")

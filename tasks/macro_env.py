@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import SupportsIndex
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.arrays import Info, Observed
-from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
+from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_integer, require_known
 from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, State, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.values import Json
@@ -48,15 +46,6 @@ class EnvState:
 
 _EPISODE = ("begun", "latest", "_people", "_steps", "_observations", "_observed")
 """Attributes that say where an episode stands: latest macro-action, and what lag keeps back."""
-
-
-def require_integer(name: str, given: SupportsIndex, low: int) -> int:
-    """An integer from ``low`` on, also one of numpy. Raises InvalidValueError: it is none."""
-    with contextlib.suppress(TypeError):
-        number = operator.index(given)
-        if number >= low:
-            return number
-    raise InvalidValueError(f"{name} is {brief(given)}; give an integer from {low} on.")
 
 
 def options_of(options: Info | None) -> Info:

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from imagine_bench.arrays import Info, Observed
 from imagine_bench.cores import usable_cores
-from imagine_bench.errors import InvalidValueError, brief, require_known
+from imagine_bench.errors import InvalidValueError, brief, require_integer, require_known
 from imagine_bench.interfaces import Floats, Frame
 
-from .macro_env import MacroEnv, Step, options_of, require_integer
+from .macro_env import MacroEnv, Step, options_of
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
 Batch = tuple[Observed, Floats, NDArray[np.bool_], NDArray[np.bool_], Info]

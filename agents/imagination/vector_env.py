@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from imagine_bench.arrays import Info, State
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, brief, require_integer
 from imagine_bench.interfaces import Floats, Frame
 from imagine_bench.interfaces.model import UNCERTAINTIES
 
@@ -50,8 +50,6 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
     """
 
     def __init__(self, imagination: Imagination, starts: Latents, *, num_envs: int = 1, horizon: int = 10) -> None:
-        if num_envs < 1 or horizon < 1:
-            raise InvalidValueError(f"num_envs is {num_envs} and horizon {horizon}; each must be at least 1.")
         imagination.require_no_confidence("An imagined environment")
         model = imagination.model
         if starts.ndim != 2 or len(starts) == 0 or starts.shape[1] != model.latent_size:
@@ -61,8 +59,8 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self.imagination = imagination
         self.starts = starts
-        self.num_envs = num_envs
-        self.horizon = horizon
+        self.num_envs = require_integer("num_envs", num_envs, 1)
+        self.horizon = require_integer("horizon", horizon, 1)
         self._generator = torch.Generator(imagination.generators["rollouts"].device)
         self.single_observation_space = gymnasium.spaces.Box(-LATENT_LIMIT, LATENT_LIMIT, (model.latent_size,))
         self.single_action_space = gymnasium.spaces.Discrete(model.n_actions)
@@ -73,8 +71,13 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
         self._gathered = torch.zeros(num_envs, device=self._generator.device)
 
     def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Latents, Info]:
-        """Begin N episodes; the first observations (N, Z), and no info. No options are known."""
-        super().reset(seed=seed)
+        """Begin N episodes; the first observations (N, Z), and no info.
+
+        InvalidValueError for a seed that is no integer from 0 on, or for options, of which there are none.
+        """
+        if options:
+            raise InvalidValueError(f"Reset options {brief(options)} are given; imagined episodes take none.")
+        super().reset(seed=None if seed is None else require_integer("seed", seed, 0))
         self._z = self._draw_starts(self.num_envs)
         self._steps[:] = 0
         self._gathered.zero_()
@@ -139,8 +142,8 @@ class ImaginedEnv(gymnasium.Env[Latents, np.int64]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Latents, Info]:
         """Begin an episode: latents (Z,)."""
-        super().reset(seed=seed)
-        seen, info = self.world.reset(seed=seed)
+        seen, info = self.world.reset(seed=seed, options=options)
+        super().reset(seed=None if seed is None else int(seed))
         return seen[0], info
 
     def step(self, action: np.int64) -> tuple[Latents, float, bool, bool, Info]:

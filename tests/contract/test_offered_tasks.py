@@ -45,6 +45,16 @@ def test_every_macrostate_looks_otherwise_and_as_its_environment_shows_it() -> N
     env.close()
 
 
+@pytest.mark.usefixtures("site")
+def test_gymnasium_imports_its_module_and_makes_lanes_of_it() -> None:
+    lanes = gymnasium.make_vec("lights_out:lights_out/LightsOut-v0", num_envs=2)
+    seen, _ = lanes.reset(seed=[4, 5])
+    env = gymnasium.make("lights_out/LightsOut-v0")
+    assert np.array_equal(seen[1], env.reset(seed=5)[0])
+    env.close()
+    lanes.close()
+
+
 @pytest.mark.slow
 def test_it_goes_from_list_to_recording(site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "lights_out" not in registry.TASKS

@@ -150,6 +150,10 @@ def begun() -> ImaginedVectorEnv:
     ("do", "words"),
     [
         (lambda: ImaginedVectorEnv(ruled(TASK), np.zeros((3, 4), np.float32)), r"shape \(P, 15\)"),
+        (lambda: puzzle(num_envs=0), "num_envs is 0; give an integer from 1 on"),
+        (lambda: puzzle(horizon="x"), "horizon is 'x'; give an integer from 1 on"),  # type: ignore[arg-type]
+        (lambda: puzzle().reset(seed=-1), "seed is -1; give an integer from 0 on"),
+        (lambda: puzzle().reset(options={"macrostate": (0, 1, 2, 0)}), "imagined episodes take none"),
         (lambda: puzzle().step(np.zeros(4, np.int64)), "call reset before step"),
         (lambda: begun().step(np.array([0, 0, 0, 6])), r"Actions \[0 0 0 6\] must be 4 in \[0, 6\)"),
     ],
