@@ -34,58 +34,103 @@ def test_running_means_by_hand() -> None:
 FIVE, OTHERS = [0.2, 0.5, 0.55, 0.6, 0.9], [0.1, 0.15, 0.3, 0.2, 0.8, 0.25, 0.2, 0.35]
 
 
-@pytest.mark.parametrize(("trim", "cut"), [(0.0, 0), (0.25, 2)])
-def test_an_interval_is_student_s_and_of_a_trimmed_mean_tukey_s(trim: float, cut: int) -> None:
-    """Of eight, so many are cut off at each end."""
-    spread = stats.mstats.winsorize(np.array(OTHERS), limits=(trim, trim)).std(ddof=1)
-    left = 8 - 2 * cut
-    half = stats.t.ppf(0.975, left - 1) * spread * math.sqrt(7 / (left * (left - 1)))  # Yuen (1974)
-    middle = stats.trim_mean(OTHERS, trim)
-    assert statistics.interval(OTHERS, trim=trim) == pytest.approx((middle - half, middle + half), abs=1e-12)
+def student(values: list[float], trim: float) -> tuple[float, float]:
+    """Tukey and McLaughlin's interval (1963), with the degrees of freedom of all values."""
+    cut, count = int(trim * len(values)), len(values)
+    spread = stats.mstats.winsorize(np.array(values), limits=(trim, trim)).std(ddof=1)
+    left = count - 2 * cut
+    half = stats.t.ppf(0.975, count - 1) * spread * math.sqrt((count - 1) / (left * (left - 1)))  # Yuen (1974)
+    middle = stats.trim_mean(values, trim)
+    return middle - half, middle + half
 
 
-def test_one_stuck_seed_in_five_does_not_decide() -> None:
-    low, high = statistics.interval([0.16, 0.95, 0.96, 0.97, 0.99], trials=200)
-    assert 0.85 < low < 0.96 < high <= 1.0
-    assert statistics.interval([0.16, 0.95, 0.96], trials=200)[0] == 0.0, "of three it is not trimmed, and says so"
+def test_an_interval_holds_what_the_trimmed_and_the_plain_mean_allow() -> None:
+    """And the median's exact interval: of eight, from the least to the greatest."""
+    found = statistics.interval(OTHERS, share=False)
+    ends = [student(OTHERS, 0.0), student(OTHERS, 0.25), (min(OTHERS), max(OTHERS))]
+    assert found == pytest.approx((min(low for low, _ in ends), max(high for _, high in ends)), abs=1e-12)
+    assert statistics.bounds([OTHERS, OTHERS], share=False).T.tolist() == [list(found), list(found)], "many at once"
 
 
-def test_equal_scores_are_as_sure_as_their_tests() -> None:
-    low, high = statistics.interval([1.0, 1.0, 1.0], trials=200)
-    assert high == 1.0 and 0.985 < low < 0.995
-    few_tests, _ = statistics.interval([1.0, 1.0, 1.0], trials=10)
-    assert few_tests < 0.9
-    assert statistics.interval([0.5, 0.5, 0.5]) == (0.5, 0.5)
+def test_a_trimmed_mean_hides_a_stuck_group_and_its_interval_does_not() -> None:
+    """A quarter of the runs is stuck and cut off: what is left says 95 %, of any width that it likes."""
+    scores = [0.16, 0.18, 0.95, 0.95, 0.96, 0.96, 0.97, 0.99]
+    assert statistics.iqm(scores) == pytest.approx(0.955)
+    low, high = statistics.interval(scores, trials=200)
+    assert low < float(np.mean(scores)) < 0.8 and high > 0.96
 
 
-def test_intervals_of_shares_stay_shares() -> None:
-    assert statistics.interval([0.0, 0.1], trim=0.0)[0] < 0.0
-    assert statistics.interval([0.0, 0.1], trim=0.0, share=True)[0] == 0.0
+def test_the_chance_of_common_starts_is_in_a_level() -> None:
+    """Runs that agree are as sure as one run's tests: the starts are the same for all."""
+    equal = [1.0] * statistics.FEWEST
+    assert statistics.interval(equal, trials=200) == pytest.approx(statistics.wilson(200, 200))
+    assert statistics.interval(equal, trials=10) == pytest.approx(statistics.wilson(10, 10))
+    assert statistics.interval(equal) == (1.0, 1.0)
+    apart = [0.5, 0.52, 0.55, 0.6, 0.62, 0.65, 0.7]
+    alone, starts = statistics.interval(apart), statistics.wilson(round(0.588 * 1000), 1000)
+    both = statistics.interval(apart, trials=1000)
+    assert 0.588 - both[0] == pytest.approx(math.hypot(0.588 - alone[0], 0.588 - starts[0]), abs=1e-12)
 
 
-def test_one_run_gives_no_interval() -> None:
-    assert all(math.isnan(end) for end in statistics.interval([0.3], trials=200))
-    assert math.isnan(statistics.gain([0.3], [0.2]).low)
-    assert all(math.isnan(part) for part in statistics.difference([0.3], [0.2])[1:])
-    assert math.isnan(statistics.detectable([0.3], [0.2], cells=1))
-    assert math.isfinite(statistics.gain([0.3, 0.31], [0.2, 0.21]).low), "two do"
+def test_no_interval_of_rates_leaves_zero_to_one() -> None:
+    rates = [0.0, 0.0, 0.0, 0.0, 0.1, 0.1, 0.9]
+    assert statistics.interval(rates)[0] == 0.0 > statistics.interval(rates, share=False)[0]
+    assert statistics.interval([1.0 - rate for rate in rates])[1] == 1.0
+    with pytest.raises(InvalidValueError, match=r"-1 to 2 are no shares in \[0, 1\]; pass share=False for others"):
+        statistics.interval([-1.0, 2.0])
 
 
-@pytest.mark.parametrize("trim", [0.0, 0.25])
-def test_a_difference_is_welch_s_and_of_trimmed_means_yuen_s(trim: float) -> None:
-    found = statistics.difference(FIVE, OTHERS, trim=trim)
-    expected = stats.ttest_ind(FIVE, OTHERS, equal_var=False, trim=trim)
-    assert found.p == pytest.approx(expected.pvalue, abs=1e-12)
-    assert found[1:3] == pytest.approx(tuple(expected.confidence_interval(0.95)), abs=1e-11)
-    assert found.value == pytest.approx(stats.trim_mean(FIVE, trim) - stats.trim_mean(OTHERS, trim))
+@pytest.mark.parametrize("runs", range(1, statistics.FEWEST))
+def test_too_few_runs_say_nothing(runs: int) -> None:
+    """Between two groups of equal size three runs are all of one group in 25 of 100 samples, six still in 3."""
+    few, base = [0.3] * runs, [0.2, 0.25, 0.2, 0.2, 0.2, 0.3, 0.25]
+    assert all(math.isnan(end) for end in statistics.interval(few, trials=200))
+    found = statistics.difference(few, base)
+    assert found.value == pytest.approx(0.3 - statistics.iqm(base))
+    nothing = [*found[1:], *statistics.gain(few, base)[1:3], statistics.detectable(few, base, cells=1)]
+    assert all(map(math.isnan, nothing)) == (runs < statistics.FEWEST_TESTED)
+    assert statistics.can_show((runs, 7), 1) == (runs >= statistics.FEWEST_TESTED)
+
+
+def test_both_the_trimmed_and_the_plain_means_must_differ() -> None:
+    """Each of two groups, four runs and one: the trimmed means see one group alone."""
+    most_fail, most_solve = [0.2, 0.21, 0.22, 0.2, 0.95], [0.95, 0.96, 0.94, 0.95, 0.2]
+    found = statistics.difference(most_fail, most_solve)
+    assert found.p > stats.ttest_ind(most_fail, most_solve, equal_var=False).pvalue > 0.05 and found.high > 0.0
+    assert stats.ttest_ind(most_fail, most_solve, equal_var=False, trim=0.25).pvalue < 0.001, "Yuen's alone would"
+
+
+def test_a_difference_has_welchs_statistic_and_fewer_degrees_of_freedom() -> None:
+    a, b = [0.2, 0.5, 0.55, 0.6, 0.9], [0.1, 0.15, 0.3, 0.2, 0.22, 0.25, 0.2, 0.35]
+    found = statistics.difference(a, b, trim=0.0)
+    welch = stats.ttest_ind(a, b, equal_var=False)
+    freedom = (welch.df + 4) / 2
+    assert found.p == pytest.approx(2 * stats.t.sf(welch.statistic, freedom))
+    error = (np.mean(a) - np.mean(b)) / welch.statistic
+    half = stats.t.ppf(0.975, freedom) * error
+    assert found[:3] == pytest.approx((np.mean(a) - np.mean(b) + half * np.array([0, -1, 1])).tolist())
+    trimmed = statistics.difference(a, b)
+    assert trimmed.value == pytest.approx(stats.trim_mean(a, 0.25) - stats.trim_mean(b, 0.25))
+    assert (trimmed.low <= found.low) and (trimmed.high >= found.high) and trimmed.p >= found.p
+
+
+@pytest.mark.parametrize("runs", [(5, 5), (5, 10), (7, 7), (20, 6)])
+def test_no_p_value_is_below_the_chance_of_two_groups(runs: tuple[int, int]) -> None:
+    """Runs of one law that has two groups fall apart by agents so often, at the worst share of the groups."""
+    shares = np.linspace(0.001, 0.999, 999)
+    worst = 2.0 * (shares ** runs[0] * (1.0 - shares) ** runs[1]).max()
+    found = statistics.difference([1.0] * runs[0], [0.0] * runs[1])
+    assert found.p == pytest.approx(worst, rel=1e-4) and found[:3] == (1.0, 1.0, 1.0)
+    cells = int(0.05 / found.p)
+    assert statistics.can_show(runs, cells) and not statistics.can_show(runs, cells + 1)
+    assert math.isnan(statistics.detectable([1.0] * runs[0], [0.0] * runs[1], cells=cells + 1))
 
 
 def test_equal_runs_differ_by_more_than_their_tests() -> None:
-    far = statistics.difference([1.0, 1.0, 1.0], [0.16, 0.16, 0.16], trials=200)
-    assert far.value == 0.84 and 0.0 < far.p < 0.01 and 0.7 < far.low < 0.84 < far.high
-    near = statistics.difference([1.0, 1.0, 1.0], [0.995, 0.995, 0.995], trials=200)
+    far = statistics.difference([1.0] * 5, [0.16] * 5, trials=200)
+    assert far.value == 0.84 and far.p < 0.01 and 0.7 < far.low < 0.84 < far.high
+    near = statistics.difference([1.0] * 5, [0.999] * 5, trials=200)
     assert near.p > 0.2
-    assert statistics.difference([3.0, 3.0], [1.0, 1.0, 1.0]) == (2.0, 2.0, 2.0, 0.0), "without tests there is no doubt"
 
 
 def test_holm_by_hand() -> None:
@@ -107,12 +152,13 @@ def test_a_detectable_difference_is_found_four_times_in_five() -> None:
         found += statistics.difference(a + sizes, b).p < 0.05
     assert 0.7 < found / 400 < 0.93
     assert statistics.detectable(FIVE, OTHERS, cells=9) > statistics.detectable(FIVE, OTHERS, cells=1)
-    assert statistics.detectable([1.0, 1.0], [0.0, 0.0], cells=1) == 0.0
+    assert statistics.detectable([1.0] * 5, [0.0] * 5, cells=1) == 0.0
 
 
 def test_gain_is_the_thesis_table() -> None:
     assert statistics.gain([62.17], [42.18]).value == pytest.approx(0.4739, abs=1e-4)  # table 5.2 at 2000 episodes
-    gain, ratio = statistics.gain(FIVE, [0.4, 0.45, 0.5]), statistics.ratio(FIVE, [0.4, 0.45, 0.5])
+    base = [0.4, 0.45, 0.5, 0.4, 0.5]
+    gain, ratio = statistics.gain(FIVE, base), statistics.ratio(FIVE, base)
     assert gain[:3] == pytest.approx([end - 1.0 for end in ratio[:3]])
 
 
@@ -134,8 +180,8 @@ def test_a_ratio_s_ends_are_fieller_s(paired: bool) -> None:
 
 
 def test_a_gain_over_perhaps_nothing_has_no_interval_and_over_nothing_no_value() -> None:
-    value, low, high, _ = statistics.gain([0.3, 0.4, 0.5], [0.0, 0.0, 0.1])
-    assert value == pytest.approx(11.0) and math.isnan(low) and math.isnan(high)
+    value, low, high, _ = statistics.gain([0.3, 0.4, 0.5, 0.3, 0.5], [0.0, 0.0, 0.1, 0.0, 0.0])
+    assert value == pytest.approx(19.0) and math.isnan(low) and math.isnan(high)
     assert math.isnan(statistics.gain([0.1, 0.2], [0.0, 0.0]).value)
 
 

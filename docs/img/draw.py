@@ -48,12 +48,15 @@ def rates(folder: str, agent: str) -> dict[int, np.ndarray]:
 
 
 def curve(axes: plt.Axes, folder: str, agent: str, label: str | None = None) -> None:
-    """Interquartile mean over seeds with its 95 % interval."""
+    """Interquartile mean over seeds with its 95 % interval, or with the range of seeds that are too few for one."""
     table = rates(folder, agent)
     budgets = list(table)
     tests = json.loads((RESULTS / folder / "bench.json").read_text())["protocol"]["evaluation_episodes"]
     means = [100 * statistics.iqm(values) for values in table.values()]
-    ends = [[100 * end for end in statistics.interval(values, trials=tests)] for values in table.values()]
+    intervals = [statistics.interval(values, trials=tests) for values in table.values()]
+    if np.isnan(intervals).any():
+        intervals = [(values.min(), values.max()) for values in table.values()]
+    ends = 100 * np.array(intervals)
     axes.plot(budgets, means, "o-", color=COLORS[agent], label=label or agent, markersize=4, linewidth=2)
     axes.fill_between(budgets, *zip(*ends, strict=True), color=COLORS[agent], alpha=0.15, linewidth=0)
 
@@ -271,22 +274,19 @@ def why() -> None:
 
 
 def radar() -> None:
-    """Scores of the kept suites."""
-    scores: dict[str, dict[str, statistics.Estimate]] = {}
+    """Scores of the kept suites, of two seeds: too few for an interval."""
+    scores: dict[str, dict[str, float]] = {}
     for kept in ("suite", "suite-own"):
         with (RESULTS / kept / "scores.csv").open() as file:
             for row in csv.DictReader(file):
-                values = (float(row[name] or "nan") for name in ("score", "low_95", "high_95"))
-                scores.setdefault(label_today(row["agent"]), {})[row["experiment"]] = statistics.Estimate(*values)
+                scores.setdefault(label_today(row["agent"]), {})[row["experiment"]] = float(row["score"] or "nan")
     spokes = list(dict.fromkeys(name for found in scores.values() for name in found))
     figure = plt.figure(figsize=(8.4, 6.8), layout="constrained")
     axes = figure.add_subplot(projection="polar", theta_offset=np.pi / 2.0, theta_direction=-1)
     angles = np.linspace(0.0, 2.0 * np.pi, len(spokes) + 1)
     for agent, found in scores.items():
-        estimates = [found[name][:3] for name in (*spokes, spokes[0])]
-        middle, low, high = np.clip(estimates, 0.0, 1.0).T
+        middle = np.clip([found[name] for name in (*spokes, spokes[0])], 0.0, 1.0)
         axes.plot(angles, middle, "o-", color=figures.color(agent), label=agent_title(agent))
-        axes.vlines(angles, low, high, color=figures.color(agent), alpha=0.4)
     axes.set(ylim=(0.0, 1.0), yticks=(0.25, 0.5, 0.75, 1.0))
     axes.set_xticks(angles[:-1], [spoke.replace("_", " ") for spoke in spokes])
     axes.tick_params(axis="x", pad=20)

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from imagine_bench import reference
+from imagine_bench.arrays import Floats
 from imagine_bench.report import figures, sections
 from imagine_bench.report.data import (
     BASE_AGENT,
@@ -36,10 +37,12 @@ from imagine_bench.report.page import (
     Table,
     count,
     made,
+    over_seeds,
     p_value,
     percent,
     printed,
     seconds,
+    seeds_note,
     signed_percent,
 )
 from imagine_bench.statistics import LEVEL, Estimate, first_lasting
@@ -65,7 +68,7 @@ def bench_page(result: BenchResult) -> Page:
         files["open_loop.csv"] = open_loop_csv(result)
     dataset = f" · trained first on dataset {protocol.dataset}" if protocol.dataset else ""
     split = f" · tests start where training never does, {protocol.split}" if protocol.split else ""
-    interval = "95 % interval over seeds (Student's, of the trimmed mean)"
+    interval = seeds_note(len(protocol.seeds))
     if len(protocol.seeds) == 1:
         interval = "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
     subtitle = (
@@ -105,8 +108,8 @@ def _against_dqn(data: ReportData, agent: str) -> str:
         f"after {best['episodes']:,} episodes {percent(best['success_iqm'])} % of tests, DQN "
         f"{percent(base['success_iqm'])} %, difference {estimated(best, DIFFERENCE, signed_percent)} points"
     )
-    if math.isnan(best["p"]):
-        return f"“{agent_title(agent)}” against DQN: {clearest}. One seed does not show which is better."
+    if math.isnan(best["detectable_difference"]):
+        return f"“{agent_title(agent)}” against DQN: {clearest}. Too few seeds to say which is better."
     words = []
     for word, sign in (("better", 1), ("worse", -1)):
         if budgets := [f"{row['episodes']:,}" for row in rows if shown(row) == sign]:
@@ -155,8 +158,8 @@ def success(data: ReportData) -> Section:
     """Success of every agent at every budget, and of every seed."""
     caption = (
         "Test episodes solved after so many real training episodes; the axis is logarithmic. Points are interquartile "
-        "means over seeds (independent trainings), with 95 % intervals; dashed: chance level and optimum; diamonds: "
-        "the thesis, with standard deviations."
+        "means over seeds (independent trainings); bands are 95 % intervals, or the range of seeds where these are too "
+        "few; dashed: chance level and optimum; diamonds: the thesis, with standard deviations."
     )
     image = figures.image("success", lambda: success_figure(data), caption)
     budgets = set(data.result.protocol.budgets).union(*data.thesis.values())
@@ -168,7 +171,7 @@ def _scores(data: ReportData, budgets: Sequence[int]) -> Table:
     """Ours at these budgets, the thesis' below it where it has any of them, and the exact ends of the scale."""
     rows: list[tuple[str, Mapping[int, str]]] = []
     for agent in data.result.protocol.agents:
-        rows.append((agent_title(agent), {each["episodes"]: estimated(each, SCORE) for each in data.of(agent)}))
+        rows.append((agent_title(agent), {each["episodes"]: _solved(data, each) for each in data.of(agent)}))
         if not data.thesis[agent].keys().isdisjoint(budgets):
             cells = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
             rows.append((f"{agent_title(agent)}, thesis", cells))
@@ -180,6 +183,19 @@ def _scores(data: ReportData, budgets: Sequence[int]) -> Table:
     if any(title.endswith(", thesis") for title, _ in rows):
         caption += f" Thesis: {reference.success_source(str(data.spec.reference))}."
     return Table("scores", header, lines, caption, "not tested")
+
+
+def _solved(data: ReportData, record: Record) -> str:
+    """Of one seed with the interval over its tests."""
+    if record["seeds"] == 1:
+        return estimated(record, SCORE)
+    trials = data.result.protocol.evaluation_episodes
+    return over_seeds(_shares(data, record).tolist(), trials=trials, share=True)
+
+
+def _shares(data: ReportData, record: Record) -> Floats:
+    place = data.result.protocol.budgets.index(record["episodes"])
+    return data.result.success_rates(record["agent"])[:, place]
 
 
 def _mean_std(mean: float, std: float) -> str:
@@ -206,18 +222,19 @@ def gain(data: ReportData) -> Section | None:
         return None
     words = (
         "Difference: percentage points of test episodes solved. Gain: the same relative to DQN, (agent − DQN) / DQN, "
-        "the thesis' measure. One seed has no interval, nor has a gain over a DQN that may have solved nothing."
+        "the thesis' measure. Both the interquartile means and the means of all seeds must show a difference. Too few "
+        "seeds have no interval, nor has a gain over a DQN that may have solved nothing."
     )
     records = [record for record in data.records if record["agent"] in data.compared]
     sizes = [record["detectable_difference"] for record in records]
-    detectable = ""
+    detectable = f"Too few seeds to say: none of {len(sizes)} cells can show a difference."
     if not math.isnan(sizes[0]):
         detectable = (
             f"p-values are Holm-corrected for {len(sizes)} cells. The smallest difference that would be shown with "
             f"probability 80 % is {percent(min(sizes))} to {percent(max(sizes))} points, by cell."
         )
     rows = [{heading: cell(record) for heading, cell in _AGAINST_DQN.items()} for record in records]
-    why = "not said by the thesis, one seed, or DQN solved nothing to compare with"
+    why = "not said by the thesis, too few seeds, or DQN solved nothing to compare with"
     return Section("Gain over DQN", [words], tables=[Table.of("gains", rows, detectable, why)])
 
 
@@ -254,9 +271,7 @@ def success_figure(data: ReportData) -> Figure:
     curves = {}
     for agent in agents:
         rows = data.of(agent)
-        curves[agent_title(agent)] = {
-            row["episodes"]: Estimate(*(100.0 * row[column] for column in SCORE)) for row in rows
-        }
+        curves[agent_title(agent)] = {row["episodes"]: _band(data, row) for row in rows}
     figure = figures.lines({"": curves}, figures.colors(agents), "real training episodes (logarithmic)")
     (axes,) = figure.axes
     for level in (data.facts.optimum, data.facts.chance_level):
@@ -271,6 +286,14 @@ def success_figure(data: ReportData) -> Figure:
     axes.minorticks_off()
     axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
     return figure
+
+
+def _band(data: ReportData, record: Record) -> Estimate:
+    """A score, %, with its interval, or with the lowest and the highest of seeds that are too few for one."""
+    found = Estimate(*(100.0 * record[column] for column in SCORE))
+    shares = _shares(data, record)
+    ends = {"low": 100.0 * float(shares.min()), "high": 100.0 * float(shares.max())}
+    return found._replace(**ends) if math.isnan(found.low) else found
 
 
 SECTIONS: tuple[Callable[[ReportData], Section | None], ...] = (

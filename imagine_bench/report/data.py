@@ -144,7 +144,7 @@ def _record(data: ReportData, agent: str, place: int, fewest: Callable[[State], 
         "episodes": budget,
         "seeds": len(rows),
         **dict(zip(SCORE, (statistics.iqm(shares[:, place]), *ends), strict=True)),
-        "interval_over": "episodes" if len(rows) == 1 else "seeds",
+        "interval_over": "episodes" if len(rows) == 1 else "too few seeds" if math.isnan(ends[0]) else "seeds",
         "env_steps": mean(row.env_steps for row in rows),
         "train_cpu_s": mean(row.train_cpu_s for row in rows),
         "gradient_updates": mean(row.diagnostics.get("gradient_updates", math.nan) for row in rows),
@@ -167,7 +167,7 @@ def _record(data: ReportData, agent: str, place: int, fewest: Callable[[State], 
 
 
 def _against_dqn(data: ReportData, agent: str, place: int) -> Record:
-    """An agent compared with DQN; NaN where one seed allows no interval."""
+    """An agent compared with DQN; NaN where too few seeds allow no test."""
     result = data.result
     protocol = result.protocol
     trials = protocol.evaluation_episodes

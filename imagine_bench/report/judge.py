@@ -36,7 +36,7 @@ from imagine_bench.report.page import (
     p_value,
     write_page,
 )
-from imagine_bench.statistics import difference, holm, iqm
+from imagine_bench.statistics import can_show, difference, holm, iqm
 from imagine_bench.store.files import read_json, table_text
 
 QUESTIONS = {
@@ -259,12 +259,12 @@ def compared(found: Judged) -> Section:
             named = (f"{_title(model)} ({number(iqm(values[model]))})" for model in best)
             better = "it is better" if p < 0.05 else "no difference is shown"
             verdict = f"difference {estimate(each, number)}, {p_value(p)}, Holm-corrected: {better}"
-            if math.isnan(p):
-                verdict = "one seed does not show which is better"
+            if not can_show((len(values[best[0]]), len(values[best[1]])), len(pairs)):
+                verdict = "too few seeds to say which is better"
             answers.append(f"Smallest unbiased Brier score{found.after}: {', then '.join(named)}; {verdict}.")
     header = ["model", "against", "difference of unbiased Brier score", "p"]
-    caption = f"Unbiased Brier score of one step{found.after}; Yuen's test over seeds, p by Holm."
-    table = Table("differences", header, rows, caption, "one seed says nothing", "Every pair")
+    caption = f"Unbiased Brier score of one step{found.after}; Yuen's and Welch's tests over seeds, p by Holm."
+    table = Table("differences", header, rows, caption, "too few seeds say nothing", "Every pair")
     return Section("Against each other", tables=[table], answers=answers)
 
 

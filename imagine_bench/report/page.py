@@ -149,13 +149,39 @@ def estimate(found: statistics.Estimate, words: Callable[[float], str] = percent
     return f"{words(found.value)}{interval}"
 
 
-def over_seeds(values: Sequence[float], words: Callable[[float], str] = percent, *, share: bool = False) -> str:
-    """Interquartile mean over seeds with its 95 % interval, of a ``share`` in [0, 1]; a dash for no number."""
+def over_seeds(
+    values: Sequence[float],
+    words: Callable[[float], str] = percent,
+    *,
+    trials: int | None = None,
+    share: bool = False,
+) -> str:
+    """``95.5 / 91.2 [84.0, 97.6]``: interquartile mean over seeds, mean of all, and 95 % interval.
+
+    The mean stands there where the other leaves seeds out. Too few seeds have, for an interval, ``(90.0 to 97.5)``, the
+    lowest and the highest. No number is a dash; ``trials`` and ``share`` are as in :func:`.statistics.bounds`.
+    """
     known = [value for value in values if not math.isnan(value)]
     if not known:
         return DASH
-    low, high = statistics.interval(known, share=share)
-    return estimate(statistics.Estimate(statistics.iqm(known), math.nan if low == high else low, high), words)
+    middle = words(statistics.iqm(known))
+    if statistics.left_out(len(known)) and min(known) < max(known):
+        middle += f" / {words(float(np.mean(known)))}"
+    low, high = statistics.interval(known, trials=trials, share=share)
+    ends = f"[{words(low)}, {words(high)}]"
+    if math.isnan(low):
+        low, high = min(known), max(known)
+        ends = f"({words(low)} to {words(high)})"
+    return middle if low == high else f"{middle} {ends}"
+
+
+def seeds_note(seeds: int) -> str:
+    """What :func:`over_seeds` shows of so many seeds."""
+    out = statistics.left_out(seeds)
+    middle = f"interquartile mean ({out} of {seeds} seeds left out) / mean of all" if out else "mean over seeds"
+    if seeds < statistics.FEWEST:
+        return f"{middle} (lowest to highest seed; too few for an interval)"
+    return f"{middle} [95 % interval, of seeds and starts]"
 
 
 def mean_std(values: Sequence[float] | NDArray[np.float64]) -> str:

@@ -49,7 +49,7 @@ def study_page(study: Study, lines: Sequence[Line]) -> Page:
         title=study.question,
         subtitle=f"{study.execution} · {study.appearance} · tuning seeds {seeds} · {study.evaluation_episodes} tests",
         question="Interquartile means, differences with 95 % intervals over seeds, each alone: of many, some exclude "
-        "zero by chance.",
+        "zero by chance. Fewer than five seeds have none.",
         answers=[],
         sections=[Section("Variants", tables=[table])],
         files={"seeds.csv": _seeds_csv(study, lines), "study.json": json_text(made)},
@@ -124,9 +124,10 @@ def _scores(result: SuiteResult) -> Table:
         prices.append(seconds(len(result.suite.seeds) * sum(trained)))
     words = (
         "(success − chance) / (optimum − chance), mean over the levels of each experiment, with 95 % intervals: "
-        "Student's over seeds, and at least that of the tests. 0 is chance, 1 the exact optimum, with memory where "
-        "frames hide something or are late. Uncertainty is scored by the AUROC with which epistemic uncertainty tells "
-        "wrong imagined transitions from right ones, from 0.5 to 1; an agent that does not say has 0.5."
+        "Student's over seeds, and at least that of the tests; two to six seeds are too few. 0 is chance, 1 the exact "
+        "optimum, with memory where frames hide something or are late. Uncertainty is scored by the AUROC with which "
+        "epistemic uncertainty tells wrong imagined transitions from right ones, from 0.5 to 1; an agent that does not "
+        "say has 0.5."
     )
     header = ["experiment: dial", *map(agent_title, result.agents)]
     return Table("suite", header, [*rows, prices], words, "not run, or no imagined transition was wrong")

@@ -36,8 +36,8 @@ def score(values: Floats, scales: Sequence[Scale], *, trials: int | None = None)
     """Mean over levels and seeds of ``values`` (S, L), each on its level's scale, with a 95 % interval.
 
     The interval is Student's over seeds, and at least as wide as the tests alone make it, where the values are shares
-    of so many ``trials``; with one seed it is of the tests alone. A level without values is left out; all is NaN where
-    none has any.
+    of so many ``trials``; with one seed it is of the tests alone, and more that are too few have none. A level without
+    values is left out; all is NaN where none has any.
     """
     there = ~np.isnan(values).all(axis=0)
     known = values[:, there]
@@ -47,8 +47,8 @@ def score(values: Floats, scales: Sequence[Scale], *, trials: int | None = None)
     span = np.array([scale.optimum for scale in scales])[there] - chance
     seeds = np.nanmean((known - chance) / span, axis=1)
     value = float(seeds.mean())
-    low, high = statistics.interval(seeds, trim=0.0)
-    if trials is not None:
+    low, high = statistics.interval(seeds, trim=0.0, share=False)
+    if trials is not None and (len(seeds) == 1 or not math.isnan(low)):
         half = float(scipy.stats.norm.isf(0.025)) * _error_of_tests(known, span, trials)
         low, high = np.fmin(low, value - half), np.fmax(high, value + half)
     return statistics.Estimate(value, float(low), float(high))

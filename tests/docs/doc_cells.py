@@ -17,6 +17,7 @@ import numpy as np
 from imagine_bench import reference, registry, rules, statistics
 from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.registry.entries import agent_label, label_today
+from imagine_bench.report.page import over_seeds
 from imagine_bench.running.bench import read_protocol
 from imagine_bench.store import encoders
 from imagine_bench.sweep.grid import STUDIES
@@ -108,9 +109,8 @@ def points(share: float) -> str:
 
 
 def iqm(budget: str, where: str) -> str:
-    """Interquartile mean of the success rate, % [95 % interval over seeds]."""
-    values = scores(budget, where)
-    return interval(statistics.iqm(values), *statistics.interval(values, trials=trials(budget, where)))
+    """Interquartile mean of the success rate / mean, % [95 % interval], or of few seeds (lowest to highest)."""
+    return over_seeds(scores(budget, where).tolist(), trials=trials(budget, where), share=True)
 
 
 def ahead(budget: str, treated: str, base: str) -> str | list[Compared]:
@@ -174,7 +174,7 @@ def area(budget: str, where: str, task: str = "arrow_puzzle") -> str:
     """Mean success over all episodes to a budget, %: interquartile mean [95 %]."""
     budgets, table = _curves(where)
     means = statistics.running_means(budgets, table, _facts(task).chance_level)[:, budgets.index(int(budget))]
-    return interval(statistics.iqm(means), *statistics.interval(means, trials=trials(budget, where)))
+    return over_seeds(means.tolist(), trials=trials(budget, where), share=True)
 
 
 def reached(where: str, level: str) -> np.ndarray:
@@ -207,11 +207,12 @@ def price_to(where: str, level: str, what: str) -> str:
     return f"{np.mean([float(row[what]) for row in rows]):,.0f}"
 
 
-def coverage(seeds_and_stuck: str, what: str) -> str:
-    """A rate of the simulation of intervals and tests, %."""
-    count, stuck = seeds_and_stuck.split("/")
-    rows = {(row["seeds"], row["stuck"]): row for row in _json("coverage/coverage.json")["rows"]}
-    return percent(rows[int(count), float(stuck)][what])
+def coverage(law: str, what: str, count: str) -> str:
+    """A rate of the simulation of intervals and tests at so many seeds, %; of too few an en dash."""
+    kept = _json("coverage/coverage.json")
+    rows = {(row["law"], row["seeds"]): row for row in kept["rows"] + kept["power"]}
+    rate = rows[law, int(count)].get(what, "")
+    return "–" if rate == "" else percent(rate)
 
 
 def episodes_to(where: str, level: str) -> str:
@@ -287,12 +288,15 @@ def _success(folder: str, variant: str, budget: str) -> list[float]:
 
 
 def answers(folder: str, agent: str, path: str) -> str:
-    """What the models of a bench answered, %: mean [95 % over seeds]."""
+    """What the models of a bench answered, %: mean [95 % over seeds], or of few (lowest to highest)."""
     runs = _json(f"{folder}/generalisation.json")["runs"]
     values: list[Any] = [run for run in runs if label_today(run["agent"]) == agent]
     for name in path.split("/"):
         values = [value[name] for value in values]
-    return interval(np.mean(values), *statistics.interval(values, trim=0.0, share=True))
+    low, high = statistics.interval(values, trim=0.0)
+    if not np.isnan(low):
+        return interval(np.mean(values), low, high)
+    return f"{percent(np.mean(values))} ({percent(min(values))} to {percent(max(values))})"
 
 
 def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
@@ -345,22 +349,20 @@ def futures(folder: str, agent: str, measure: str, depth: str) -> str:
 
 
 def judged(folder: str, model: str, transitions: str, score: str) -> str:
-    """A score of the judge: interquartile mean over the seeds in which it is a number [95 %]."""
+    """A score of the judge: interquartile mean / mean over the seeds in which it is a number, as :func:`iqm`."""
     rows = picked(f"{folder}/scores.csv", model=model, transitions=transitions)
     values = [float(row[score]) for row in rows if row[score]]
     if not values:
         return "–"
     share = score.startswith(("auroc", "total", "tv", "after", "counter", "best"))
     digits = 2 if share or "skill" in score else 1
-    numbers = (statistics.iqm(values), *statistics.interval(values, share=share))
-    value, *ends = (f"{number:.{digits}f}".replace("-", "−") for number in numbers)
-    few = f" ({len(values)} of {len(rows)})" if len(values) < len(rows) else ""
-    return (value if "nan" in ends or len({value, *ends}) == 1 else f"{value} [{', '.join(ends)}]") + few
+    few = f"; {len(values)} of {len(rows)}" if len(values) < len(rows) else ""
+    return over_seeds(values, lambda number: f"{number:.{digits}f}".replace("-", "−"), share=share) + few
 
 
 def judged_after(folder: str, model: str, score: str, transitions: str) -> str:
-    """The same by what the model learned from, without the interval."""
-    return re.sub(r" \[.*\]", "", judged(folder, model, transitions, score))
+    """The same by what the model learned from, the interquartile mean alone."""
+    return re.sub(r" [\[(/].*", "", judged(folder, model, transitions, score))
 
 
 # Regression, speed, rules ----------------------------------------------------------------------------------------

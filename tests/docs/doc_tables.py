@@ -26,7 +26,9 @@ from imagine_bench import statistics
 
 PAGES = [ROOT / "README.md", *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.parent.name != "report")]
 """All but the reports that somebody has written of kept results, which git ignores."""
-_MARKED = re.compile(r"<!-- table: (?P<spec>.*?) -->\n(?P<table>(?:\|[^\n]*\n)+(?:\n\*Bold: [^\n]*\*\n)?)", re.DOTALL)
+_MARKED = re.compile(
+    r"<!-- table: (?P<spec>.*?) -->\n(?P<table>(?:\|[^\n]*\n)+(?:\n\*(?:Bold|Too few)[^\n]*\*\n)?)", re.DOTALL
+)
 
 
 @dataclass(frozen=True)
@@ -82,12 +84,17 @@ def _text(parts: list[Compared], adjusted: Iterator[float]) -> str:
 
 
 def _caption(tests: Sequence[Compared]) -> list[str]:
-    sizes = [min(100.0 * test.detectable(cells=len(tests)), 100.0) for test in tests if not np.isnan(test.p)]
-    if not sizes:
+    if not tests:
         return []
+    tested = [test for test in tests if not np.isnan(test.p)]
+    sizes = [min(100.0 * test.detectable(cells=len(tested)), 100.0) for test in tested]
+    sizes = [size for size in sizes if not np.isnan(size)]
+    if not sizes:
+        return ["", f"*Too few seeds to say which is better: none of {len(tests)} comparisons can be shown.*"]
     least, most = (f"{size:.1f}" if size < 9.95 else f"{size:.0f}" for size in (min(sizes), max(sizes)))
     could = f"{least} to {most} points" if least != most else f"{least} points"
-    return ["", f"*Bold: shown (Holm, {len(tests)} tests). Detectable: {could}.*"]
+    few = f" Too few seeds in {len(tests) - len(sizes)}." if len(sizes) < len(tests) else ""
+    return ["", f"*Bold: shown (Holm, {len(tested)} tests). Detectable: {could}.{few}*"]
 
 
 def _cells(line: str) -> list[str]:

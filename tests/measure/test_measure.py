@@ -8,25 +8,51 @@ from pathlib import Path
 import coverage
 import numpy as np
 import pytest
+import scipy
 import speed
 
-from imagine_bench import registry
+from imagine_bench import registry, statistics
 from imagine_bench.errors import InvalidValueError
 
-DRAWS = 150
+DRAWS = 60
+CHANCE = 3.0 * (0.05 * 0.95 / DRAWS) ** 0.5  # three standard errors of a rate of 5 %
 
 
-def test_intervals_hold_on_kept_scores() -> None:
-    found = list(coverage.measure(coverage.populations(coverage.RESULTS)[:40], DRAWS, np.random.default_rng(0)))
-    assert len(found) == len(coverage.STUCK) * len(coverage.SEEDS)
-    assert np.mean([kept["coverage"] for kept in found]) > 0.93, "of 1,200 intervals"
-    assert np.mean([kept["false_table"] for kept in found]) < 0.05, "of 1,200 tables"
+@pytest.fixture(scope="module")
+def scores() -> list[coverage.Floats]:
+    return coverage.populations(coverage.RESULTS)[:40]
 
 
+def test_intervals_hold_and_tables_do_not_err_under_any_law(scores: list[coverage.Floats]) -> None:
+    found = list(coverage.measure(scores, DRAWS, np.random.default_rng(0), seeds=(3, 5, 7)))
+    assert len(found) == 3 * (len(coverage.LAWS) + 2)
+    for row in found:
+        few = [np.isnan(row[name]) for name in ("difference", "false_table")]
+        assert few == [row["seeds"] == 3] * 2 and (row["seeds"] == 7 or np.isnan(row["coverage"]))
+        assert not row["coverage"] < 0.93 - CHANCE and not row["difference"] < 0.95 - CHANCE, row
+        assert not row["false_table"] > 0.05 + CHANCE, row
+
+
+def test_a_true_gap_of_40_points_is_shown() -> None:
+    five, ten, *_ = coverage.power(DRAWS, np.random.default_rng(0), seeds=(5, 10))
+    assert five["alone"] > 0.8 and ten["alone"] > 0.95 and ten["table"] > 0.95
+
+
+def test_a_mistake_of_these_tests_would_be_seen() -> None:
+    """Of two groups Yuen's test alone claims a false difference in every third table of six."""
+    rng = np.random.default_rng(0)
+    a, b = coverage.LAWS[coverage.WORST](rng, (2, 1000, 5))
+    yuen = scipy.stats.ttest_ind(a, b, axis=1, equal_var=False, trim=0.25).pvalue
+    assert np.mean(yuen < 0.05 / 6) > 0.04
+    assert np.mean(statistics.differences(a, b)[3] < 0.05 / 6) < 0.01
+
+
+@pytest.mark.slow
 def test_rates_are_kept_and_nothing_to_draw_from_is_said(tmp_path: Path) -> None:
     coverage.main(2, out=tmp_path / "new" / "coverage.json")
     kept = json.loads((tmp_path / "new" / "coverage.json").read_text())
-    assert len(kept["rows"]) == len(coverage.SEEDS) * len(coverage.STUCK) and kept["draws"] == 2
+    assert len(kept["rows"]) == len(coverage.SEEDS) * (len(coverage.LAWS) + 2) and kept["draws"] == 2
+    assert len(kept["power"]) == len(coverage.SEEDS) * len(coverage.PAIRS)
     with pytest.raises(InvalidValueError, match="no learner has five seeds; give a folder of kept results"):
         coverage.populations(tmp_path)
 

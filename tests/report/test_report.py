@@ -30,8 +30,15 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
 
 
 @pytest.fixture(scope="module")
-def page(result: BenchResult) -> Page:
-    return bench_page(result)
+def many(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
+    """With as many seeds as an interval needs."""
+    protocol = dataclasses.replace(WIDE, seeds=tuple(range(statistics.FEWEST)))
+    return bench_result(tmp_path_factory.mktemp("bench"), protocol=protocol)
+
+
+@pytest.fixture(scope="module")
+def page(many: BenchResult) -> Page:
+    return bench_page(many)
 
 
 @pytest.fixture(scope="module")
@@ -74,12 +81,25 @@ def test_tables_show_the_columns_of_the_summary(page: Page) -> None:
     assert len(against) > 5
     for row in records(page, "summary.csv"):
         title, budget = agent_title(row["agent"]), f"{int(row['episodes']):,}"
-        assert scores[title][budget] == worded(row, SCORE, percent)
+        middle, _, ends = scores[title][budget].partition(" / ")
+        assert ends or row["agent"] == "oracle"
+        assert (f"{middle} {ends.partition(' ')[2]}" if ends else middle) == worded(row, SCORE, percent)
         if row["gain"]:
             difference, p, gain, _ = against.pop((title, budget))
             assert difference == worded(row, DIFFERENCE, signed_percent) and gain == worded(row, GAIN, signed_percent)
             assert p == f"{float(row['p_holm']):.3f}"
     assert not against
+
+
+def test_the_mean_stands_beside_a_mean_that_leaves_seeds_out(many: BenchResult, result: BenchResult) -> None:
+    shares = many.success_rates("dqn")[:, 0]
+    (row,) = (row for row in table(bench_page(many), "scores").rows if row[0] == "DQN")
+    assert row[1].startswith(f"{percent(statistics.iqm(shares))} / {percent(shares.mean())} [")
+    assert "(2 of 7 seeds left out) / mean of all" in bench_page(many).subtitle
+    shares = result.success_rates("dqn")[:, 0]
+    (row,) = (row for row in table(bench_page(result), "scores").rows if row[0] == "DQN")
+    assert row[1] == f"{percent(shares.mean())} ({percent(shares.min())} to {percent(shares.max())})"
+    assert "too few for an interval" in bench_page(result).subtitle
 
 
 def test_every_seed_is_the_one_of_the_csv(page: Page) -> None:
@@ -90,8 +110,8 @@ def test_every_seed_is_the_one_of_the_csv(page: Page) -> None:
     assert len({cell for row in shares.values() for cell in row}) > 10, "a mix-up would show"
 
 
-def test_open_loop_csv_has_every_depth_of_every_budget(result: BenchResult, page: Page) -> None:
-    loops = [point.open_loop for _, point in result.rows if point.open_loop is not None]
+def test_open_loop_csv_has_every_depth_of_every_budget(many: BenchResult, page: Page) -> None:
+    loops = [point.open_loop for _, point in many.rows if point.open_loop is not None]
     depths = [(loop, depth) for loop in loops for depth in range(len(loop.count))]
     for row, (loop, depth) in zip(records(page, "open_loop.csv"), depths, strict=True):
         assert int(row["depth"]) == depth + 1
@@ -119,8 +139,8 @@ def test_chapter_3_is_quoted_without_a_standard_deviation(tmp_path: Path) -> Non
     assert "mean of 10 runs, 100 test episodes each" in found.caption
 
 
-def test_the_terminal_has_the_scores_and_the_verdict(result: BenchResult, page: Page) -> None:
-    lines = page.summary.splitlines()
+def test_the_terminal_has_the_scores_and_the_verdict(many: BenchResult, page: Page) -> None:
+    lines, result = page.summary.splitlines(), many
     (line,) = (line for line in lines if line.startswith("DQN ") and "[" in line)
     assert all(percent(share) in line for share in result.success_rates("dqn").mean(axis=0))
     assert lines[-len(page.answers) :] == list(page.answers)
@@ -147,27 +167,38 @@ def shifted(result: BenchResult, **shares: list[int]) -> BenchResult:
 @pytest.mark.parametrize(
     ("successes", "sentence"),
     [
-        ([150, 152, 154], "better after 250, 2,000, 6,000 real episodes (3 budgets)"),
-        ([50, 52, 54], "worse after 250, 2,000, 6,000 real episodes (3 budgets)"),
-        ([80, 100, 140], "no difference is shown (3 budgets)"),
+        ([150, 152, 152, 152, 152, 152, 154], "better after 250, 2,000, 6,000 real episodes (3 budgets)"),
+        ([50, 52, 52, 52, 52, 52, 54], "worse after 250, 2,000, 6,000 real episodes (3 budgets)"),
+        ([80, 90, 100, 105, 105, 110, 140], "no difference is shown (3 budgets)"),
     ],
 )
-def test_the_verdict_says_which_way_it_went(result: BenchResult, successes: list[int], sentence: str) -> None:
-    changed = shifted(result, dqn=[100, 102, 104], imagination=successes)
+def test_the_verdict_says_which_way_it_went(many: BenchResult, successes: list[int], sentence: str) -> None:
+    changed = shifted(many, dqn=[100, 102, 102, 102, 102, 102, 104], imagination=successes)
     (line,) = (line for line in verdict(collect(changed)) if line.startswith("“imagination” "))
     assert sentence in line
-    assert f"difference {signed_percent((sum(successes) / 3 - 102) / 200)} [" in line
+    assert f"difference {signed_percent((sum(successes[1:-1]) / 5 - 102) / 200)} [" in line
 
 
-def test_the_verdict_takes_the_budget_of_the_smallest_corrected_p(result: BenchResult) -> None:
-    data = collect(result)
+def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult) -> None:
+    changed = shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200])
+    (line,) = (line for line in verdict(collect(changed)) if line.startswith("“imagination” "))
+    assert line.endswith("Too few seeds to say which is better.")
+    page = bench_page(changed)
+    assert table(page, "gains").caption.startswith("Too few seeds to say")
+    rows = records(page, "summary.csv")
+    assert {row["interval_over"] for row in rows} == {"too few seeds"}
+    assert all(row[name] in ("", "nan") for row in rows for name in (*SCORE[1:], *DIFFERENCE[1:], "p_holm"))
+
+
+def test_the_verdict_takes_the_budget_of_the_smallest_corrected_p(many: BenchResult) -> None:
+    data = collect(many)
     best = min(data.of("imagination_uncertainty"), key=lambda record: record["p_holm"])
     (line,) = (line for line in verdict(data) if line.startswith("“imagination + uncertainty” "))
     assert f"after {best['episodes']:,} episodes {percent(best['success_iqm'])} %" in line
 
 
-def test_a_difference_is_shown_only_after_holms_correction(result: BenchResult) -> None:
-    changed = shifted(result, dqn=[90, 100, 110], imagination=[116, 126, 136])
+def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) -> None:
+    changed = shifted(many, dqn=[90, 92, 95, 100, 105, 108, 110], imagination=[103, 105, 108, 113, 118, 121, 123])
     data = collect(changed)
     compared = [record for record in data.records if "gain" in record]
     one = data.of("imagination")[1]
@@ -185,8 +216,7 @@ def test_one_seed_gets_an_interval_over_episodes_and_no_verdict(tmp_path: Path) 
     page = bench_page(bench_result(tmp_path, protocol=protocol))
     assert {row["interval_over"] for row in records(page, "summary.csv")} == {"episodes"}
     assert all(row["gain_low_95"] in ("", "nan") for row in records(page, "summary.csv"))
-    assert all(line.endswith("One seed does not show which is better.") for line in page.answers)
-    assert table(page, "gains").caption == "", "one seed tells no size"
+    assert all(line.endswith("Too few seeds to say which is better.") for line in page.answers)
     check_page(text_of(page)["index.html"])
 
 
@@ -222,10 +252,10 @@ def test_the_page_can_be_read_alone_and_shows_every_figure(folder: Path) -> None
     assert all((folder / picture).read_bytes().startswith(b"\x89PNG") for picture in pictures)
 
 
-def test_how_it_was_made_is_complete_and_escaped(result: BenchResult, page: Page) -> None:
+def test_how_it_was_made_is_complete_and_escaped(many: BenchResult, page: Page) -> None:
     written = text_of(page)
-    command = str(result.environment["command"])
-    for fact in (command, result.protocol.hash, "3.17.0", f"git checkout 0123456789ab &amp;&amp; {command}"):
+    command = str(many.environment["command"])
+    for fact in (command, many.protocol.hash, "3.17.0", f"git checkout 0123456789ab &amp;&amp; {command}"):
         assert fact in written["index.html"]
     assert "a <processor>" not in written["index.html"]
     assert html.escape("a <processor> & more") in written["index.html"]

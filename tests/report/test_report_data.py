@@ -24,8 +24,9 @@ from imagine_bench.store.results import BenchResult, Checkpoint, KeptEpisodes, R
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
-    """Three seeds that differ in all they cost."""
+    """Seven seeds that differ in all they cost."""
     rng = np.random.default_rng(0)
+    protocol = dataclasses.replace(WIDE, seeds=tuple(range(statistics.FEWEST)))
 
     def change(run: RunResult, row: Checkpoint) -> Checkpoint:
         said = {name: float(rng.uniform()) for name in (*row.diagnostics, "gradient_updates") if row.diagnostics}
@@ -34,7 +35,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
             eval_cpu_s=float(rng.uniform(1, 2)), faults=int(rng.integers(9)),
         )  # fmt: skip
 
-    return rewritten(bench_result(tmp_path_factory.mktemp("bench"), protocol=WIDE), change)
+    return rewritten(bench_result(tmp_path_factory.mktemp("bench"), protocol=protocol), change)
 
 
 @pytest.mark.parametrize("agent", ["random", "imagination"])
@@ -59,7 +60,7 @@ def test_open_loop_quality_is_the_mean_at_the_last_budget(result: BenchResult) -
     found = open_loop_means(result)
     assert set(found) == {agent for agent in result.protocol.agents if agent.startswith("imagination")}
     last = [run.checkpoints[-1].open_loop for run in result.of("imagination")]
-    assert found["imagination"]["count"].tolist() == [300] * 10
+    assert found["imagination"]["count"].tolist() == [100 * statistics.FEWEST] * 10
     for name in ("correct", "reward_mae", "auroc_epistemic"):
         assert found["imagination"][name] == pytest.approx(np.mean([getattr(loop, name) for loop in last], 0))
     assert np.isnan(found["imagination"]["auroc_modal"][0]), "unknown in every run"
@@ -113,7 +114,7 @@ def test_a_seed_solves_the_task_from_where_every_test_reaches_its_threshold(resu
         data = collect(result)
         data = dataclasses.replace(data, spec=dataclasses.replace(data.spec, success_threshold=threshold))
         (seeds,) = (table for table in success(data).tables if table.name == "seeds")
-        assert [row[-1] for row in seeds.rows if row[0] == agent_title(agent)] == [reached] * 3
+        assert [row[-1] for row in seeds.rows if row[0] == agent_title(agent)] == [reached] * statistics.FEWEST
 
 
 # Start by start ----------------------------------------------------------------------------------------------------

@@ -24,15 +24,17 @@ def _row(share):
 
 @pytest.mark.parametrize("share", [-0.1, 0.0, 0.25, 1.0])
 def test_chance_is_zero_and_the_optimum_one(share):
-    found = score(np.array([_row(share)] * 3), SCALES)
+    found = score(np.array([_row(share)] * statistics.FEWEST), SCALES)
     assert found[:3] == pytest.approx((share, share, share), abs=1e-12)
 
 
-def test_the_interval_over_seeds_is_students_on_their_means():
-    rows = np.array([_row(0.2), _row(0.4), _row(0.9)])
-    found = score(rows, SCALES)
+def test_the_interval_over_seeds_is_that_of_their_means():
+    shares = [0.2, 0.4, 0.9, 0.5, 0.5, 0.5, 0.5]
+    found = score(np.array([_row(share) for share in shares]), SCALES)
     assert found.value == pytest.approx(0.5)
-    assert (found.low, found.high) == pytest.approx(statistics.interval([0.2, 0.4, 0.9], trim=0.0))
+    assert (found.low, found.high) == pytest.approx(statistics.interval(shares, trim=0.0))
+    few = score(np.array([_row(share) for share in shares[1:]]), SCALES, trials=100)
+    assert math.isnan(few.low) and math.isnan(few.high), "the tests alone would not know of the seeds"
 
 
 def test_tests_alone_make_an_interval_that_covers():
