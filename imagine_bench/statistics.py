@@ -125,10 +125,12 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 def _wilson(shares: Floats, trials: int) -> Floats:
     """Both ends (2, ...) of Wilson's intervals of shares (...) of so many trials."""
-    z = float(scipy.stats.norm.isf((1.0 - LEVEL) / 2.0))
-    middle = (2.0 * trials * shares + z**2) / (2.0 * (trials + z**2))
-    half = z / (2.0 * (trials + z**2)) * np.sqrt(4.0 * trials * (shares * (1.0 - shares)).clip(0.0) + z**2)
-    return np.stack([middle - half, middle + half]).clip(0.0, 1.0)
+    within = shares.clip(0.0, 1.0)
+    z = scipy.special.ndtri(0.5 + 0.5 * LEVEL)
+    twice = 2.0 * (trials + z**2)
+    middle = (2.0 * trials * within + z**2) / twice
+    half = z / twice * np.sqrt(4.0 * trials * within * (1.0 - within) + z**2)
+    return np.stack([np.where(within > 0.0, middle - half, 0.0), np.where(within < 1.0, middle + half, 1.0)])
 
 
 def first_lasting(budgets: Sequence[int], scores: ArrayLike, threshold: float) -> int | None:

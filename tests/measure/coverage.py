@@ -42,12 +42,12 @@ def one_mode(mean: float, spread: float) -> Law:
     return lambda rng, shape: rng.normal(mean, spread, shape).clip(0.0, 1.0)
 
 
-def two_modes(low_share: float, low: float = 0.2, high: float = 0.95, spread: float = 0.03) -> Law:
-    """Two groups of runs, each normal."""
+def two_modes(low_share: float, low: float = 0.2, high: float = 0.95) -> Law:
+    """Two groups of runs, each normal with a standard deviation of 3 points."""
 
     def law(rng: np.random.Generator, shape: tuple[int, ...]) -> Floats:
         middle = np.where(rng.random(shape) < low_share, low, high)
-        return (middle + rng.normal(0.0, spread, shape)).clip(0.0, 1.0)
+        return (middle + rng.normal(0.0, 0.03, shape)).clip(0.0, 1.0)
 
     return law
 
@@ -70,7 +70,7 @@ LAWS: dict[str, Law] = {
 WORST = "two modes 1:1"
 PAIRS = {
     "one mode, gap of 40": (one_mode(0.7, 0.15), one_mode(0.3, 0.15)),
-    "two modes, 1:3 against 3:1": (two_modes(1 / 4, spread=0.0), two_modes(3 / 4, spread=0.0)),
+    "two modes, 1:3 against 3:1": (two_modes(1 / 4), two_modes(3 / 4)),
 }
 """Laws of two agents that differ."""
 
