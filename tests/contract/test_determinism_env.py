@@ -144,6 +144,30 @@ def test_a_state_goes_on_to_the_same_bits(task, execution, appearance):
         each.close()
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"appearance": "mild"},
+        {"execution": "physics"},
+        {"physics": {"pad_friction": 0.5}},
+        {"physics": {"object_mass": 2.0}},
+        {"physics": {"finger_force_n": 10.0}},
+    ],
+    ids=str,
+)
+def test_a_state_of_other_looks_or_physics_is_refused(options):
+    """Whoever went on from it would play in another world under the name of this one."""
+    env, other = (make(**{"execution": "kinematic", **given}) for given in ({}, options))
+    for each in (env, other):
+        each.reset(seed=0)
+    before = full_state(env)
+    with pytest.raises(InvalidValueError, match="is no state of"):
+        env.set_state(other.get_state())
+    assert np.array_equal(full_state(env), before)
+    env.close()
+    other.close()
+
+
 # As other tools use environments ------------------------------------------------------------------------------------
 
 

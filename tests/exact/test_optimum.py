@@ -84,6 +84,22 @@ class _Corridor:
         return False
 
 
+@dataclass(frozen=True)
+class _Maze:
+    """Four rooms, and the way out, 4: where each of two doors of a room leads."""
+
+    doors: tuple[tuple[int, int], ...]
+
+    n_actions, states, start_states = 2, None, ((0,), (1,), (2,))
+
+    def outcomes(self, state, action):
+        to = self.doors[state[0]][action]
+        return (Outcome(1.0, (min(to, 3),), 0.0, terminated=to == 4, success=to == 4),)
+
+    def is_terminal(self, state):
+        return False
+
+
 class _Wall:
     """Only the end rooms can be told."""
 
@@ -106,6 +122,8 @@ TINY = {
     "walls": (_Corridor(), _Wall(), 5),
     "late": (_Corridor(), _Lit(), 4),
     "slipping": (_Corridor(slip=0.2), _Wall(), 6),
+    "solved if no later": (_Maze(((2, 2), (4, 2), (3, 0), (2, 1))), _Lit(), 5),
+    "solved if later": (_Maze(((4, 3), (2, 1), (1, 0), (0, 0))), _Lit(), 5),
     "wheel": (Wheels(n=1, slip=0.3), Glimpse(finger=0.5, lag=1), 3),
 }
 

@@ -7,6 +7,7 @@ from contextlib import closing
 import gymnasium
 import numpy as np
 import pytest
+from machines import Glimpse, Wheels
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
@@ -71,6 +72,30 @@ def test_what_is_shown_is_possible_by_the_sight(name):
                     assert belief is not None
                     assert tuple(info["macrostate"].tolist()) in {windows[-1] for windows, _ in belief[1]}
     assert late and (hidden or "gesture" not in name)
+
+
+@pytest.mark.parametrize("sight", [Glimpse(finger="first"), Glimpse(finger=0.5, lag=1)], ids=str)
+def test_what_the_oracle_knew_of_an_episode_is_forgotten_in_the_next(sight):
+    """It acts as one does that begins with this episode."""
+    rules, horizon, rng = Wheels(n=2, fickle=0.3), 3, np.random.default_rng(0)
+    used, longest = OptimalPolicy(rules, sight, horizon), 0
+    for _ in range(15):
+        fresh = OptimalPolicy(rules, sight, horizon)
+        states = [rules.start_states[rng.integers(len(rules.start_states))]]
+        for step in range(horizon):
+            frame = max(0, step - sight.lag)
+            if step == 0 or frame > 0:
+                shares, frames = zip(*sight.seen(states[frame], frame), strict=True)
+                seen = frames[rng.choice(len(frames), p=shares)]
+            action = used(seen, step)
+            assert action == fresh(seen, step)
+            outcomes = rules.outcomes(states[-1], action)
+            outcome = outcomes[rng.choice(len(outcomes), p=[each.probability for each in outcomes])]
+            longest = max(longest, step)
+            if outcome.terminated:
+                break
+            states.append(outcome.macrostate)
+    assert longest == horizon - 1
 
 
 def test_with_too_many_beliefs_it_votes(monkeypatch):
