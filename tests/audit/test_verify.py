@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 import pytest
 from forger import FORGERIES, mend, rewrite, rewrite_protocol
-from small_runs import Inline, context, small
+from small_runs import Inline, context, small, written
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
@@ -26,6 +26,7 @@ from imagine_bench.report import bench_page
 from imagine_bench.report.audits import blank_images, verify, what_is_shown, with_report
 from imagine_bench.report.page import texts
 from imagine_bench.running.bench import bench, load_bench
+from imagine_bench.running.control import plan_control
 from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode, replay
 from imagine_bench.running.retraining import Retraining, chance_to_find, drawn
 from imagine_bench.running.run_state import environments
@@ -73,6 +74,25 @@ def test_every_kind_of_forgery_is_found(finished: Path, tmp_path: Path) -> None:
                 missed.append(name)
             assert all("\n" not in str(each) for each in found)
     assert not missed
+
+
+NAMED = {
+    "successes": "successes is", "mean return": "mean_return is", "mean length": "mean_length is",
+    "sum of faults": "faults is", "start": "the start is", "return": "the return is", "success": "the success is",
+    "faults": "the number of faults is", "fingerprint": "the fingerprint is", "training return": "the return is",
+}  # fmt: skip
+
+
+def test_a_forged_figure_is_named_where_there_is_no_report_too(finished: Path, tmp_path: Path) -> None:
+    """Each figure and each coordinate by itself, whatever the others say."""
+    rng = np.random.default_rng(0)
+    with environments(small(), observation="state") as envs:
+        replays = Replays(*envs)
+        for name, words in NAMED.items():
+            folder = tmp_path / name / finished.name
+            shutil.copytree(finished, folder, ignore=shutil.ignore_patterns("report"))
+            FORGERIES[name](folder, rng)
+            assert words in " ".join(each.complaint for each in verdicts(folder, replays)), name
 
 
 @pytest.mark.parametrize("name", ["index.html", "summary.csv", "results.csv"])
@@ -306,6 +326,17 @@ def test_on_another_processor_tests_are_compared_within_what_is_said(pair: Path,
 
     *_, far = verify(forged(pair, tmp_path / "far", cheat), again())
     assert "points" in far.complaint
+
+
+@pytest.mark.parametrize("begins", ["dataset", "demonstrations"])
+def test_benches_whose_training_began_with_other_episodes_hold(begins: str, tmp_path: Path) -> None:
+    """Episodes are numbered from the first, whoever played it."""
+    first = {"dataset": written(tmp_path / "set").folder} if begins == "dataset" else {"demonstrations": 2}
+    few = {"agents": ("table",), "seeds": (0,), "budgets": (9,), "evaluation_episodes": 2, "recorded_episodes": 0}
+    how = {"appearance": "mild", "execution": "kinematic", "open_loop_starts": 0}
+    wanted, paths = plan_control("arrow_puzzle", "smoke", **few, **how, **first)
+    (found, *_) = verify(bench(wanted, paths, root=tmp_path, launcher=Inline()).folder)
+    assert not found.complaint and found.episodes == 2 + 9 - (6 if begins == "dataset" else 0)
 
 
 @pytest.mark.parametrize(

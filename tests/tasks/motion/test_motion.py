@@ -101,6 +101,18 @@ def test_a_turn_keeps_the_limits_of_speed_and_force_and_returns(arm, turner):
     np.testing.assert_array_equal(data.qpos, reached)  # rollout and stepping agree, bit for bit
 
 
+def test_a_turn_depends_on_positions_alone(turner):
+    """Not on how fast anything moved before, nor on what the solvers and the servos were told."""
+    ends = []
+    for left_over in (0.0, 0.3):
+        place(turner.model, turner.data, (0, 0.1, 0))
+        for array in (turner.data.qvel, turner.data.qacc_warmstart, turner.data.ctrl):
+            array[:] = left_over
+        assert turner.turn(cube=1, clockwise=True).fault is None
+        ends.append(np.concatenate([turner.data.qpos, turner.data.qvel]))
+    np.testing.assert_array_equal(*ends)
+
+
 @pytest.mark.parametrize("clockwise", [True, False])
 def test_very_skew_cubes_are_squared(turner, clockwise):
     """Even 25 degrees off, where the wrist would leave its range if it took the usual faces."""
