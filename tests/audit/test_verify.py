@@ -328,15 +328,13 @@ def test_on_another_processor_tests_are_compared_within_what_is_said(pair: Path,
     assert "points" in far.complaint
 
 
-@pytest.mark.parametrize("begins", ["dataset", "demonstrations"])
-def test_benches_whose_training_began_with_other_episodes_hold(begins: str, tmp_path: Path) -> None:
-    """Episodes are numbered from the first, whoever played it."""
-    first = {"dataset": written(tmp_path / "set").folder} if begins == "dataset" else {"demonstrations": 2}
+def test_a_bench_whose_training_began_with_a_dataset_holds(tmp_path: Path) -> None:
+    """Episodes are numbered from the first of the dataset, which are not played again."""
     few = {"agents": ("table",), "seeds": (0,), "budgets": (9,), "evaluation_episodes": 2, "recorded_episodes": 0}
     how = {"appearance": "mild", "execution": "kinematic", "open_loop_starts": 0}
-    wanted, paths = plan_control("arrow_puzzle", "smoke", **few, **how, **first)
+    wanted, paths = plan_control("arrow_puzzle", "smoke", **few, **how, dataset=written(tmp_path / "set").folder)
     (found, *_) = verify(bench(wanted, paths, root=tmp_path, launcher=Inline()).folder)
-    assert not found.complaint and found.episodes == 2 + 9 - (6 if begins == "dataset" else 0)
+    assert not found.complaint and found.episodes == 9 - 6 + 2
 
 
 @pytest.mark.parametrize(
