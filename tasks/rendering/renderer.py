@@ -20,7 +20,7 @@ import hashlib
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,6 +120,23 @@ def _release() -> None:
     egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, nothing, nothing, egl.EGL.EGL_NO_CONTEXT)
 
 
+@contextlib.contextmanager
+def _others_kept(ours: Container[int | None]) -> Iterator[None]:
+    """Make a context of other code that is current in this thread so again in the end: dm_control never asks."""
+    current = _current()() if _is_egl() and "mujoco.egl" in sys.modules else None
+    if current is None or current in ours:
+        yield
+        return
+    from mujoco.egl import EGL  # noqa: PLC0415  (after the platform is chosen)
+
+    surfaces = EGL.eglGetCurrentSurface(EGL.EGL_DRAW), EGL.eglGetCurrentSurface(EGL.EGL_READ)
+    theirs = EGL.eglGetCurrentDisplay(), *surfaces, EGL.eglGetCurrentContext()
+    try:
+        yield
+    finally:
+        EGL.eglMakeCurrent(*theirs)
+
+
 def _drawing(model: mujoco.MjModel, view: View) -> tuple[mujoco.MjvOption, mujoco.MjvCamera, mujoco.MjvScene]:
     """What a view draws, from where, and an empty scene to be filled with it."""
     option = mujoco.MjvOption()
@@ -143,7 +160,7 @@ class _Canvas:
     def __init__(self, model: mujoco.MjModel, view: View, thread: int | None) -> None:
         self.thread = thread
         self.gl = new_gl_context(view.width, view.height)
-        self._address = ctypes.cast(self.gl._context, ctypes.c_void_p).value if _is_egl() else None
+        self.address = ctypes.cast(self.gl._context, ctypes.c_void_p).value if _is_egl() else None
         try:
             self.mjr = mujoco.MjrContext(_in_quality(model, view), mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except mujoco.FatalError as error:  # GLFW makes a context object without a display, but nothing can be drawn
@@ -176,7 +193,7 @@ class _Canvas:
 
     def make_current(self) -> None:
         """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything."""
-        if self._address is None or _current()() != self._address:
+        if self.address is None or _current()() != self.address:
             self.gl.make_current()
 
     def close(self) -> None:
@@ -223,6 +240,10 @@ class _Canvases:
             _close_at_exit()
         self._canvases[scene, view, thread] = canvas
         return canvas
+
+    def addresses(self) -> set[int | None]:
+        """Of all contexts."""
+        return {canvas.address for canvas in self._canvases.values()}
 
     def close(self, keep: int = 0) -> None:
         """Free the contexts that this thread may free, but for those that were used last."""
@@ -308,7 +329,7 @@ class Renderer:
             SetupError: As :meth:`frame`.
         """
         drawn = []
-        with _canvases.lock:
+        with _canvases.lock, _others_kept(_canvases.addresses()):
             canvas = _canvases.find(self._drawn_as, self._model, self.view, self._canvas)
             self._canvas = canvas
             canvas.make_current()

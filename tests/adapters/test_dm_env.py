@@ -100,6 +100,17 @@ def test_physics_shows_the_scene_and_cannot_change_it():
     other.close()
 
 
+def test_dm_control_draws_the_same_whatever_was_drawn_before():
+    env = as_dm_env(ARROWS, seed=0, execution="kinematic")
+    env.reset()
+    env.physics.render(32, 32)
+    for action in (0, 2, 4):
+        env.step(action)
+        images = [env.physics.render(32, 32, camera_id="wrist") for _ in range(3)]
+        assert np.ptp(images, axis=0).max() == 0 < np.std(images)
+    env.close()
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_a_copy_plays_on_and_shows_its_own_scene(copied):
     env = as_dm_env("imagine_bench/PickPlace-v0", seed=1, execution="kinematic", appearance="strong")
