@@ -80,12 +80,16 @@ def test_renderers_of_one_scene_and_view_share_a_context(world, made):
 
 @pytest.fixture
 def foreign(world, monkeypatch):
-    """Another renderer of the same scene in the same process."""
-    if sys.platform == "linux":
-        from mujoco.rendering.classic import gl_context
+    """Another renderer of the same scene in the same process, whose context is not current."""
+    if sys.platform != "linux":
+        return mujoco.Renderer(world.model, 64, 64)
+    from mujoco.rendering.classic import gl_context
 
-        monkeypatch.setattr(gl_context, "GLContext", pytest.importorskip("mujoco.egl").GLContext)
-    return mujoco.Renderer(world.model, 64, 64)
+    egl = pytest.importorskip("mujoco.egl")
+    monkeypatch.setattr(gl_context, "GLContext", egl.GLContext)
+    renderer = mujoco.Renderer(world.model, 64, 64)
+    egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_SURFACE, egl.EGL.EGL_NO_CONTEXT)
+    return renderer
 
 
 def test_frames_survive_a_foreign_renderer_in_the_same_process(world, foreign):
