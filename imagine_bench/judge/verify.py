@@ -28,7 +28,7 @@ from imagine_bench.running.retraining import Repeat, part_digest
 from imagine_bench.running.run_state import Counters, CountVisits, environments
 from imagine_bench.seeding import Purpose, episode_seed, evaluation_split
 from imagine_bench.store import encoders, run_folder
-from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
+from imagine_bench.store.bench_folder import BenchStore, read_control
 from imagine_bench.store.results import Checkpoint, KeptEpisodes, RunResult
 from imagine_bench.values import Json
 
@@ -85,8 +85,6 @@ def verify_runs(folder: Path) -> list[Verdict]:
         ArtefactError: It is no bench of agents with folders of their own, or its protocol is damaged.
     """
     protocol = read_control(folder)
-    if is_archive(folder):
-        raise ArtefactError(f"{folder} keeps results and no episodes; give a bench's folder, runs/<task>/<preset>-...")
     unseen = {"observation": "state"} if registry.is_own(protocol.task) else {}  # nobody looks at frames
     with environments(protocol, **unseen) as envs:
         return verdicts(folder, Replays(*envs))

@@ -31,7 +31,7 @@ from imagine_bench.running.trained import (
     protocol_of_agents,
     require_control,
 )
-from imagine_bench.store.bench_folder import newest_bench, read_control, require_either
+from imagine_bench.store.bench_folder import bench_facts, is_archive, newest_bench, read_control, require_either
 from imagine_bench.store.files import (
     csv_text,
     lock,
@@ -251,6 +251,11 @@ def verify(folder: Path, retraining: Retraining | None = None) -> list[Verdict]:
         ArtefactError: It is no bench of agents with folders of their own, or its protocol is damaged.
         InvalidValueError: Fewer than one run of each agent is to be trained again.
     """
+    if is_archive(folder):
+        if retraining is not None:
+            raise ArtefactError(f"{folder} keeps results and no runs; give a bench's folder, runs/<task>/<preset>-...")
+        load_so_far(folder)
+        return [Verdict(what=str(folder), holds="its table can be read, but no episode is kept: nothing can be shown")]
     found = with_report(folder, verify_runs(folder))
     if retraining is None or any(each.complaint for each in found):
         return found
@@ -260,7 +265,10 @@ def verify(folder: Path, retraining: Retraining | None = None) -> list[Verdict]:
 def what_is_shown(folder: Path, retraining: Retraining | None = None) -> str:
     """What a verdict does not show, and how likely runs that are trained again find forged ones, as text."""
     protocol = read_control(folder)
-    lines = [f"Not shown: {each}." for each in UNSHOWN]
+    environment = bench_facts(folder)["environment"]
+    benches = [each for each in (environment, *environment.values()) if isinstance(each, Mapping) and "commit" in each]
+    commits = ", ".join(sorted({str(each["commit"]) for each in benches}))
+    lines = [*(f"Not shown: {each}." for each in UNSHOWN), f"Made at commit {commits}, as it says."]
     if retraining is None:
         return "\n".join([*lines, "Training again, verify --train 1, shows whether a run of each agent repeats."])
     count = len(protocol.seeds)

@@ -398,6 +398,9 @@ def test_what_is_not_there_is_said_in_a_line_a_run(finished: Path, tmp_path: Pat
     shutil.rmtree(folder / "random")
     one, other, *_ = verify(folder)
     assert str(one) == "table seed 0: it is not finished." and "random" in other.complaint
-    with pytest.raises(ArtefactError, match="keeps results and no episodes"):
-        verify(Path("docs/results/arrow_puzzle-quick"))
+    kept = Path(__file__).parents[2] / "docs" / "results" / "arrow_puzzle-quick"
+    assert "no episode is kept: nothing can be shown" in " ".join(map(str, verify(kept)))
+    assert "Made at commit 2898baf91de0, as it says." in what_is_shown(kept)
+    with pytest.raises(ArtefactError, match="keeps results and no runs"):
+        verify(kept, again())
     assert load_bench(finished)
