@@ -14,7 +14,7 @@ import bench_fakes
 import gymnasium
 import numpy as np
 import pytest
-from forger import FORGERIES, mend, rewrite, rewrite_protocol
+from forger import FORGERIES, IN_TRAINING, mend, rewrite, rewrite_protocol
 from small_runs import Inline, context, small, written
 
 from imagine_bench import registry
@@ -163,6 +163,12 @@ def test_two_seeds_of_a_learner_share_nothing(
     one, other, *_ = verify(forged(pair, tmp_path, forge))
     assert not one.complaint
     assert other.complaint.startswith(f"its {what}") and "those of seed 0" in other.complaint
+
+
+@pytest.mark.parametrize("name", IN_TRAINING)
+def test_whatever_is_claimed_of_training_follows_from_its_macro_actions(pair: Path, tmp_path: Path, name: str) -> None:
+    folder = forged(pair, tmp_path, lambda folder: IN_TRAINING[name](folder, np.random.default_rng(0)))
+    assert any(each.complaint for each in verify(folder))
 
 
 @pytest.mark.parametrize(

@@ -170,15 +170,26 @@ def in_training(name: str) -> Forge:
     return forge
 
 
-def without_training(bench: Path, rng: np.random.Generator) -> None:
-    """One array of the training episodes is deleted, or all are, where the format says that they are kept."""
+def tried(bench: Path, rng: np.random.Generator) -> None:
+    """A macro-action was tried an episode later than it was."""
 
     def change(values: dict[str, Any], arrays: Arrays) -> None:
-        names = [name for name in arrays if name.startswith("training/")]
-        for name in names if rng.random() < 0.5 else [str(rng.choice(names))]:
-            del arrays[name]
+        values["tried"][str(rng.choice(list(values["tried"])))] += 1
 
     change_checkpoint(learner(bench, rng), change)
+
+
+def without(beginning: str) -> Forge:
+    """The arrays of a learner's checkpoint whose names begin so are deleted, though its format says they are kept."""
+
+    def forge(bench: Path, rng: np.random.Generator) -> None:
+        def change(values: dict[str, Any], arrays: Arrays) -> None:
+            for name in [name for name in arrays if name.startswith(beginning)]:
+                del arrays[name]
+
+        change_checkpoint(learner(bench, rng), change)
+
+    return forge
 
 
 def rewrite_protocol(bench: Path, **values: Any) -> Path:
@@ -245,10 +256,13 @@ FORGERIES: dict[str, Forge] = {
     "damage": damage, "surplus": surplus(lengthen=False),
     "after the end": surplus(lengthen=True), "budget": metric("episodes"), "successes": metric("successes"),
     "mean return": metric("mean_return"), "mean length": metric("mean_length"), "sum of faults": metric("faults"),
-    "table of a run": metric("mean_length", everywhere=False), "training steps": metric("env_steps"),
-    "training start": in_training("training/starts"), "training action": in_training("training/actions"),
-    "training success": in_training("success"), "kept training success": in_training("training/success"),
-    "training length": in_training("length"), "training fault": in_training("training/faults"),
-    "training return": in_training("training/returns"), "simulated time": in_training("training/sim_times_s"),
-    "training deleted": without_training,
+    "table of a run": metric("mean_length", everywhere=False),
+}  # fmt: skip
+IN_TRAINING: dict[str, Forge] = {
+    "steps": metric("env_steps"), "start": in_training("training/starts"), "action": in_training("training/actions"),
+    "success": in_training("success"), "kept success": in_training("training/success"),
+    "length": in_training("length"), "faults": in_training("training/faults"),
+    "return": in_training("training/returns"), "simulated time": in_training("training/sim_times_s"),
+    "nothing": without("training/"), "no simulated time": without("training/sim_times_s"),
+    "no simulated time of tests": without("rows/0/kept/sim_times_s"), "tried": tried,
 }  # fmt: skip
