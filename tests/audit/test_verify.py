@@ -91,7 +91,7 @@ def test_a_forged_figure_is_named_where_there_is_no_report_too(finished: Path, t
         for name, words in NAMED.items():
             folder = tmp_path / name / finished.name
             shutil.copytree(finished, folder, ignore=shutil.ignore_patterns("report"))
-            FORGERIES[name](folder, rng)
+            (FORGERIES | IN_TRAINING)[name](folder, rng)
             assert words in " ".join(each.complaint for each in verdicts(folder, replays)), name
 
 

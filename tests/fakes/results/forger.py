@@ -259,10 +259,10 @@ FORGERIES: dict[str, Forge] = {
     "table of a run": metric("mean_length", everywhere=False),
 }  # fmt: skip
 IN_TRAINING: dict[str, Forge] = {
-    "steps": metric("env_steps"), "start": in_training("training/starts"), "action": in_training("training/actions"),
-    "success": in_training("success"), "kept success": in_training("training/success"),
-    "length": in_training("length"), "faults": in_training("training/faults"),
-    "return": in_training("training/returns"), "simulated time": in_training("training/sim_times_s"),
+    "training steps": metric("env_steps"), "training start": in_training("training/starts"), "training action": in_training("training/actions"),
+    "training success": in_training("success"), "training kept success": in_training("training/success"),
+    "training length": in_training("length"), "training faults": in_training("training/faults"),
+    "training return": in_training("training/returns"), "simulated time": in_training("training/sim_times_s"),
     "nothing": without("training/"), "no simulated time": without("training/sim_times_s"),
     "no simulated time of tests": without("rows/0/kept/sim_times_s"), "tried": tried,
 }  # fmt: skip
