@@ -259,7 +259,8 @@ FORGERIES: dict[str, Forge] = {
     "table of a run": metric("mean_length", everywhere=False),
 }  # fmt: skip
 IN_TRAINING: dict[str, Forge] = {
-    "training steps": metric("env_steps"), "training start": in_training("training/starts"), "training action": in_training("training/actions"),
+    "training steps": metric("env_steps"), "training start": in_training("training/starts"),
+    "training action": in_training("training/actions"),
     "training success": in_training("success"), "training kept success": in_training("training/success"),
     "training length": in_training("length"), "training faults": in_training("training/faults"),
     "training return": in_training("training/returns"), "simulated time": in_training("training/sim_times_s"),
