@@ -106,7 +106,7 @@ storm: ready  ## Try every death, damage and hostile input on small runs; prints
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n 0 tests/storm $(ARGS)
 
 mutants: ready  ## Plant 300 small bugs one at a time and count those that a test notices (half an hour)
-	@PATH="$$PATH:$(BIN)" uv pip install -q --python $(BIN)/python 'cosmic-ray>=8.7,<9'
+	@PATH="$$PATH:$(BIN)" uv pip install -q --python $(BIN)/python --no-deps --require-hashes -r .ci/mutants.lock
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/tools/mutants.py $(ARGS)
 
 lint: ready  ## Check style, format and types
@@ -122,8 +122,11 @@ docs: ready  ## Build the site into build/docs; warnings are errors
 build: ready  ## Build the wheel into dist/ and use it in an empty folder
 	@.ci/build.sh $(VENV)
 
-lock:  ## Pin every package in .ci/requirements.lock after a change of pyproject.toml; ARGS=--upgrade takes the newest
-	@PATH="$$PATH:$(BIN)" uv pip compile -q pyproject.toml --extra dev --extra docs --universal --fork-strategy fewest --python-version 3.11 --generate-hashes --no-annotate --no-emit-package torch --config-file .ci/lock.toml --custom-compile-command 'make lock' -o .ci/requirements.lock $(ARGS) >/dev/null
+uv_lock = PATH="$$PATH:$(BIN)" uv pip compile -q --python-version 3.11 --generate-hashes --no-annotate --custom-compile-command 'make lock'
+lock:  ## Pin every package after a change of pyproject.toml, in .ci/*.lock; ARGS=--upgrade takes the newest
+	@$(uv_lock) pyproject.toml --extra dev --extra docs --universal --fork-strategy fewest --no-emit-package torch --config-file .ci/lock.toml -o .ci/requirements.lock $(ARGS) >/dev/null
+	@$(uv_lock) pyproject.toml --extra mutants --universal --constraint .ci/requirements.lock --no-emit-package torch --config-file .ci/lock.toml -o .ci/mutants.lock $(ARGS) >/dev/null
+	@$(uv_lock) pyproject.toml .ci/lowest.in --extra all --extra data --extra play --resolution lowest-direct --no-config -o .ci/lowest.lock $(ARGS) >/dev/null
 
 speed: ready  ## Measure how fast everything is, as ratios to plain code in the same run
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/measure/speed.py $(ARGS)

@@ -174,3 +174,18 @@ def test_the_container_installs_what_drawing_needs() -> None:
     assert gl_packages is not None
     (installs,) = re.findall(r"apt-get install (.*)", steps)
     assert {"make", "git", *gl_packages[1].split()} <= set(installs.split())
+
+
+def test_whatever_ci_fetches_is_named_by_its_digest() -> None:
+    """Actions by commit, packages by a lock with hashes; what floats on purpose is the job of MuJoCo's newest."""
+    for workflow in (_TOP / ".github/workflows").glob("*.yml"):
+        text = workflow.read_text()
+        for used in re.findall(r"uses: (\S+)", text):
+            assert re.fullmatch(r"[\w./-]+@[0-9a-f]{40}", used), used
+        for line in re.findall(
+            r"(?:pip install|uv pip) .*", text.partition("  mujoco-4:")[0] + text.partition("  lowest:")[2]
+        ):
+            assert "--require-hashes" in line or line.endswith("--no-deps --no-build-isolation -e ."), line
+    for lock in (_TOP / ".ci").glob("*.lock"):
+        for wanted in re.split(r"\n(?=\S)", lock.read_text()):
+            assert wanted.startswith("#") or "--hash=sha256:" in wanted, f"{lock.name}: {wanted}"

@@ -379,8 +379,9 @@ def _reader_of_world(spec: TaskSpec, appearance: str, code: ModuleType) -> tuple
             print(f"The reader of images of {spec.id} is trained into {path.parent}, once: about a minute.", flush=True)
             reader = code.train_reader(spec, appearance)
             write_bytes(path, reader.content())
-            found = {"sha256": sha256(path), "errors": reader_errors(reader, spec, appearance)}
-            write_json(card, sealed(found))
+            errors = reader_errors(reader, spec, appearance)
+            print(f"It misreads {errors['misread']:.1%} of new frames and reads nothing in {errors['refused']:.1%}.")
+            write_json(card, sealed({"sha256": sha256(path), "errors": errors}))
         facts = read_sealed(card, "a reader's card")
         if sha256(path) != facts["sha256"]:
             raise ArtefactError(f"{path} is damaged; remove {path.parent}, and the same command trains it anew.")

@@ -46,6 +46,7 @@ from imagine_bench.report.page import (
     signed_percent,
 )
 from imagine_bench.statistics import LEVEL, Estimate, first_lasting
+from imagine_bench.store import encoders
 from imagine_bench.store.loading import archive_files
 from imagine_bench.store.results import BenchResult
 
@@ -96,7 +97,8 @@ def bench_page(result: BenchResult) -> Page:
 
 def verdict(data: ReportData) -> list[str]:
     """What is missing, and a line a learner: whether it is better or worse than DQN, and where most clearly."""
-    lines = [*_unfinished(data.result), *_not_installed(data), *(_against_dqn(data, agent) for agent in data.compared)]
+    first = [*_unfinished(data.result), *_not_installed(data), *_misread(data)]
+    lines = [*first, *(_against_dqn(data, agent) for agent in data.compared)]
     return lines or ["Nothing is compared: that needs dqn and another learner side by side."]
 
 
@@ -123,6 +125,18 @@ def _against_dqn(data: ReportData, agent: str) -> str:
 def shown(record: Record) -> int:
     """1 where an agent is ahead of DQN, -1 where it is behind, 0 where no difference is shown."""
     return int(np.sign(record["difference_to_dqn"])) if record["p_holm"] < 1.0 - LEVEL else 0
+
+
+def _misread(data: ReportData) -> list[str]:
+    """A line an agent whose encoder reads few frames right."""
+    lines = []
+    for agent in data.result.protocol.agents:
+        entry = known_agent(agent)
+        used = data.result.protocol.encoder_of(entry.encoder_kind) if entry.make and entry.needs_encoder else None
+        words = encoders.doubt(None if used is None else encoders.find(used))
+        if words:
+            lines.append(f"“{agent_title(agent)}” sees through {words}.")
+    return lines
 
 
 def _unfinished(result: BenchResult) -> list[str]:

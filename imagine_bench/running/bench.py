@@ -41,7 +41,7 @@ from imagine_bench.protocols.data import (
     TaskType,
 )
 from imagine_bench.registry.machine import describe_environment, gl_renderer
-from imagine_bench.store import loading
+from imagine_bench.store import encoders, loading
 from imagine_bench.store.bench_folder import (
     BenchStore,
     bench_folder,
@@ -258,6 +258,8 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
         ArtefactError: A file is damaged or foreign; it is left untouched.
     """
     folder = bench_folder(root, wanted)
+    for words in filter(None, map(encoders.doubt, paths.values())):
+        print(f"Note: agents see through {words}.")
     failures, missing = carry_out([(wanted, paths)], root=root, launcher=launcher)
     require_done(failures, missing)
     if not missing:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Callable
 from importlib import resources
@@ -23,6 +24,8 @@ _TRAIN = "imagine_bench.agents.encoders.cli:retrain"
 _FIT = "imagine_bench.agents.encoders.training:fit_offered"
 _SUFFIX = ".safetensors"
 _PATIENCE_S = 3600.0
+READS_AT_LEAST = 0.9
+"""Share of held-out frames whose macrostate is read right; reports and commands name an encoder that is below it."""
 
 
 def bundled() -> dict[str, Path]:
@@ -150,6 +153,23 @@ def card(used: str | None) -> dict[str, Any] | None:
     """The card of an encoder that :func:`find` finds; None where it finds none. Raises ArtefactError: damaged."""
     path = None if used is None else find(used)
     return None if path is None else _card(path)
+
+
+def doubt(path: Path | None) -> str:
+    """What to say of an encoder that reads few frames right, in words; empty where its card says nothing like that."""
+    share = 1.0 if path is None else _share_read(path)
+    if path is None or not share < READS_AT_LEAST:
+        return ""
+    return (
+        f"the encoder {path.stem}, from which a probe reads only {share:.1%} of new frames right (less than "
+        f"{READS_AT_LEAST:.0%}); scores say little of an agent that sees through it"
+    )
+
+
+def _share_read(path: Path) -> float:
+    """Share of held-out frames whose whole macrostate an encoder's probe reads right; NaN where its card says none."""
+    found: float = (_card(path) or {}).get("probe", {}).get("mlp", math.nan)
+    return found
 
 
 def _card(path: Path) -> dict[str, Any] | None:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
+from small_runs import Inline
 
 from imagine_bench import registry
+from imagine_bench.report import bench_page
+from imagine_bench.running.bench import bench, plan
 from imagine_bench.store import encoders
 
 LOOK_ALIKE = ("arrows:cubes=2", "arrows:cubes=2,slip=0.2", "arrows:cubes=2,goal=01,coupling=neighbour,shuffle=3")
@@ -49,3 +54,21 @@ def test_what_looks_otherwise_is_trained_for_itself(trained):
 def test_three_cubes_have_the_bundled_one(trained, name):
     place = encoders.own(registry.task(name), "clean", "latents")
     assert place == encoders.bundled()["arrow_puzzle-clean"] and not trained
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(0.0345, True), (0.8999, True), (0.9, False), (1.0, False)])
+def test_an_encoder_that_reads_few_frames_right_is_named(tmp_path, share, doubted):
+    (tmp_path / "theirs.json").write_text(json.dumps({"probe": {"mlp": share}}))
+    words = encoders.doubt(tmp_path / "theirs.safetensors")
+    assert bool(words) == doubted
+    assert not doubted or (f"reads only {share:.1%} of new frames right" in words and "theirs" in words)
+
+
+def test_a_bench_and_its_report_name_an_encoder_that_misreads(tmp_path, capsys):
+    """The bundled codes of the strongest look read a ninth of its frames."""
+    few = {"budgets": (1,), "evaluation_episodes": 1, "open_loop_starts": 0, "recorded_episodes": 0}
+    agents = ("factored:given",)
+    wanted, paths = plan("arrow_puzzle", "smoke", agents=agents, appearance="strong", execution="kinematic", **few)
+    result = bench(wanted, paths, root=tmp_path, launcher=Inline())
+    assert "reads only 11.5% of new frames right" in capsys.readouterr().out
+    assert any("reads only 11.5% of new frames right" in line for line in bench_page(result).answers)
