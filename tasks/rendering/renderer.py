@@ -20,7 +20,7 @@ import hashlib
 import os
 import sys
 import threading
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,29 +112,12 @@ def _current() -> Callable[[], int | None]:
     return ctypes.CFUNCTYPE(ctypes.c_void_p)(("eglGetCurrentContext", PLATFORM.EGL))
 
 
-def _release() -> None:
-    """Let no context of EGL be current in this thread, so that another thread may use it."""
+def _release(theirs: tuple[Any, ...] | None) -> None:
+    """Let a context of other code be current in this thread, or none, so that another thread may use ours."""
     from mujoco import egl  # noqa: PLC0415  (after the platform is chosen)
 
     nothing = egl.EGL.EGL_NO_SURFACE
-    egl.EGL.eglMakeCurrent(egl.EGL_DISPLAY, nothing, nothing, egl.EGL.EGL_NO_CONTEXT)
-
-
-@contextlib.contextmanager
-def _others_kept(ours: Container[int | None]) -> Iterator[None]:
-    """Make a context of other code that is current in this thread so again in the end: dm_control never asks."""
-    current = _current()() if _is_egl() and "mujoco.egl" in sys.modules else None
-    if current is None or current in ours:
-        yield
-        return
-    from mujoco.egl import EGL  # noqa: PLC0415  (after the platform is chosen)
-
-    surfaces = EGL.eglGetCurrentSurface(EGL.EGL_DRAW), EGL.eglGetCurrentSurface(EGL.EGL_READ)
-    theirs = EGL.eglGetCurrentDisplay(), *surfaces, EGL.eglGetCurrentContext()
-    try:
-        yield
-    finally:
-        EGL.eglMakeCurrent(*theirs)
+    egl.EGL.eglMakeCurrent(*(theirs or (egl.EGL_DISPLAY, nothing, nothing, egl.EGL.EGL_NO_CONTEXT)))
 
 
 def _drawing(model: mujoco.MjModel, view: View) -> tuple[mujoco.MjvOption, mujoco.MjvCamera, mujoco.MjvScene]:
@@ -241,9 +224,15 @@ class _Canvases:
         self._canvases[scene, view, thread] = canvas
         return canvas
 
-    def addresses(self) -> set[int | None]:
-        """Of all contexts."""
-        return {canvas.address for canvas in self._canvases.values()}
+    def of_others(self) -> tuple[Any, ...] | None:
+        """What makes a context of other code, if one is current in this thread, so again: dm_control never asks."""
+        current = _current()() if _is_egl() and "mujoco.egl" in sys.modules else None
+        if current is None or any(current == canvas.address for canvas in reversed(self._canvases.values())):
+            return None
+        from mujoco.egl import EGL  # noqa: PLC0415  (after the platform is chosen)
+
+        surfaces = EGL.eglGetCurrentSurface(EGL.EGL_DRAW), EGL.eglGetCurrentSurface(EGL.EGL_READ)
+        return EGL.eglGetCurrentDisplay(), *surfaces, EGL.eglGetCurrentContext()
 
     def close(self, keep: int = 0) -> None:
         """Free the contexts that this thread may free, but for those that were used last."""
@@ -329,15 +318,16 @@ class Renderer:
             SetupError: As :meth:`frame`.
         """
         drawn = []
-        with _canvases.lock, _others_kept(_canvases.addresses()):
+        with _canvases.lock:
+            theirs = _canvases.of_others()
             canvas = _canvases.find(self._drawn_as, self._model, self.view, self._canvas)
             self._canvas = canvas
             canvas.make_current()
             for scene in scenes:
                 mujoco.mjv_updateScene(*scene, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
                 drawn.append(canvas.draw(self._scene)[::-1].copy())
-            if canvas.thread is None:
-                _release()
+            if canvas.thread is None or theirs is not None:
+                _release(theirs)
         return drawn
 
     def close(self) -> None:
