@@ -72,7 +72,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
     [
         ("report a --merge", "--merge has no value; give at least one behind it, or leave it out."),
         ("plan HERE --max-epistemic=-1", "more epistemic uncertainty than -1.0: give at least 0."),
-        ("sweep toy_regression", "toy_regression is of a regression task, in which no agent acts"),
+        ("sweep toy_regression", "toy_regression is a regression task, in which no agent acts"),
         ("sweep arrow_puzzle --name suite", "ladder takes no --task; leave it out."),
         ("sweep --name smoke", "smoke is a study of one task; give a task as the first word."),
         ("report a --task arrow_puzzle", "Both a and --task arrow_puzzle were given; leave one of them"),

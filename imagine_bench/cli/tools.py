@@ -55,8 +55,8 @@ class DatasetCommand:
 
     def __call__(self) -> None:
         """Collect, or describe."""
-        if (self.task is None) == (self.describe is None and not self.standard):
-            raise InvalidValueError("Give a task to collect episodes of, or one of --describe and --standard.")
+        if [self.task is None, self.describe is None, not self.standard].count(False) != 1:
+            raise InvalidValueError("Give exactly one of a task to collect episodes of, --describe and --standard.")
         if self.describe is not None:
             print(describe(read_dataset(self.describe)))
             return

@@ -155,7 +155,8 @@ def _texts(pairs: Sequence[str], where: str) -> dict[str, str]:
     for pair in pairs:
         name, equals, text = pair.partition("=")
         if not equals or not name:
-            raise InvalidValueError(f"{where} {pair!r} is not of the form name=value, such as controller.discount=0.9.")
+            example = "pad_friction=0.5" if where == "--physics" else "controller.discount=0.9"
+            raise InvalidValueError(f"{where} {pair!r} is not of the form name=value, such as {example}.")
         if name in texts:
             raise InvalidValueError(f"{where} names {name!r} twice; give it once.")
         texts[name] = text

@@ -66,7 +66,7 @@ def chosen(given: Path | None, root: Path, task: str | None) -> Path:
     require_either(given, task)
     if task is not None:
         task_type(task)  # knows every name
-        require_control(task, f"Task {task!r}")
+        require_control(task, task)
     return given or newest_bench(root, *(registry.tasks() if task is None else (task,)))
 
 

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench import reference
 from imagine_bench.arrays import Floats
+from imagine_bench.registry.entries import FIRST
 from imagine_bench.report import figures, sections
 from imagine_bench.report.data import (
     BASE_AGENT,
@@ -145,10 +146,12 @@ def _unfinished(result: BenchResult) -> list[str]:
     part = result.protocol
     whole = result.whole or part
     named = "; ".join(result.missing[:4]) + ("; …" if len(result.missing) > 4 else "")
+    then = "The same bench command goes on."
+    if whole.agent_names == FIRST:
+        then = "Its agents had other names when it was begun: today's command begins a new bench in another folder."
     return [
         f"This bench is not finished: shown are {len(part.seeds)} of {len(whole.seeds)} seeds up to "
-        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {named}. "
-        "The same bench command goes on."
+        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {named}. {then}"
     ]
 
 

@@ -118,7 +118,8 @@ def read_agent(folder: Path, *, encoder: str | None = None) -> KeptAgent:
 def require_control(task: str, what: str) -> None:
     """Raise ArtefactError for a task in which no agent acts."""
     if not registry.has_task(task):
-        raise ArtefactError(f"{what} is of a regression task, in which no agent acts; give one of agents.")
+        is_one = "is" if what == task else "is of"
+        raise ArtefactError(f"{what} {is_one} a regression task, in which no agent acts; give one of agents.")
 
 
 def protocol_of_agents(bench: Path) -> Protocol:

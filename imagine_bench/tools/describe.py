@@ -28,6 +28,7 @@ def describe_task(name: str) -> str:
         return _page(data.title, data.description, rows)
     spec = registry.task(name)
     facts = spec.facts()
+    exact = certificate(spec)
     factors = (f"{n} ({', '.join(v)})" for n, v in zip(spec.macrostate_names, spec.macrostate_values, strict=True))
     chance = "some macro-actions have several outcomes" if is_random(spec.rules) else "none: each has one outcome"
     family, _, options = spec.id.partition(":")  # the family's id needs no look-up first
@@ -39,13 +40,14 @@ def describe_task(name: str) -> str:
         "observation": f"64 x 64 RGB frame, for encoders preprocessed as {spec.preprocessing}",
         "macro-actions": f"{spec.n_actions}: {'; '.join(spec.action_names)}",
         "macrostate": "; ".join(factors),
-        "macrostates": f"{len(states_of(spec.rules)):,}, {len(spec.rules.start_states):,} of them starts",
+        "macrostates": f"{exact.macrostates:,} can come up, {len(spec.rules.start_states):,} of them starts; "
+        f"{len(states_of(spec.rules)):,} with those that cannot",
         "chance": chance,
         "horizon": f"{spec.horizon} macro-actions",
         "chance level": f"{100 * facts.chance_level:.1f} % of episodes solved by blind choice",
         "optimum": f"{100 * facts.optimum:.1f} %, with a return of {facts.optimal_return:.2f}",
         "plan lengths": f"{_plan_lengths(spec)}; mean {facts.mean_plan_length:.2f}",
-        **certificate_rows(certificate(spec)),
+        **certificate_rows(exact),
         "encoders": _encoders(spec),
     }
     return _page(spec.title, spec.description, rows)

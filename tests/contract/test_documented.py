@@ -6,6 +6,7 @@ A line of ``frozen/documented.txt`` is a module, ``module:name`` or ``module:Cla
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import re
 import subprocess
 import warnings
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from imagine_bench import MOVED_NAMES
+from imagine_bench import MOVED, MOVED_NAMES, registry
 from imagine_bench.cli import parsed
 from imagine_bench.errors import InvalidValueError
 
@@ -90,3 +91,14 @@ def test_a_former_make_target_types_a_command_that_there_is(target: str) -> None
         with pytest.raises(SystemExit) as ended:
             parsed([command, "--help"])
         assert ended.value.code == 0, command
+
+
+def test_every_stable_module_is_there_under_its_own_name() -> None:
+    page = (Path(__file__).parents[2] / "docs/reference/api.md").read_text()
+    section = page.partition("## Modules that other packages may import")[2].partition("\n## ")[0]
+    modules = set(re.findall(r"(?<=`)imagine_bench\.[a-z_.]+(?=`)", section)) - set(MOVED)
+    assert len(modules) > 20
+    for module in modules:
+        assert importlib.util.find_spec(module) is not None, module
+    entries = re.findall(r"`(\w+Entry)`", section)
+    assert len(entries) == 5 and all(hasattr(registry, name) for name in entries)

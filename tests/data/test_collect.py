@@ -142,7 +142,9 @@ def test_standard_sets_are_of_three_strengths_and_are_kept(tmp_path: Path, monke
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ([], "Give a task to collect episodes of, or one of --describe and --standard."),
+        ([], "Give exactly one of a task to collect episodes of, --describe and --standard."),
+        (["arrow_puzzle", "--describe", "nowhere"], "Give exactly one of"),
+        (["--standard", "--describe", "nowhere"], "Give exactly one of"),
         (["arrow_puzzle", "--policy", "best"], "No policy 'best'. Known: random, uniform, oracle, mixed, or a run's"),
         (["arrow_puzzle", "--policy", "."], "a run's configuration; give a run's folder"),
         (["arrow_puzzle", "--motion-hz", "5000", "--episodes", "1"], "Motion cannot be captured at 5000.0 Hz"),
