@@ -385,7 +385,10 @@ def require_done(folder: Path) -> dict[str, Any]:
 
     Raises ArtefactError: the run is unfinished, damaged or of another format.
     """
-    digests = read_sealed(folder / _DONE, "the mark of a finished run")["sha256"]
+    what = "the mark of a finished run"
+    done = read_sealed(folder / _DONE, what)
+    with reading(folder / _DONE, what):
+        digests = {_CONFIG: None, _METRICS: None, **done["sha256"]}  # these have one in every run
     for name, written in digests.items():
         if name == _RECORDING and not recording_path(folder).exists():
             continue  # recordings are large, and nothing else needs them
