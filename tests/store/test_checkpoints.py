@@ -20,7 +20,16 @@ from imagine_bench.interfaces import AgentState
 from imagine_bench.running.evaluation import EvaluationCounts
 from imagine_bench.running.run_state import Counters
 from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, OpenLoop, PolicyTable
-from imagine_bench.store.run_folder import Snapshot, load_newest, load_snapshot, pack, save_snapshot, unpack
+from imagine_bench.store.run_folder import (
+    Snapshot,
+    load_newest,
+    load_snapshot,
+    pack,
+    save_snapshot,
+    training_arrays,
+    training_of,
+    unpack,
+)
 
 ARRAYS_ONLY = (OpenLoop, KeptEpisodes, ComparedRollout)
 """Classes whose arrays are kept without values beside them."""
@@ -52,6 +61,25 @@ def test_every_present_and_absent_part_is_read_back(kind: Any) -> None:
         for kept in (json.loads(json.dumps(values)), None)[: 1 + (kind in ARRAYS_ONLY)]:
             read = unpack(kind, kept, arrays)
             assert type(read) is kind and exact(dataclasses.asdict(read)) == exact(dataclasses.asdict(value))
+
+
+def test_2000_training_episodes_take_less_than_150_kb_and_are_read_back_to_the_bit() -> None:
+    rng = np.random.default_rng(0)
+    n_episodes, n_actions = 2000, 30
+    kept = KeptEpisodes(
+        starts=rng.integers(4, size=(n_episodes, 6)),
+        lengths=np.full(n_episodes, n_actions),
+        actions=rng.integers(6, size=n_episodes * n_actions),
+        returns=rng.normal(size=n_episodes),
+        success=rng.random(n_episodes) < 0.5,
+        faults=rng.integers(2, size=n_episodes),
+        fingerprints=rng.integers(2**32, size=n_episodes),
+        sim_times_s=rng.random(n_episodes),
+    )
+    arrays = training_arrays(kept)
+    assert sum(array.nbytes for array in arrays.values()) < 150_000
+    read = training_of(Snapshot(episode=n_episodes, agent=AgentState(arrays={}, values={}), arrays=arrays, values={}))
+    assert read is not None and exact(vars(read)) == exact(vars(kept))
 
 
 def test_numpy_scalars_are_kept_as_numbers_and_what_an_older_file_lacks_takes_its_default() -> None:
