@@ -153,10 +153,8 @@ def _distances(gray: Floats, pixels: Ints, examples: Floats) -> Floats:
 
 def _pixels_of_patches(frames: Frame, before: Ints, actions: Ints, n_actions: int) -> list[Ints]:
     """Pixels that change under the same macro-actions; those that differ only between episodes are a patch, too."""
-    changed = np.abs(frames[before + 1].astype(np.int16) - frames[before]).max(axis=3) > _CHANGED
-    changed = changed.reshape(len(actions), -1)
-    taken = [changed[actions == action] for action in range(n_actions)]
-    rates = np.stack([each.sum(axis=0) / max(1, len(each)) for each in taken], axis=1)  # [4096, A]
+    taken = [before[actions == action] for action in range(n_actions)]
+    rates = np.stack([_change_rates(frames, rows) for rows in taken], axis=1)  # [4096, A]
     differing = np.flatnonzero(np.ptp(frames, axis=0).max(axis=2) > _CHANGED)
     rates = rates[differing]
     _, kinds = np.unique(rates > _OFTEN, axis=0, return_inverse=True)
@@ -166,6 +164,13 @@ def _pixels_of_patches(frames: Frame, before: Ints, actions: Ints, n_actions: in
     typical = np.stack([rates[kinds == kind].mean(axis=0) for kind in large])
     nearest = ((rates[:, None] - typical) ** 2).sum(axis=2).argmin(axis=1)  # a small group joins a large one
     return [differing[nearest == index] for index in range(len(large))]
+
+
+def _change_rates(frames: Frame, rows: Ints) -> Floats:
+    """Share of the transitions from these frames in which each pixel changes; 0 of none. Shape (4096,)."""
+    away = np.abs(frames[rows + 1].astype(np.int16) - frames[rows]).max(axis=3)
+    rates: Floats = (away > _CHANGED).sum(axis=0).ravel() / max(1, len(rows))
+    return rates
 
 
 def _patch(frames: Frame, gray: Floats, pixels: Ints) -> Patch:

@@ -65,7 +65,8 @@ def squared_distance(exact: Mapping[State, float], imagined: Mapping[State, floa
 
     has the expected value sum_x (q_x - p_x)^2: 0 for a perfect sampler, whatever S. It is the U-statistic over pairs of
     futures i and j, the mean of sum_x (1[x_i = x] - p_x) (1[x_j = x] - p_x) over all i != j. A single one may be less
-    than 0, and its mean is where futures are spread more evenly than independent ones.
+    than 0, and its mean is where futures are spread more evenly than independent ones. Of futures that share a draw of
+    the model's weights q are the probabilities under those weights.
 
     Args:
         exact: Probabilities p.
