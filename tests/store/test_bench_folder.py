@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ from small_runs import small
 from imagine_bench.errors import ArtefactError, BusyError
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.launchers.jobs import launcher
-from imagine_bench.store.bench_folder import BenchStore, bench_facts, bench_folder, newest_bench, newest_recording
+from imagine_bench.store.bench_folder import BenchStore, bench_folder, newest_bench, newest_recording
 
 _ENVIRONMENT = {"command": "imagine-bench bench", "commit": "abc", "versions": {"torch": "1"}, "gl_renderer": "x"}
 
@@ -67,17 +66,6 @@ def test_a_session_elsewhere_is_noticed(tmp_path: Path) -> None:
     elsewhere = {**_ENVIRONMENT, "machine": {"cpu": "another", "cores": 2}}
     assert opened(tmp_path).begin_session(elsewhere) == ["cpu"]
     assert opened(tmp_path).begin_session({**_ENVIRONMENT, "gl_renderer": "y"}) == ["gl_renderer"]
-
-
-def test_a_bench_took_as_long_as_all_its_sessions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for lasts_s in (5.0, 2.0):
-        store = opened(tmp_path)
-        store.begin_session(_ENVIRONMENT)
-        now_s = time.monotonic()
-        monkeypatch.setattr(time, "monotonic", lambda now_s=now_s, lasts_s=lasts_s: now_s + lasts_s)
-        store.save_time()
-        monkeypatch.undo()
-    assert bench_facts(store.folder)["wall_s"] == pytest.approx(7.0, abs=0.5)
 
 
 @pytest.mark.parametrize("content", ["[{}]", "null", "{}", '{"sessions": []}'])

@@ -99,19 +99,6 @@ def test_both_cameras_film_the_motion():
     env.close()
 
 
-def test_after_a_replay_the_scene_stands_as_before():
-    """In a world in which what was moved stands elsewhere than where the motion left it."""
-    env = make("pick_place", motion_hz=5, gesture=0.5).unwrapped
-    env.reset(seed=0, options={"macrostate": (0, 1, 0, 3)})
-    env.step(1)
-    before, seen = env.data.qpos.copy(), env.agent_view()
-    assert not np.array_equal(env.latest.motion.qpos[-1], before)
-    for show in (env.motion, env.arm_motion, env.agent_film):
-        show()
-        np.testing.assert_array_equal(env.data.qpos, before)
-        np.testing.assert_array_equal(env.agent_view(), seen)
-
-
 def test_a_standing_scene_is_one_sample_at_rest():
     for options in ({"execution": "kinematic", "motion_hz": 100}, {}):
         env = make(**options)
