@@ -77,10 +77,17 @@ def test_every_kind_of_forgery_is_found(finished: Path, tmp_path: Path) -> None:
 
 
 NAMED = {
-    "successes": "successes is", "mean return": "mean_return is", "mean length": "mean_length is",
-    "sum of faults": "faults is", "start": "the start is", "return": "the return is", "success": "the success is",
-    "faults": "the number of faults is", "fingerprint": "the fingerprint is", "training return": "the return is",
-}  # fmt: skip
+    "successes": "successes is",
+    "mean return": "mean_return is",
+    "mean length": "mean_length is",
+    "sum of faults": "faults is",
+    "start": "the start is",
+    "return": "the return is",
+    "success": "the success is",
+    "faults": "the number of faults is",
+    "fingerprint": "the fingerprint is",
+    "training return": "the return is",
+}
 
 
 def test_a_forged_figure_is_named_where_there_is_no_report_too(finished: Path, tmp_path: Path) -> None:
