@@ -99,7 +99,7 @@ class Hostile:
         return {}
 
     def raises(self) -> Arrays:
-        raise KeyError("depth\x1b[31m\nsecond line")
+        raise ValueError("depth\x1b[31m\nsecond line")
 
     def gives_text(self) -> Arrays:
         return {"text": "text"}  # type: ignore[dict-item]

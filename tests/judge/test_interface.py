@@ -74,7 +74,7 @@ class Records(Exact):
         return found
 
 
-TASK = "arrows:cubes=2"
+TASK = "pick_place"
 
 
 def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:
@@ -85,7 +85,7 @@ def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:
 
     def answered(order: int | None) -> tuple[dict[str, Predictions], list[list[State]]]:
         model = Records(world)
-        given: dict[str, Any] = {"samples": 2, "reader": BlindReader(2), "index": world.index}
+        given: dict[str, Any] = {"samples": 2, "reader": BlindReader(4), "index": world.index}
 
         def ask(asked: EvalSet, name: str) -> Predictions:
             drawn = None if order is None else np.random.default_rng(order)

@@ -203,12 +203,13 @@ def test_what_models_do_wrong_is_a_sentence_each(said: Said) -> None:
 
 def test_a_model_finds_no_truth_and_changes_nothing_for_the_next(said: Said) -> None:
     """The spy says, too, that nothing changes; it and *cheat* spoil all that they are handed."""
-    scores = {
-        (cell["model"], cell["transitions"]): cell for cell in kept(said.folder, _of("spy", "cheat", "copy", "exact"))
-    }
+    models = ("spy", "cheat", "copy", "exact")
+    scores = {(cell["model"], cell["transitions"]): cell for cell in kept(said.folder, _of(*models))}
     for one, other in (("spy", "copy"), ("cheat", "exact")):
         for name in ("total_variation", "tv_by_depth", "after_the_end", "value_loss", "data"):
             assert scores[one, 60][name] == scores[other, 60][name], (one, name)
+    learned = judgement.data_of(_of(*_MODELS), said.folder, 1000).episodes
+    assert learned.frames.any(), "the data that this process holds are as they were"
 
 
 def test_privileged_models_are_marked_wherever_they_stand(said: Said) -> None:

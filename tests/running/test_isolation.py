@@ -75,7 +75,7 @@ _ENDS = [
     ("dies", (0,), "ended itself with exit code 0"),
     ("dies", (3,), "ended itself with exit code 3"),
     ("hangs", (), "was stopped after 5 s"),
-    ("raises", (), r"KeyError: 'depth\\x1b\[31m\\nsecond line'"),
+    ("raises", (), r"ValueError: depth\\x1b\[31m$"),
     ("gives_text", (), "AttributeError"),
 ]
 
