@@ -62,6 +62,8 @@ def report_page(result: RegressionResult) -> Page:
     rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
     tables = [table for section in sections for table in section.tables]
     answers = [answer for section in sections for answer in section.answers]
+    first = next(section for section in sections if section.tables)  # its answers say its table again
+    others = [answer for section in sections if section is not first for answer in section.answers]
     return Page(
         title=f"{spec.title}: does the model know what it does not know?",
         subtitle=f"Preset {protocol.preset} · networks a dataset: {protocol.networks} · protocol {protocol.hash}",
@@ -69,7 +71,7 @@ def report_page(result: RegressionResult) -> Page:
         answers=answers,
         sections=[Section("What was compared", (_COMPARED,)), *sections],
         files={"results.csv": table_text(rows), **{f"{table.name}.csv": table.csv for table in tables}},
-        summary="\n".join([tables[0].text, "", *answers]),
+        summary="\n".join([tables[0].text, "", *others]),
         facts=made(result, {pair.agent: pair.title for pair in result.pairs.values()}),
     )
 
@@ -272,8 +274,10 @@ def _robot(result: RegressionResult) -> list[Section]:
             ),
             tables=(Table.of("choices", rows, why_dash="not measured there"),),
             answers=[
-                f"{row['network']} samples, {row['measure']} of the choice of least uncertainty: epistemic "
-                f"{row['epistemic']}, nll {row['nll']}."
+                f"{row['network']} samples, the least uncertain of 20 places "
+                f"{'anywhere on the disc' if row['measure'].startswith('disc') else 'within reach'}: misses times "
+                f"those of a random choice {row['epistemic']} by epistemic uncertainty, {row['nll']} by negative "
+                "log-likelihood."
                 for row in rows
                 if "ratio" in row["measure"]
             ],
