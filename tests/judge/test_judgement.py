@@ -406,7 +406,7 @@ def test_judges_at_once_train_one_reader_of_a_world_and_see_it_whole(
     code = ModuleType("reader")
     vars(code).update(__file__=__file__, train_reader=train, load_reader=lambda spec, path: path.read_bytes())
     monkeypatch.setattr(registry, "load", lambda name: code)
-    monkeypatch.setattr(judgement, "reader_errors", lambda *_: {})
+    monkeypatch.setattr(judgement, "reader_errors", lambda *_: {"misread": 0.0, "refused": 0.0})
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
     folders = [tmp_path / name for name in ("one", "one", "other")]
     for folder in folders:
