@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +25,17 @@ Array = NDArray[np.generic]
 """An array of any dtype and shape that is only passed on."""
 Arrays = dict[str, NDArray[Any]]
 """Arrays by name, as a file or a state holds them: each has a dtype and a shape of its own."""
+D = TypeVar("D", bound=np.generic)
 Observed = NDArray[Any] | Arrays
 """What is observed of one moment: one part, an image or a vector, or several by name."""
 Action = np.int64 | int
 """The number of a macro-action."""
 Info = dict[str, Any]
 """Gymnasium's ``info``: numpy scalars and arrays, and sentences."""
+
+
+def read_only(array: NDArray[D]) -> NDArray[D]:
+    """A view of an array that cannot be written to: whoever is handed it changes nothing that others are handed."""
+    view = array.view()
+    view.flags.writeable = False
+    return view

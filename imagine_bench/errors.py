@@ -13,6 +13,12 @@ from collections.abc import Iterable
 from typing import Self, SupportsIndex
 
 _LONGEST = 200
+_LONGEST_REASON = 1000
+"""Characters of a library's own complaint that are handed on."""
+_OF_CONSTRUCTORS = re.compile(
+    r"__init__\(\) (missing \d+ required .*arguments?: (?P<missing>.+)|got an unexpected \D+ (?P<unknown>'[^']*'))"
+)
+"""What Python says where values of a file are not the fields of the dataclass that they are for."""
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _LONGEST
 _SHORT.maxother = _LONGEST
@@ -23,6 +29,19 @@ _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxarray = 10
 def brief(value: object) -> str:
     """``repr(value)`` on one line, whatever the value is, at most a few hundred characters of it."""
     return " ".join(_SHORT.repr(value).split())
+
+
+def why(error: Exception) -> str:
+    """What is wrong, for a sentence: an error's first line, names where a dataclass lacks or does not know a field."""
+    text = str(error).strip()
+    found = _OF_CONSTRUCTORS.search(text)
+    if found is not None:
+        return f"it lacks {found['missing']}" if found["missing"] else f"it has {found['unknown']}, which is unknown"
+    if isinstance(error, KeyError):
+        return f"{text} is missing"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return plain(text.partition("\n")[0][:_LONGEST_REASON]).rstrip(". ") or type(error).__name__
 
 
 def plain(text: object) -> str:

@@ -230,6 +230,8 @@ def test_who_stops_reading_gets_no_traceback() -> None:
         (["report", "\x1b[31mred"], r"The word '\x1b[31mred' cannot be meant"),
         (["report", "\udcff"], "outside Unicode"),
         (["report", "x" * 900], "File name too long"),
+        (["bench", "arrow_puzzle", "--encoder", "~nobody_at_all/x.safetensors"], "knows no such home folder"),
+        (["new", "agent", "mine", "--out", "~nobody_at_all/x"], "knows no such home folder"),
         (["bench", "--task", "arrow_puzzle", "--set", "memory.real=" + "[" * 900], "it takes int"),
     ],
 )

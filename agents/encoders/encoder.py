@@ -16,7 +16,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief, why
 from imagine_bench.interfaces import Frame
 from imagine_bench.preprocessing import join_cells, preprocess
 
@@ -167,8 +167,8 @@ class Encoder:
             _fill(probe, tensors, "probe.")
             return cls(network, probe, card, device)
         except Exception as error:  # a file that is no encoder can be wrong in any way
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:300].rstrip(".")
-            raise ArtefactError(f"{path} is not a usable encoder ({reason}); choose another or retrain it.") from error
+            remedy = "choose another or retrain it"
+            raise ArtefactError(f"{path} is not a usable encoder ({why(error)}); {remedy}.") from error
 
 
 def bundled_encoder(name: str) -> Path:
@@ -215,9 +215,17 @@ def _empty_network(card: EncoderCard) -> EncoderNetwork:
 
 
 def _fill(network: nn.Module, tensors: dict[str, Tensor], prefix: str) -> None:
-    """Give an empty network its weights; RuntimeError where names or shapes do not fit."""
+    """Give an empty network its weights; InvalidValueError where names, shapes or numbers do not fit."""
     weights = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-    network.load_state_dict(weights, strict=True, assign=True)
+    wanted = network.state_dict()
+    lacking = sorted(wanted.keys() - weights.keys())
+    unknown = sorted(weights.keys() - wanted.keys())
+    if lacking or unknown:
+        raise InvalidValueError(f"of the tensors {prefix}* it lacks {brief(lacking)} and has {brief(unknown)} instead")
     for name, value in weights.items():
+        if value.shape != wanted[name].shape:
+            shapes = f"{tuple(value.shape)}, not {tuple(wanted[name].shape)}"
+            raise InvalidValueError(f"tensor {prefix}{name} has shape {shapes}")
         if not value.isfinite().all():
-            raise InvalidValueError(f"weight {prefix}{name} is not finite")
+            raise InvalidValueError(f"tensor {prefix}{name} is not finite")
+    network.load_state_dict(weights, strict=True, assign=True)

@@ -59,16 +59,16 @@ class Convolutional:
         """Squared error of pixels and rewards, cross-entropy of ends; as many steps whatever the data."""
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         initialise(self.network, generator)
-        before = torch.from_numpy(dataset.rows[0])
-        frames = torch.from_numpy(dataset.frames)
-        actions = torch.from_numpy(dataset.actions)
-        rewards = torch.from_numpy(dataset.rewards).float()
-        ended = torch.from_numpy(dataset.terminated).float()
+        before = dataset.rows[0]
+        actions = torch.tensor(dataset.actions)
+        rewards = torch.tensor(dataset.rewards).float()
+        ended = torch.tensor(dataset.terminated).float()
         optimiser = torch.optim.Adam(self.network.parameters(), lr=_RATE)
         for _ in range(_STEPS):
             rows = torch.randint(len(actions), (_BATCH,), generator=generator)
-            images = _images(frames[before[rows]])
-            target = _images(frames[before[rows] + 1])
+            chosen = before[rows.numpy()]
+            images = _images(torch.from_numpy(dataset.frames[chosen]))
+            target = _images(torch.from_numpy(dataset.frames[chosen + 1]))
             drawn, reward, logit = self.network(images, actions[rows])
             loss = 50.0 * (drawn - target).square().mean() + (reward - rewards[rows] / _REWARD).square().mean()
             loss = loss + functional.binary_cross_entropy_with_logits(logit, ended[rows])
@@ -80,8 +80,8 @@ class Convolutional:
     def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
         """One future, fed its own pictures; see :class:`.interfaces.model.WorldModel`."""
         del samples, rng
-        asked = torch.from_numpy(actions[:, frames.shape[1] - 1 :])
-        pieces = zip(torch.from_numpy(frames[:, -1]).split(_CHUNK), asked.split(_CHUNK), strict=True)
+        asked = torch.tensor(actions[:, frames.shape[1] - 1 :])
+        pieces = zip(torch.tensor(frames[:, -1]).split(_CHUNK), asked.split(_CHUNK), strict=True)
         rolled = [self._roll(*piece) for piece in pieces]
         pictures, rewards, ended = (torch.cat(column).numpy()[:, None] for column in zip(*rolled, strict=True))
         certain = np.ones((len(frames), 1, asked.shape[1]))

@@ -59,7 +59,7 @@ class LatentModel:
         mu, sigma = (each.cpu() for each in self.encoder.encode(dataset.frames))
         columns = {
             "mu": mu[before], "sigma": sigma[before], "next_mu": mu[before + 1], "next_sigma": sigma[before + 1],
-            "action": dataset.actions, "reward": dataset.rewards.astype(np.float32),
+            "action": dataset.actions.copy(), "reward": dataset.rewards.astype(np.float32),
             "terminated": dataset.terminated.astype(np.float32),
         }  # fmt: skip
         for batch in self.batches({name: np.asarray(column) for name, column in columns.items()}, dataset, generator):
@@ -85,7 +85,7 @@ class LatentModel:
         """Futures in closed loop through latents; see :class:`.interfaces.model.WorldModel`."""
         generator = self._generator(rng)
         rows = len(frames)
-        asked = torch.from_numpy(actions[:, frames.shape[1] - 1 :]).repeat_interleave(samples, dim=0)
+        asked = torch.tensor(actions[:, frames.shape[1] - 1 :]).repeat_interleave(samples, dim=0)
         turns = iter(asked.unbind(dim=1))
         z = self.states(frames, actions).repeat_interleave(samples, dim=0)  # [N S, Z]
         weights = self.imagination.draw_weights(generator)

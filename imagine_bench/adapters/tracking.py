@@ -10,7 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from imagine_bench.errors import InvalidValueError, lacking, require_known
-from imagine_bench.store.files import make_folder, table_rows
+from imagine_bench.store import run_folder
+from imagine_bench.store.files import make_folder, reading, table_rows
 
 Rows = list[dict[str, float]]
 
@@ -28,22 +29,27 @@ def track(folder: Path, tool: str) -> Path:
     Raises:
         UnknownNameError: Another tool.
         InvalidValueError: No run there has been tested, or it is a bench of regressors.
+        ArtefactError: A table is damaged, or a part of a finished run is missing.
         SetupError: The tool is not installed.
     """
     write = TOOLS[require_known("tracking tool", tool, TOOLS)]
-    runs = {path.parent.relative_to(folder): path.read_text() for path in sorted(folder.glob("*/seed_*/metrics.csv"))}
+    for run in sorted(folder.glob("*/seed_*")):
+        if run_folder.is_done(run):
+            run_folder.require_done(run)
+    runs = {path: path.read_bytes().decode(errors="replace") for path in sorted(folder.glob("*/seed_*/metrics.csv"))}
     if not runs:
         raise InvalidValueError(f"No run in {folder} has been tested yet; give the folder of a bench.")
     if not all(table.startswith("episodes,") for table in runs.values()):
         raise InvalidValueError(f"{folder} compares no agents by training episodes; give the folder of such a bench.")
     out = folder / tool
     shutil.rmtree(out, ignore_errors=True)
-    for run, table in runs.items():
-        rows = table_rows(table, ("solved",))
-        for row in rows:
-            del row["solved"]
-            row["success_rate"] = row["successes"] / row["test_episodes"]
-        write(make_folder(out), run, rows)
+    for path, table in runs.items():
+        with reading(path, "the table of a run of an agent"):
+            rows = table_rows(table, ("solved",))
+            for row in rows:
+                del row["solved"]
+                row["success_rate"] = row["successes"] / row["test_episodes"]
+        write(make_folder(out), path.parent.relative_to(folder), rows)
     return out
 
 

@@ -30,7 +30,7 @@ from imagine_bench.cli.tools import (
     ViewCommand,
 )
 from imagine_bench.errors import EXTRAS, ImagineBenchError, InvalidValueError, SetupError, brief, lacking, plain
-from imagine_bench.store.files import reason
+from imagine_bench.store.files import expanded, reason
 from imagine_bench.version import __version__
 
 INTERRUPTED = 130
@@ -120,7 +120,7 @@ def _readable(word: str) -> str:
             f"The word {brief(word)} cannot be meant: give at most {_LONGEST_WORD:,} characters, none of them a "
             "control character or outside Unicode."
         )
-    return re.sub(r"^(--[a-z-]+=)?~(?=/|$)", lambda found: f"{found[1] or ''}{Path.home()}", word)
+    return re.sub(r"^(--[a-z-]+=)?~(?=/|$)", lambda found: f"{found[1] or ''}{expanded(Path('~'))}", word)
 
 
 def _with_task_first(words: list[str]) -> list[str]:

@@ -2,6 +2,8 @@
 
 A row is a macro-action: the frame before it, the action, and what came of it (``next.reward``, ``next.done``, ...). The
 layout has no row for the frame that an episode ends with; it lies in ``final_frames.parquet``, which only we read.
+LeRobot's own tools leave that file behind. Whoever deletes, splits or merges episodes with them copies it into the new
+folder, one ``final_frames*.parquet`` a dataset that went into it: the digest of an episode's rows finds its last frame.
 
 Source: https://github.com/huggingface/lerobot, ``src/lerobot/datasets``, versions 0.4.4 and 0.6.1.
 """
@@ -12,8 +14,9 @@ import io
 import itertools
 import json
 import operator
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -22,19 +25,25 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from imagine_bench.arrays import Array, Arrays
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame
-from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes
+from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes, content_hash
 from imagine_bench.store.files import make_folder, read_json, reading, write_json
 from imagine_bench.values import Json
 
 _VERSION = "v3.0"
 _INFO = "meta/info.json"
 _FINAL = "final_frames.parquet"
+_FINALS = "final_frames*.parquet"
 _PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _IMAGE = "observation.image"
 _MASK = "available"
 _EPISODE = "episode_index"
+_DIGEST = "episode_digest"
+_DIGESTED = ("action", "next.reward", "next.terminated", "next.truncated", "next.success")
+"""Columns that an episode is known by, with its frames and masks: those that no tool of LeRobot's changes."""
+_TOLERANCE_S = 1e-4
+"""How far a timestamp may be from that of its row, as LeRobot has it."""
 _ROWS = 20_000
 _FILES = 1000
 """Rows of a file, at most 100 MB; files of a chunk."""
@@ -54,6 +63,7 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
     frames = episodes.frames[before]
     masks = episodes.action_masks.astype(np.bool_)
     table = _table({**columns, _MASK: masks[before]}, frames)
+    digests = _digests(columns, masks[before], frames, episodes.lengths)
     text = [str(card["description"])]
     places = [divmod(file, _FILES) for file in (firsts // _ROWS).tolist()]
     spans = [slice(*span) for span in zip(firsts.tolist(), (firsts + episodes.lengths).tolist(), strict=True)]
@@ -70,7 +80,8 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
         rows.append(row | {f"stats/{name}/{each}": value for name, of in stats.items() for each, value in of.items()})
     pq.write_table(pa.Table.from_pylist(rows), _file(folder / "meta/episodes", 0, 0))
     pq.write_table(_tasks(text), folder / "meta/tasks.parquet")
-    pq.write_table(_table({_EPISODE: np.arange(len(last)), _MASK: masks[last]}, episodes.frames[last]), folder / _FINAL)
+    ends = _table({_EPISODE: np.arange(len(last)), _MASK: masks[last]}, episodes.frames[last])
+    pq.write_table(ends.append_column(_DIGEST, pa.array(digests)), folder / _FINAL)
     write_json(folder / "meta/stats.json", _statistics(columns, frames))
     write_json(folder / _INFO, _info(episodes))
 
@@ -163,43 +174,114 @@ def _info(episodes: Episodes) -> dict[str, Json]:
     }  # fmt: skip
 
 
+def _digests(columns: Mapping[str, Array], masks: Array, frames: Frame, lengths: NDArray[np.int64]) -> list[str]:
+    """What stands for each episode of so many rows."""
+    known = {**{name: columns[name] for name in _DIGESTED}, _MASK: masks, _IMAGE: frames}
+    ends = np.cumsum(lengths)
+    spans = [slice(end - length, end) for end, length in zip(ends.tolist(), lengths.tolist(), strict=True)]
+    return [content_hash({name: array[span] for name, array in known.items()}) for span in spans]
+
+
 def read(path: Path) -> Episodes:
     """Read such a dataset from its ``info.json``. Raises ArtefactError: damaged, not whole, or not of our columns."""
     info = read_json(path, "the metadata of a LeRobot dataset")
     folder = path.parents[1]
     with reading(folder, f"a LeRobot dataset of macro-actions, version {_VERSION}"):
-        if info["codebase_version"] != _VERSION:
-            raise InvalidValueError(f"it is of version {info['codebase_version']}")
-        lacks = [name for name in (*_TYPES, _MASK, _IMAGE) if name not in info["features"]]
-        if lacks:
-            raise InvalidValueError(f"it has no {lacks[0]}, which 'imagine-bench dataset' writes")
-    with reading(folder / _FINAL, "the last frames of episodes"):
-        ends = pq.read_table(folder / _FINAL)
-    with reading(folder, f"a LeRobot dataset of macro-actions, version {_VERSION}"):
-        table = pa.concat_tables(map(pq.read_table, sorted(folder.glob("data/*/*.parquet"))))
+        table = _rows(folder, info)
         column = {name: table[name].to_numpy() for name in _TYPES}
-        lengths = np.bincount(column[_EPISODE], minlength=len(ends))
-        if (len(table), len(lengths), len(ends)) != (info["total_frames"], *[info["total_episodes"]] * 2):
-            raise InvalidValueError(f"{info['total_frames']} rows are said to be in it and {len(table)} are")
-        if not np.array_equal(column["index"], np.arange(len(table))) or (np.diff(column[_EPISODE]) < 0).any():
-            raise InvalidValueError("its rows are not in order")
-        if not np.array_equal(column["action"].astype(np.int64), column["action"]):
-            raise InvalidValueError("an action is no integer")
-        frames, masks = ([*part, *last] for part, last in zip(_decoded(table), _decoded(ends), strict=True))
+        lengths = _lengths(column, info)
+        frames, masks = _decoded(table)
+        ends = _ends(folder, _digests(column, masks, frames, lengths))
+        last_frames, last_masks = _decoded(ends)
         order = np.argsort(np.concatenate([np.arange(len(table)), np.cumsum(lengths) - 0.5]))
         return Episodes(
-            lengths=lengths, frames=np.stack(frames)[order], action_masks=np.array(masks, dtype=np.int8)[order],
-            actions=column["action"].astype(np.int64), rewards=column["next.reward"],
-            terminated=column["next.terminated"], truncated=column["next.truncated"],
+            lengths=lengths,
+            frames=np.concatenate([frames, last_frames])[order],
+            action_masks=np.concatenate([masks, last_masks])[order].astype(np.int8),
+            actions=column["action"].astype(np.int64),
+            rewards=column["next.reward"],
+            terminated=column["next.terminated"],
+            truncated=column["next.truncated"],
             success=column["next.success"][np.cumsum(lengths) - 1],
-        )  # fmt: skip
+        )
 
 
-def _decoded(table: pa.Table) -> Iterator[list[Frame]]:
+def _rows(folder: Path, info: Mapping[str, Any]) -> pa.Table:
+    """The rows of all files. Raises InvalidValueError: there are others than ``info`` says, or they lack a column."""
+    if info["codebase_version"] != _VERSION:
+        raise InvalidValueError(f"it is of version {info['codebase_version']}")
+    lacks = [name for name in (*_TYPES, _MASK, _IMAGE) if name not in info["features"]]
+    if lacks:
+        raise InvalidValueError(f"it has no {lacks[0]}, which 'imagine-bench dataset' writes")
+    tables = [pq.read_table(file) for file in sorted(folder.glob("data/*/*.parquet"))]
+    rows = sum(map(len, tables))
+    if not tables or rows != info["total_frames"]:
+        files = f"in {len(tables)} files data/*/*.parquet; is one missing?"
+        raise InvalidValueError(f"{info['total_frames']} rows are said to be in it and {rows} are, {files}")
+    return pa.concat_tables(tables)
+
+
+def _lengths(column: Mapping[str, Array], info: Mapping[str, Any]) -> NDArray[np.int64]:
+    """Rows of each episode. Raises InvalidValueError: rows are in another order, or at other times, than ``info``'s."""
+    which = column[_EPISODE]
+    in_order = np.array_equal(column["index"], np.arange(len(which))) and not which[0]
+    if not in_order or not np.isin(np.diff(which), (0, 1)).all():
+        raise InvalidValueError("its rows are not in order")
+    lengths = np.bincount(which)
+    if len(lengths) != info["total_episodes"]:
+        raise InvalidValueError(f"{info['total_episodes']} episodes are said to be in it and {len(lengths)} are")
+    count = np.arange(len(which)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    on_time = np.abs(column["timestamp"] - count / info["fps"]) <= _TOLERANCE_S + 1e-6 * count
+    wrong = np.flatnonzero(~on_time | (column["frame_index"] != count))
+    if len(wrong):
+        row = int(wrong[0])
+        found = f"frame_index {column['frame_index'][row]} and timestamp {column['timestamp'][row]:g}"
+        wanted = f"row {count[row]} of its episode, at {info['fps']} a second"
+        raise InvalidValueError(f"row {row} has {found}, but is {wanted}")
+    if not np.array_equal(column["action"].astype(np.int64), column["action"]):
+        raise InvalidValueError("an action is no integer")
+    return lengths
+
+
+def _ends(folder: Path, digests: list[str]) -> pa.Table:
+    """The last frame and mask of each episode.
+
+    Raises:
+        ArtefactError: No file has them, or one is damaged.
+        InvalidValueError: No file has those of an episode.
+    """
+    remedy = (
+        f"LeRobot's own tools leave {_FINAL} behind: copy it from the dataset that this one was made from; of several "
+        "datasets, as final_frames_1.parquet, final_frames_2.parquet and so on"
+    )
+    files = sorted(folder.glob(_FINALS))
+    if not files:
+        raise ArtefactError(f"There is no {folder / _FINAL}, which has the last frames of episodes. {remedy}.")
+    tables = []
+    for file in files:
+        with reading(file, "the last frames of episodes"):
+            tables.append(pq.read_table(file))
+    ends = pa.concat_tables(tables)
+    if _DIGEST not in ends.column_names:  # written before 2026-11-28, in the order of the episodes
+        if len(ends) != len(digests):
+            raise InvalidValueError(f"it has {len(digests)} episodes and {len(ends)} last frames")
+        return ends
+    places: dict[str, list[int]] = {}
+    for row, digest in enumerate(ends[_DIGEST].to_pylist()):
+        places.setdefault(digest, []).append(row)
+    chosen = []
+    for episode, digest in enumerate(digests):
+        rows = places.get(digest)
+        if rows is None:
+            raise InvalidValueError(f"{_FINALS} has no last frame of episode {episode}; {remedy}")
+        chosen.append(rows.pop(0) if len(rows) > 1 else rows[0])  # of episodes that are alike, in their order
+    return ends.take(chosen)
+
+
+def _decoded(table: pa.Table) -> tuple[Frame, NDArray[np.bool_]]:
     """The images of a table, and its masks."""
     images = [PIL.Image.open(io.BytesIO(image["bytes"]), formats=["PNG"]) for image in table[_IMAGE].to_pylist()]
     for image in images:
         if (image.mode, image.size) != ("RGB", FRAME_SHAPE[:2]):
             raise InvalidValueError(f"an image is {image.mode} of {image.size} pixels")
-    yield [np.asarray(image) for image in images]
-    yield table[_MASK].to_pylist()
+    return np.stack([np.asarray(image) for image in images]), np.array(table[_MASK].to_pylist(), dtype=np.bool_)

@@ -17,5 +17,6 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
 
 def read(path: Path) -> Episodes:
     """Read an archive. Raises ArtefactError: it is damaged, or the arrays are not those of episodes."""
-    with reading(path, "an archive of episodes"):
-        return Episodes(**read_arrays(path))
+    what = "an archive of episodes"
+    with reading(path, what):
+        return Episodes(**read_arrays(path, what))

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imagine_bench.arrays import Array, Arrays, Frame
+from imagine_bench.arrays import Array, Arrays, Frame, read_only
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.observation import Observation, Transition
 
@@ -33,7 +33,7 @@ FRAME_SHAPE = (64, 64, 3)
 
 @dataclass(frozen=True, kw_only=True)
 class Episodes:
-    """Episodes one behind another, all that a learner may be given.
+    """Episodes one behind another, all that a learner may be given. Their arrays cannot be written to.
 
     Raises:
         InvalidValueError: Arrays that do not fit together, a reward that is not finite, an action that does not exist,
@@ -55,6 +55,7 @@ class Episodes:
             if not isinstance(found, np.ndarray) or found.dtype != dtype:
                 given = getattr(found, "dtype", type(found).__name__)
                 raise InvalidValueError(f"{name} holds {given}, not {dtype.__name__}")
+            object.__setattr__(self, name, read_only(found))
         if self.lengths.ndim != 1 or not len(self.lengths) or self.lengths.min() < 1:
             raise InvalidValueError("lengths must be those of one or more episodes, each of at least 1")
         episodes = len(self.lengths)

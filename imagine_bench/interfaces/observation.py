@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imagine_bench.arrays import Array, Frame, Info, Macrostate, Observed
+from imagine_bench.arrays import Array, Frame, Info, Macrostate, Observed, read_only
 
 OBSERVATIONS = ("frame", "human", "state", "proprio")
 """Parts of what an environment of ours can show of one moment."""
@@ -21,7 +21,7 @@ OBSERVATION_SIZES_PX = (32, 256)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observation:
-    """What an agent is given before it acts."""
+    """What an agent is given before it acts. Its arrays cannot be written to."""
 
     #: the camera image, uint8. Shape (64, 64, 3), or as the protocol says (size, size, 3), or (0, 0, 3) for none
     frame: Frame
@@ -30,6 +30,13 @@ class Observation:
     shown: Macrostate | None = None  #: what ``frame`` shows of the macrostate it was taken of, -1 for what it hides
     #: other parts of :data:`OBSERVATIONS` that the protocol shows, by name; no agent that takes frames alone gets any
     more: Mapping[str, Array] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("frame", "macrostate", "shown"):
+            array = getattr(self, name)
+            if array is not None:
+                object.__setattr__(self, name, read_only(array))
+        object.__setattr__(self, "more", {name: read_only(part) for name, part in self.more.items()})
 
     @classmethod
     def of(cls, seen: Observed, info: Info, *, privileged: bool) -> Observation:

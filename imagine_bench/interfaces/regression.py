@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from imagine_bench.arrays import Arrays, Floats
+from imagine_bench.arrays import Arrays, Floats, read_only
 from imagine_bench.interfaces.scene import Motion, Shape3D
 from imagine_bench.seeding import SeedTree
 from imagine_bench.values import Setting
@@ -21,10 +21,14 @@ from imagine_bench.values import Setting
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegressionData:
-    """Pairs to learn from or to be tested on: inputs (N, X), targets (N, D)."""
+    """Pairs to learn from or to be tested on: inputs (N, X), targets (N, D). They cannot be written to."""
 
     inputs: Floats
     targets: Floats
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "inputs", read_only(self.inputs))
+        object.__setattr__(self, "targets", read_only(self.targets))
 
 
 Dataset = RegressionData

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imagine_bench.arrays import Bools, Ints
+from imagine_bench.arrays import Bools, Ints, read_only
 from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, Frame, Observation, Outcome, Rules, State, TaskSpec
@@ -86,7 +86,7 @@ def frames_to_ask_with(agent: Agent, spec: TaskSpec, *, appearance: str, purpose
         if left.any():
             frames[left] = spec.render_macrostates(states[left], appearance, rng)
             left[left] = misread(agent, frames[left], states[left])
-    return frames
+    return read_only(frames)
 
 
 def misread(agent: Agent, frames: Frame, states: Ints) -> Bools:

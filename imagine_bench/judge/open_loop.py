@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from imagine_bench.arrays import Floats, Ints
+from imagine_bench.arrays import Floats, Ints, read_only
 from imagine_bench.interfaces import Frame, Sight, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer, begin_episode
 from imagine_bench.judge.questions import EvalSet
@@ -41,8 +41,8 @@ def imagined_from(
     """
     found = []
     for row, frame in enumerate(frames):
-        given = None if actions is None else actions[row]
-        found.append(agent.imagine(frame, actions=given, depth=depth, rng=seeds.child(row).generator()))
+        given = None if actions is None else read_only(actions[row])
+        found.append(agent.imagine(read_only(frame), actions=given, depth=depth, rng=seeds.child(row).generator()))
     return found
 
 

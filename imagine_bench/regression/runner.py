@@ -19,7 +19,7 @@ import numpy as np
 import scipy  # its parts load, slowly, when they are first used
 
 from imagine_bench import registry
-from imagine_bench.arrays import Arrays, Bools, Floats
+from imagine_bench.arrays import Arrays, Bools, Floats, read_only
 from imagine_bench.interfaces.regression import (
     Mixtures,
     Prediction,
@@ -34,7 +34,7 @@ from imagine_bench.seeding import SeedTree
 from imagine_bench.statistics import auroc
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_protocol_as
-from imagine_bench.store.files import grouped, read_arrays, table_rows, table_text, write_arrays, write_bytes
+from imagine_bench.store.files import grouped, read_arrays, reading, table_rows, table_text, write_arrays, write_bytes
 from imagine_bench.store.results import AllRuns, OneRun
 
 LEVELS = (0.5, 0.8, 0.95)
@@ -111,8 +111,9 @@ def _begun(folder: Path) -> tuple[list[Row], dict[str, Arrays]]:
     if not (folder / EVALUATION).exists():
         return [], {}
     evaluations = grouped(read_arrays(folder / EVALUATION))
-    rows: list[Row] = table_rows((folder / METRICS).read_text(), texts=("variant",))
-    return [row for row in rows if row["variant"] in evaluations], evaluations
+    with reading(folder / METRICS, "the table of a run of a regressor"):
+        rows: list[Row] = table_rows((folder / METRICS).read_text(), texts=("variant",))
+        return [row for row in rows if row["variant"] in evaluations], evaluations
 
 
 def load_run(folder: Path) -> RegressionRun:
@@ -219,7 +220,7 @@ def _learn(
             tell("training", f"{variant}, epoch {done} of {epochs}", 0.9 * done / epochs)
 
     def predict(inputs: Floats, name: str) -> Prediction:
-        return regressor.predict(inputs, seeds.child("predict", variant, name).generator())
+        return regressor.predict(read_only(inputs), seeds.child("predict", variant, name).generator())
 
     begun_s = time.process_time()
     shared: Row = {**regressor.train(on_epoch)}  # of all networks together; the CPU seconds are a network's share
@@ -256,7 +257,7 @@ def calibrate(
     """
     inputs = np.stack([test.inputs for test in tests])
     targets = np.stack([test.targets for test in tests])
-    prediction = regressor.predict(inputs, rng)
+    prediction = regressor.predict(read_only(inputs), rng)
     error = np.stack([task.errors(variant, *pair) for pair in zip(inputs, prediction.prediction, strict=True)])
     wrong = error > task.wrong_above
     measured = {

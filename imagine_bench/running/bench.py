@@ -258,7 +258,8 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
         ArtefactError: A file is damaged or foreign; it is left untouched.
     """
     folder = bench_folder(root, wanted)
-    for words in filter(None, map(encoders.doubt, paths.values())):
+    artefacts = [path for kind, path in paths.items() if kind != "dataset"]
+    for words in filter(None, map(encoders.doubt, artefacts)):
         print(f"Note: agents see through {words}.")
     failures, missing = carry_out([(wanted, paths)], root=root, launcher=launcher)
     require_done(failures, missing)

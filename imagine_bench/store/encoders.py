@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 from collections.abc import Callable
@@ -12,13 +13,14 @@ from typing import Any
 
 import numpy as np
 import platformdirs
+from safetensors import safe_open
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec, bundled_name
 from imagine_bench.registry.entries import file_name
 from imagine_bench.rules import states_of
-from imagine_bench.store.files import lock, make_folder, read_json, sha256
+from imagine_bench.store.files import expanded, lock, make_folder, reading, sha256
 
 _TRAIN = "imagine_bench.agents.encoders.cli:retrain"
 _FIT = "imagine_bench.agents.encoders.training:fit_offered"
@@ -35,9 +37,19 @@ def bundled() -> dict[str, Path]:
 
 
 def cache_folder() -> Path:
-    """Where encoders of tasks that none is bundled for are kept: ``$IMAGINE_BENCH_CACHE``, or the user's cache."""
+    """Where encoders of tasks that none is bundled for are kept: ``$IMAGINE_BENCH_CACHE``, or the user's cache.
+
+    Raises:
+        InvalidValueError: The variable begins with a home folder that the system does not know.
+        SetupError: It is not set, and the system knows no home folder of this user.
+    """
     given = os.environ.get("IMAGINE_BENCH_CACHE")
-    return Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("imagine_bench"))
+    if given:
+        return expanded(Path(given))
+    try:
+        return Path(platformdirs.user_cache_dir("imagine_bench"))
+    except RuntimeError as error:
+        raise SetupError("This user has no home folder; name one for encoders in IMAGINE_BENCH_CACHE.") from error
 
 
 def _frames(spec: TaskSpec, appearance: str) -> Frame:
@@ -93,14 +105,16 @@ def find(used: str) -> Path | None:
 def resolve(spec: TaskSpec, appearance: str, given: str) -> Path:
     """The encoder file that is meant by ``given``: a bundled name, one that a package offers, or a path.
 
-    Raises UnknownNameError: it is none of them.
+    Raises:
+        UnknownNameError: It is none of them.
+        InvalidValueError: The path begins with a home folder that the system does not know.
     """
     if given in bundled():
         return bundled()[given]
     offers = registry.offers(registry.ENCODER_GROUP)
     if given in offers:
         return offered(spec, appearance, given)
-    path = Path(given).expanduser()
+    path = expanded(Path(given))
     if (os.sep in given or given.endswith(_SUFFIX)) and path.is_file():
         return path.resolve()
     raise UnknownNameError("encoder", given, [*bundled(), *offers])
@@ -132,7 +146,10 @@ def own(spec: TaskSpec, appearance: str, kind: str = "latents") -> Path:
 
 def _once(path: Path, what: str, make: Callable[[], object]) -> None:
     """Make an artefact unless it is there; a process waits while another makes it."""
-    make_folder(path.parent)
+    try:
+        make_folder(path.parent)
+    except SetupError as error:
+        raise SetupError(f"{error} A folder of encoders may be named in IMAGINE_BENCH_CACHE.") from error
     with lock(path.parent / ".lock", f"The folder of encoders {path.parent}", patience_s=_PATIENCE_S):
         if not path.is_file():
             print(f"{what} into {path.parent}, once: up to two minutes on one core.", flush=True)
@@ -140,8 +157,8 @@ def _once(path: Path, what: str, make: Callable[[], object]) -> None:
 
 
 def kind(path: Path) -> str:
-    """Whether an encoder gives ``"latents"`` or ``"codes"``, by its card. Raises ArtefactError: the card is damaged."""
-    return "codes" if (_card(path) or {}).get("code_sizes") else "latents"
+    """Whether an encoder gives ``"latents"`` or ``"codes"``, by its card. Raises ArtefactError: the file is damaged."""
+    return "codes" if _card(path).get("code_sizes") else "latents"
 
 
 def identity(path: Path) -> str:
@@ -168,10 +185,11 @@ def doubt(path: Path | None) -> str:
 
 def _share_read(path: Path) -> float:
     """Share of held-out frames whose whole macrostate an encoder's probe reads right; NaN where its card says none."""
-    found: float = (_card(path) or {}).get("probe", {}).get("mlp", math.nan)
+    found: float = _card(path).get("probe", {}).get("mlp", math.nan)
     return found
 
 
-def _card(path: Path) -> dict[str, Any] | None:
-    beside = path.with_suffix(".json")
-    return read_json(beside, "an encoder's card") if beside.is_file() else None
+def _card(path: Path) -> dict[str, Any]:
+    """The card that an artefact holds; the ``.json`` beside it is for people and may be gone."""
+    with reading(path, "an encoder with a card"), safe_open(path, framework="numpy") as file:
+        return dict(json.loads(file.metadata()["card"]))

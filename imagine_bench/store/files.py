@@ -21,11 +21,9 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from imagine_bench.arrays import Array, Arrays
-from imagine_bench.errors import ArtefactError, BusyError, SetupError, brief
+from imagine_bench.errors import ArtefactError, BusyError, InvalidValueError, SetupError, brief, why
 from imagine_bench.values import Json
 
-_LONGEST = 1000
-"""Characters of a library's own complaint that are handed on."""
 _REASONS = {
     errno.EACCES: "you may not write there; choose another folder or change its permissions",
     errno.EPERM: "you may not write there; choose another folder or change its permissions",
@@ -49,6 +47,14 @@ def writing(path: Path) -> Iterator[None]:
 def reason(error: OSError) -> str:
     """Why the system refused, in words."""
     return _REASONS.get(error.errno or 0, error.strerror or str(error))
+
+
+def expanded(path: Path) -> Path:
+    """A path with ``~`` as a home folder. Raises InvalidValueError: the system knows no such home."""
+    try:
+        return path.expanduser()
+    except RuntimeError as error:
+        raise InvalidValueError(f"{path}: the system knows no such home folder; give a path without '~'.") from error
 
 
 def make_folder(folder: Path) -> Path:
@@ -192,14 +198,12 @@ def reading(path: Path, what: str) -> Iterator[None]:
     """Turn whatever is wrong with the file ``path``, which should be ``what``, into one ArtefactError."""
     try:
         yield
+    except ArtefactError:  # of a file that this one names
+        raise
     except FileNotFoundError as error:
         raise ArtefactError(f"There is no {path}, {what}.") from error
     except Exception as error:  # what is not as it was written can be wrong in any way
-        why: object = error.strerror if isinstance(error, OSError) and error.strerror else error
-        if isinstance(error, KeyError):
-            why = f"{error} is missing"
-        text = str(why).strip().rstrip(".") or type(error).__name__
-        raise ArtefactError(f"{path} is not {what}: {text[:_LONGEST]}. It was left untouched.") from error
+        raise ArtefactError(f"{path} is not {what}: {why(error)}. It was left untouched.") from error
 
 
 def first_difference(then: Json, now: Json, name: str = "") -> tuple[str, Json, Json] | None:

@@ -365,9 +365,9 @@ def finish(
 ) -> None:
     """Keep what an agent imagined at its end and mark its run as done, or raise SetupError and leave it unmarked."""
     write_arrays(folder / _IMAGINED, pack({"imagined": imagined, "sampled_rollouts": sampled_rollouts})[1])
-    newest = _checkpoints(folder / CHECKPOINTS)[-1]
-    state = (newest / _STATE).relative_to(folder).as_posix()
-    mark_done(folder, [_CONFIG, _METRICS, _IMAGINED, state])
+    newest = _checkpoints(folder / CHECKPOINTS)[-1].relative_to(folder)
+    parts = [(newest / name).as_posix() for name in (_STATE, _AGENT, _RUNNER)]
+    mark_done(folder, [_CONFIG, _METRICS, _IMAGINED, *parts])
 
 
 def mark_done(folder: Path, names: Sequence[str]) -> None:
@@ -392,11 +392,15 @@ def require_done(folder: Path) -> dict[str, Any]:
     for name, written in digests.items():
         if name == _RECORDING and not recording_path(folder).exists():
             continue  # recordings are large, and nothing else needs them
-        if sha256(folder / name) != written:
-            raise ArtefactError(
-                f"{folder / name} is not as the run left it (it was changed or damaged). It was left untouched; delete "
-                f"{folder} to run it anew."
-            )
+        path = folder / name
+        if not path.exists():
+            how = "missing"
+        elif sha256(path) != written:
+            how = "not as the run left it"
+        else:
+            continue
+        remedy = f"put it back, or delete {folder} to run it anew"
+        raise ArtefactError(f"{path} is {how}, although the run is finished. It was left untouched; {remedy}.")
     return read_config(folder)
 
 

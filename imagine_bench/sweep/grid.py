@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known, why
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest, require_types
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
@@ -179,9 +179,9 @@ def read_grid(path: Path) -> Study | Suite:
         return Suite(**{**data, "experiments": tuple(experiments)})
     except ImagineBenchError as error:
         raise InvalidValueError(f"{path}: {error}") from error
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except Exception as error:  # a file can be wrong in any way
         raise InvalidValueError(
-            f"{path} is no study: {type(error).__name__}: {error}. Give {', '.join(Study.__annotations__)} and "
+            f"{path} is no study: {why(error)}. Give {', '.join(Study.__annotations__)} and "
             f"[[variants]] with {', '.join(Variant.__annotations__)}, as TOML or JSON; a suite has [[experiments]]."
         ) from error
 

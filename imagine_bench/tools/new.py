@@ -12,7 +12,7 @@ import jinja2
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.store.files import make_folder, write_bytes
+from imagine_bench.store.files import expanded, make_folder, write_bytes
 
 KINDS = {"task": registry.TASK_GROUP, "agent": registry.AGENT_GROUP, "model": registry.WORLD_MODEL_GROUP}
 _PYPROJECT = """[build-system]
@@ -53,7 +53,7 @@ def new_package(kind: str, name: str, out: Path) -> str:
     }  # fmt: skip
     if name in taken:
         raise InvalidValueError(f"{name!r} is a name of imagine_bench already; give another name.")
-    folder = out.expanduser() / name
+    folder = expanded(out) / name
     if folder.exists():
         raise InvalidValueError(f"{folder} exists; give another name or --out. Nothing was written.")
     if find_spec(name) is not None:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from bench_fakes import Pupil
 from guest_packages import Guests
+from numpy.typing import NDArray
+from small_runs import Inline, collected, context, do, written
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import SetupError
+from imagine_bench.interfaces import Observation
 from imagine_bench.registry.machine import versions
+from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.collect import Policy, collect
 from imagine_bench.store.bench_folder import newest_bench
 
 _ONE = {registry.AGENT_GROUP: {"their_agent": "their_package:ENTRY"}}
@@ -114,3 +124,58 @@ def test_an_offer_that_is_no_agent_costs_nobody_anything(
     assert main(["list"]) == 0
     said = capsys.readouterr().out
     assert sentence in said and "fine" in said
+
+
+def arrays_in(value: object) -> Iterator[NDArray[np.generic]]:
+    """Every array that somebody is handed within dataclasses, mappings and sequences."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from arrays_in(getattr(value, field.name))
+    elif isinstance(value, Mapping | list | tuple):
+        for part in value.values() if isinstance(value, Mapping) else value:
+            yield from arrays_in(part)
+
+
+def a_pupil(tmp_path: Path, agent: str, **protocol: Any) -> object:
+    """All that an agent was shown in a run, in training and in tests."""
+    do(tmp_path / "run", agent=agent, **protocol)
+    pupil = Pupil.made[-1]
+    return [pupil.seen, pupil.shown]
+
+
+def of_dataset(tmp_path: Path) -> object:
+    written(tmp_path / "set")
+    few = {"execution": "kinematic", "appearance": "mild", "evaluation_episodes": 1, "recorded_episodes": 0}
+    wanted, paths = plan("arrow_puzzle", "smoke", agents=("pupil",), seeds=(0,), dataset=tmp_path / "set", **few)
+    bench(wanted, paths, root=tmp_path / "runs", launcher=Inline())
+    return Pupil.made[-1].shown
+
+
+def who_collects(_: Path) -> object:
+    pupil = Pupil(context())
+    policy = Policy(name="pupil", players=[(pupil, True)], facts={})
+    collect(registry.task("arrow_puzzle"), policy, episodes=1, seed=0, execution="kinematic", appearance="clean")
+    return pupil.seen
+
+
+HANDED: dict[str, Callable[[Path], object]] = {
+    "an agent": lambda path: a_pupil(path, "pupil", queries=2),
+    "an agent that watches demonstrations": lambda path: a_pupil(path, "pupil", demonstrations=4),
+    "an agent shown more than frames": lambda _: Observation(frame=np.zeros(3, np.uint8), more={"state": np.zeros(3)}),
+    "a privileged agent": lambda path: a_pupil(path, "pupil_privileged"),
+    "a learner of a dataset": of_dataset,
+    "a policy that collects": who_collects,
+    "a world model": lambda _: [collected()[0], collected()[0].first(5)],
+    "a regressor": lambda _: registry.regression("toy_regression").training("base", np.random.default_rng(0)),
+}
+
+
+@pytest.mark.parametrize("who", HANDED)
+def test_nobody_can_write_to_what_is_handed_out(tmp_path: Path, who: str) -> None:
+    handed = list(arrays_in(HANDED[who](tmp_path)))
+    assert len(handed) >= 2
+    for array in handed:
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0

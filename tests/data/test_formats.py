@@ -5,12 +5,16 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium
 import minari
 import numpy as np
 import PIL.Image
+import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from small_runs import FORMATS, collected, written
@@ -18,6 +22,7 @@ from small_runs import FORMATS, collected, written
 from imagine_bench import registry
 from imagine_bench.data import lerobot
 from imagine_bench.data.folder import read_apart, read_dataset
+from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces.episodes import Episodes
 
 
@@ -158,6 +163,63 @@ def test_the_layout_is_lerobots(tmp_path: Path) -> None:
     assert tasks.to_pydict() == {"task_index": [0], index: [registry.task("arrow_puzzle").description]}
     told = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
     assert told["observation.image"] == {"_type": "Image"} and told["action"] == {"dtype": "float32", "_type": "Value"}
+
+
+def told(episodes: Episodes, index: int) -> list[bytes]:
+    """All that a set says of one of its episodes."""
+    steps, frames = episodes.steps(index)
+    by_step = [getattr(episodes, name)[steps] for name in ("actions", "rewards", "terminated", "truncated")]
+    by_frame = [episodes.frames[frames], episodes.action_masks[frames], episodes.success[index]]
+    return [array.tobytes() for array in (*by_step, *by_frame)]
+
+
+def edited(out: Path, *chosen: tuple[Path, Sequence[int]]) -> None:
+    """Some episodes of some sets as one, as LeRobot's own tools delete, split and merge: they renumber columns."""
+    tables = [pq.read_table(folder / "data/chunk-000/file-000.parquet") for folder, _ in chosen]
+    kept = [
+        table.filter(pc.equal(table["episode_index"], episode))
+        for table, (_, episodes) in zip(tables, chosen, strict=True)
+        for episode in episodes
+    ]
+    table = pa.concat_tables(kept)
+    numbers = {"episode_index": np.repeat(np.arange(len(kept)), list(map(len, kept))), "index": np.arange(len(table))}
+    for name, column in numbers.items():
+        table = table.set_column(table.schema.get_field_index(name), name, pa.array(column))
+    (out / "data/chunk-000").mkdir(parents=True)
+    pq.write_table(table, out / "data/chunk-000/file-000.parquet")
+    info = json.loads((chosen[0][0] / "meta/info.json").read_text())
+    info |= {"total_frames": len(table), "total_episodes": len(kept)}
+    (out / "meta").mkdir()
+    (out / "meta/info.json").write_text(json.dumps(info))
+
+
+@pytest.mark.parametrize(
+    "which", [((0, 2, 5), ()), ((3, 4, 5), ()), (range(6), range(4))], ids=["delete", "split", "merge"]
+)
+def test_what_lerobots_tools_made_is_read_with_the_last_frames_copied(
+    tmp_path: Path, which: tuple[Sequence[int], Sequence[int]]
+) -> None:
+    """Those of 0.4.4 were run on such sets, and gave what is made here; they leave ``final_frames.parquet`` behind."""
+    wanted = []
+    for seed, episodes in enumerate(which):
+        written(tmp_path / f"set{seed}", "lerobot", seed=seed)
+        wanted += [told(collected(seed=seed)[0], episode) for episode in episodes]
+    edited(tmp_path / "out", *((tmp_path / f"set{seed}", episodes) for seed, episodes in enumerate(which)))
+    with pytest.raises(
+        ArtefactError, match="copy it from the dataset that this one was made from; of several datasets"
+    ):
+        read_dataset(tmp_path / "out")
+    for seed in range(2):
+        shutil.copy(tmp_path / f"set{seed}/final_frames.parquet", tmp_path / f"out/final_frames_{seed}.parquet")
+    found = read_dataset(tmp_path / "out").episodes
+    assert [told(found, episode) for episode in range(len(found))] == wanted and wanted
+
+
+def test_last_frames_of_before_they_had_digests_are_read_in_their_order(tmp_path: Path) -> None:
+    written(tmp_path / "set", "lerobot")
+    path = tmp_path / "set/final_frames.parquet"
+    pq.write_table(pq.read_table(path).drop_columns("episode_digest"), path)
+    assert same(read_dataset(tmp_path / "set").episodes, collected()[0])
 
 
 def test_statistics_are_those_of_the_arrays(tmp_path: Path) -> None:

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_runs import do, same_but_for_time, small
+from small_runs import Inline, do, same_but_for_time, small
 
+from imagine_bench.adapters.tracking import track
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.running.bench import load_bench
+from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.store.bench_folder import bench_folder
 from imagine_bench.store.files import lock, read_json, write_bytes
+from imagine_bench.store.loading import load_so_far as load_so_far_of_bench
 from imagine_bench.store.run_folder import load_run, load_so_far, mark_done, recording_path
 
 WHOLE = Path(__file__).parent / "of_abcb05c/whole"
@@ -37,6 +39,19 @@ def test_a_changed_state_of_a_checkpoint_is_refused(tmp_path: Path, values: dict
     change(unfinished(tmp_path) / "state.json", **values)
     with pytest.raises(ArtefactError, match=r"state\.json is damaged"):
         load_so_far(tmp_path)
+
+
+_SEALED = ["config.json", "metrics.csv", "imagined.npz", "agent.safetensors", "runner.safetensors", "state.json"]
+
+
+@pytest.mark.parametrize("name", _SEALED)
+def test_a_part_that_a_finished_bench_lost_is_named(tmp_path: Path, name: str) -> None:
+    whole = bench(small(), {}, root=tmp_path, launcher=Inline()).folder
+    (path,) = whole.rglob(name)
+    path.unlink()
+    for read in (load_so_far_of_bench, load_bench, lambda folder: track(folder, "tensorboard")):
+        with pytest.raises(ArtefactError, match=rf"{name} is missing, although the run is finished.*; put it back, or"):
+            read(whole)
 
 
 def test_a_finished_run_without_its_checkpoint_says_so(tmp_path: Path) -> None:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 from small_runs import Inline
 
 from imagine_bench import registry
+from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.report import bench_page
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.store import encoders
@@ -58,8 +62,9 @@ def test_three_cubes_have_the_bundled_one(trained, name):
 
 @pytest.mark.parametrize(("share", "doubted"), [(0.0345, True), (0.8999, True), (0.9, False), (1.0, False)])
 def test_an_encoder_that_reads_few_frames_right_is_named(tmp_path, share, doubted):
-    (tmp_path / "theirs.json").write_text(json.dumps({"probe": {"mlp": share}}))
-    words = encoders.doubt(tmp_path / "theirs.safetensors")
+    path = tmp_path / "theirs.safetensors"
+    save_file({"a": np.zeros(1)}, path, {"card": json.dumps({"probe": {"mlp": share}})})
+    words = encoders.doubt(path)
     assert bool(words) == doubted
     assert not doubted or (f"reads only {share:.1%} of new frames right" in words and "theirs" in words)
 
@@ -72,3 +77,32 @@ def test_a_bench_and_its_report_name_an_encoder_that_misreads(tmp_path, capsys):
     result = bench(wanted, paths, root=tmp_path, launcher=Inline())
     assert "reads only 11.5% of new frames right" in capsys.readouterr().out
     assert any("reads only 11.5% of new frames right" in line for line in bench_page(result).answers)
+
+
+@pytest.mark.parametrize("kind", ["latents", "codes"])
+def test_an_artefact_says_itself_what_it_gives(tmp_path, kind):
+    """Without the card that lies beside it, and of a bare file of tensors nothing is assumed."""
+    name = "arrow_puzzle-clean-codes" if kind == "codes" else "arrow_puzzle-clean"
+    path = tmp_path / "alone.safetensors"
+    shutil.copy(encoders.bundled()[name], path)
+    assert encoders.kind(path) == kind
+    save_file({"a": np.zeros(1)}, path)
+    with pytest.raises(ArtefactError, match=r"alone\.safetensors is not an encoder with a card"):
+        encoders.kind(path)
+
+
+@pytest.mark.parametrize(
+    ("given", "home", "sentence"),
+    [
+        (None, "/dev/null/nowhere", "A folder of encoders may be named in IMAGINE_BENCH_CACHE"),
+        ("/dev/null/cache", "/tmp", "A folder of encoders may be named in IMAGINE_BENCH_CACHE"),
+        ("~nobody_at_all/x", "/tmp", "the system knows no such home folder; give a path without '~'"),
+        (None, None, "This user has no home folder; name one for encoders in IMAGINE_BENCH_CACHE"),
+    ],
+)
+def test_a_cache_that_cannot_be_names_the_way_out(monkeypatch, given, home, sentence):
+    for name, value in (("IMAGINE_BENCH_CACHE", given), ("HOME", home), ("XDG_CACHE_HOME", None)):
+        monkeypatch.delenv(name, raising=False) if value is None else monkeypatch.setenv(name, value)
+    monkeypatch.setattr("pwd.getpwuid", dict[int, str]().__getitem__)  # as in a container whose user has no name
+    with pytest.raises(ImagineBenchError, match=sentence):
+        encoders.own(registry.task("arrows:cubes=2"), "clean")

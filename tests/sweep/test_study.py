@@ -141,10 +141,10 @@ def test_settings_in_a_file_may_be_nested(tmp_path: Path) -> None:
     ("old", "new", "sentence"),
     [
         ("budgets = [2]", "budgets = 2", "budgets was given 2; it takes tuple"),
-        ("budgets = [2]", "budgets = [", "is no study: TOMLDecodeError"),
+        ("budgets = [2]", "budgets = [", "is no study: Invalid value (at"),
         ("test_appearance", "looks", "No field that a variant may change 'looks'"),
         ('preset = "smoke"', 'name = "a/b"', "a name is 1 to 60 letters"),
-        ('[[variants]]', '[[variant]]', "KeyError: 'variants'"),
+        ('[[variants]]', '[[variant]]', "'variants' is missing. Give name"),
     ],
 )  # fmt: skip
 def test_a_file_that_is_no_study_says_why(

@@ -112,7 +112,7 @@ def _tell(job: Job, progress: Progress) -> None:
 
 
 def _latest(job: Job) -> Progress | None:
-    with suppress(OSError):  # not begun
+    with suppress(OSError, ValueError, TypeError):  # not begun, or no file of ours
         return Progress(**json.loads(_news(job).read_bytes()))
     return None
 

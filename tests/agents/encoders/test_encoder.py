@@ -328,20 +328,23 @@ def test_bad_files_are_named_and_left_untouched(tiny: Encoder, tmp_path: Path) -
     def saved(tensors: dict[str, Tensor], **changes: object) -> bytes:
         return save(tensors, metadata={"card": json.dumps({**card, **changes})})
 
-    bad = {
-        "cut": good[:5000],
-        "text": b"not an encoder at all, only words",
-        "other_format": saved(state, format="something/2"),
-        "other_net": saved(state, recipe={**card["recipe"], "latents": 5}),
-        "other_size": saved(state, latent_size=card["latent_size"] + 1),
-        "words_for_numbers": saved(state, cardinalities=[4, "4", 4, 3]),
-        "nan": saved({**state, "vae.brightness": torch.tensor(math.nan)}),
-    }
+    renamed = {name.replace("vae.brightness", "vae.light"): tensor for name, tensor in state.items()}
+    bad = [
+        (good[:5000], ""),
+        (b"not an encoder at all, only words", ""),
+        (saved(state, format="something/2"), "its format is not"),
+        (saved(state, latents=1), "it has 'latents', which is unknown"),
+        (saved(state, recipe={**card["recipe"], "latents": 5}), r"tensor vae\.\S+ has shape \(.*, not \("),
+        (saved(state, latent_size=card["latent_size"] + 1), r"tensor \S+ has shape"),
+        (saved(state, cardinalities=[4, "4", 4, 3]), ""),
+        (saved({**state, "vae.brightness": torch.tensor(math.nan)}), r"tensor vae\.brightness is not finite"),
+        (saved(renamed), r"of the tensors vae\.\* it lacks \['brightness'\] and has \['light'\] instead"),
+    ]
     path.write_bytes(saved(state))
     assert Encoder.load(path).card == tiny.card, "the negatives below are not vacuous"
-    for content in bad.values():
+    for content, reason in bad:
         path.write_bytes(content)
-        with pytest.raises(ArtefactError, match=r"e\.safetensors is not a usable encoder \(.+\); choose another"):
+        with pytest.raises(ArtefactError, match=rf"e\.safetensors is not a usable encoder \(.*{reason}.*\); choose"):
             Encoder.load(path)
         assert path.read_bytes() == content
 

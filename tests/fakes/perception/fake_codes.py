@@ -26,7 +26,7 @@ class FakeCodes:
     card = SimpleNamespace(code_sizes=SIZES)
 
     def encode(self, frames: Frame) -> tuple[torch.Tensor, torch.Tensor]:
-        codes = torch.as_tensor(frames[:, 0, : len(SIZES), 0]).long()
+        codes = torch.tensor(frames[:, 0, : len(SIZES), 0]).long()
         hot = [functional.one_hot(codes[:, factor], size) for factor, size in enumerate(SIZES)]
         mu = torch.cat(hot, dim=1).float()
         return mu, torch.zeros_like(mu)

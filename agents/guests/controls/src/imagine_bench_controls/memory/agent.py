@@ -78,7 +78,8 @@ class RememberingAgent(DQN, ABC):
         A frame that was not acted on is taken for the next one of the episode, or for the first of another.
         """
         seen = self._seen
-        frames = seen.frames if seen.frames and seen.frames[-1] is frame else [*seen.frames, frame]
+        acted_on = bool(seen.frames) and np.shares_memory(seen.frames[-1], frame)  # an observation has a view of it
+        frames = seen.frames if acted_on else [*seen.frames, frame]
         return self.perception.recall(frames, seen.actions[: len(frames) - 1])[0]
 
     def act(self, observation: Observation, *, explore: bool) -> int:
