@@ -88,6 +88,7 @@ class FilmedScene:
 
     def __init__(self, world: World, motion_hz: float) -> None:
         self.world = world
+        self._capture_motion_hz: float
         self.capture_motion_hz = motion_hz
         self._cameras: list[Renderer] = []
         self.latest: MacroResult | None = None
