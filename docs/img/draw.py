@@ -72,8 +72,13 @@ def finish(axes: plt.Axes, budgets: list[int]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-PEERS = ("arrow_puzzle-controls-networks", "arrow_puzzle-peers", "arrow_puzzle-dreamer_latents")
-"""Kept benches with the same tests after 100, 250 and 500 episodes."""
+PEERS = (
+    "arrow_puzzle-controls-networks", "arrow_puzzle-peers-sb3_latents", "arrow_puzzle-peers",
+    "arrow_puzzle-dreamer_latents",
+)  # fmt: skip
+"""Kept benches with the same tests after 100, 250 and 500 episodes; an agent of two is that of the first."""
+UNSCALED = ("sb3_dqn", "sb3_qrdqn")
+"""Agents that were last run with rewards as they are, for which their library is not made."""
 SETTINGS = {"replay_ratio": " tuned", "discount": " defaults"}
 """What stands behind a name that has settings, by one that only those have."""
 
@@ -83,7 +88,9 @@ def peers() -> None:
     rows = []
     for kept in PEERS:
         data = collect(load_so_far(RESULTS / kept))
-        rows += [(data, record) for record in data.records if record["episodes"] == 500 and "area" in record]
+        known = {record["agent"] for _, record in rows}
+        last = [record for record in data.records if record["episodes"] == 500 and "area" in record]
+        rows += [(data, record) for record in last if record["agent"] not in known]
     rows.sort(key=lambda row: row[1]["area"])
     figure, axes = plt.subplots(figsize=(9, 0.9 + 0.28 * len(rows)), layout="constrained")
     columns = {1.14: "frames\nbefore", 1.28: "updates", 1.40: "CPU s"}
@@ -107,7 +114,9 @@ def peers() -> None:
     names = []
     for _, record in rows:
         settings = "".join(said for name, said in SETTINGS.items() if name in record["agent"])
-        names.append(record["agent"].partition(":")[0] + settings)
+        rewards = " unscaled" if record["agent"] in UNSCALED else ""
+        label = record["agent"] if record["agent"] in COLORS else record["agent"].partition(":")[0]
+        names.append(label + settings + rewards)
     axes.set_yticks(range(len(rows)), names)
     axes.set(xlim=(0, 100), ylim=(-0.6, len(rows) - 0.4))
     axes.set_xlabel("mean success over the first 500 real episodes (%); dotted: chance")
