@@ -42,6 +42,11 @@ class _Spoils(_Wrong):
         dataset.rewards[0] += 1.0
 
 
+class _Sneaks(_Wrong):
+    def fit(self, dataset: Any, rng: Any) -> None:
+        dataset.rewards.base[0] += 1.0
+
+
 class _Uncounted(_Wrong):
     def parameters(self) -> Any:
         return None
@@ -80,7 +85,8 @@ class _Drawn(_Wrong):
     ("made", "holds", "words"),
     [
         (_Lacking, "it is made", "_Lacking lacks parameters"),
-        (_Spoils, "it learns", "fit() alters the episodes"),
+        (_Spoils, "it learns", "fit() failed (ValueError: assignment destination is read-only)"),
+        (_Sneaks, "it learns", "fit() alters the episodes"),
         (_Uncounted, "it learns", "parameters() gave None; give how many numbers were fitted"),
         (_Short, "it imagines pictures", "imagine() gave pictures of shape"),
         (_Paints, "it imagines pictures", "imagine() alters the frames or actions"),
@@ -98,5 +104,5 @@ def test_wrong_models_are_found(
             with pytest.raises(InvalidValueError) as caught:
                 check()
             assert words in str(caught.value)
-        elif made not in (_Lacking, _Short, _Paints):
+        elif made not in (_Lacking, _Spoils, _Short, _Paints):
             check()
