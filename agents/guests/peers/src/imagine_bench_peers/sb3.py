@@ -79,10 +79,11 @@ class LibraryAgent:
         """The library's greedy action; ArtefactError before training."""
         if self._model is None:
             raise ArtefactError("This agent has no policy before its training loop has run; train it first.")
-        frame = observation.frame
+        frame = observation.frame.copy()  # torch wants arrays that it may write into
         seen: Any = frame if self._encoder is None else self._encoder.latents(frame)
         if observation.more:
-            seen = {**observation.more, **({"frame": frame} if frame.size else {})}
+            more = {name: part.copy() for name, part in observation.more.items()}
+            seen = {**more, **({"frame": frame} if frame.size else {})}
         return int(self._model.predict(seen, deterministic=not explore)[0])
 
     def observe(self, transition: Transition, *, episode: int) -> None:
