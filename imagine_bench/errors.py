@@ -124,6 +124,12 @@ class RunFailedError(ImagineBenchError):
     exit_code = 1
 
 
+class CheckFailedError(ImagineBenchError):
+    """A command that checks has found something wrong, and has printed what."""
+
+    exit_code = 1
+
+
 EXTRAS = {
     "torch": "agents",
     "matplotlib": "report",

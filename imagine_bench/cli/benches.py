@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,10 +30,10 @@ from imagine_bench.cli.options import (
     added_up,
     shown,
 )
-from imagine_bench.errors import InvalidValueError, RunFailedError
+from imagine_bench.errors import CheckFailedError, InvalidValueError, RunFailedError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
-from imagine_bench.judge.judgement import Judgement, judge
-from imagine_bench.judge.verify import cost
+from imagine_bench.judge.judgement import Judgement, judge, kept
+from imagine_bench.judge.verify import Verdict, cost
 from imagine_bench.protocols.data import Encoders, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, load_so_far, plan
@@ -321,6 +320,8 @@ class Judge:
             encoder=self.encoder,
         )
         folder, failed = judge(judgement, self.out, workers=workers)
+        if not kept(folder, judgement):  # a report without a model would replace one of other models
+            raise RunFailedError("\n".join(failed))
         print(judgement_report(folder, judgement))
         print(f"Recording: {record_judgement(folder, judgement)}")
         if failed:
@@ -369,10 +370,14 @@ class Verify(OfBench):
             )
         begun_s = time.process_time()
         verdicts = audits.verify(folder, again)
+        if again is not None and not any(verdict.of_training for verdict in verdicts):
+            verdicts.append(Verdict(what="training again", holds="no run was, as not all of the above holds"))
+            again = None
         print(*verdicts, audits.what_is_shown(folder, again), sep="\n")
         print(cost(verdicts, time.process_time() - begun_s))
-        if any(verdict.complaint for verdict in verdicts):
-            sys.exit(1)
+        complaints = sum(bool(verdict.complaint) for verdict in verdicts)
+        if complaints:
+            raise CheckFailedError(f"{complaints} of {len(verdicts)} verdicts are complaints.")
 
     def _require_fitting(self) -> None:
         """Raise InvalidValueError for options that do not go together."""

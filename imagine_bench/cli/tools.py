@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +11,7 @@ import tyro
 from imagine_bench import registry
 from imagine_bench.cli.options import Count, EncoderWord, File, MaybeTaskWord, OfBench, TaskWord, Word
 from imagine_bench.data.folder import read_dataset, require_format, require_new, write_dataset
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import CheckFailedError, InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.registry.entries import file_name
 from imagine_bench.running.collect import collect, describe, policy_of
@@ -212,7 +211,7 @@ class CheckCommand:
                 self.task, self.out, turns=self.turns, trials=self.trials, appearances=self.appearances
             )
         if failed:
-            sys.exit(1)
+            raise CheckFailedError("Not everything that was checked holds; see above.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,4 +241,4 @@ class Doctor:
         text, works = examine()
         print(text)
         if not works:
-            sys.exit(1)
+            raise CheckFailedError("Something is wrong with this installation; see above.")

@@ -200,7 +200,8 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
         else:
             work_through(carry, waiting, workers=workers, on_news=print, on_end=ended)
     facts = {"closed_off": why_open() or True, **describe_environment()}
-    write_json(folder / "judgement.json", {**dataclasses.asdict(judgement), **facts})
+    if any((folder / cell.file).exists() for cell in cells):  # otherwise what others left here stays as it is
+        write_json(folder / "judgement.json", {**dataclasses.asdict(judgement), **facts})
     return folder, list(failed)
 
 
@@ -282,6 +283,7 @@ def _judged(
         "imagine_s_per_1000": 1000.0 * cpu_s / sum(each.steps for each in answers.values()),
         **judged.cost,
         "reader": world.reader_digest,
+        "privileged": model_entry(cell.model).privileged,
     }
     return found, _images(cell.model, judged.model, world, scores["worst"], seeds.child("pictures").generator())
 
@@ -429,6 +431,13 @@ def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
             f"Cells in {folder} were read by different readers ({', '.join(sorted(readers))}) and cannot be compared; "
             "give another folder with --out."
         )
+    for cell in found:
+        if "privileged" in cell and cell["privileged"] != model_entry(cell["model"]).privileged:
+            was = "privileged" if cell["privileged"] else "not privileged"
+            raise ArtefactError(
+                f"World model {cell['model']} was {was} when it was judged in {folder}, and is registered otherwise "
+                "now; give another folder with --out."
+            )
     return found
 
 

@@ -64,6 +64,7 @@ class Verdict:
     episodes: int = 0  # played again
     unshown: tuple[str, ...] = ()  # what is not kept, so that it cannot be shown
     holds: str = "holds"  # what is said where all does
+    of_training: bool = False  # whether it is on a run that was trained again
 
     def __str__(self) -> str:
         if self.complaint:
@@ -75,7 +76,7 @@ class Verdict:
     def of(cls, repeat: Repeat) -> Verdict:
         """That on a run which was trained again."""
         name = f"{repeat.agent} seed {repeat.seed}, trained again"
-        return cls(what=name, complaint=brief_lines(repeat.complaint), holds=repeat.remark)
+        return cls(what=name, complaint=brief_lines(repeat.complaint), holds=repeat.remark, of_training=True)
 
 
 def verify_runs(folder: Path) -> list[Verdict]:

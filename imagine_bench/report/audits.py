@@ -20,6 +20,7 @@ from imagine_bench.judge.verify import UNSHOWN, Verdict, does_not_fit, verify_ru
 from imagine_bench.recording.filmstrips import filmstrip, png
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.report.bench import bench_page
+from imagine_bench.report.data import known_agent
 from imagine_bench.report.page import DASH, Page, Table, percent, texts, write_page
 from imagine_bench.report.sections import HEAD, causes_table
 from imagine_bench.running.bench import counted, load_bench, task_type
@@ -269,6 +270,8 @@ def what_is_shown(folder: Path, retraining: Retraining | None = None) -> str:
     benches = [each for each in (environment, *environment.values()) if isinstance(each, Mapping) and "commit" in each]
     commits = ", ".join(sorted({str(each["commit"]) for each in benches}))
     lines = [*(f"Not shown: {each}." for each in UNSHOWN), f"Made at commit {commits}, as it says."]
+    if is_archive(folder):
+        return "\n".join(lines)
     if retraining is None:
         return "\n".join([*lines, "Training again, verify --train 1, shows whether a run of each agent repeats."])
     count = len(protocol.seeds)
@@ -290,6 +293,10 @@ def with_report(folder: Path, runs: list[Verdict]) -> list[Verdict]:
     """The verdicts on the runs of a bench and, where all hold, one on its report."""
     if any(each.complaint for each in runs) or not (folder / "report").is_dir():
         return runs
+    elsewhere = [agent for agent in read_control(folder).agents if not known_agent(agent).make]
+    if elsewhere:  # a script's, or of a package that is not installed here
+        unshown = f"what it says, for no package here offers {', '.join(elsewhere)}"
+        return [*runs, Verdict(what="report", holds="not compared", unshown=(unshown,))]
     try:
         complaint = _report_complaint(folder)
     except ArtefactError as error:

@@ -18,6 +18,7 @@ from forger import FORGERIES, IN_TRAINING, mend, rewrite, rewrite_protocol
 from small_runs import Inline, context, small, written
 
 from imagine_bench import registry
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError
 from imagine_bench.judge.verify import Replays, _verify_test, has_own_failures, verdicts
 from imagine_bench.protocols.control import Protocol, context_of, protocol
@@ -272,6 +273,23 @@ def test_an_honest_run_repeats_to_the_bit_and_each_nonce_draws_its_own(pair: Pat
     assert "--nonce a" in what_is_shown(pair, again("a"))
 
 
+def test_a_report_on_agents_that_are_not_installed_here_is_not_blamed(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(registry.AGENTS, "table")
+    *_, last = verify(finished)
+    assert str(last) == "report: not compared; not shown: what it says, for no package here offers table"
+
+
+def test_runs_that_do_not_hold_are_not_said_to_be_trained_again(
+    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = forged(pair, tmp_path, share_weights)
+    assert main(["verify", str(folder), "--train", "1"]) == 1
+    said = capsys.readouterr().out
+    assert "training again: no run was" in said and "Trained again" not in said and "Chance" not in said
+
+
 def test_the_chance_to_find_a_forged_run_is_that_of_drawing_one() -> None:
     wanted = small(seeds=(0, 1, 2, 3, 4))
     draws = [{seed for _, seed in drawn(wanted, 2, str(nonce))} for nonce in range(2000)]
@@ -413,7 +431,7 @@ def test_what_is_not_there_is_said_in_a_line_a_run(finished: Path, tmp_path: Pat
     assert str(one) == "table seed 0: it is not finished." and "random" in other.complaint
     kept = Path(__file__).parents[2] / "docs" / "results" / "arrow_puzzle-quick"
     assert "no episode is kept: nothing can be shown" in " ".join(map(str, verify(kept)))
-    assert "Made at commit 2898baf91de0, as it says." in what_is_shown(kept)
+    assert what_is_shown(kept).endswith("Made at commit 2898baf91de0, as it says."), "there is nothing to train again"
     with pytest.raises(ArtefactError, match="keeps results and no runs"):
         verify(kept, again())
     assert load_bench(finished)

@@ -209,7 +209,7 @@ def test_a_model_finds_no_truth_and_changes_nothing_for_the_next(said: Said) -> 
         for name in ("total_variation", "tv_by_depth", "after_the_end", "value_loss", "data"):
             assert scores[one, 60][name] == scores[other, 60][name], (one, name)
     learned = judgement.data_of(_of(*_MODELS), said.folder, 1000).episodes
-    assert learned.frames.any(), "the data that this process holds are as they were"
+    assert learned.frames.any(axis=(1, 2, 3)).all(), "the data that this process holds are as they were"
 
 
 def test_privileged_models_are_marked_wherever_they_stand(said: Said) -> None:
@@ -222,6 +222,23 @@ def test_privileged_models_are_marked_wherever_they_stand(said: Said) -> None:
     for text in (said.out, page, recording):
         assert "cheat (privileged)" in text and "exact (privileged)" in text
         assert "frame (privileged)" not in text
+
+
+def test_a_cell_says_whether_its_model_was_privileged_when_it_was_judged(
+    said: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert kept(said.folder, _of("cheat"))
+    entry = registry.world_model_entry("cheat")
+    monkeypatch.setitem(registry.WORLD_MODELS, "cheat", dataclasses.replace(entry, privileged=False))
+    with pytest.raises(ArtefactError, match="cheat was privileged when it was judged"):
+        kept(said.folder, _of("cheat"))
+
+
+def test_a_command_that_judges_nothing_leaves_the_report_of_others(said: Said) -> None:
+    before = {path: path.read_bytes() for path in [said.folder / "judgement.json", *said.folder.glob("report/*")]}
+    words = ["judge", "--task", "pick_place", "--out", str(said.folder.parent), "--workers", "1"]
+    assert main([*words, "--sizes", "60", "--seeds", "1000", "--samples", "2", "--models", "unmade"]) == 1
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_each_cell_names_its_reader_and_is_not_compared_with_those_of_another(said: Said, tmp_path: Path) -> None:
