@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 
 from imagine_bench.errors import ArtefactError, InvalidValueError, brief, why
 from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces.episodes import content_hash
 from imagine_bench.preprocessing import join_cells, preprocess
 
 from .discrete_encoder import DiscreteEncoder
@@ -65,6 +67,7 @@ class EncoderCard:
         values: dict[str, Any] = json.loads(text)
         if values.pop("format") != FORMAT:
             raise InvalidValueError(f"its format is not {FORMAT}")
+        values.pop("content", None)
         recipe = values.pop("recipe")
         recipe = Recipe(**{**recipe, "widths": tuple(recipe["widths"])})
         lists = {name: tuple(value) for name, value in values.items() if isinstance(value, list)}
@@ -138,7 +141,8 @@ class Encoder:
             for name, module in (("vae", self.network), ("probe", self.probe))
             for key, value in module.state_dict().items()
         }
-        card = self.card.to_json()
+        told = {**json.loads(self.card.to_json()), "content": _content(self.card, tensors)}
+        card = json.dumps(told, indent=2)
         contents = {".json": f"{card}\n".encode(), ".png": picture, path.suffix: save(tensors, metadata={"card": card})}
         path.parent.mkdir(parents=True, exist_ok=True)
         begun = _begun(path)
@@ -159,8 +163,13 @@ class Encoder:
             raise ArtefactError(f"No encoder at {path}; make one with `imagine-bench encoder`.")
         try:
             with safe_open(path, framework="pt") as file:
-                card = EncoderCard.from_json((file.metadata() or {}).get("card", ""))
-                tensors = {key: file.get_tensor(key).float() for key in file.keys()}
+                text = (file.metadata() or {}).get("card", "")
+                card = EncoderCard.from_json(text)
+                stored = {key: file.get_tensor(key) for key in file.keys()}
+            content = json.loads(text).get("content")
+            if content not in (None, _content(card, stored)):  # None: written before 2026-11-28
+                raise InvalidValueError("it is not as it was written")
+            tensors = {key: tensor.float() for key, tensor in stored.items()}
             network = _empty_network(card)
             probe = Probe(card.latent_size, card.cardinalities)
             _fill(network, tensors, "vae.")
@@ -192,6 +201,12 @@ def refuse_existing(path: Path) -> None:
     for each in (path, *beside):
         if each.exists():
             raise ArtefactError(f"{each} exists already and is never overwritten; choose another folder or remove it.")
+
+
+def _content(card: EncoderCard, tensors: Mapping[str, Tensor]) -> str:
+    """The hash of a card and of the tensors it is written with."""
+    text = np.frombuffer(card.to_json().encode(), np.uint8)
+    return content_hash({"card": text, **{name: tensor.numpy() for name, tensor in tensors.items()}})
 
 
 def _begun(path: Path) -> Path:

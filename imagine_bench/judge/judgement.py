@@ -10,7 +10,7 @@ import inspect
 import json
 import math
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -182,7 +182,7 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
         data_of(judgement, folder, seed)
     prepare(judgement, folder)
     cells = judgement.cells
-    waiting = [cell for cell in cells if not (folder / cell.file).exists()]
+    waiting = [cell for cell in cells if not _is_whole(folder, cell)]
     if waiting and why_open():
         print(f"Note: models are judged in processes that this system cannot close off ({why_open()}).")
     failed: dict[str, None] = {}
@@ -208,15 +208,24 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
 def carry_out(judgement: Judgement, folder: Path, cell: ModelFit, tell: Callable[[str], None] = print) -> str:
     """Fit one model, question it and keep the scores; why that failed, or an empty text. It has nothing to ``tell``."""
     del tell
+    if _is_whole(folder, cell):  # another judgement in the same folder was there first
+        return ""
     try:
         found, images = judge_cell(judgement, folder, cell)
     except ImagineBenchError as error:
         return str(error)
-    if cell.transitions == judgement.sizes[-1]:
-        write_arrays(folder / cell.images, images)
-        found["images"] = content_hash(images)
-    write_json(folder / cell.file, sealed(with_null(found)))
+    with _making(folder):  # so that a cell and its images are of the same fit
+        if cell.transitions == judgement.sizes[-1]:
+            write_arrays(folder / cell.images, images)
+            found["images"] = content_hash(images)
+        write_json(folder / cell.file, sealed(with_null(found)))
     return ""
+
+
+def _is_whole(folder: Path, cell: ModelFit) -> bool:
+    """Whether a cell is kept, and its images are where it has some. Raises ArtefactError: it is damaged."""
+    file = folder / cell.file
+    return file.exists() and ("images" not in read_sealed(file, "a judged cell") or (folder / cell.images).exists())
 
 
 def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict[str, Any], Arrays]:
@@ -234,8 +243,9 @@ def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict
         with opened(*given, folder=folder, log=log) as judged:
             return _judged(judgement, folder, cell, world, judged, seeds)
     finally:
-        if log.exists() and not log.stat().st_size:
-            log.unlink()
+        with suppress(FileNotFoundError):  # there is none, or another judgement in the same folder removed it
+            if not log.stat().st_size:
+                log.unlink()
 
 
 def _judged(
@@ -445,14 +455,14 @@ def shown(folder: Path, judgement: Judgement) -> dict[str, dict[str, Any]]:
     """By model, the images and the cell of its first seed that are kept, after the most transitions.
 
     Raises:
-        ArtefactError: A file is damaged.
+        ArtefactError: A file is damaged, or images are lost.
     """
     found: dict[str, dict[str, Any]] = {}
     for cell in kept(folder, judgement):
         model = cell["model"]
         images = folder / ModelFit(model, cell["seed"], cell["transitions"]).images
-        if model not in found and images.exists():
-            arrays = read_arrays(images)
+        if model not in found and ("images" in cell or images.exists()):
+            arrays = read_arrays(images, "images of a judged fit; the same judgement makes lost ones anew")
             if cell.get("images", content_hash(arrays)) != content_hash(arrays):
                 raise ArtefactError(f"{images} is damaged: it is not as it was written. It was left untouched.")
             found[model] = arrays | cell

@@ -38,6 +38,7 @@ from imagine_bench import registry
 from imagine_bench.arrays import Arrays
 from imagine_bench.cores import ONE_THREAD
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
+from imagine_bench.store.files import writing
 
 _PATIENCE_S = 5.0
 _POLL_S = 0.05
@@ -94,7 +95,9 @@ class Isolated:
         self.cpu_s = 0.0
         """CPU seconds of all calls, as that process says."""
         ours, theirs = socket.socketpair()
-        with theirs, log.open("ab") as printed:
+        with writing(log):
+            opened = log.open("ab")
+        with theirs, opened as printed:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-c", f"from {__name__} import serve; serve({theirs.fileno()})"],
                 stdin=subprocess.PIPE,  # nothing is written: its end tells that this process has ended

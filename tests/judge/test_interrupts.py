@@ -15,8 +15,10 @@ import psutil
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.judge.judgement import Judgement
-from imagine_bench.store.files import make_folder
+from imagine_bench.errors import BusyError
+from imagine_bench.judge import judgement
+from imagine_bench.judge.judgement import Judgement, judge
+from imagine_bench.store.files import lock, make_folder
 
 pytestmark = pytest.mark.slow
 _MODEL = """
@@ -151,3 +153,34 @@ def test_a_worker_that_is_killed_costs_one_cell(command: Judge) -> None:
     assert judge.returncode == 1 and "copy the last frame" in output
     assert "World model waits: its process ended early with exit code -9 (-9: it was killed" in errors
     assert len(command.scores("killed")) == 3
+
+
+def test_two_at_once_in_one_folder_share_its_cells_and_keep_the_figures_of_one(command: Judge) -> None:
+    for out in ("shared", "alone"):
+        judges = [command.start(out, waits_s=0.0, workers=1) for _ in range(2 if out == "shared" else 1)]
+        for process in judges:
+            output, errors = process.communicate(timeout=300)
+            assert process.returncode == 0 and "copy the last frame" in output, errors
+            assert "Traceback" not in errors and "damaged" not in errors
+    assert len(command.scores("alone")) == 8
+    assert command.scores("shared") == command.scores("alone"), "to the bit"
+
+
+def test_who_waits_too_long_for_another_judgement_is_told_which_process_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = Judgement(task="arrows:cubes=1", models=("copy",), sizes=(5,), seeds=(0,), samples=1)
+    folder = make_folder(tmp_path / one.folder_name)
+    hold = "import sys, time; from pathlib import Path; from imagine_bench.store.files import lock\n"
+    hold += "with lock(Path(sys.argv[1]), 'it'):\n    print('held', flush=True)\n    time.sleep(600)"
+    holder = subprocess.Popen([sys.executable, "-c", hold, folder / ".lock"], stdout=subprocess.PIPE, text=True)
+    assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+    monkeypatch.setattr(judgement, "_PATIENCE_S", 0.1)
+    try:
+        with pytest.raises(BusyError, match=rf"^The folder .* is in use by process {holder.pid} on .*; wait for it,"):
+            judge(one, tmp_path, workers=1)
+    finally:
+        holder.kill()
+        holder.communicate()
+    with lock(folder / ".lock", "it"):
+        pass  # the system let go of it

@@ -6,6 +6,7 @@ import contextlib
 import csv
 import dataclasses
 import io
+import itertools
 import json
 import re
 import shutil
@@ -27,6 +28,7 @@ from recordings import contents, times
 from small_runs import Inline, small
 
 from imagine_bench import registry
+from imagine_bench.arrays import Arrays
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.judge import judgement, questions
@@ -302,6 +304,48 @@ def test_the_same_seed_gives_the_same_scores(said: Said, tmp_path: Path) -> None
     assert {name: value for name, value in first.items() if name not in timed} == json.loads(
         json.dumps(judgement.with_null({name: value for name, value in again.items() if name not in timed}))
     )
+
+
+def test_lost_images_are_refused_where_they_are_shown_and_made_anew_by_the_same_judgement(
+    said: Said, tmp_path: Path
+) -> None:
+    one = _of("exact")
+    root = tmp_path / "judged"
+    folder = root / one.folder_name
+    shutil.copytree(said.folder, folder)
+    images = folder / ModelFit("exact", 1000, 60).images
+    before = read_arrays(images)
+    images.unlink()
+    with pytest.raises(ArtefactError, match=r"^There is no .*exact-seed1000-60\.npz, .* makes lost ones anew\.$"):
+        shown(folder, one)
+    assert judge(one, root, workers=1) == (folder, [])
+    assert {name: array.tobytes() for name, array in read_arrays(images).items()} == {
+        name: array.tobytes() for name, array in before.items()
+    }
+    assert shown(folder, one).keys() == {"exact"}
+
+
+def test_a_cell_judged_at_once_by_several_is_kept_with_the_images_of_the_same_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, cell, at_once = _of("exact"), ModelFit("exact", 1000, 60), threading.Barrier(4)
+
+    def fitted(*_: object) -> tuple[dict[str, object], Arrays]:
+        rng = np.random.default_rng(at_once.wait())
+        return cell._asdict(), {"futures_before": rng.random(100_000)}
+
+    def written(path: Path, values: object) -> None:
+        first = next(order) == 0
+        time.sleep(0.3 * first)
+        write_json(path, values)
+
+    order = itertools.count()
+    monkeypatch.setattr(judgement, "judge_cell", fitted)
+    monkeypatch.setattr(judgement, "write_json", written)
+    with ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(judgement.carry_out, one, tmp_path, cell) for _ in range(4)]
+    assert [job.result() for job in jobs] == [""] * 4
+    assert shown(tmp_path, one).keys() == {"exact"}
 
 
 @pytest.fixture(scope="module")

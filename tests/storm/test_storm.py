@@ -5,15 +5,13 @@ Each test prints what it counted. What is drawn is drawn from a generator with a
 
 from __future__ import annotations
 
-import builtins
 import io
 import itertools
 import json
-import os
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ import gymnasium
 import numpy as np
 import pytest
 from small_runs import Inline, do, final_arrays, same_but_for_time, small
+from storms import as_word, damages, facts, hostile, interrupted, one_sentence
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
@@ -28,93 +27,37 @@ from imagine_bench.errors import ImagineBenchError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, load_bench, plan
 from imagine_bench.store.loading import load_so_far
+from imagine_bench.store.results import RunResult
 
 pytestmark = pytest.mark.slow
 _FEW: dict[str, Any] = {"budgets": (2, 4), "evaluation_episodes": 2}
-_REGIONS = 40
-"""Places in each file that are damaged, each in three ways."""
-
-
-class _DeathError(BaseException):
-    """The end of a process: nothing that catches errors catches it."""
-
-
-def one_sentence(error: BaseException) -> str:
-    text = str(error)
-    assert isinstance(error, ImagineBenchError), f"raw {type(error).__name__}: {text[:300]}"
-    assert len(text) < 3000 and "\n" not in text and text.isprintable(), text[:300]
-    return text
 
 
 # --- deaths ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("how", ["death", "full disk"])
-def test_every_file_operation_may_be_the_last(  # noqa: C901
+def test_every_file_operation_may_be_the_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], how: str
 ) -> None:
-    whole = do(tmp_path / "whole", every_s=0.0, **_FEW)
+    def act(folder: Path) -> RunResult:
+        return do(folder, every_s=0.0, **_FEW)
+
+    whole = act(tmp_path / "whole")
     weights = final_arrays(tmp_path / "whole")["table"].tobytes()
-    count, deaths = itertools.count(), 0
-    at: int | None = None
-
-    def guarded(real: Callable[..., Any], arms: Callable[..., bool] = lambda *_, **__: True) -> Callable[..., Any]:
-        def call(*args: Any, **named: Any) -> Any:
-            if arms(*args, **named) and next(count) == at:
-                raise _DeathError if how == "death" else OSError(28, "No space left on device")
-            return real(*args, **named)
-
-        return call
-
-    def writes(*args: Any, **named: Any) -> bool:
-        mode = args[1] if len(args) > 1 else named.get("mode", "r")
-        return any(mark in str(mode) for mark in "wax+") and str(tmp_path) in str(args[0])
-
-    for name in ("mkdir", "replace", "rename", "unlink", "fsync", "rmdir"):
-        monkeypatch.setattr(os, name, guarded(getattr(os, name)))
-    for module in (builtins, io):
-        monkeypatch.setattr(module, "open", guarded(open, writes))
-    for at in itertools.count():
-        count = itertools.count()
-        folder = tmp_path / f"run_{at}"
-        try:
-            do(folder, every_s=0.0, **_FEW)
-        except (_DeathError, ImagineBenchError) as error:
-            deaths += 1
-            if isinstance(error, ImagineBenchError):
-                one_sentence(error)
-        ended = next(count) <= at
-        count = itertools.count(10**9)
-        assert same_but_for_time(whole, do(folder, every_s=0.0, **_FEW)), at
-        assert final_arrays(folder)["table"].tobytes() == weights, at
+    deaths = 0
+    for folder in interrupted(tmp_path, monkeypatch, how, act):
+        deaths += 1
+        assert same_but_for_time(whole, act(folder)), folder
+        assert final_arrays(folder)["table"].tobytes() == weights, folder
         litter = [path.name for path in folder.rglob("*partial*")]
-        assert not litter, (at, litter)
-        shutil.rmtree(folder)
-        if ended:
-            break
+        assert not litter, (folder, litter)
     with capsys.disabled():
-        print(f"\nstorm: {deaths} of {at} file operations ended by {how}, 0 differing bits")
+        print(f"\nstorm: {deaths} file operations ended by {how}, 0 differing bits")
     assert deaths > 50
 
 
 # --- damages -----------------------------------------------------------------------------------------------------
-
-
-def damages(content: bytes, rng: np.random.Generator) -> Iterator[bytes]:
-    """A bit flipped, a byte replaced by a digit and an end cut off, in each of many regions."""
-    yield b""
-    edges = np.unique(np.linspace(0, len(content), min(_REGIONS, len(content)) + 1).astype(int))
-    for low, high in itertools.pairwise(edges.tolist()):
-        place = int(rng.integers(low, high))
-        for byte in (content[place] ^ (1 << int(rng.integers(8))), 48 + int(rng.integers(10))):
-            yield content[:place] + bytes([byte]) + content[place + 1 :]
-        yield content[:place]
-
-
-def facts(result: Any) -> str:
-    """All that a report could say, as text."""
-    rows = [(run.agent, run.seed, run.settings, run.checkpoints, run.training_success.tolist()) for run in result.runs]
-    return f"{result.protocol}{result.environment}{rows}"
 
 
 @pytest.mark.parametrize("finished", [True, False])
@@ -171,28 +114,8 @@ def test_every_region_of_every_file_may_be_damaged(  # noqa: C901, PLR0912
 # --- hostile inputs ----------------------------------------------------------------------------------------------
 
 
-_TEXTS = [
-    "", " ", "x" * 5000, "\x1b[31mred", "\udcff", "a\nb", "../..", "~nobody/x", "NaN", "null", "quick\x00", "[" * 900,
-]  # fmt: skip
-_NUMBERS = [-1, 0, 10**9, 10**30, -(10**400), 0.5, 1e308, float("nan"), float("inf"), -float("inf"), True, None]
-_OTHERS: list[Any] = [
-    [], {}, (), [[]], {"a": {}}, b"\xff", np.ma.masked, np.array(["clean", "mild"]), np.zeros((3, 3)), object(),
-    Ellipsis, np.array([]), range(3), {1, 2}, [1.5, None], np.float64("nan"), np.datetime64("NaT"), 1j, len,
-]  # fmt: skip
-
-
-def hostile(rng: np.random.Generator) -> Any:
-    """A value that nobody means."""
-    everything = [*_TEXTS, *_NUMBERS, *_OTHERS]
-    return everything[int(rng.integers(len(everything)))]
-
-
 _BEGINS = 77
 """The exit code of a command that would begin a bench: what it was given has been accepted."""
-
-
-def as_word(value: Any) -> str:
-    return value if isinstance(value, str) else str(value)[:4000]
 
 
 def command(rng: np.random.Generator, root: Path) -> str:

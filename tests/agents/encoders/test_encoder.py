@@ -331,6 +331,7 @@ def test_bad_files_are_named_and_left_untouched(tiny: Encoder, tmp_path: Path) -
     renamed = {name.replace("vae.brightness", "vae.light"): tensor for name, tensor in state.items()}
     bad = [
         (good[:5000], ""),
+        (good[:-1] + bytes([good[-1] ^ 1]), "it is not as it was written"),
         (b"not an encoder at all, only words", ""),
         (saved(state, format="something/2"), "its format is not"),
         (saved(state, latents=1), "it has 'latents', which is unknown"),
