@@ -259,16 +259,17 @@ class _RunCheck:
                 raise ArtefactError(f"its {name} are those of seed {owner}, and no two seeds of a learner share them.")
 
     def _marks(self) -> dict[str, str]:
-        """What no two seeds of a learner share, by name."""
+        """What no two seeds of a learner share, by name; of a dataset alone they may learn the same."""
+        shared = _of_dataset(self.protocol)
         snapshot = run_folder.load_newest(self.folder / run_folder.CHECKPOINTS)
         marks = {}
-        if snapshot is not None and snapshot.agent.arrays:
+        if snapshot is not None and snapshot.agent.arrays and self.trained > shared:
             marks["weights"] = part_digest(snapshot.agent)
         for row in self.run.checkpoints:
             where = f"after {row.episodes:,} episodes"
             if row.train_cpu_s:
                 marks[f"CPU seconds {where}"] = repr(row.train_cpu_s)
-            if row.kept is not None and has_own_failures(row.kept, self.protocol):
+            if row.kept is not None and row.episodes > shared and has_own_failures(row.kept, self.protocol):
                 marks[f"tests {where}"] = part_digest(row.kept.actions)
         return marks
 

@@ -368,6 +368,26 @@ def test_a_bench_whose_training_began_with_a_dataset_holds(tmp_path: Path) -> No
     assert not found.complaint and found.episodes == 9 - 6 + 2
 
 
+@pytest.mark.parametrize(("episodes", "complaint"), [(6, ""), (7, "those of seed 0")])
+def test_two_seeds_may_learn_the_same_from_a_dataset_alone(tmp_path: Path, episodes: int, complaint: str) -> None:
+    few = {"agents": ("table",), "seeds": (0, 1), "budgets": (episodes,), "evaluation_episodes": 4}
+    how = {"execution": "kinematic", "appearance": "mild", "open_loop_starts": 0, "recorded_episodes": 0}
+    wanted, paths = plan_control("arrow_puzzle", "smoke", **few, **how, dataset=written(tmp_path / "set").folder)
+    folder = bench(wanted, paths, root=tmp_path, launcher=Inline()).folder
+    counts = EvaluationCounts()
+    with environments(wanted, observation="state") as (_, env):
+        oracle = registry.make_agent("oracle", context_of(RunSpec(protocol=wanted, agent="oracle", seed=0)))
+        counts.add(play_test_episode(env, oracle, seed=episode_seed("evaluation", 0, 0), privileged=True))
+        for test in (1, 2, 3):
+            counts.add(replay(env, episode_seed("evaluation", 0, test), [1, 0, 3, 2, 5, 4] * 2)[0])
+    for seed in (0, 1):
+        run = load_run(folder / "table" / f"seed_{seed}")
+        rewrite(run.folder, [dataclasses.replace(r, kept=counts.kept(), **counts.figures()) for r in run.checkpoints])
+    assert has_own_failures(counts.kept(), wanted)
+    first, second, *_ = verify(folder)
+    assert not first.complaint and complaint in second.complaint and bool(complaint) == bool(second.complaint)
+
+
 @pytest.mark.parametrize(
     ("env_id", "execution", "appearance"),
     [
