@@ -98,7 +98,7 @@ def bench_page(result: BenchResult) -> Page:
 
 def verdict(data: ReportData) -> list[str]:
     """What is missing, and a line a learner: whether it is better or worse than DQN, and where most clearly."""
-    first = [*_unfinished(data.result), *_not_installed(data), *_misread(data)]
+    first = [*_unfinished(data.result), *_left_out(data.result), *_not_installed(data), *_misread(data)]
     lines = [*first, *(_against_dqn(data, agent) for agent in data.compared)]
     return lines or ["Nothing is compared: that needs dqn and another learner side by side."]
 
@@ -153,6 +153,12 @@ def _unfinished(result: BenchResult) -> list[str]:
         f"This bench is not finished: shown are {len(part.seeds)} of {len(whole.seeds)} seeds up to "
         f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {named}. {then}"
     ]
+
+
+def _left_out(result: BenchResult) -> list[str]:
+    if not result.left_out:
+        return []
+    return [f"Left out, for some agent has not been run with that seed: {', '.join(result.left_out)}."]
 
 
 def _not_installed(data: ReportData) -> list[str]:

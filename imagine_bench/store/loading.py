@@ -172,7 +172,7 @@ def cut(result: RunResult, part: Protocol) -> RunResult:
 def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
     """Several benches, or parts of them, that differ only in agents or in seeds, as one in a new folder below ``root``.
 
-    Shown are the seeds that every agent has, and the budgets that all benches have.
+    Shown are the seeds that every agent has, and the budgets that all benches have; ``left_out`` names the other runs.
 
     Raises:
         InvalidValueError: They differ in more, an agent's seed is in two of them, or no budget is in all.
@@ -196,6 +196,7 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
         wall_s=sum(result.wall_s for result in results),
         certificate=next((result.certificate for result in results if result.certificate is not None), None),
         missing=tuple(sentence for result in results for sentence in result.missing),
+        left_out=tuple(f"{agent} seed {seed}" for agent, seed in sorted(runs) if seed not in part.seeds),
     )
 
 

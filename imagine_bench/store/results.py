@@ -174,6 +174,7 @@ class AllRuns(Generic[P, R]):
     folder: Path  #: Where the bench's files lie
     wall_s: float  #: Wall seconds of the bench, over all its sessions
     missing: tuple[str, ...] = ()  #: What a part lacks, one sentence a run
+    left_out: tuple[str, ...] = ()  #: Runs of merged benches that are not shown, for not all agents have their seeds
 
     def __post_init__(self) -> None:
         wanted = sorted(itertools.product(self.protocol.agents, self.protocol.seeds))

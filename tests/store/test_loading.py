@@ -63,6 +63,8 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     assert np.array_equal(joined.success_rates("random")[0], own.success_rates("random")[0, 1:])
     assert joined.environment["bench 2"]["command"] == own.environment["command"]
     assert joined.folder.name.startswith("merged-") and joined.missing == ()
+    assert joined.left_out == ("oracle seed 0", "random seed 2")
+    assert "Left out, for some agent has not been run with that seed: oracle seed 0, random" in summary_table(joined)
 
 
 @pytest.mark.parametrize(
