@@ -57,7 +57,10 @@ def _layers(rules: Rules, sight: Sight, horizon: int) -> Iterator[_Layer]:
                 links[now, action] = list(_next(rules, sight, now, action, step))
                 outcomes = rules.outcomes(now[0][-1], action)
                 wins[now, action] = sum(o.probability for o in outcomes if o.terminated and o.success)
+                total: dict[_Seen, float] = defaultdict(float)  # several outcomes may lead to one place
                 for share, then in links[now, action]:
+                    total[then] += share
+                for then, share in total.items():
                     reached[then] = max(reached[then], share)
             for then, share in reached.items():
                 after[then] += weight * share

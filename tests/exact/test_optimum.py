@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections import defaultdict
 from dataclasses import dataclass
@@ -100,6 +101,24 @@ class _Maze:
         return False
 
 
+class _Halves:
+    """The same rules, each outcome as two of half its probability."""
+
+    states = None
+
+    def __init__(self, rules):
+        self.rules = rules
+        self.n_actions = rules.n_actions
+        self.start_states = rules.start_states
+
+    def outcomes(self, state, action):
+        halves = (dataclasses.replace(o, probability=o.probability / 2) for o in self.rules.outcomes(state, action))
+        return tuple(each for half in halves for each in (half, half))
+
+    def is_terminal(self, state):
+        return False
+
+
 class _Wall:
     """Only the end rooms can be told."""
 
@@ -124,6 +143,8 @@ TINY = {
     "slipping": (_Corridor(slip=0.2), _Wall(), 6),
     "solved if no later": (_Maze(((2, 2), (4, 2), (3, 0), (2, 1))), _Lit(), 5),
     "solved if later": (_Maze(((4, 3), (2, 1), (1, 0), (0, 0))), _Lit(), 5),
+    "in halves": (_Halves(_Corridor(slip=0.2)), _Wall(), 6),
+    "late, in halves": (_Halves(_Maze(((4, 3), (2, 1), (1, 0), (0, 0)))), _Lit(), 5),
     "wheel": (Wheels(n=1, slip=0.3), Glimpse(finger=0.5, lag=1), 3),
 }
 
