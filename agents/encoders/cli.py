@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,8 @@ def retrain(
     picture = io.BytesIO()
     sample_sheet(encoder, spec, frames, macrostates, noise).savefig(picture, format="png")
     encoder.save(path, picture.getvalue())
-    unfinished.unlink(missing_ok=True)
+    with suppress(OSError):  # the encoder is whole
+        unfinished.unlink(missing_ok=True)
     bundled = bundled_encoder(name)
     other = bundled.is_file() and bundled.resolve() != path.resolve()
     return f"Wrote {path}.\n{compare(encoder.card, Encoder.load(bundled).card if other else None)}"

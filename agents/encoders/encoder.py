@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
@@ -17,7 +18,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from imagine_bench.errors import ArtefactError, InvalidValueError, brief, why
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, brief, why
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import content_hash
 from imagine_bench.preprocessing import join_cells, preprocess
@@ -134,6 +135,7 @@ class Encoder:
 
         Raises:
             ArtefactError: Either file exists already; it is left untouched.
+            SetupError: It cannot be written.
         """
         refuse_existing(path)
         tensors = {
@@ -144,13 +146,14 @@ class Encoder:
         told = {**json.loads(self.card.to_json()), "content": _content(self.card, tensors)}
         card = json.dumps(told, indent=2)
         contents = {".json": f"{card}\n".encode(), ".png": picture, path.suffix: save(tensors, metadata={"card": card})}
-        path.parent.mkdir(parents=True, exist_ok=True)
         begun = _begun(path)
-        begun.touch()
-        for suffix, content in contents.items():
-            if content:
-                write_whole(path.with_suffix(suffix), content)
-        begun.unlink()
+        with _writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            begun.touch()
+            for suffix, content in contents.items():
+                if content:
+                    write_whole(path.with_suffix(suffix), content)
+            begun.unlink()
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu") -> Encoder:
@@ -185,14 +188,27 @@ def bundled_encoder(name: str) -> Path:
     return Path(str(resources.files("imagine_bench.assets"))) / "encoders" / f"{name}.safetensors"
 
 
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SetupError(f"Cannot write {path}: {error.strerror or error}.") from error
+
+
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that it is whole or as before, whenever the process is killed."""
+    """Write a file so that it is whole or as before, whenever the process is killed.
+
+    Raises:
+        SetupError: It cannot be written.
+    """
     partial = path.with_name(f".{path.name}.partial")
-    with partial.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(partial, path)
+    with _writing(path):
+        with partial.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(partial, path)
 
 
 def refuse_existing(path: Path) -> None:

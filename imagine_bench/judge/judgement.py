@@ -243,7 +243,7 @@ def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict
         with opened(*given, folder=folder, log=log) as judged:
             return _judged(judgement, folder, cell, world, judged, seeds)
     finally:
-        with suppress(FileNotFoundError):  # there is none, or another judgement in the same folder removed it
+        with suppress(OSError):  # there is none, another judgement removed it, or the disk refuses: it stays, empty
             if not log.stat().st_size:
                 log.unlink()
 

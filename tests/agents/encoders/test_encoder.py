@@ -32,7 +32,7 @@ from imagine_bench.agents.networks.mlp import initialise
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, UnknownNameError
+from imagine_bench.errors import ArtefactError, DivergedError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.preprocessing import gray_cells
 
 
@@ -371,7 +371,7 @@ def test_saving_that_fails_half_way_leaves_no_artefact_and_is_done_again(
             raise error
         whole(source, target)
 
-    with mock.patch("os.replace", failing), pytest.raises((KeyboardInterrupt, OSError)):
+    with mock.patch("os.replace", failing), pytest.raises((KeyboardInterrupt, SetupError)):
         tiny.save(path, b"picture")
     assert not path.exists()
     tiny.save(path, b"picture")
