@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
 import importlib.util
 import operator
 import re
 import reprlib
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Self, SupportsIndex
 
 _LONGEST = 200
@@ -19,6 +21,15 @@ _OF_CONSTRUCTORS = re.compile(
     r"__init__\(\) (missing \d+ required .*arguments?: (?P<missing>.+)|got an unexpected \D+ (?P<unknown>'[^']*'))"
 )
 """What Python says where values of a file are not the fields of the dataclass that they are for."""
+_REASONS = {
+    errno.EACCES: "you may not write there; choose another folder or change its permissions",
+    errno.EPERM: "you may not write there; choose another folder or change its permissions",
+    errno.EROFS: "that file system is read-only; choose another folder",
+    errno.ENOSPC: "the disk is full; free some space and run the same command again",
+    errno.ENOTDIR: "a part of that path is a file, not a folder; choose another folder",
+    errno.EEXIST: "a part of that path is a file, not a folder; choose another folder",
+}
+"""What to do about refusals of the operating system; of others its own words are shown."""
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _LONGEST
 _SHORT.maxother = _LONGEST
@@ -106,6 +117,20 @@ class ArtefactError(ImagineBenchError):
 
 class SetupError(ImagineBenchError):
     """The machine lacks something: headless GL, disk space, write permission. Says what to install or change."""
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the operating system's refusal to write at ``path`` into a SetupError of one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise SetupError(f"Cannot write {path}: {reason(error)}.") from error
+
+
+def reason(error: OSError) -> str:
+    """Why the system refused, in words."""
+    return _REASONS.get(error.errno or 0, error.strerror or str(error))
 
 
 class BusyError(ImagineBenchError):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
@@ -18,7 +17,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, brief, why
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief, why, writing
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import content_hash
 from imagine_bench.preprocessing import join_cells, preprocess
@@ -147,7 +146,7 @@ class Encoder:
         card = json.dumps(told, indent=2)
         contents = {".json": f"{card}\n".encode(), ".png": picture, path.suffix: save(tensors, metadata={"card": card})}
         begun = _begun(path)
-        with _writing(path):
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             begun.touch()
             for suffix, content in contents.items():
@@ -188,14 +187,6 @@ def bundled_encoder(name: str) -> Path:
     return Path(str(resources.files("imagine_bench.assets"))) / "encoders" / f"{name}.safetensors"
 
 
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise SetupError(f"Cannot write {path}: {error.strerror or error}.") from error
-
-
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that it is whole or as before, whenever the process is killed.
 
@@ -203,7 +194,7 @@ def write_whole(path: Path, content: bytes) -> None:
         SetupError: It cannot be written.
     """
     partial = path.with_name(f".{path.name}.partial")
-    with _writing(path):
+    with writing(path):
         with partial.open("wb") as stream:
             stream.write(content)
             stream.flush()

@@ -29,8 +29,8 @@ from imagine_bench.cli.tools import (
     Play,
     ViewCommand,
 )
-from imagine_bench.errors import EXTRAS, ImagineBenchError, InvalidValueError, SetupError, brief, lacking, plain
-from imagine_bench.store.files import expanded, reason
+from imagine_bench.errors import EXTRAS, ImagineBenchError, InvalidValueError, SetupError, brief, lacking, plain, reason
+from imagine_bench.store.files import expanded
 from imagine_bench.version import __version__
 
 INTERRUPTED = 130

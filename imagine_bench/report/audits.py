@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import reference, registry, statistics
-from imagine_bench.errors import ArtefactError, InvalidValueError, brief
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief, writing
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.causes import causes_of
 from imagine_bench.judge.plans import PlanResult, make_plans, require_threshold
@@ -40,7 +40,6 @@ from imagine_bench.store.files import (
     table_text,
     write_bytes,
     write_json,
-    writing,
 )
 from imagine_bench.store.loading import load_so_far
 

@@ -37,8 +37,7 @@ from safetensors.numpy import load, save
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays
 from imagine_bench.cores import ONE_THREAD
-from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
-from imagine_bench.store.files import writing
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain, writing
 
 _PATIENCE_S = 5.0
 _POLL_S = 0.05

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import errno
 import hashlib
 import io
 import json
@@ -21,32 +20,8 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from imagine_bench.arrays import Array, Arrays
-from imagine_bench.errors import ArtefactError, BusyError, InvalidValueError, SetupError, brief, why
+from imagine_bench.errors import ArtefactError, BusyError, InvalidValueError, SetupError, brief, why, writing
 from imagine_bench.values import Json
-
-_REASONS = {
-    errno.EACCES: "you may not write there; choose another folder or change its permissions",
-    errno.EPERM: "you may not write there; choose another folder or change its permissions",
-    errno.EROFS: "that file system is read-only; choose another folder",
-    errno.ENOSPC: "the disk is full; free some space and run the same command again",
-    errno.ENOTDIR: "a part of that path is a file, not a folder; choose another folder",
-    errno.EEXIST: "a part of that path is a file, not a folder; choose another folder",
-}
-"""What to do about refusals of the operating system; of others its own words are shown."""
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn the operating system's refusal to write at ``path`` into a SetupError of one sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise SetupError(f"Cannot write {path}: {reason(error)}.") from error
-
-
-def reason(error: OSError) -> str:
-    """Why the system refused, in words."""
-    return _REASONS.get(error.errno or 0, error.strerror or str(error))
 
 
 def expanded(path: Path) -> Path:

@@ -31,7 +31,7 @@ import numpy as np
 from safetensors.numpy import load, save
 
 from imagine_bench.arrays import Array, Arrays
-from imagine_bench.errors import ArtefactError
+from imagine_bench.errors import ArtefactError, writing
 from imagine_bench.interfaces import AgentState
 from imagine_bench.protocols.data import ProtocolData, RunSpec
 from imagine_bench.registry.entries import agent_label
@@ -52,7 +52,6 @@ from imagine_bench.store.files import (
     write_arrays,
     write_bytes,
     write_json,
-    writing,
 )
 from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RunResult
 from imagine_bench.values import Json
