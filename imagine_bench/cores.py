@@ -30,7 +30,7 @@ def _quota(root: Path) -> float:
         if not controllers or "cpu" in controllers.split(","):
             top = root / "sys/fs/cgroup" / controllers
             inner = top / path.lstrip("/")
-            for folder in (inner, *inner.parents):  # each limits what is below it
+            for folder in (inner, *inner.parents):  # each limits all groups below it
                 if folder.is_relative_to(top):
                     least = min(least, _limit(folder))
     return least

@@ -20,7 +20,7 @@ _LONGEST_REASON = 1000
 _OF_CONSTRUCTORS = re.compile(
     r"__init__\(\) (missing \d+ required .*arguments?: (?P<missing>.+)|got an unexpected \D+ (?P<unknown>'[^']*'))"
 )
-"""What Python says where values of a file are not the fields of the dataclass that they are for."""
+"""Python's message where a file does not have the fields of its dataclass: one is missing, or one is unknown."""
 _REASONS = {
     errno.EACCES: "you may not write there; choose another folder or change its permissions",
     errno.EPERM: "you may not write there; choose another folder or change its permissions",
@@ -29,7 +29,7 @@ _REASONS = {
     errno.ENOTDIR: "a part of that path is a file, not a folder; choose another folder",
     errno.EEXIST: "a part of that path is a file, not a folder; choose another folder",
 }
-"""What to do about refusals of the operating system; of others its own words are shown."""
+"""Advice about refusals of the operating system; of others its own words are shown."""
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _LONGEST
 _SHORT.maxother = _LONGEST
@@ -43,7 +43,7 @@ def brief(value: object) -> str:
 
 
 def why(error: Exception) -> str:
-    """What is wrong, for a sentence: an error's first line, names where a dataclass lacks or does not know a field."""
+    """The reason of an error, for a sentence: its first line, or the fields that a dataclass lacks or does not know."""
     text = str(error).strip()
     found = _OF_CONSTRUCTORS.search(text)
     if found is not None:
@@ -150,7 +150,7 @@ class RunFailedError(ImagineBenchError):
 
 
 class CheckFailedError(ImagineBenchError):
-    """A command that checks has found something wrong, and has printed what."""
+    """A command that checks has found something wrong and has printed its complaints."""
 
     exit_code = 1
 

@@ -215,7 +215,7 @@ def differences(treated: ArrayLike, base: ArrayLike, *, trials: int | None = Non
 
     Runs of one seed share starts and first weights, but what training makes of them does not agree: of the kept benches
     the correlation over seeds is about 0.1, so they are not paired. ``trials`` are tests behind each score: the error
-    of a mean is at least theirs. What is hard from the same starts for both agents cancels.
+    of a mean is at least theirs. Starts that are equally hard for both agents cancel.
     """
     a = _finite(treated)
     b = _finite(base)

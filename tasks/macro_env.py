@@ -70,7 +70,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
     Starting State: one of the rules' start states, equally likely, or ``reset(options={"macrostate": ...})``.
 
     Episode End: terminated where the rules say so; truncation is the registered time limit, or a simulation that blew
-    up: then the reward is 0, observation and macrostate are those before, and ``fault_reason`` says what happened.
+    up: then the reward is 0, observation and macrostate are those before, and ``fault_reason`` names the cause.
 
     Info: ``macrostate`` and what the observation shows of it, ``shown``, late, or -1 where hidden (int64, (M,)),
     ``is_success``, ``success``, ``legal``, ``fault`` and ``fault_reason`` (empty where there is none), ``sim_time_s``
@@ -344,7 +344,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         )
 
     def _blown_up(self, standing: WorldState, why: str) -> Step:
-        """What :meth:`act` returns of a simulation that blew up: the scene stands as before, the episode is over."""
+        """The result of :meth:`act` if the simulation blew up: the scene stands as before, the episode is over."""
         self.world.set_state(standing)
         self.latest = None
         return 0.0, False, True, self._info(success=False, legal=self._rules.is_legal(self._macrostate), fault=why)

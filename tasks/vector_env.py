@@ -34,7 +34,7 @@ class _Acting(NamedTuple):
     """A lane in the middle of a macro-action, or of the reset that takes its place."""
 
     begun_s: float  #: when it began, on the clock that all lanes share
-    step: Future[Step] | None  #: what becomes of it; None for a reset
+    step: Future[Step] | None  #: its result; None for a reset
 
     def due_s(self) -> float:
         """When it ends on that clock; waits until it has been simulated."""
@@ -192,7 +192,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
     # --- details -------------------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is copied and pickled: all but the threads, of which a copy has its own.
+        """The attributes of a copy or a pickle: all but the threads, of which a copy has its own.
 
         Raises:
             InvalidValueError: A lane is acting.

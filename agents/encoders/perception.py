@@ -65,12 +65,12 @@ def prepare_torch(device: str) -> torch.device:
 
 
 def keep_torch() -> None:
-    """Let what :func:`prepare_torch` has changed so far stay."""
+    """Keep torch's present settings: :func:`restore_torch` will not undo the changes that were made before."""
     _replaced.clear()
 
 
 def restore_torch() -> None:
-    """Undo what :func:`prepare_torch` has changed since :func:`keep_torch`."""
+    """Undo all changes of torch's settings that :func:`prepare_torch` has made since :func:`keep_torch`."""
     if _replaced:
         _set_up(*_replaced[0])
     _replaced.clear()

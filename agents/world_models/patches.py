@@ -1,4 +1,4 @@
-"""A plain world model without a network, between *copy* and the networks: what an engineer writes in an afternoon.
+"""A plain world model without a network, between *copy* and the networks: an engineer's work of one afternoon.
 
 Pixels that change under the same macro-actions are a patch. The looks of each patch are grouped. A table counts which
 look follows which under each macro-action, another which rewards and ends came with the looks. Frames are drawn by
@@ -35,7 +35,7 @@ _LEVEL = 0.02  # of the largest distance: differences below it count as none
 Looks = tuple[int, ...]
 """The look of each patch, by its number."""
 Memory = defaultdict[Hashable, list[int]]
-"""The looks of a patch that followed, each as often as it did, by what was there before."""
+"""A table of one patch: the looks before and a macro-action, and a list of all looks that followed them."""
 
 
 class Patch(NamedTuple):
@@ -190,7 +190,7 @@ def _patch(frames: Frame, gray: Floats, pixels: Ints) -> Patch:
 
 
 def _table(steps: Sequence[tuple[Looks, int, Looks]], index: int) -> Memory:
-    """What followed a patch's own look and, where that foretells more, what followed the looks of all patches."""
+    """The looks that followed a patch's own look and, if these predict it better, the looks of all patches."""
     own: Memory = defaultdict(list)
     whole: Memory = defaultdict(list)
     for before, action, after in steps:
@@ -202,7 +202,7 @@ def _table(steps: Sequence[tuple[Looks, int, Looks]], index: int) -> Memory:
 
 
 def _foretold(table: Memory) -> float:
-    """Log-likelihood of what followed, each time by all other times."""
+    """Log-likelihood of the looks that followed, each predicted from all others in its list."""
     found = 0.0
     for seen in table.values():
         for count in Counter(seen).values():

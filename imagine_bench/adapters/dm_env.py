@@ -136,7 +136,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
         self._env.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is copied and pickled: all but the physics shown, which show the scene of this environment alone."""
+        """The attributes of a copy or a pickle: all but the physics, which show the scene of this environment alone."""
         return {**vars(self), "_physics": None}
 
     # --- the viewer ----------------------------------------------------------------------------------------------

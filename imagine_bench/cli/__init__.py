@@ -191,7 +191,10 @@ class _Printable(io.StringIO):
 
 
 def _of_torch(function: str) -> None:
-    """Call what scopes torch's settings, which hold for the whole process, if they may have been changed."""
+    """Call ``keep_torch`` or ``restore_torch`` if torch's settings may have been changed.
+
+    The settings hold for the whole process.
+    """
     if _SETS_UP_TORCH in sys.modules:
         registry.load(f"{_SETS_UP_TORCH}:{function}")()
 

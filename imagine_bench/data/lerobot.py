@@ -175,7 +175,7 @@ def _info(episodes: Episodes) -> dict[str, Json]:
 
 
 def _digests(columns: Mapping[str, Array], masks: Array, frames: Frame, lengths: NDArray[np.int64]) -> list[str]:
-    """What stands for each episode of so many rows."""
+    """A digest of each episode, by which its last frame is found; ``lengths`` are their numbers of rows."""
     known = {**{name: columns[name] for name in _DIGESTED}, _MASK: masks, _IMAGE: frames}
     ends = np.cumsum(lengths)
     spans = [slice(end - length, end) for end, length in zip(ends.tolist(), lengths.tolist(), strict=True)]

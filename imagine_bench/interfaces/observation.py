@@ -21,7 +21,7 @@ OBSERVATION_SIZES_PX = (32, 256)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observation:
-    """What an agent is given before it acts. Its arrays cannot be written to."""
+    """One observation, which an agent is given before it acts. Its arrays cannot be written to."""
 
     #: the camera image, uint8. Shape (64, 64, 3), or as the protocol says (size, size, 3), or (0, 0, 3) for none
     frame: Frame

@@ -200,7 +200,7 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
         else:
             work_through(carry, waiting, workers=workers, on_news=print, on_end=ended)
     facts = {"closed_off": why_open() or True, **describe_environment()}
-    if any((folder / cell.file).exists() for cell in cells):  # otherwise what others left here stays as it is
+    if any((folder / cell.file).exists() for cell in cells):  # otherwise the file of another judgement stays
         write_json(folder / "judgement.json", {**dataclasses.asdict(judgement), **facts})
     return folder, list(failed)
 

@@ -92,7 +92,7 @@ class ServedModel:
         return {}
 
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Arrays:
-        """What the model imagines; InvalidValueError where it is not what it must be."""
+        """The fields of the model's :class:`Imagined`, by name. Raises InvalidValueError: one has wrong values."""
         found = self._model.imagine(frames, actions, samples, rng)
         depth = actions.shape[1] - frames.shape[1] + 1
         require_imagined(found, name=self._name, rows=len(frames), depth=depth, samples=samples)
@@ -139,7 +139,7 @@ class JudgedModel:
 
     model: WorldModel
     cost: dict[str, str | int]  # spent beforehand: the encoder's name and frames
-    visited: set[tuple[State, int]] | None  # what a trained agent has experienced; None for a model that learns here
+    visited: set[tuple[State, int]] | None  # tried in an agent's training; None for a model that learns here
     cpu_s: Callable[[], float]  # CPU seconds so far of the process that it is in
 
 
@@ -157,7 +157,7 @@ def opened(
 ) -> Iterator[JudgedModel]:
     """A new model, or a trained agent, in a process of its own; a privileged one in this process.
 
-    What is printed there is added to ``log``. ``folder`` is the judgement's, which is hidden from models as its
+    The output of that process is added to ``log``. ``folder`` is the judgement's, which is hidden from models as its
     neighbours are.
 
     Raises:
@@ -249,9 +249,9 @@ def _visited(run: Path) -> set[tuple[State, int]]:
 def make(
     name: str, spec: TaskSpec, index: RenderedFrameIndex, appearance: str, seeds: SeedTree, encoder: str | None = None
 ) -> tuple[WorldModel, dict[str, str | int]]:
-    """A new model, or a trained agent, in this process, and what was spent on it beforehand.
+    """A new model, or a trained agent, in this process, and the cost of its encoder.
 
-    That is the encoder's name and frames.
+    The cost is the encoder's name and the number of frames that it was trained on.
     """
     if Path(name) in runs_of(name).values():
         kept = read_agent(Path(name))
@@ -266,7 +266,7 @@ def make(
 def _context(
     name: str, spec: TaskSpec, appearance: str, seeds: SeedTree, encoder: str | None
 ) -> tuple[AgentContext, dict[str, str | int]]:
-    """What a registered model is made from, and what was spent on that."""
+    """The context from which a registered model is made, and the cost of its encoder."""
     entry = registry.world_model_entry(name)
     path = None if entry.encoder_kind is None else _encoder(spec, appearance, entry.encoder_kind, encoder)
     context = AgentContext(

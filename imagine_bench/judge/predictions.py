@@ -37,7 +37,7 @@ class ImageReader(Protocol):
 
 
 def reader_errors(reader: ImageReader, spec: TaskSpec, appearance: str) -> dict[str, float]:
-    """How often a reader is wrong on frames that it was not trained on, and how often it reads what shows nothing.
+    """Error rates of a reader, on frames that it was not trained on and on images that show nothing of this world.
 
     Shares of real frames: ``misread``, taken for another macrostate, and ``refused``; the others are shares taken for
     an image of this world of black and gray fog, noise, and blends of two frames of different macrostates.
@@ -160,8 +160,8 @@ def evaluate(
     """Run a model and classify its images.
 
     An image that equals a rendered frame gets that frame's macrostate; the reader classifies the rest. A model is
-    handed copies, so that it cannot change what others are asked. ``order`` shuffles the questions; without it they
-    are asked in their own order. ``cpu_clock`` is that of the process in which the model is.
+    handed copies, so that it cannot change the questions of other models. ``order`` shuffles the questions; without it
+    they are asked in their own order. ``cpu_clock`` is that of the process in which the model is.
 
     Raises:
         InvalidValueError: The model fails, or hands in what it must not; the message names model and method.

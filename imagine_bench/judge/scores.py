@@ -109,8 +109,9 @@ def after_the_end_scores(asked: EvalSet | None, predictions: Predictions | None,
 def ranking_scores(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> Scores:
     """Mean regret: the exact return of the best of each start's sequences, less that of the one ranked first.
 
-    ``regret`` ranks by the model's own rewards, ``regret_ruled`` by the rules' rewards for what the model imagines. The
-    latter is NaN for a model that gives probabilities of several images: it does not say which of them follow which.
+    ``regret`` ranks by the model's own rewards, ``regret_ruled`` by the rules' rewards for the imagined macrostates.
+    The latter is NaN for a model that gives probabilities of several images: it does not say which of them follow
+    which.
     """
     exact = np.array([sum(map(expected_reward, steps)) for steps in questions.truth]).reshape(-1, RANKED)
 
@@ -150,11 +151,11 @@ def _ruled(questions: EvalSet, predictions: Predictions, rules: Rules) -> tuple[
 
 
 def imagined_models(questions: EvalSet, predictions: Predictions, rules: Rules) -> dict[str, Model]:
-    """What a model expects of every macro-action in the macrostates of :func:`.questions.one_step`.
+    """A model's predictions for every macro-action in the macrostates of :func:`.questions.one_step`.
 
     Returns:
-        ``ruled``, with the rules' rewards and ends for what it imagines; and ``own``, with those that it predicts,
-        where it predicts both.
+        ``ruled``, with the rules' rewards and ends for the imagined macrostates; and ``own``, with the rewards and ends
+        that the model predicts, where it predicts both.
     """
     states = questions.macrostates
     shape = (len(states), rules.n_actions, -1)
@@ -175,13 +176,15 @@ def imagined_models(questions: EvalSet, predictions: Predictions, rules: Rules) 
 
 
 def _costs(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dict[str, float | list[float]]:
-    """Value losses, in the mean, the worst and by start, and what abstaining gains; NaN where not all is asked about.
+    """Value losses, in the mean, the worst and by start, and the gain of abstaining; NaN where not all is asked about.
 
     A loss is V* - V of the policy that is optimal in the model, by its own rewards and ends; NaN where it leaves them
-    out. ``value_loss_ruled`` is the mean loss with the rules' rewards and ends for what the model imagines. Abstaining
-    gains what planning gains where it avoids transitions, but for where all of a macrostate's would be avoided: those
-    that the model knows least of, of :data:`_AVOIDED` the best share with the truth known and 0 where none gains; or
-    those that its own filter discards.
+    out. ``value_loss_ruled`` is the mean loss with the rules' rewards and ends for the imagined macrostates.
+
+    The gain of abstaining is the gain in value of a planner that avoids some transitions, except in macrostates where
+    it would avoid all of them. ``worth_of_refusing`` avoids those that the model knows least of; it tries the shares
+    of :data:`_AVOIDED` and is the gain of the best one with the truth known, or 0 where none gains.
+    ``worth_of_filter`` avoids those that the model's own filter discards.
     """
     states = questions.macrostates
     starts = spec.rules.start_states

@@ -1,6 +1,7 @@
 """Verification: every kept episode, of training and of tests, is played again, and all that follows is computed anew.
 
-What a replay cannot show, :data:`UNSHOWN` says; training again (:mod:`imagine_bench.running.retraining`) shows more.
+:data:`UNSHOWN` lists the claims that a replay cannot show. Training again (:mod:`imagine_bench.running.retraining`)
+shows more.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _CLAIMS = {
     "fingerprints": "fingerprint",
     "sim_times_s": "simulated time in seconds",
 }
-"""What is kept of an episode beside its actions, and what it is called."""
+"""The kept fields of an episode beside its actions, and their names in a complaint."""
 _SAME_TIME = 0.05
 """Share by which simulated times may differ: kinds of CPU differ by a step of physics."""
 _OF_DATASET = re.compile("-([0-9]+)@")
@@ -52,7 +53,7 @@ UNSHOWN = (
     "CPU seconds, diagnostics, and what observers measured",
     "pictures and recordings",
 )
-"""What playing episodes again cannot show of any bench."""
+"""Claims of any bench that playing its episodes again cannot show."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,8 +63,8 @@ class Verdict:
     what: str
     complaint: str = ""  # empty where all holds
     episodes: int = 0  # played again
-    unshown: tuple[str, ...] = ()  # what is not kept, so that it cannot be shown
-    holds: str = "holds"  # what is said where all does
+    unshown: tuple[str, ...] = ()  # claims that the kept files cannot show
+    holds: str = "holds"  # the words where there is no complaint
     of_training: bool = False  # whether it is on a run that was trained again
 
     def __str__(self) -> str:
@@ -119,17 +120,17 @@ def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
 
 
 def brief_lines(error: object) -> str:
-    """What an error says, on one line."""
+    """The message of an error, on one line."""
     return " ".join(plain(error).split())
 
 
 def does_not_fit(error: Exception) -> str:
-    """A complaint of what nobody foresaw in a file that somebody changed and sealed again."""
+    """The complaint for an error that no check foresees, in a file that somebody changed and sealed again."""
     return f"its parts do not fit together ({type(error).__name__}: {brief_lines(error)})."
 
 
 def cost(found: Sequence[Verdict], cpu_s: float) -> str:
-    """What playing episodes again cost, in a sentence."""
+    """The cost of playing episodes again, in a sentence."""
     return f"{sum(each.episodes for each in found):,} episodes; checked in {cpu_s:,.1f} CPU s."
 
 
@@ -151,7 +152,7 @@ class Replays:
 
 @dataclasses.dataclass
 class _RunCheck:
-    """One run that is verified. ArtefactError says in one sentence what does not hold."""
+    """One run that is verified. An ArtefactError names in one sentence the first claim that does not hold."""
 
     folder: Path
     protocol: Protocol
@@ -160,7 +161,7 @@ class _RunCheck:
     replays: Replays
 
     def load(self) -> RunResult:
-        """Read the run, and compare what needs no replay."""
+        """Read the run, and check all claims that need no replay."""
         run_folder.require_run_of(self.folder, self.protocol, self.agent, self.seed)
         if not run_folder.is_done(self.folder):
             raise ArtefactError("it is not finished.")
@@ -185,7 +186,7 @@ class _RunCheck:
         return run
 
     def play(self) -> tuple[int, list[str]]:
-        """Play all episodes again. Returns how many these were, and what of the run is not kept."""
+        """Play all episodes again. Returns their number, and the claims of the run that cannot be shown."""
         count = self.protocol.evaluation_episodes
         purpose = evaluation_split(self.seed)
         kept = [self.run.training, *(row.kept for row in self.run.checkpoints)]
@@ -233,7 +234,7 @@ class _RunCheck:
             raise ArtefactError("which macro-actions were tried where does not follow from its training episodes.")
 
     def _unshown(self) -> list[str]:
-        """What this run does not keep."""
+        """The claims of this run that cannot be shown, such as training episodes that were not kept."""
         protocol = self.protocol
         unshown = []
         if self.is_older:
@@ -250,7 +251,7 @@ class _RunCheck:
         return unshown
 
     def require_own(self, owners: dict[tuple[str, str, str], int]) -> None:
-        """Compare what no two seeds of a learner share with that of the seeds before, which ``owners`` holds."""
+        """Compare the run's marks with those of the seeds before, which ``owners`` holds; no two seeds share one."""
         if not self.trained:
             return
         for name, mark in self._marks().items():
@@ -259,7 +260,10 @@ class _RunCheck:
                 raise ArtefactError(f"its {name} are those of seed {owner}, and no two seeds of a learner share them.")
 
     def _marks(self) -> dict[str, str]:
-        """What no two seeds of a learner share, by name; of a dataset alone they may learn the same."""
+        """Results that no two seeds of a learner share, by name: weights, CPU seconds, and tests with own failures.
+
+        Two seeds that have learned from the same dataset alone may share weights and tests: these are left out then.
+        """
         shared = _of_dataset(self.protocol)
         snapshot = run_folder.load_newest(self.folder / run_folder.CHECKPOINTS)
         marks = {}
@@ -275,7 +279,7 @@ class _RunCheck:
 
 
 def _entry_of(agent: str) -> AgentEntry | None:
-    """What is registered of an agent; None where its package is not here."""
+    """The registry line of an agent; None where its package is not here."""
     try:
         return registry.agent_entry(agent)
     except UnknownNameError:
@@ -311,7 +315,7 @@ def has_own_failures(kept: KeptEpisodes, protocol: Protocol) -> bool:
 
 
 def _of_protocol(protocol: Protocol, results: Mapping[str, RunResult]) -> Iterator[Verdict]:
-    """A verdict on what runs of a protocol have in common, where there is something to say."""
+    """A verdict on the encoders and settings of a protocol, if there is a complaint or an unshown claim."""
     complaint, unshown = _settings(protocol, results)
     entries = [_entry_of(agent) for agent in protocol.agents]
     is_older = any(run.training is None for run in results.values())
@@ -327,7 +331,7 @@ def _of_protocol(protocol: Protocol, results: Mapping[str, RunResult]) -> Iterat
 
 
 def _settings(protocol: Protocol, results: Mapping[str, RunResult]) -> tuple[str, list[str]]:
-    """What is wrong with the settings of learners, or empty, and what of them is not shown."""
+    """A complaint about the settings of learners, or an empty text, and the unshown claims about them."""
     settings: dict[str, Json] = {}
     silent = []
     for agent, run in results.items():
@@ -349,7 +353,7 @@ def _settings(protocol: Protocol, results: Mapping[str, RunResult]) -> tuple[str
 
 
 def _verify_test(row: Checkpoint, count: int, purpose: Purpose, replays: Replays) -> None:
-    """Raise ArtefactError where a row, or one of its ``count`` test episodes, is not what its macro-actions give."""
+    """Raise ArtefactError where a row, or one of its ``count`` tests, does not follow from its macro-actions."""
     where = f"after {row.episodes:,} episodes"
     kept = row.kept
     again = EvaluationCounts()

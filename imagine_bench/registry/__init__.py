@@ -358,7 +358,7 @@ def make_agent(name: str, context: AgentContext) -> Agent:
 
 
 def made(what: str, target: str, *given: Any) -> Any:
-    """What a package's target makes; ``what`` it is. Raises as :func:`make_agent`."""
+    """The object that a package's target makes; ``what`` names it in an error. Raises as :func:`make_agent`."""
     with guests_faults(what, target):
         return load(target)(*given)
 

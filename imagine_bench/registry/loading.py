@@ -1,4 +1,4 @@
-"""Objects by ``"module:attr"``, and what went wrong where the code of another package cannot be loaded."""
+"""Objects by ``"module:attr"``, and the errors of other packages whose code cannot be loaded."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def load(target: str) -> Any:
 
 
 def _hidden(module: ModuleType) -> str:
-    """What to say of a module that is only a folder, without code, or of a worker's ``__main__``."""
+    """A hint for an error about a module that is only a folder, without code, or about a worker's ``__main__``."""
     if module.__name__ == "__main__":
         return ": worker processes cannot import a notebook or standard input; write the code to a file and name that"
     if getattr(module, "__file__", None) is not None:
@@ -64,7 +64,7 @@ def refuse_while_loading() -> None:
 
 
 def fault(error: BaseException) -> str:
-    """What went wrong in the code of another package, on one line."""
+    """Type and message of an error in the code of another package, on one line."""
     return f"{type(error).__name__}: {plain(error)}".partition("\n")[0]
 
 

@@ -1,4 +1,4 @@
-"""What a script or a notebook registers, for the processes that carry out its runs and do not import it."""
+"""The registry lines of a script or a notebook, for the processes that carry out its runs and do not import it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def registered() -> Registered:
 
 
 def register(there: Registered) -> None:
-    """Register what is registered in another process."""
+    """Add the registry lines of another process to those of this process."""
     for table, entries in zip(_TABLES, there, strict=True):
         table.update(entries)
 

@@ -263,7 +263,7 @@ def verify(folder: Path, retraining: Retraining | None = None) -> list[Verdict]:
 
 
 def what_is_shown(folder: Path, retraining: Retraining | None = None) -> str:
-    """What a verdict does not show, and how likely runs that are trained again find forged ones, as text."""
+    """The claims that a verdict does not show, and the chance that training again finds a forged run, as text."""
     protocol = read_control(folder)
     environment = bench_facts(folder)["environment"]
     benches = [each for each in (environment, *environment.values()) if isinstance(each, Mapping) and "commit" in each]

@@ -176,7 +176,7 @@ def over_seeds(
 
 
 def seeds_note(seeds: int) -> str:
-    """What :func:`over_seeds` shows of so many seeds."""
+    """The names of the figures that :func:`over_seeds` shows of so many seeds."""
     out = statistics.left_out(seeds)
     middle = f"interquartile mean ({out} of {seeds} seeds left out) / mean of all" if out else "mean over seeds"
     if seeds < statistics.FEWEST:

@@ -143,7 +143,7 @@ class Counted(AbstractContextManager["Counted"]):
 
 
 def counted(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:
-    """The items, counted as :class:`Counted` shows it; ``what`` is what they are called."""
+    """The items, counted as :class:`Counted` shows it; ``what`` is their name on the screen."""
     with Counted(what, total=total) as counting:
         for item in items:
             yield item

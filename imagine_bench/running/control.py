@@ -110,7 +110,7 @@ def resolved_settings(wanted: Protocol) -> dict[str, Json]:
 
 
 def _encoders(wanted: Protocol, given: str | None) -> Encoders:
-    """The artefact of each kind that an agent needs. Raises InvalidValueError: none reads what a given one gives."""
+    """The encoder of each kind that an agent needs. Raises InvalidValueError: no agent reads the given encoder."""
     entries = [registry.agent_entry(agent) for agent in wanted.agents]
     needed = {entry.encoder_kind for entry in entries if entry.needs_encoder}
     spec = registry.task(wanted.task)

@@ -38,7 +38,7 @@ _INTEGERS = ("starts", "lengths", "actions", "faults", "fingerprints")
 
 @dataclass
 class EpisodeRecord:
-    """What is kept of an episode, while it is played; see :class:`.KeptEpisodes`."""
+    """The record of an episode, while it is played; see :class:`.KeptEpisodes`."""
 
     start: list[int]
     fingerprint: int

@@ -1,4 +1,4 @@
-"""Judged code in a process of its own: it is given what it is asked and can look at nothing else of its caller.
+"""Judged code in a process of its own: it is given its questions and can look at nothing else of its caller.
 
 Calls go over a pipe. An answer is arrays as a safetensors file, or a sentence; never a pickle, which would carry out
 the guest's code here. The process has limits of time and memory, some modules cannot be imported in it, and it ends
@@ -6,7 +6,7 @@ with its caller, by whatever death.
 
 On Linux, where user namespaces are allowed, it also has no network, sees no process but its own, finds the folders
 empty that are hidden from it, and nothing that it starts outlives it. Where :func:`why_open` says that the system has
-no such means, as macOS has none, it has all rights of its user, and what it detaches from itself may outlive it.
+no such means, as macOS has none, it has all rights of its user, and a process that it detaches may outlive it.
 """
 
 from __future__ import annotations
@@ -54,23 +54,23 @@ _CAPABILITIES_VERSION = 0x20080522
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What a guest may use."""
+    """Limits of a guest."""
 
     call_s: float = 3_600.0  #: Wall seconds of a call
     memory: int = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 3 // 4  #: Bytes of its data (on Linux)
 
 
 class GuestError(InvalidValueError):
-    """What a guest raised, in its words."""
+    """An error of a guest, in its own words."""
 
 
 class Isolated:
     """An object that judged code makes, in a process of its own.
 
     Args:
-        make: ``"module:attr"`` of what makes the object. Each of its methods returns arrays by name.
-        given: What it is made from.
-        log: File to which is added what is printed there.
+        make: ``"module:attr"`` of the factory. Each method of the object that it makes returns arrays by name.
+        given: Arguments of the factory.
+        log: File to which the output of the process is added.
         forbidden: Modules that cannot be imported there, nor any below them.
         hidden: Folders that are empty there, if it is closed off.
         limits: Time and memory.
@@ -137,11 +137,11 @@ class Isolated:
             self._process.stdin.close()
 
     def call(self, method: str, *given: object) -> Arrays:
-        """What a method returns.
+        """Call a method of the object, and return its arrays.
 
         Raises:
             InvalidValueError: The guest raised an error that is written for users, its process ended or was stopped, or
-                it sent what is no answer.
+                it sent bytes that are no answer.
             GuestError: It raised anything else.
         """
         begun_s = time.monotonic()
@@ -186,7 +186,7 @@ def why_open() -> str:
 
 
 def close_off(hidden: Iterable[str]) -> None:
-    """Take the network and these folders from this process; what it forks sees no other processes.
+    """Take the network and these folders from this process; its later children see no other processes.
 
     Raises OSError: the system does not allow it.
     """
@@ -232,7 +232,7 @@ def serve(pipe_number: int) -> None:
             time.sleep(_POLL_S)
     code = os.waitstatus_to_exitcode(ended[1])
     with suppress(ProcessLookupError, PermissionError):
-        os.killpg(guest, signal.SIGKILL)  # what it started and left
+        os.killpg(guest, signal.SIGKILL)  # processes that it started and left
     os._exit(code if code >= 0 else 128 - code)
 
 

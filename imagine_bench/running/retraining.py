@@ -1,4 +1,4 @@
-"""Runs trained again, some of each agent drawn at random, and what of them does not repeat."""
+"""Runs trained again, some of each agent drawn at random, and compared with the kept ones."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SAME_COST = (4.0, 3.0)
 _OF_MACHINES = {"cpu", "gl_renderer", "device"}
 """Facts on which bits depend, and which whoever trains again may not be able to choose."""
 _OF_OBSERVERS = ("open_loop", "beliefs", "imagined")
-"""Beginnings of the names of what only runs that are observed keep."""
+"""Beginnings of the names of parts that only observed runs keep."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,12 +48,12 @@ class Retraining:
 
 
 class Repeat(NamedTuple):
-    """What came of one run that was trained again."""
+    """The comparison of one run with the same run trained again."""
 
     agent: str
     seed: int
     complaint: str  #: Empty where it repeats
-    remark: str  #: What could be compared
+    remark: str  #: The parts that repeat, or why bits were not compared
 
 
 def drawn(protocol: Protocol, count: int, nonce: str) -> list[tuple[str, int]]:
@@ -122,7 +122,7 @@ def _spec(protocol: Protocol, agent: str, seed: int, retraining: Retraining) -> 
 
 
 def _differing(store: BenchStore) -> list[str]:
-    """Facts that decide the bits of a result and are not now what they were in all sessions of a bench."""
+    """Facts that decide the bits of a result and that differ now, or between sessions of the bench."""
     environment = describe_environment()
     with reading(store.folder, "a bench with environment and sessions"):
         names = {*store.changed(environment)}
@@ -132,7 +132,7 @@ def _differing(store: BenchStore) -> list[str]:
 
 
 def _compared(kept: RunResult, again: RunResult, differing: Sequence[str]) -> tuple[str, str]:
-    """What does not repeat, or empty, and what could be compared."""
+    """A complaint, empty if the run repeats, and a remark on the comparison."""
     before = _digests(kept)
     now = _digests(again)
     is_older = run_folder.read_config(kept.folder)["format"] == run_folder.WITHOUT_TRAINING
@@ -158,7 +158,7 @@ def _compared(kept: RunResult, again: RunResult, differing: Sequence[str]) -> tu
 
 
 def _digests(run: RunResult) -> dict[str, str]:
-    """A digest of each part of a run that repeats to the bit, by name; none of what it does not keep."""
+    """A digest of each part of a run that repeats to the bit, by name; a part that was not kept has none."""
     snapshot = run_folder.load_newest(run.folder / run_folder.CHECKPOINTS)
     parts: dict[str, object] = {
         "settings": run.settings,

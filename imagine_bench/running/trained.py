@@ -29,7 +29,7 @@ class Trained:
     """An agent as its run left it."""
 
     agent: Agent  #: The agent itself
-    spec: RunSpec[Protocol]  #: What its run was
+    spec: RunSpec[Protocol]  #: Protocol, agent, seed and encoder of its run
     task: TaskSpec  #: The task it was trained on
     episodes: int  #: Real training episodes it has had on its task, without those on tasks before
     folder: Path  #: Its run's folder
@@ -41,12 +41,12 @@ class Trained:
 
 
 class KeptAgent(NamedTuple):
-    """What the agent of a run is made from again, with the settings it ran with, and its last checkpoint."""
+    """The factory, the context and the last checkpoint of a run's agent, with the settings it ran with."""
 
-    make: str  #: ``"module:attr"`` of what makes it
+    make: str  #: ``"module:attr"`` of the factory
     context: AgentContext
     state: AgentState
-    spec: RunSpec[Protocol]  #: What its run was
+    spec: RunSpec[Protocol]  #: Protocol, agent, seed and encoder of its run
     episodes: int  #: As of :class:`Trained`
     folder: Path  #: Its run's folder
 
@@ -80,7 +80,7 @@ def load_trained(folder: Path, *, encoder: str | None = None) -> Trained:
 
 
 def read_agent(folder: Path, *, encoder: str | None = None) -> KeptAgent:
-    """Read what the agent of a run is made from.
+    """Read the factory, the context and the last checkpoint of a run's agent.
 
     ``folder`` is such as ``runs/arrow_puzzle/quick-<hash>/imagination/seed_0``; ``encoder`` is a bundled name or a
     path, where the run used an encoder that is not bundled.

@@ -173,7 +173,7 @@ def card(used: str | None) -> dict[str, Any] | None:
 
 
 def doubt(path: Path | None) -> str:
-    """What to say of an encoder that reads few frames right, in words; empty where its card says nothing like that."""
+    """A warning about an encoder from which few frames are read right; empty where its card does not say so."""
     share = 1.0 if path is None else _share_read(path)
     if path is None or not share < READS_AT_LEAST:
         return ""

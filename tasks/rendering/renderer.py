@@ -225,7 +225,10 @@ class _Canvases:
         return canvas
 
     def of_others(self) -> tuple[Any, ...] | None:
-        """What makes a context of other code, if one is current in this thread, so again: dm_control never asks."""
+        """Display, surfaces and context of other code, if its context is current in this thread; else None.
+
+        They make that context current again later, as dm_control expects: it never checks whether its own still is.
+        """
         current = _current()() if _is_egl() and "mujoco.egl" in sys.modules else None
         if current is None or any(current == canvas.address for canvas in reversed(self._canvases.values())):
             return None

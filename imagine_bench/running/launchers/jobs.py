@@ -142,11 +142,11 @@ def work_through(
     """Carry out every item in one of so many processes of this machine, in order; none outlives this process.
 
     Args:
-        function: Carries out an item and returns why that failed, or an empty text. What it tells its second argument
-            reaches ``on_news``.
-        items: What is to be done.
+        function: Carries out an item and returns why that failed, or an empty text. Its second argument is a callback
+            for news, such as progress.
+        items: The items to carry out.
         workers: Processes at a time, at least 1.
-        on_news: Told here what is told there.
+        on_news: Called in this process with each piece of news of an item.
         on_end: Told of each item why it failed, or an empty text; a process that dies costs its item alone.
         fresh: Whether each item has a process of its own; else a process carries out one after another.
     """
@@ -234,7 +234,7 @@ class _Worker(Generic[Item, News]):
 
 
 def _work(function: Callable[[Item, Callable[[News], None]], str], pipe: Connection, there: Registered) -> None:
-    """The life of a worker process: items, of each what it tells, and why it failed or an empty text."""
+    """The life of a worker process: it receives items, and sends the news of each and why it failed, if it did."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all: the parent ends its workers in order
     threading.Thread(target=_die_with_parent, daemon=True).start()
     register(there)

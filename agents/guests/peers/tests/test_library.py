@@ -136,7 +136,7 @@ def test_latents_are_those_of_our_own_agents() -> None:
 
 
 class Listener:
-    """An algorithm of the library's shape, which only listens: what it was rewarded with, and what was truly paid."""
+    """An algorithm of the library's shape that learns nothing: it compares its rewards with those of the task."""
 
     def __init__(self, policy: str, world: gymnasium.Env[Any, Any], **keywords: Any) -> None:
         self.world = world

@@ -59,8 +59,8 @@ class LibrarySettings:
 
     sb3: SB3Settings = field(default_factory=SB3Settings)
     ppo: PPOSettings = field(default_factory=PPOSettings)
-    #: What the library sees of a reward is its product with this. Rewards of up to 50 become rewards of up to 2: the
-    #: library's losses and its authors' settings are made for rewards of about 1.
+    #: Every reward is multiplied by this number before the library sees it. Rewards of up to 50 become rewards of up
+    #: to 2: the library's losses and its authors' settings are made for rewards of about 1.
     reward_scale: float = setting(0.04, POSITIVE)
 
 
