@@ -93,9 +93,9 @@ class Isolated:
         self._limits = limits
         self.cpu_s = 0.0
         """CPU seconds of all calls, as that process says."""
-        ours, theirs = socket.socketpair()
         with writing(log):
             opened = log.open("ab")
+        ours, theirs = socket.socketpair()
         with theirs, opened as printed:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-c", f"from {__name__} import serve; serve({theirs.fileno()})"],
