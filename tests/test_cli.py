@@ -30,7 +30,7 @@ from imagine_bench.store.encoders import bundled
 from imagine_bench.sweep.grid import GRIDS
 
 DRAWING = {"MUJOCO_GL", "LP_NUM_THREADS", "PYOPENGL_PLATFORM"}
-"""What MuJoCo, PyOpenGL and Mesa read as long as the process draws (docs/reference/api.md)."""
+"""Variables that MuJoCo, PyOpenGL and Mesa read as long as the process draws (docs/reference/api.md)."""
 
 
 def bench_words(out: Path, *more: str) -> list[str]:

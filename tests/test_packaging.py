@@ -177,7 +177,7 @@ def test_the_container_installs_what_drawing_needs() -> None:
 
 
 def test_whatever_ci_fetches_is_named_by_its_digest() -> None:
-    """Actions by commit, packages by a lock with hashes; what floats on purpose is the job of MuJoCo's newest."""
+    """Actions by commit, packages by a lock with hashes; only the job of MuJoCo's newest version floats."""
     for workflow in (_TOP / ".github/workflows").glob("*.yml"):
         text = workflow.read_text()
         for used in re.findall(r"uses: (\S+)", text):

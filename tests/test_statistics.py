@@ -53,7 +53,7 @@ def test_an_interval_holds_what_the_trimmed_and_the_plain_mean_allow() -> None:
 
 
 def test_a_trimmed_mean_hides_a_stuck_run_and_its_interval_does_not() -> None:
-    """One of nine is stuck and cut off, as in the median's interval: what is left says 95 %."""
+    """One of nine is stuck and cut off, as in the median's interval: the trimmed mean says 95 %."""
     scores = [0.16, 0.94, 0.95, 0.95, 0.96, 0.96, 0.97, 0.98, 0.99]
     assert statistics.iqm(scores) == pytest.approx(0.958)
     low, high = statistics.interval(scores)

@@ -337,9 +337,9 @@ class Verify(OfBench):
     """
 
     train: Count = None
-    """Runs of each agent, drawn at random, that are trained again; what they give is compared to the bit."""
+    """Runs of each agent, drawn at random, that are trained again; their results are compared to the bit."""
     nonce: Word = None
-    """With --train: what decides which; give one only to repeat a draw."""
+    """With --train: the word that decides which runs are drawn; give one only to repeat a draw."""
     workers: Count = None
     """With --train: processes at a time; one a core by default."""
     dataset: File = None

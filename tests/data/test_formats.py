@@ -199,7 +199,7 @@ def edited(out: Path, *chosen: tuple[Path, Sequence[int]]) -> None:
 def test_what_lerobots_tools_made_is_read_with_the_last_frames_copied(
     tmp_path: Path, which: tuple[Sequence[int], Sequence[int]]
 ) -> None:
-    """Those of 0.4.4 were run on such sets, and gave what is made here; they leave ``final_frames.parquet`` behind."""
+    """LeRobot 0.4.4's tools turned such sets into the ones made here; they leave ``final_frames.parquet`` behind."""
     wanted = []
     for seed, episodes in enumerate(which):
         written(tmp_path / f"set{seed}", "lerobot", seed=seed)

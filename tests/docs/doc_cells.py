@@ -288,7 +288,7 @@ def _success(folder: str, variant: str, budget: str) -> list[float]:
 
 
 def answers(folder: str, agent: str, path: str) -> str:
-    """What the models of a bench answered, %: mean [95 % over seeds], or of few (lowest to highest)."""
+    """A score of a bench's models, %: mean [95 % interval over seeds], or with few seeds (lowest to highest)."""
     runs = _json(f"{folder}/generalisation.json")["runs"]
     values: list[Any] = [run for run in runs if label_today(run["agent"]) == agent]
     for name in path.split("/"):
@@ -361,7 +361,7 @@ def judged(folder: str, model: str, transitions: str, score: str) -> str:
 
 
 def judged_after(folder: str, model: str, score: str, transitions: str) -> str:
-    """The same by what the model learned from, the interquartile mean alone."""
+    """The score of a model that learned from so many transitions: the interquartile mean alone."""
     return re.sub(r" [\[(/].*", "", judged(folder, model, transitions, score))
 
 

@@ -1,4 +1,4 @@
-"""What the fault-injection tests share: deaths at any file operation, damages of any file, values that nobody means."""
+"""Tools of the fault-injection tests: deaths at any file operation, damages of any file, values that nobody means."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def interrupted(
 ) -> Iterator[Path]:
     """New folders below ``root`` in which ``act`` was ended at the file operations ``places``, by default at each.
 
-    ``how`` is ``"full disk"``, ``"death"`` (what catches errors does not catch it) or ``"kill"`` (of a process of its
-    own, in which nothing else runs after it).
+    ``how`` is ``"full disk"``, ``"death"`` (an exception that ``except Exception`` does not catch) or ``"kill"`` (of a
+    process of its own, in which nothing else runs after it).
     """
     count = itertools.count(10**9)
     at: int | None = None

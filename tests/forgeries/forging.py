@@ -1,6 +1,6 @@
-"""What a forger of results has: an honest bench, the project's own way to write its files, and worlds to play in.
+"""Tools of a forger of results: an honest bench, the project's own way to write its files, and worlds to play in.
 
-Nothing here rests on how ``verify`` checks. A forger opens a run, changes what it says, and seals it again at every
+Nothing here rests on how ``verify`` checks. A forger opens a run, changes its claims, and seals it again at every
 level: the table, the checkpoint, the mark of a finished run, the protocol in each configuration, the folder's name.
 """
 
@@ -79,7 +79,7 @@ def honest_bench(root: Path, launcher: Remembering, **changes: Any) -> Path:
 
 @functools.cache
 def world() -> Env:
-    """Where a forger plays what is to be believed."""
+    """The world in which a forger plays the episodes that are to be believed."""
     return make_env(WORLD, "arrow_puzzle")
 
 
@@ -197,7 +197,7 @@ class OpenRun:
             self.say_steps(row)
 
     def say_steps(self, row: dict[str, Any]) -> None:
-        """What an agent says of its own steps agrees with the run's."""
+        """Make the agent's own counts of its steps agree with the run's."""
         for name in ("real_transitions", "gradient_updates"):
             if name in row["diagnostics"]:
                 row["diagnostics"][name] = float(row["env_steps"])
@@ -302,7 +302,7 @@ class Forger:
         self.set_protocol(seeds=[names.get(seed, seed) for seed in self.protocol["seeds"]])
 
     def sessions(self, change: Callable[[dict[str, Any]], None]) -> None:
-        """Change what the bench says of its sessions."""
+        """Change the bench's record of its sessions."""
         path = self.folder / "sessions.json"
         found = read_json(path, "")
         found.pop("seal")

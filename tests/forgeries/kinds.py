@@ -92,7 +92,7 @@ def edited_table(f: Forger, donors: Donors) -> None:
 
 
 def new_names(f: Forger) -> dict[int, int]:
-    """Seeds and what they are called: new ones, or one another's."""
+    """Seeds and the false names that they get: new ones, or one another's."""
     if f.every and f.pick("new", "turned") == "turned":
         return dict(zip(f.seeds, np.roll(f.seeds, f.pick(1, 2)).tolist(), strict=True))
     drawn = f.rng.choice(np.arange(3, 900), len(f.seeds), replace=False)
@@ -152,7 +152,7 @@ def renamed_with_starts(f: Forger, donors: Donors) -> None:
 
 
 def renamed_without_starts(f: Forger, donors: Donors) -> None:
-    """A seed called another, and what would show it deleted."""
+    """A seed called another, and the arrays that would show it deleted."""
     names = new_names(f)
     how = f.pick(
         "training", "older", "older and its starts", "older and no tests", "starts of tests", "training starts"
@@ -403,7 +403,7 @@ def cheaper(row: dict[str, Any], how: str, factor: float) -> None:
 
 
 def prices(f: Forger, donors: Donors) -> None:
-    """Costs that are invented: CPU seconds, steps, what came before."""
+    """Costs that are invented: CPU seconds, steps, training episodes on earlier tasks."""
     how = f.pick("train_cpu_s", "train_cpu_s", "eval_cpu_s", "env_steps", "shorter training", "before", "time/")
     factor = float(np.exp(f.rng.uniform(np.log(0.02), np.log(0.9))))
     has_lengths = f.chance(0.5)

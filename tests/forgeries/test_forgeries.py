@@ -17,7 +17,7 @@ from imagine_bench.running.retraining import Retraining
 
 VARIANTS = 30
 PASSING = ("a failed seed dropped", "prices invented")
-"""What docs/how_to/verify.md says passes even where every run of an agent is forged."""
+"""Forgeries that pass even where every run of an agent is forged, as docs/how_to/verify.md says."""
 
 
 class Court:

@@ -60,7 +60,7 @@ def test_what_is_wrong_is_one_sentence(changes: dict[str, Any], words: str) -> N
 
 
 class Records(Exact):
-    """The exact model, which keeps what it is asked."""
+    """The exact model, which keeps its questions."""
 
     def __init__(self, world: JudgedWorld) -> None:
         super().__init__(world.spec, world.index)

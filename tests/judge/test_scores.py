@@ -91,7 +91,7 @@ def best(rules: Rules, state: State, left: int, choose: Callable[[State], list[i
 
 
 def losses(world: JudgedWorld, choose: Callable[[State], list[int]], horizon: int = 5) -> list[float]:
-    """By start: what always choosing so loses to the best."""
+    """The value that a policy loses to the best one, for each start."""
     rules = world.spec.rules
     every = list(range(rules.n_actions))
     return [
@@ -157,7 +157,7 @@ def test_what_is_left_out_is_a_dash_and_the_rules_stand_in_beside_it(left_out: s
 
 
 class Drawing(Exact):
-    """Draws futures from other probabilities: with ``mistaken`` nothing happens, else what may happen by the rules."""
+    """Draws futures: with probability ``mistaken`` that nothing happens, else one of those that the rules allow."""
 
     def __init__(self, world: JudgedWorld, mistaken: float = 0.0, seed: int = 0) -> None:
         super().__init__(world.spec, world.index)
@@ -212,7 +212,7 @@ def test_a_model_that_draws_is_comparable_with_one_that_gives_probabilities(mist
 
 
 def test_a_brier_score_is_a_mean_over_questions_however_many_guesses_each_has() -> None:
-    """Half of the probability on the truth, half on what cannot be: 1/4 + 1/4 a question."""
+    """Half of the probability on the truth, half on an impossible outcome: 1/4 + 1/4 a question."""
     world = judged_world(ARROWS)
     scores = world.scores(Giving(world, 0.5))
     assert scores["outcome_brier"] == scores["unbiased"] == pytest.approx(0.5)

@@ -85,6 +85,6 @@ def test_the_truth_advances_by_hand() -> None:
 
 
 def test_what_is_over_stays_over_and_earns_nothing() -> None:
-    """Also where the dynamics lead on to what would be no end."""
+    """Also where the dynamics lead on to a macrostate that ends no episode."""
     after = advance(Toss(), {((0,), True): (1.0, 7.0)}, 0)  # type: ignore[arg-type]
     assert after == {((1,), True): (0.25, 0.0), ((2,), True): (0.75, 0.0)}

@@ -1,4 +1,4 @@
-"""Judged code finds nothing of its caller, cannot outlive or stop it, and what it does wrong is one sentence."""
+"""Judged code finds nothing of its caller and cannot outlive or stop it; each of its faults is one sentence."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _grows(file: Path) -> bool:
 @pytest.mark.parametrize("closed", [CLOSED, OPEN])
 def test_nothing_outlives_the_caller(tmp_path: Path, closed: bool) -> None:
     beat = tmp_path / "beat"
-    leave = f"guest.call('leaves', {str(beat)!r})" if closed else ""  # elsewhere what detaches itself stays
+    leave = f"guest.call('leaves', {str(beat)!r})" if closed else ""  # elsewhere a detached process stays
     lines = (
         "import sys; from pathlib import Path; from imagine_bench.running.isolation import Isolated",
         f"sys.path.insert(0, {str(Path(__file__).parents[1] / 'fakes')!r})",

@@ -63,7 +63,7 @@ def a_dataset(folder: Path, format: str) -> object:
 
 
 def an_encoder(folder: Path) -> object:
-    """What a world's own encoder, trained once into the cache, reads of a black frame."""
+    """The latents of a black frame by a world's own encoder, which is trained once into the cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("IMAGINE_BENCH_CACHE", str(folder))
         path = own(registry.task(_WORLD), "clean")
@@ -157,7 +157,7 @@ DAMAGED: dict[str, Callable[[Path], object]] = {
 }
 _GRID = 'question = "?"\nbudgets = [5]\nseeds = [1000]\n\n[[variants]]\nname = "a"\nagent = "random"\n'
 _WRITTEN_BY_PEOPLE = ("results.csv", "mine.toml")
-"""Files without a digest: what they say is taken as it is written, but never raw."""
+"""Files without a digest: a changed value is taken as it is written, or refused in one sentence."""
 
 
 def _fill(folder: Path, door: str) -> list[Path]:
@@ -210,7 +210,7 @@ def test_every_region_of_every_file_may_be_damaged(
 
 
 _BEGINS = 77
-"""The exit code of a command that would begin its work: what it was given has been accepted."""
+"""The exit code of a command that would begin its work: its options have been accepted."""
 _WORK = ("cli.tools.collect", "cli.benches.judge", "cli.benches.run_study", "cli.benches.run_suite")
 _FLAGS = {
     "dataset": ["policy", "format", "seed", "execution", "appearance", "motion-hz", "episodes", "describe"],
@@ -221,7 +221,7 @@ _FLAGS = {
 
 
 def a_lane(rng: np.random.Generator, lanes: Any) -> None:
-    """A reset or a step of lanes with what nobody means."""
+    """A reset or a step of lanes with values that nobody means."""
     lanes.reset(seed=0)
     if rng.random() < 0.5:
         lanes.step(hostile(rng))

@@ -1,4 +1,4 @@
-"""What a script or a notebook registers reaches the processes that carry out its runs, which do not run it again."""
+"""Registry lines of a script or a notebook reach the processes that carry out its runs and do not run it again."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def test_a_turn_keeps_the_limits_of_speed_and_force_and_returns(arm, turner):
 
 
 def test_a_turn_depends_on_positions_alone(turner):
-    """Not on how fast anything moved before, nor on what the solvers and the servos were told."""
+    """Not on earlier speeds, nor on the solver's warm start or the servos' targets."""
     ends = []
     for left_over in (0.0, 0.3):
         place(turner.model, turner.data, (0, 0.1, 0))

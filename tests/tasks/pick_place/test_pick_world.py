@@ -190,7 +190,7 @@ def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
 
 @pytest.mark.parametrize(("state", "action"), [((1, 0, 0, OPEN_PALM), HAND_OVER), ((0, 1, 0, 2), 1)])
 def test_a_gripper_that_has_let_go_is_open_in_both_executions(state, action):
-    """Of a handover and of what was put back: as wide as where nothing was ever held."""
+    """After a handover or a put-back the gripper is as wide open as if it had never held anything."""
     for execution in ("kinematic", "physics"):
         env = gymnasium.make(SPEC.env_id, execution=execution, observation="proprio").unwrapped
         empty, _ = env.reset(seed=0, options={"macrostate": (0, 0, 0, 2)})
