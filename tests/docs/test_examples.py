@@ -142,16 +142,16 @@ def test_what_an_agent_needs_over_the_floor(
 def test_how_far_learned_tables_are_from_the_rules(
     example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Far after one transition, near after as many as the floor says."""
+    """Far after one transition, nearer after a quarter as many as the cautious learner needs."""
     floor = certificate(registry.task("arrows:slip=0.1")).floor
     assert floor
-    monkeypatch.setattr(example, "FLOORS", (1 / floor.transitions, 1.0))
+    monkeypatch.setattr(example, "FLOORS", (1 / floor.transitions, 0.25))
     example.main(["slip=0.1", "--seeds", "1000", "--out", str(tmp_path / "tables.json")])
     world = json.loads((tmp_path / "tables.json").read_text())["worlds"]["slip=0.1"]
     ((first, learned),) = world["total_variation"]
-    assert world["transitions"] == [1, round(floor.transitions)]
+    assert world["transitions"] == [1, round(0.25 * floor.transitions)]
     assert first > 0.4 and first <= 1.0
-    assert learned > 0.0 and learned < 0.08
+    assert learned > 0.0 and learned < 0.5 * first
 
 
 def test_the_study_on_a_page_could_be_run(tmp_path: Path) -> None:
