@@ -75,7 +75,7 @@ why: ready  ## Give every failed test episode of the newest bench the one cause 
 study: ready  ## Change one factor of the comparison on TASK at a time, on tuning seeds
 	@$(BIN)/imagine-bench sweep $(options)
 
-suite: ready  ## Run the ladder of experiments, each of which changes one world parameter; EXPERIMENT=memory runs one
+suite: ready  ## Run the benchmark suite: twelve experiments, each of which changes one world parameter; EXPERIMENT=memory runs one
 	@$(BIN)/imagine-bench sweep $(options)
 
 view: ready  ## Open the newest recording in the Rerun viewer

@@ -9,7 +9,7 @@ copyright = "2026, the imagine_bench developers"
 release = metadata.version("imagine-bench")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
-myst_enable_extensions = ["deflist"]
+myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 4
 exclude_patterns = ["results/**/report", "**/*.ipynb"]
 
