@@ -256,7 +256,7 @@ class Plan(OfBench):
 
     def __call__(self) -> None:
         """Find, plan, report."""
-        from imagine_bench.report.audits import plan_report  # noqa: PLC0415 - fonts and pillow load slowly
+        from imagine_bench.tools.audits import plan_report  # noqa: PLC0415 - fonts and pillow load slowly
 
         run, task = self.meant()
         print(
@@ -304,7 +304,7 @@ class Judge:
     def __call__(self) -> None:
         """Judge and report."""
         from imagine_bench.recording.judgement import record_judgement  # noqa: PLC0415 - as below
-        from imagine_bench.report.judge import judgement_report  # noqa: PLC0415 - as below
+        from imagine_bench.report.judge import judged, judgement_page  # noqa: PLC0415 - as below
 
         workers = at_a_time(self.workers)
         usual = tuple(name for name, entry in registry.WORLD_MODELS.items() if entry.by_default)
@@ -322,7 +322,7 @@ class Judge:
         folder, failed = judge(judgement, self.out, workers=workers)
         if not kept(folder, judgement):  # a report without a model would replace one of other models
             raise RunFailedError("\n".join(failed))
-        print(judgement_report(folder, judgement))
+        _write(judgement_page(judged(folder, judgement)), folder / "report")
         print(f"Recording: {record_judgement(folder, judgement)}")
         if failed:
             raise RunFailedError("\n".join(failed))
@@ -351,7 +351,7 @@ class Verify(OfBench):
 
     def __call__(self) -> None:
         """Play and compare."""
-        from imagine_bench.report import audits  # noqa: PLC0415 - matplotlib loads slowly
+        from imagine_bench.tools import audits  # noqa: PLC0415 - matplotlib loads slowly
 
         given, task = self.meant()
         self._require_fitting()

@@ -78,17 +78,14 @@ def bench_page(result: BenchResult) -> Page:
         f"{len(protocol.seeds)} seed(s), {protocol.evaluation_episodes} test episodes{dataset}{split} · {interval} · "
         f"protocol {result.protocol_hash}"
     )
-    answers = verdict(data)
-    solved = _scores(data, protocol.budgets)
     return Page(
         title=f"{data.spec.title}: does imagination save real experience?",
         subtitle=subtitle,
         question="Does training on transitions that a learned world model imagines save real episodes? Every agent is "
         "tested without exploring, on the same new episodes, after each number of real training episodes.",
-        answers=answers,
+        table=_scores(data, protocol.budgets),
         sections=[section for make in SECTIONS if (section := make(data)) is not None],
         files=files,
-        summary="\n\n".join([f"{data.spec.title}: {subtitle}", solved.text, "\n".join(answers)]),
         facts=made(result, {agent: agent_title(agent) for agent in protocol.agents}),
     )
 
@@ -171,10 +168,10 @@ def _not_installed(data: ReportData) -> list[str]:
 
 
 def compared(data: ReportData) -> Section:
-    """The task and the agents."""
+    """The task, the agents and the verdict on them."""
     rows = [[agent_title(agent), known_agent(agent).description] for agent in data.result.protocol.agents]
     table = Table("agents", ["agent", "what it does"], rows, prose=True)
-    return Section("What was compared", [data.spec.description], tables=[table])
+    return Section("What was compared", [data.spec.description], tables=[table], answers=verdict(data))
 
 
 def success(data: ReportData) -> Section:

@@ -17,9 +17,8 @@ from imagine_bench import registry
 from imagine_bench.arrays import Arrays
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.change import FALSE_ALARMS, LENGTH, SLIP
-from imagine_bench.judge.judgement import Judgement, kept, prepare, shown
+from imagine_bench.judge.judgement import Judgement, kept, shown
 from imagine_bench.judge.models import model_entry, runs_of
-from imagine_bench.judge.truth import sampling_noise_floor, shares
 from imagine_bench.recording.filmstrips import TileRow, png, transition_sheet
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report.page import (
@@ -28,13 +27,10 @@ from imagine_bench.report.page import (
     Page,
     Section,
     Table,
-    decimals,
     estimate,
-    flat,
     number,
     over_seeds,
     p_value,
-    write_page,
 )
 from imagine_bench.statistics import can_show, difference, holm, iqm
 from imagine_bench.store.files import read_json, table_text
@@ -142,13 +138,12 @@ class Judged:
         return f" after {self.judgement.sizes[-1]:,} transitions" if self.judgement.learning else ""
 
 
-def judgement_report(folder: Path, judgement: Judgement) -> str:
-    """Write ``folder / "report"`` and return the short table and where everything lies."""
+def judged(folder: Path, judgement: Judgement) -> Judged:
+    """A judgement with what is kept of it in its folder. Raises ArtefactError: a file is damaged."""
     cells: dict[tuple[str, int], list[Scores]] = {}
     for cell in kept(folder, judgement):
         cells.setdefault((cell["model"], cell["transitions"]), []).append(cell)
-    page = judgement_page(Judged(folder, judgement, registry.task(judgement.task), cells))
-    return f"{page.summary}\n\nReport: {write_page(folder / 'report', page)}"
+    return Judged(folder, judgement, registry.task(judgement.task), cells)
 
 
 def judgement_page(found: Judged) -> Page:
@@ -160,11 +155,10 @@ def judgement_page(found: Judged) -> Page:
         title=f"{found.spec.title}: world models against the exact truth",
         subtitle=f"{data} · appearance “{judgement.appearance}” · {judgement.samples} futures a question",
         question="Which model imagines what really happens, how sure is it, and what do its mistakes cost?",
-        answers=[answer for section in sections for answer in section.answers],
+        table=sections[0].tables[0],
         sections=sections,
         files={"scores.csv": _csv(found)},
-        facts=flat("", read_json(found.folder / "judgement.json", "a judgement")),
-        summary=sections[0].tables[0].text,
+        facts=read_json(found.folder / "judgement.json", "a judgement"),
     )
 
 
@@ -222,16 +216,8 @@ def in_short(found: Judged) -> Section:
         "own errors are in the second table: the shares of real frames that it takes for another macrostate or does "
         "not recognize, and the shares of fog, noise and blends of two frames that it wrongly takes for a real frame."
     )
-    samples = found.judgement.samples
-    truth = prepare(found.judgement, found.folder).asked["rollouts"].truth
-    noise = np.mean([[sampling_noise_floor(shares(each), samples) for each in steps] for steps in truth], axis=0)
-    chance = (
-        f"A perfect model that draws {samples} futures has a total variation of {', '.join(map(decimals, noise))} "
-        f"after 1 to {len(noise)} macro-actions; one that gives probabilities has 0. The unbiased Brier score is fair "
-        "to both."
-    )
     reader = Table.of("reader", [errors], "What the reader of images gets wrong itself.")
-    return Section("In short", [words, chance], tables=[_scores(found, "short", SHORT), reader])
+    return Section("In short", [words], tables=[_scores(found, "short", SHORT), reader])
 
 
 def question(found: Judged, title: str) -> Section:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import statistics
-from imagine_bench.store.files import csv_text, make_folder, sweep, write_bytes
+from imagine_bench.store.files import csv_text, json_text, make_folder, sweep, write_bytes
 
 DASH = "–"  # printed where there is no number; the table's caption says why
 
@@ -94,11 +94,20 @@ class Page:
     title: str  # its heading
     subtitle: str  # preset, execution and the like, in one line
     question: str  # what was asked
-    answers: Sequence[str]  # the verdict, one line a finding
+    table: Table  # the one that a terminal shows
     sections: Sequence[Section]  # in their order
     files: Mapping[str, str]  # the CSV files beside the page, by name
-    facts: Sequence[tuple[str, str]] = ()  # how it was made, protocol and settings: name and value
-    summary: str = ""  # the report on a terminal
+    facts: Mapping[str, object]  # how it was made, protocol and settings: JSON-like
+
+    @property
+    def answers(self) -> list[str]:
+        """The verdict: the lines of every section, in their order."""
+        return [answer for section in self.sections for answer in section.answers]
+
+    @property
+    def summary(self) -> str:
+        """The report on a terminal."""
+        return "\n".join([self.title, self.subtitle, "", self.table.text, "", *self.answers]).rstrip()
 
 
 # How numbers are printed -------------------------------------------------------------------------------------------
@@ -207,8 +216,8 @@ def write_page(folder: Path, page: Page) -> Path:
     return folder / "index.html"
 
 
-def texts(page: Page) -> dict[str, str]:
-    """The files of a report, by name, but for its images."""
+def texts(page: Page, *, images: bool = True) -> dict[str, str]:
+    """The files of a report, by name, but for its images; these are in the page too, unless they need not be drawn."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("imagine_bench.report"),
         autoescape=True,
@@ -216,11 +225,12 @@ def texts(page: Page) -> dict[str, str]:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters["base64"] = lambda png: base64.b64encode(png).decode()
+    environment.filters["base64"] = lambda image: base64.b64encode(image.png).decode() if images else ""
+    environment.filters["json"] = json_text
     return {**page.files, "index.html": environment.get_template("page.html.j2").render(page=page)}
 
 
-def made(result: Any, titles: Mapping[str, str]) -> list[tuple[str, str]]:
+def made(result: Any, titles: Mapping[str, str]) -> dict[str, object]:
     """How a result of any kind was made: the facts of its Page, with the settings of its learners by title.
 
     All seeds of a learner have the same settings.
@@ -229,15 +239,9 @@ def made(result: Any, titles: Mapping[str, str]) -> list[tuple[str, str]]:
     commit = str(environment.get("commit") or "").partition("+")[0]
     where = f"git checkout {commit} && " if commit else ""
     settings = {title: result.of(name)[0].settings for name, title in titles.items()}
-    protocol = {"hash": result.protocol_hash, **result.protocol.as_dict()}
-    facts = flat("", {**environment, "protocol": protocol, "settings": settings})
-    return [("reproduce", f"{where}{environment.get('command', '')}"), *facts]
-
-
-def flat(prefix: str, value: object) -> list[tuple[str, str]]:
-    """Nested values as rows of dotted name and text."""
-    if isinstance(value, list | tuple) and any(isinstance(each, Mapping) for each in value):
-        value = dict(enumerate(value, 1))
-    if isinstance(value, Mapping):
-        return [row for key, each in value.items() for row in flat(f"{prefix}.{key}" if prefix else str(key), each)]
-    return [(prefix, "; ".join(map(str, value)) if isinstance(value, list | tuple) else str(value))]
+    return {
+        "reproduce": f"{where}{environment.get('command', '')}",
+        **environment,
+        "protocol": {"hash": result.protocol_hash, **result.protocol.as_dict()},
+        "settings": settings,
+    }

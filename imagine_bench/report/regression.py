@@ -61,17 +61,13 @@ def report_page(result: RegressionResult) -> Page:
     sections = [*own(result), _calibration(result)]
     rows = [{"agent": run.agent, "seed": run.seed, **row} for run in result.runs for row in run.rows]
     tables = [table for section in sections for table in section.tables]
-    answers = [answer for section in sections for answer in section.answers]
-    first = next(section for section in sections if section.tables)  # its answers say its table again
-    others = [answer for section in sections if section is not first for answer in section.answers]
     return Page(
         title=f"{spec.title}: does the model know what it does not know?",
         subtitle=f"Preset {protocol.preset} · networks a dataset: {protocol.networks} · protocol {protocol.hash}",
         question=spec.description,
-        answers=answers,
+        table=tables[0],
         sections=[Section("What was compared", (_COMPARED,)), *sections],
         files={"results.csv": table_text(rows), **{f"{table.name}.csv": table.csv for table in tables}},
-        summary="\n".join([tables[0].text, "", *others]),
         facts=made(result, {pair.agent: pair.title for pair in result.pairs.values()}),
     )
 

@@ -16,7 +16,6 @@ from imagine_bench.report.page import (
     count,
     decimals,
     estimate,
-    flat,
     percent,
     seconds,
     signed_percent,
@@ -50,11 +49,10 @@ def study_page(study: Study, lines: Sequence[Line]) -> Page:
         subtitle=f"{study.execution} · {study.appearance} · tuning seeds {seeds} · {study.evaluation_episodes} tests",
         question="Interquartile means, differences with 95 % intervals over seeds, each alone: of many, some exclude "
         "zero by chance. Fewer than five seeds have none.",
-        answers=[],
+        table=table,
         sections=[Section("Variants", tables=[table])],
         files={"seeds.csv": _seeds_csv(study, lines), "study.json": json_text(made)},
-        facts=flat("", made),
-        summary=table.text,
+        facts=made,
     )
 
 
@@ -90,7 +88,7 @@ def suite_page(result: SuiteResult) -> Page:
     suite = result.suite
     environments = [each.environment for levels in result.levels.values() for each in levels if each.environment]
     commits = sorted({str(each.get("commit")) for each in environments})
-    made = flat("", {**(environments[0] if environments else {}), "commits of all benches": ", ".join(commits)})
+    made = {**(environments[0] if environments else {}), "commits of all benches": ", ".join(commits)}
     definition = {"suite": dataclasses.asdict(suite), "hash": suite.hash, "agents": list(result.agents)}
     table = _scores(result)
     questions = [f"{each.name}: {each.question}" for each in suite.experiments]
@@ -100,15 +98,14 @@ def suite_page(result: SuiteResult) -> Page:
         f"{suite.evaluation_episodes} tests a level",
         question="Each experiment changes one parameter of a world of arrows. Where is an agent between blind choice "
         "(0) and perfect play (1), which are exact?",
-        answers=result.failures,
-        sections=[Section("Scores", questions, tables=[table])],
+        table=table,
+        sections=[Section("Scores", questions, tables=[table], answers=result.failures)],
         facts=made,
         files={
             "levels.csv": levels_csv(result),
             "scores.csv": scores_csv(result),
-            "suite.json": json_text({**definition, "made": dict(made)}),
+            "suite.json": json_text({**definition, "made": made}),
         },
-        summary="\n".join([table.text, *result.failures]),
     )
 
 

@@ -24,7 +24,6 @@ from imagine_bench.judge.verify import Replays, _verify_test, has_own_failures, 
 from imagine_bench.protocols.control import Protocol, context_of, protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.report import bench_page
-from imagine_bench.report.audits import blank_images, verify, what_is_shown, with_report
 from imagine_bench.report.page import texts
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.control import plan_control
@@ -35,6 +34,7 @@ from imagine_bench.seeding import episode_seed
 from imagine_bench.store.files import read_sealed, sealed
 from imagine_bench.store.results import KeptEpisodes
 from imagine_bench.store.run_folder import load_newest, load_run, save_snapshot
+from imagine_bench.tools.audits import verify, what_is_shown, with_report
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     wanted = small(agents=("table", "random"), evaluation_episodes=8)
     result = bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
     (result.folder / "report").mkdir()
-    for name, text in texts(blank_images(bench_page(result))).items():  # type: ignore[arg-type]
+    for name, text in texts(bench_page(result), images=False).items():  # type: ignore[arg-type]
         (result.folder / "report" / name).write_text(text)
     return result.folder
 

@@ -15,8 +15,6 @@ from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.judge import causes
 from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
-from imagine_bench.report import audits
-from imagine_bench.report.audits import blank_images, verify, why_report
 from imagine_bench.report.page import Page, texts
 from imagine_bench.report.sections import read_causes
 from imagine_bench.rules import states_of
@@ -24,13 +22,15 @@ from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import make_folder, write_bytes
+from imagine_bench.tools import audits
+from imagine_bench.tools.audits import verify, why_report
 
 SPEC = registry.task("arrow_puzzle")
 
 
 def write_texts(folder: Path, page: Page) -> None:
     """A report without images, which are slow to draw."""
-    for name, text in texts(blank_images(page)).items():
+    for name, text in texts(page, images=False).items():
         write_bytes(make_folder(folder) / name, text.encode())
 
 

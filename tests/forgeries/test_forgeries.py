@@ -12,8 +12,8 @@ from forging import Forger, Remembering, honest_bench
 from kinds import KINDS, Donors
 
 from imagine_bench.errors import ArtefactError, ImagineBenchError
-from imagine_bench.report import audits
 from imagine_bench.running.retraining import Retraining
+from imagine_bench.tools import audits
 
 VARIANTS = 30
 PASSING = ("a failed seed dropped", "prices invented")

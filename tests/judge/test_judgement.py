@@ -35,7 +35,7 @@ from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
 from imagine_bench.judge.models import JudgedModel, make, model_entry, opened
 from imagine_bench.judge.predictions import RenderedFrameIndex
-from imagine_bench.report.judge import COLUMNS, Judged, judgement_page, judgement_report
+from imagine_bench.report.judge import COLUMNS, Judged, judged, judgement_page
 from imagine_bench.report.page import DASH
 from imagine_bench.running import bench as benches
 from imagine_bench.seeding import SeedTree
@@ -383,7 +383,7 @@ def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tm
     assert (cell["seed"], cell["transitions"]) == (0, 40), "it learns nothing here: once"
     assert cell["nothing"] == cell["total_variation"] == cell["after_the_end"] == 1.0
     assert cell["fit_s"] is None
-    assert "imaginer, seed 0  " in judgement_report(folder, one)
+    assert "imaginer, seed 0  " in judgement_page(judged(folder, one)).summary
     folder, other = _judged(tmp_path, "copy", seeds=(1001,))
     assert [shown(folder, each)["copy"]["seed"] for each in (one, other)] == [1000, 1001], "images of the first seed"
 

@@ -23,10 +23,10 @@ from imagine_bench.judge.plans import PlanResult, carry_out, make_env, make_plan
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.recording.plans import record_plans
-from imagine_bench.report.audits import plan_report, summarise, write_plans
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running.bench import bench
 from imagine_bench.running.trained import Trained
+from imagine_bench.tools.audits import plan_report, summarise, write_plans
 
 TASK = registry.task("arrow_puzzle")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from fake_results import WIDE, bench_result, rewritten
-from report_pages import check_page, without_images
+from report_pages import check_page
 
 from imagine_bench import reference, statistics
 from imagine_bench.errors import ArtefactError
@@ -49,7 +49,7 @@ def folder(result: BenchResult) -> Path:
 
 def text_of(page: Page) -> dict[str, str]:
     """The texts of a page, without its figures."""
-    return texts(without_images(page))
+    return texts(page, images=False)
 
 
 def table(page: Page, name: str) -> Table:

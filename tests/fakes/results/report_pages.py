@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from html import unescape
 
-from imagine_bench.report.page import Page
-
 PAGE_PX = 1200 - 2 * 24  # the page's own margin
 CHARACTER_PX, PADDING_PX = 8.0, 19.2
-
-
-def without_images(page: Page) -> Page:
-    """A page whose figures are not drawn, which is slow."""
-    sections = [dataclasses.replace(each, images=()) for each in page.sections]
-    return dataclasses.replace(page, sections=sections)
 
 
 def check_page(page: str) -> None:

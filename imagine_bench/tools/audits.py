@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from imagine_bench.recording.filmstrips import filmstrip, png
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.report.bench import bench_page
 from imagine_bench.report.data import known_agent
-from imagine_bench.report.page import DASH, Page, Table, percent, texts, write_page
+from imagine_bench.report.page import DASH, Table, percent, texts, write_page
 from imagine_bench.report.sections import HEAD, causes_table
 from imagine_bench.running.bench import counted, load_bench, task_type
 from imagine_bench.running.retraining import Retraining, chance_to_find, train_again
@@ -45,15 +44,16 @@ from imagine_bench.store.loading import load_so_far
 
 RECORDING = "recording.rrd"
 _SHOWN = 6  # the first plans, and the first that failed, as filmstrips
-_COUNTS = {
-    "attempted": "plans",
-    "solved": "solved",
-    "optimal": "of these optimal",
-    "refused": "refused as too uncertain",
-    "steps": "macro-actions carried out",
-    "steps_as_imagined": "that led where imagined",
-    "faults": "faults of the physics",
+_COUNTS: Mapping[str, tuple[str, Callable[[PlanResult], int]]] = {
+    "attempted": ("plans", lambda plan: 1),
+    "solved": ("solved", lambda plan: plan.solved),
+    "optimal": ("of these optimal", lambda plan: plan.optimal),
+    "refused": ("refused as too uncertain", lambda plan: bool(plan.refused)),
+    "steps": ("macro-actions carried out", lambda plan: plan.done),
+    "steps_as_imagined": ("that led where imagined", lambda plan: int(plan.as_imagined.sum())),
+    "faults": ("faults of the physics", lambda plan: plan.faults),
 }
+"""The counts over plans by name: their words in the table, and how many each plan adds."""
 _IMAGE = re.compile("base64,[A-Za-z0-9+/=]*")
 
 
@@ -124,20 +124,8 @@ def plan_report(
 
 
 def summarise(plans: Sequence[PlanResult]) -> dict[str, int]:
-    """Counts over plans.
-
-    ``steps`` are macro-actions carried out, ``steps_as_imagined`` those that led where they were imagined to, and
-    ``faults`` those whose physics disagreed with the rules.
-    """
-    return {
-        "attempted": len(plans),
-        "refused": sum(bool(plan.refused) for plan in plans),
-        "solved": sum(plan.solved for plan in plans),
-        "optimal": sum(plan.optimal for plan in plans),
-        "steps": sum(plan.done for plan in plans),
-        "steps_as_imagined": sum(int(plan.as_imagined.sum()) for plan in plans),
-        "faults": sum(plan.faults for plan in plans),
-    }
+    """The counts over plans, by their names in ``summary.json``."""
+    return {name: sum(map(of, plans)) for name, (_, of) in _COUNTS.items()}
 
 
 def plan_table(plans: Sequence[PlanResult], task: TaskSpec) -> Table:
@@ -147,7 +135,7 @@ def plan_table(plans: Sequence[PlanResult], task: TaskSpec) -> Table:
     low, high = statistics.wilson(found["solved"], len(plans))
     share = f" = {percent(found['solved'] / len(plans))} % [{percent(low)}, {percent(high)}]"
     rows = []
-    for name, words in _COUNTS.items():
+    for name, (words, _) in _COUNTS.items():
         printed = thesis.get("optimal_among_solved" if name == "optimal" else name, DASH)
         rows.append([words, f"{found[name]}{share if name == 'solved' else ''}", str(printed)])
     return Table("plans", ["open-loop plans, carried out blindly", "here", "thesis"], rows)
@@ -307,7 +295,7 @@ def with_report(folder: Path, runs: list[Verdict]) -> list[Verdict]:
 
 def _report_complaint(folder: Path) -> str:
     """The first line of the report that does not follow from the runs; empty if all do."""
-    for name, text in texts(blank_images(bench_page(load_so_far(folder)))).items():
+    for name, text in texts(bench_page(load_so_far(folder)), images=False).items():
         path = folder / "report" / name
         there = path.read_text() if path.is_file() else ""
         both = zip_longest(_IMAGE.sub("base64,", there).splitlines(), text.splitlines(), fillvalue="nothing")
@@ -315,12 +303,3 @@ def _report_complaint(folder: Path) -> str:
             if has != wanted:
                 return f"{name} has {brief(has)} where the runs give {brief(wanted)}."
     return ""
-
-
-def blank_images(page: Page) -> Page:
-    """The same page with images that are empty, which need not be drawn."""
-    sections = []
-    for section in page.sections:
-        images = [dataclasses.replace(image, content=b"") for image in section.images]
-        sections.append(dataclasses.replace(section, images=images))
-    return dataclasses.replace(page, sections=sections)
