@@ -108,7 +108,7 @@ def test_the_agent_that_learns_to_see_solves_what_nobody_here_wrote(example: Mod
 def test_what_the_page_says_of_elsewhere_was_kept() -> None:
     page = (ROOT / "docs" / "explanation" / "from_nothing.md").read_text()
     kept = json.loads((ROOT / "docs" / "results" / "elsewhere" / "elsewhere.json").read_text())["environments"]
-    said = re.findall(r"(frozen lake|[\w-]+-5x5) (\d+)(?: %)? \((?:blind choice )?(\d+)\)", page)
+    said = re.findall(r"(frozen lake|[\w-]+-5x5): (\d+) % (?:solved )?\((?:random actions: )?(\d+) %\)", page)
     found = []
     for name, each in kept.items():
         short = name.removeprefix("MiniGrid-").removesuffix("-v0").replace("FrozenLake-v1", "frozen lake")
