@@ -19,6 +19,8 @@ Ints = NDArray[np.int64]
 """Whole numbers, of any shape."""
 Bools = NDArray[np.bool_]
 """True or False, of any shape."""
+Pixels = NDArray[np.uint8]
+"""Images as bytes, of any shape, RGB or gray."""
 Images = NDArray[np.uint8] | NDArray[np.floating]
 """Images of any shape: uint8, or floats in [0, 1]."""
 Array = NDArray[np.generic]

@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorWrapper
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from numpy.typing import NDArray
 
 from imagine_bench.adapters import vector_env
-from imagine_bench.arrays import Floats, Info, Observed
+from imagine_bench.arrays import Bools, Floats, Info, Ints, Observed
 from imagine_bench.environments import Lanes
-
-Mask = NDArray[np.bool_]
 
 
 def as_cleanrl(env: Lanes | str, **kwargs: Any) -> FinalObservation:
@@ -42,7 +39,7 @@ class FinalObservation(VectorWrapper):
     array (1,). Gymnasium's own ``final_obs`` is gone.
     """
 
-    def step(self, actions: NDArray[np.int64]) -> tuple[Observed, Floats, Mask, Mask, Info]:
+    def step(self, actions: Ints) -> tuple[Observed, Floats, Bools, Bools, Info]:
         """One macro-action in every lane."""
         seen, rewards, terminated, truncated, infos = self.env.step(actions)
         over = terminated | truncated

@@ -22,9 +22,8 @@ import numpy as np
 import PIL.Image
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Array, Arrays
+from imagine_bench.arrays import Array, Arrays, Bools, Ints
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes, content_hash
@@ -86,7 +85,7 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
     write_json(folder / _INFO, _info(episodes))
 
 
-def _columns(episodes: Episodes, firsts: NDArray[np.int64]) -> Arrays:
+def _columns(episodes: Episodes, firsts: Ints) -> Arrays:
     """The columns of one number a row, in the order of their types."""
     which = np.repeat(np.arange(len(firsts)), episodes.lengths)
     index = np.arange(len(episodes.actions))
@@ -174,7 +173,7 @@ def _info(episodes: Episodes) -> dict[str, Json]:
     }  # fmt: skip
 
 
-def _digests(columns: Mapping[str, Array], masks: Array, frames: Frame, lengths: NDArray[np.int64]) -> list[str]:
+def _digests(columns: Mapping[str, Array], masks: Array, frames: Frame, lengths: Ints) -> list[str]:
     """A digest of each episode, by which its last frame is found; ``lengths`` are their numbers of rows."""
     known = {**{name: columns[name] for name in _DIGESTED}, _MASK: masks, _IMAGE: frames}
     ends = np.cumsum(lengths)
@@ -221,7 +220,7 @@ def _rows(folder: Path, info: Mapping[str, Any]) -> pa.Table:
     return pa.concat_tables(tables)
 
 
-def _lengths(column: Mapping[str, Array], info: Mapping[str, Any]) -> NDArray[np.int64]:
+def _lengths(column: Mapping[str, Array], info: Mapping[str, Any]) -> Ints:
     """Rows of each episode. Raises InvalidValueError: rows are in another order, or at other times, than ``info``'s."""
     which = column[_EPISODE]
     in_order = np.array_equal(column["index"], np.arange(len(which))) and not which[0]
@@ -278,7 +277,7 @@ def _ends(folder: Path, digests: list[str]) -> pa.Table:
     return ends.take(chosen)
 
 
-def _decoded(table: pa.Table) -> tuple[Frame, NDArray[np.bool_]]:
+def _decoded(table: pa.Table) -> tuple[Frame, Bools]:
     """The images of a table, and its masks."""
     images = [PIL.Image.open(io.BytesIO(image["bytes"]), formats=["PNG"]) for image in table[_IMAGE].to_pylist()]
     for image in images:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from imagine_bench.arrays import Pixels
 from imagine_bench.interfaces import Macrostate, Rules, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.store.results import ComparedRollout
@@ -30,14 +31,14 @@ PAPER = (255, 255, 255)
 RIGHT = (0, 114, 178)  # Okabe-Ito blue and vermilion: color-blind safe
 WRONG = (213, 94, 0)
 CUT = (204, 30, 90)
-TileRow = tuple[str, Sequence[NDArray[np.uint8]] | NDArray[np.uint8], Sequence[bool] | None]
+TileRow = tuple[str, Sequence[Pixels] | Pixels, Sequence[bool] | None]
 """The name of a row of images, the images, and whether each is right; None where that is no question."""
 
 
 class Tile(NamedTuple):
     """An image of a sheet with what stands above and below it."""
 
-    frame: NDArray[np.uint8] | None  # RGB bytes of a square image; None leaves its place empty
+    frame: Pixels | None  # RGB bytes of a square image; None leaves its place empty
     above: str = ""
     below: str = ""  # its lines, in the color of the border where there is one
     right: bool | None = None  # a border: blue where True, orange where False
@@ -45,7 +46,7 @@ class Tile(NamedTuple):
     cut: bool = False  # the uncertainty filter cuts before it, which a line marks
 
 
-def sheet(rows: Sequence[tuple[str, Sequence[Tile]]], columns: int | None = None) -> NDArray[np.uint8]:
+def sheet(rows: Sequence[tuple[str, Sequence[Tile]]], columns: int | None = None) -> Pixels:
     """Draw named rows of images below one another, with room for so many ``columns``, None for all.
 
     The image has shape (height, width, 3), uint8.
@@ -54,7 +55,7 @@ def sheet(rows: Sequence[tuple[str, Sequence[Tile]]], columns: int | None = None
     return np.concatenate([_row(name, tiles[:room], LABELS_PX + room * STEP_PX) for name, tiles in rows])
 
 
-def _row(name: str, tiles: Sequence[Tile], width: int) -> NDArray[np.uint8]:
+def _row(name: str, tiles: Sequence[Tile], width: int) -> Pixels:
     top = TITLE_PX if any(tile.above for tile in tiles) else _BORDER_PX
     bottom = top + CELL_PX
     lines = max(1 + tile.below.count("\n") for tile in tiles)
@@ -80,9 +81,7 @@ def _row(name: str, tiles: Sequence[Tile], width: int) -> NDArray[np.uint8]:
     return np.asarray(canvas)
 
 
-def filmstrip(
-    compared: ComparedRollout, action_names: tuple[str, ...], *, columns: int | None = None
-) -> NDArray[np.uint8]:
+def filmstrip(compared: ComparedRollout, action_names: tuple[str, ...], *, columns: int | None = None) -> Pixels:
     """Draw one imagined rollout below reality, one column a macro-action.
 
     Each column names the macro-action and shows the real frame, the decoded imagined one, and the predicted reward,
@@ -119,7 +118,7 @@ def filmstrip(
     return sheet([("real", real), ("imagined", imagined)], None if columns is None else 1 + columns)
 
 
-def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: TaskSpec) -> NDArray[np.uint8]:
+def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: TaskSpec) -> Pixels:
     """Draw imagined rollouts of one start below one another, a column a macro-action; only the start is real.
 
     Below each imagined frame stands what a probe says has changed: in blue where the rules make it possible, in
@@ -142,7 +141,7 @@ def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: Task
     return sheet(rows)
 
 
-def transition_sheet(titles: Sequence[str], rows: Sequence[TileRow]) -> NDArray[np.uint8]:
+def transition_sheet(titles: Sequence[str], rows: Sequence[TileRow]) -> Pixels:
     """Draw single transitions side by side (thesis' figure 5.9): a title each, below it an image of
     each named row.
 
@@ -164,14 +163,14 @@ def _verdict(right: bool | None) -> str:
     return "as the rules say" if right else "not what happens"
 
 
-def png(image: NDArray[np.uint8]) -> bytes:
+def png(image: Pixels) -> bytes:
     """Encode an image (height, width, 3), uint8, as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="PNG")
     return buffer.getvalue()
 
 
-def rgb(image: NDArray[np.float32]) -> NDArray[np.uint8]:
+def rgb(image: NDArray[np.float32]) -> Pixels:
     """An image in [0, 1], gray (H, W) or RGB (H, W, 3), as RGB bytes (H, W, 3)."""
     pixels = (np.clip(image, 0.0, 1.0) * 255.0).round().astype(np.uint8)
     return np.asarray(Image.fromarray(pixels).convert("RGB"))

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Floats, Frame
+from imagine_bench.arrays import Floats, Frame, Pixels
 from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
 from imagine_bench.interfaces import Motion, SceneReader, Shape3D
@@ -115,7 +114,7 @@ class Recording:
         """Log a text."""
         self.log(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
 
-    def sheet(self, path: str, pixels: NDArray[np.uint8]) -> None:
+    def sheet(self, path: str, pixels: Pixels) -> None:
         """Log a large image, compressed. Shape (H, W, 3)."""
         self.log(path, rr.EncodedImage(contents=png(pixels), media_type="image/png"))
 

@@ -102,8 +102,7 @@ class RegressionResult(AllRuns[RegressionProtocol, RegressionRun]):
 def _write(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:
     """Write what a run has measured so far; :func:`_begun` reads it, and the rows are on disk first."""
     write_bytes(folder / METRICS, table_text(rows).encode())
-    named = {f"{variant}/{name}": arrays[name] for variant, arrays in evaluations.items() for name in arrays}
-    write_arrays(folder / EVALUATION, named)
+    write_arrays(folder / EVALUATION, run_folder.pack(evaluations)[1])
 
 
 def _begun(folder: Path) -> tuple[list[Row], dict[str, Arrays]]:

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Arrays, Pixels
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.change import FALSE_ALARMS, LENGTH, SLIP
 from imagine_bench.judge.judgement import Judgement, kept, shown
@@ -282,7 +281,7 @@ def _sheet(found: Judged, name: str, caption: str, kind: str, models: Mapping[st
     return Image(name, png(transition_sheet(titles, rows)), caption)
 
 
-def _joined(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _joined(images: Pixels) -> Pixels:
     """Images of all steps of all transitions, one behind the other."""
     return images.reshape(-1, *images.shape[2:])
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import jinja2
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import statistics
+from imagine_bench.arrays import Floats
 from imagine_bench.store.files import csv_text, json_text, make_folder, sweep, write_bytes
 
 DASH = "–"  # printed where there is no number; the table's caption says why
@@ -193,7 +193,7 @@ def seeds_note(seeds: int) -> str:
     return f"{middle} [95 % interval, of seeds and starts]"
 
 
-def mean_std(values: Sequence[float] | NDArray[np.float64]) -> str:
+def mean_std(values: Sequence[float] | Floats) -> str:
     """``2.36 (0.45)``: mean and standard deviation, as the thesis prints them; the mean alone of one value."""
     mean = decimals(float(np.mean(values)))
     return mean if mean == DASH or len(values) < 2 else f"{mean} ({np.std(values, ddof=1):.2f})"

@@ -11,6 +11,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Bools, Floats, Frame, Ints, Macrostate, Pixels
 from imagine_bench.errors import ArtefactError
 from imagine_bench.exact.certificate import Certificate
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout
@@ -30,39 +31,39 @@ class OpenLoop:
     All arrays have shape (D,), index d for imagined step d + 1.
     """
 
-    count: NDArray[np.int64]  #: Imagined transitions compared
+    count: Ints  #: Imagined transitions compared
     #: Share whose whole macrostate, read by the evaluation-only probe, is what the rules say.
-    correct: NDArray[np.float64]
+    correct: Floats
     #: The same among those the uncertainty filter keeps (NaN where it keeps none).
-    correct_accepted: NDArray[np.float64]
-    accepted: NDArray[np.float64]  #: Share the filter keeps
-    reward_mae: NDArray[np.float64]  #: Mean absolute error of the predicted reward
-    termination_error: NDArray[np.float64]  #: Share with the wrong side of 0.5 for P(terminal)
-    epistemic: NDArray[np.float64]  #: Mean epistemic uncertainty
-    aleatoric: NDArray[np.float64]  #: Mean aleatoric uncertainty
-    modal: NDArray[np.float64]  #: Mean modal uncertainty
+    correct_accepted: Floats
+    accepted: Floats  #: Share the filter keeps
+    reward_mae: Floats  #: Mean absolute error of the predicted reward
+    termination_error: Floats  #: Share with the wrong side of 0.5 for P(terminal)
+    epistemic: Floats  #: Mean epistemic uncertainty
+    aleatoric: Floats  #: Mean aleatoric uncertainty
+    modal: Floats  #: Mean modal uncertainty
     #: Imagined transitions that began in the right macrostate, so that they can be wrong by themselves.
-    judged: NDArray[np.float64]
+    judged: Floats
     #: How well epistemic uncertainty finds the wrong ones among those: the probability that a wrong one has the higher
     #: uncertainty of two; 0.5 is chance, NaN where none or all are wrong.
-    auroc_epistemic: NDArray[np.float64]
-    auroc_aleatoric: NDArray[np.float64]  #: The same for aleatoric uncertainty
-    auroc_modal: NDArray[np.float64]  #: The same for modal uncertainty
+    auroc_epistemic: Floats
+    auroc_aleatoric: Floats  #: The same for aleatoric uncertainty
+    auroc_modal: Floats  #: The same for modal uncertainty
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedRollout:
     """An imagined rollout beside what the real environment shows for the same start and actions."""
 
-    start_frame: NDArray[np.uint8]  #: The real frame it starts from. Shape (64, 64, 3), uint8.
-    start_macrostate: NDArray[np.int64]  #: Where it is seen. Shape (M,).
+    start_frame: Frame  #: The real frame it starts from
+    start_macrostate: Macrostate  #: Where it is seen
     rollout: ImaginedRollout  #: What the agent imagined
-    real_frames: NDArray[np.uint8]  #: The real frames (kinematic mode) after each action. Shape (D, 64, 64, 3), uint8.
+    real_frames: Pixels  #: The real frames (kinematic mode) after each action. Shape (D, 64, 64, 3), uint8.
     #: What they show: what the rules say, or where the task's frames are late or hide a coordinate, that, with one more
     #: than its last value for what is hidden. Shape (D, M).
-    real_macrostates: NDArray[np.int64]
-    real_rewards: NDArray[np.float64]  #: What the rules say. Shape (D,).
-    real_terminated: NDArray[np.bool_]  #: Shape (D,)
+    real_macrostates: Ints
+    real_rewards: Floats  #: What the rules say. Shape (D,).
+    real_terminated: Bools  #: Shape (D,)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,16 +81,16 @@ class PolicyTable:
 class KeptEpisodes:
     """K episodes as they were played, N macro-actions in all, so that anyone can play them again."""
 
-    starts: NDArray[np.int64]  #: Where each began. Shape (K, M).
-    lengths: NDArray[np.int64]  #: Its macro-actions. Shape (K,).
-    actions: NDArray[np.int64]  #: Those of all episodes, one behind the other. Shape (N,).
-    returns: NDArray[np.float64]  #: Its undiscounted return. Shape (K,).
-    success: NDArray[np.bool_]  #: Whether it ended in success. Shape (K,).
-    faults: NDArray[np.int64]  #: Its macro-actions whose physics disagreed with the rules. Shape (K,).
+    starts: Ints  #: Where each began. Shape (K, M).
+    lengths: Ints  #: Its macro-actions. Shape (K,).
+    actions: Ints  #: Those of all episodes, one behind the other. Shape (N,).
+    returns: Floats  #: Its undiscounted return. Shape (K,).
+    success: Bools  #: Whether it ended in success. Shape (K,).
+    faults: Ints  #: Its macro-actions whose physics disagreed with the rules. Shape (K,).
     #: CRC-32 of the environment's generator at its start and of every macrostate and reward that followed. Shape (K,).
-    fingerprints: NDArray[np.int64]
+    fingerprints: Ints
     #: Its simulated seconds, 0 in kinematic execution. Shape (K,). None in results of before 2026-11-28.
-    sim_times_s: NDArray[np.float64] | None = None
+    sim_times_s: Floats | None = None
 
     def actions_of(self, episode: int) -> list[int]:
         """The macro-actions of one episode."""
@@ -145,9 +146,9 @@ class RunResult(OneRun):
 
     checkpoints: tuple[Checkpoint, ...]  #: One a budget, in the protocol's order
     #: Whether each training episode succeeded. Shape (episodes,), or (0,) if the run was kept for good.
-    training_success: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    training_success: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     #: Macro-actions of each training episode. Shape (episodes,), or (0,) likewise.
-    training_length: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    training_length: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     #: Where the training episodes began that were played. Shape (played, M). None in results of before 2026-11-24.
     training_starts: NDArray[np.int16] | None = None
     #: The training episodes that were played: all but a dataset's, those of a resumed run from when this version took
@@ -237,6 +238,6 @@ class BenchResult(AllRuns[Protocol, RunResult]):
         """Every tested budget of every run, in the order of the protocol's agents and seeds."""
         return [(run, row) for agent in self.protocol.agents for run in self.of(agent) for row in run.checkpoints]
 
-    def success_rates(self, agent: str) -> NDArray[np.float64]:
+    def success_rates(self, agent: str) -> Floats:
         """Success rates of one agent. Shape (seeds, budgets)."""
         return np.array([[checkpoint.success_rate for checkpoint in run.checkpoints] for run in self.of(agent)])

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.arrays import Floats
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Rules
 from imagine_bench.judge.causes import expected_rightly
@@ -44,10 +44,10 @@ class Line:
     """The results of a variant."""
 
     variant: Variant
-    success: NDArray[np.float64]  #: Success shares. Shape (seeds, budgets).
+    success: Floats  #: Success shares. Shape (seeds, budgets).
     #: Share of macro-actions of which the model expects the true outcome, :func:`.judge.causes.expected_rightly`; NaN
     #: for agents without a model. Shape (seeds, budgets).
-    imagined_right: NDArray[np.float64]
+    imagined_right: Floats
     train_cpu_s: float  #: Mean CPU seconds of training a run
     #: Against the variant it is compared with, one a budget; None for a variant that is compared with nothing.
     difference: tuple[Estimate, ...] | None
@@ -101,7 +101,7 @@ def plan_variant(study: Study, task: str, variant: Variant) -> Planned:
     )
 
 
-def imagined_right(rules: Rules, runs: Sequence[RunResult]) -> NDArray[np.float64]:
+def imagined_right(rules: Rules, runs: Sequence[RunResult]) -> Floats:
     """Of each run and budget the share of macro-actions whose true outcome the agent's model expects; NaN without one.
 
     Shape (runs, budgets).
@@ -122,7 +122,7 @@ class LevelResult:
     """The results of one agent in one level."""
 
     level: Level
-    values: NDArray[np.float64]  #: Success share, or AUROC, of each seed; NaN if it was not run. Shape (seeds,).
+    values: Floats  #: Success share, or AUROC, of each seed; NaN if it was not run. Shape (seeds,).
     benches: tuple[str, ...]  #: Task and folder of the bench of each seed, below the folder of all benches
     scale: Scale | None = None  #: None if nothing was run
     train_cpu_s: float = math.nan  #: Mean CPU seconds of training a run; NaN likewise
@@ -193,7 +193,7 @@ def _level_result(experiment: Experiment, level: Level, planned: Sequence[Planne
     benches = tuple(f"{store.folder.parent.name}/{store.folder.name}" for store in stores)
     if any(store.missing() for store in stores):
         return LevelResult(level=level, values=np.full(len(stores), math.nan), benches=benches)
-    results = [load_so_far(bench_folder(root, protocol)) for protocol, _ in planned]
+    results = [load_so_far(store.folder) for store in stores]
     last = [run.checkpoints[-1] for result in results for run in result.runs]
     values = [auroc(each.open_loop) for each in last]
     scale = Scale(chance=0.5, optimum=1.0)

@@ -8,9 +8,9 @@ from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import reference, registry, statistics
+from imagine_bench.arrays import Pixels
 from imagine_bench.errors import ArtefactError, InvalidValueError, brief, writing
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.causes import causes_of
@@ -185,7 +185,7 @@ def _row(plan: PlanResult) -> dict[str, float | str]:
     }
 
 
-def _stack(plans: Sequence[PlanResult], task: TaskSpec) -> NDArray[np.uint8]:
+def _stack(plans: Sequence[PlanResult], task: TaskSpec) -> Pixels:
     """The filmstrips of plans below one another. Shape (height, width, 3)."""
     columns = max(plan.length for plan in plans)
     return np.concatenate([filmstrip(plan.compared, task.action_names, columns=columns) for plan in plans])
