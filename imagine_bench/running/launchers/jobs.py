@@ -52,8 +52,9 @@ def launcher(name: str, workers: int | None = None) -> Launcher:
         InvalidValueError: Fewer than one worker.
         SetupError: It needs something that is not installed.
     """
-    make = registry.load(LAUNCHERS[require_known("launcher", name, LAUNCHERS)])
-    return make(at_a_time(workers))
+    where = LAUNCHERS[require_known("launcher", name, LAUNCHERS)]
+    processes = at_a_time(workers)
+    return registry.load(where)(processes)
 
 
 def at_a_time(workers: int | None) -> int:

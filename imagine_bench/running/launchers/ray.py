@@ -11,18 +11,16 @@ import os
 import socket
 import time
 from collections.abc import Sequence
-from types import ModuleType
-from typing import TYPE_CHECKING
+
+import ray
+from ray import ObjectRef
+from ray.actor import ActorHandle
 
 from imagine_bench.cores import ONE_THREAD
-from imagine_bench.errors import BusyError, SetupError, lacking
+from imagine_bench.errors import BusyError, SetupError
 from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
 from imagine_bench.registry.scripts import Registered, register, registered
 from imagine_bench.running.launchers.jobs import absolute, carry_out, run_job
-
-if TYPE_CHECKING:
-    from ray import ObjectRef
-    from ray.actor import ActorHandle
 
 _LOST = 20
 """Times that a task may lose its worker or its node before its run counts as failed."""
@@ -33,29 +31,20 @@ _FREED_WITHIN_S = 60.0
 
 
 class RayCluster:
-    """Tasks of the Ray cluster at ``RAY_ADDRESS``, or ``workers`` at a time of one started here for the purpose.
-
-    Raises SetupError: Ray is not installed.
-    """
+    """Tasks of the Ray cluster at ``RAY_ADDRESS``, or ``workers`` at a time of one started here for the purpose."""
 
     def __init__(self, workers: int) -> None:
-        try:
-            import ray  # noqa: PLC0415 - an optional dependency
-        except ImportError as error:
-            raise lacking("ray") from error
         self._workers = workers
-        self._ray = ray
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job. Raises SetupError: no cluster at ``RAY_ADDRESS``, or none with the GPU wanted."""
-        ray = self._ray
-        self._connect(ray)
+        self._connect()
         try:
-            return _launch(ray, jobs, on_progress)
+            return _launch(jobs, on_progress)
         finally:
             ray.shutdown()
 
-    def _connect(self, ray: ModuleType) -> None:
+    def _connect(self) -> None:
         address = os.environ.get("RAY_ADDRESS")
         local = {} if address else {"num_cpus": self._workers, "include_dashboard": False}
         try:
@@ -75,7 +64,7 @@ def _require_listening(address: str | None) -> None:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_ANSWERS_WITHIN_S).close()
 
 
-def _launch(ray: ModuleType, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+def _launch(jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
     gpus = int(any(job.spec.protocol.device == "cuda" for job in jobs))
     if ray.cluster_resources().get("GPU", 0) < gpus:
         raise SetupError("No node of the Ray cluster has a GPU for device 'cuda'; add one, or use device 'cpu'.")
@@ -98,7 +87,7 @@ def _launch(ray: ModuleType, jobs: Sequence[Job], on_progress: OnProgress) -> tu
         for progress in ray.get(board.take.remote()):
             on_progress(progress)
         for task in ended:
-            failure = Failure(job=running.pop(task), reason=_reason(ray, task))
+            failure = Failure(job=running.pop(task), reason=_reason(task))
             if failure.reason:
                 failures.append(failure)
                 on_progress(failure.progress)
@@ -107,7 +96,7 @@ def _launch(ray: ModuleType, jobs: Sequence[Job], on_progress: OnProgress) -> tu
     return tuple(failures)
 
 
-def _reason(ray: ModuleType, task: ObjectRef) -> str:
+def _reason(task: ObjectRef) -> str:
     """Why an ended task's run failed, or an empty string."""
     try:
         reason: str = ray.get(task)

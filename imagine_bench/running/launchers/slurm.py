@@ -14,17 +14,14 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import submitit
 
 from imagine_bench.cores import ONE_THREAD
-from imagine_bench.errors import lacking
 from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
 from imagine_bench.registry.scripts import Registered, register, registered
 from imagine_bench.running.launchers.jobs import absolute, carry_out
 from imagine_bench.store.files import make_folder, write_bytes
-
-if TYPE_CHECKING:
-    import submitit
 
 _POLL_S = 1.0
 _LIMIT_MIN = 24 * 60
@@ -34,18 +31,10 @@ _LOST = 1000
 
 
 class SlurmCluster:
-    """``workers`` jobs in Slurm's queue at a time, at least 1.
-
-    Raises SetupError: submitit is not installed.
-    """
+    """``workers`` jobs in Slurm's queue at a time, at least 1."""
 
     def __init__(self, workers: int) -> None:
-        try:
-            import submitit  # noqa: PLC0415 - an extra
-        except ImportError as error:
-            raise lacking("submitit") from error
         self._workers = workers
-        self._submitit = submitit
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job, in order; those in the queue are cancelled when this is interrupted."""
@@ -76,7 +65,7 @@ class SlurmCluster:
     def _submit(self, job: Job) -> submitit.Job[str]:
         news = _news(job)
         news.unlink(missing_ok=True)
-        executor = self._submitit.AutoExecutor(folder=make_folder(news.parent), slurm_max_num_timeout=_LOST)
+        executor = submitit.AutoExecutor(folder=make_folder(news.parent), slurm_max_num_timeout=_LOST)
         executor.update_parameters(
             name=f"{job.spec.agent}-{job.spec.seed}", cpus_per_task=1, timeout_min=_LIMIT_MIN,
             gpus_per_node=int(job.spec.protocol.device == "cuda"),
@@ -97,8 +86,6 @@ class _Work:
         return carry_out(job, lambda progress: _tell(job, progress))
 
     def checkpoint(self, job: Job) -> submitit.helpers.DelayedSubmission:
-        import submitit  # noqa: PLC0415 - as above
-
         return submitit.helpers.DelayedSubmission(self, job)
 
 

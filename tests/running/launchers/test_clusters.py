@@ -18,8 +18,6 @@ from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.data import Job, Progress, RunSpec
 from imagine_bench.running.launchers.jobs import LocalPool, absolute, launcher
-from imagine_bench.running.launchers.ray import RayCluster
-from imagine_bench.running.launchers.slurm import SlurmCluster
 from imagine_bench.store import encoders
 from imagine_bench.store.run_folder import load_run
 
@@ -62,9 +60,9 @@ def test_launchers_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
         launcher("rey", 1)
     with pytest.raises(InvalidValueError, match="0 workers cannot run anything"):
         launcher("ray", 0)
-    monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
-    monkeypatch.setitem(sys.modules, "submitit", None)
     for name, module in (("ray", "ray"), ("slurm", "submitit")):
+        monkeypatch.delitem(sys.modules, f"imagine_bench.running.launchers.{name}", raising=False)
+        monkeypatch.setitem(sys.modules, module, None)  # as if it were not installed
         with pytest.raises(SetupError, match=rf"needs {module}, .*: pip install 'imagine-bench\[{name}\]'"):
             launcher(name, 1)
 
@@ -83,7 +81,7 @@ def test_submitted_jobs_give_the_same_bits_also_when_preempted(tmp_path: Path) -
                     child.send_signal(signal.SIGUSR2)
                     preempted.append(progress.episode)
 
-    assert SlurmCluster(1).launch(jobs(tmp_path / "slurm", (0,), 600), preempt) == ()
+    assert launcher("slurm", 1).launch(jobs(tmp_path / "slurm", (0,), 600), preempt) == ()
     assert preempted and (tmp_path / "slurm" / "seed_0" / "log.txt").read_text().count("begins or goes on") == 2
     assert LocalPool(1).launch(jobs(tmp_path / "home", (0,), 600), lambda _: None) == ()
     assert results(tmp_path / "slurm", (0,)) == results(tmp_path / "home", (0,))
@@ -93,7 +91,7 @@ def test_submitted_jobs_give_the_same_bits_also_when_preempted(tmp_path: Path) -
 def test_a_submitted_job_that_fails_says_why(tmp_path: Path) -> None:
     (job,) = jobs(tmp_path, (0,), 60)
     lost = dataclasses.replace(job, spec=dataclasses.replace(job.spec, encoder=tmp_path / "no.safetensors"))
-    (failure,) = SlurmCluster(1).launch([lost], lambda _: None)
+    (failure,) = launcher("slurm", 1).launch([lost], lambda _: None)
     assert "no.safetensors" in failure.reason and failure.job.spec.seed == 0
 
 
@@ -103,7 +101,7 @@ def test_a_cluster_started_here_gives_the_same_bits(tmp_path: Path, monkeypatch:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     assert LocalPool(1).launch(jobs(tmp_path / "home", (0,), 60), lambda _: None) == ()
     told: list[Progress] = []
-    assert RayCluster(1).launch(jobs(tmp_path / "ray", (0,), 60), told.append) == ()
+    assert launcher("ray", 1).launch(jobs(tmp_path / "ray", (0,), 60), told.append) == ()
     assert results(tmp_path / "ray", (0,)) == results(tmp_path / "home", (0,))
     assert told and told[-1].phase == "done"
 
@@ -135,7 +133,7 @@ def test_a_node_and_a_worker_killed_in_the_middle_cost_no_result(
             killed["worker"] = [progress.episode]
 
     try:
-        assert RayCluster(1).launch(jobs(tmp_path / "ray", seeds, episodes), kill) == ()
+        assert launcher("ray", 1).launch(jobs(tmp_path / "ray", seeds, episodes), kill) == ()
     finally:
         cluster.shutdown()
     assert killed["node"] and killed["worker"], "both must really have been killed in the middle"
@@ -160,7 +158,7 @@ def test_a_cluster_without_a_gpu_does_not_wait_for_one_for_ever(
     spec = dataclasses.replace(here.spec, protocol=dataclasses.replace(here.spec.protocol, device="cuda"))
     try:
         with pytest.raises(SetupError, match="No node of the Ray cluster has a GPU for device 'cuda'"):
-            RayCluster(1).launch([dataclasses.replace(here, spec=spec)], lambda _: None)
+            launcher("ray", 1).launch([dataclasses.replace(here, spec=spec)], lambda _: None)
     finally:
         cluster.shutdown()
     assert list(tmp_path.iterdir()) == []
@@ -172,7 +170,7 @@ def test_a_cluster_without_a_gpu_does_not_wait_for_one_for_ever(
 def test_an_address_without_a_cluster_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
     monkeypatch.setenv("RAY_ADDRESS", f"{scheme}127.0.0.1:1")
     with pytest.raises(SetupError, match=rf"No Ray cluster answers at RAY_ADDRESS={scheme}127\.0\.0\.1:1 "):
-        RayCluster(1).launch(jobs(tmp_path, (0,), 10), lambda _: None)
+        launcher("ray", 1).launch(jobs(tmp_path, (0,), 10), lambda _: None)
     assert list(tmp_path.iterdir()) == []
 
 
