@@ -25,6 +25,7 @@ highlight_language = "none"
 html_theme = "furo"
 html_title = "imagine_bench"
 html_static_path = ["_static"]
+html_search_scorer = "_static/scorer.js"
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
