@@ -2,6 +2,7 @@
 
 import os
 from importlib import metadata
+from pathlib import Path
 
 project = "imagine_bench"
 author = "The imagine_bench developers"
@@ -25,7 +26,7 @@ highlight_language = "none"
 html_theme = "furo"
 html_title = "imagine_bench"
 html_static_path = ["_static"]
-html_search_scorer = "_static/scorer.js"
+html_search_scorer = str(Path(__file__).parent / "_static" / "scorer.js")
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
