@@ -162,3 +162,26 @@ def test_kept_numbers_are_what_every_json_reader_can_read() -> None:
     assert len(files) > 40
     for file in files:
         json.loads(file.read_text(), parse_constant=lambda word, file=file: pytest.fail(f"{file} holds {word}"))
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs" / "environments").glob("*.md")), ids=name)
+def test_pages_of_environments_say_what_their_rules_say(page: Path) -> None:
+    text, spec = page.read_text(), registry.task(page.stem)
+    facts = spec.facts()
+    said = {
+        "chance": re.findall(r"macro-actions solve (?:1 of 46 episodes \()?([\d.]+) %", text),
+        "plan": re.findall(r"with ([\d.]+) macro-actions on average", text),
+        "starts": re.findall(r"Each of the (\d+) macrostates", text),
+        "actions": re.findall(r"`Discrete\((\d+)\)`", text),
+        "horizon": re.findall(r"Truncated\* after (\d+) macro-actions", text),
+    }
+    true = {
+        "chance": 100 * facts.chance_level,
+        "plan": facts.mean_plan_length,
+        "starts": len(spec.rules.start_states),
+        "actions": spec.rules.n_actions,
+        "horizon": spec.horizon,
+    }
+    for fact, values in said.items():
+        assert all(round(true[fact], len(value.partition(".")[2])) == float(value) for value in values), (fact, values)
+    assert sum(map(len, said.values())) >= (0 if page.stem == "arrows" else 3)
