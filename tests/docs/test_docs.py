@@ -14,6 +14,7 @@ from pathlib import Path
 import gymnasium
 import matplotlib
 import pytest
+import repository
 import thesis_elements
 from doc_cells import ROOT
 from doc_tables import PAGES
@@ -185,3 +186,16 @@ def test_pages_of_environments_say_what_their_rules_say(page: Path) -> None:
     for fact, values in said.items():
         assert all(round(true[fact], len(value.partition(".")[2])) == float(value) for value in values), (fact, values)
     assert sum(map(len, said.values())) >= (0 if page.stem == "arrows" else 3)
+
+
+def test_the_front_page_has_the_links_of_its_address() -> None:
+    """Badges and full links once there is an address; without one, none, and no address is made up."""
+    page = (ROOT / "README.md").read_text()
+    assert page == repository.with_badges(page, repository.REPOSITORY)
+    marked = "<!-- badges -->\n<!-- end of badges -->\n![arm](docs/img/turn.gif) [docs](docs/index.md) [own](#cite)\n"
+    assert repository.with_badges(marked, "") == repository.with_absolute_links(marked, "") == marked
+    address = "https://github.com/owner/name"
+    assert repository.with_badges(marked, address).count(address) == 2
+    full = repository.with_absolute_links(marked, address)
+    assert "![arm](https://raw.githubusercontent.com/owner/name/main/docs/img/turn.gif)" in full
+    assert f"[docs]({address}/blob/main/docs/index.md) [own](#cite)" in full
