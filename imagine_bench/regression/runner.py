@@ -34,8 +34,9 @@ from imagine_bench.seeding import SeedTree
 from imagine_bench.statistics import auroc
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_protocol_as
-from imagine_bench.store.files import grouped, read_arrays, reading, table_rows, table_text, write_arrays, write_bytes
+from imagine_bench.store.files import read_arrays, reading, table_rows, table_text, write_arrays, write_bytes
 from imagine_bench.store.results import AllRuns, OneRun
+from imagine_bench.values import grouped, pack
 
 LEVELS = (0.5, 0.8, 0.95)
 """Probabilities of the central intervals whose coverage is reported."""
@@ -102,7 +103,7 @@ class RegressionResult(AllRuns[RegressionProtocol, RegressionRun]):
 def _write(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:
     """Write what a run has measured so far; :func:`_begun` reads it, and the rows are on disk first."""
     write_bytes(folder / METRICS, table_text(rows).encode())
-    write_arrays(folder / EVALUATION, run_folder.pack(evaluations)[1])
+    write_arrays(folder / EVALUATION, pack(evaluations)[1])
 
 
 def _begun(folder: Path) -> tuple[list[Row], dict[str, Arrays]]:

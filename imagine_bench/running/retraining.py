@@ -24,7 +24,7 @@ from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_control
 from imagine_bench.store.files import reading
 from imagine_bench.store.results import RunResult
-from imagine_bench.store.run_folder import pack
+from imagine_bench.values import pack
 
 SAME_SUCCESS = 0.25
 """Difference of success at a budget that is let pass where another processor or version trains again."""
@@ -179,7 +179,7 @@ def _digests(run: RunResult) -> dict[str, str]:
 
 
 def part_digest(part: object) -> str:
-    """A digest of whatever :func:`.run_folder.pack` takes."""
+    """A digest of whatever :func:`.values.pack` takes."""
     values, arrays = pack(part)
     found = hashlib.sha256(json.dumps(values, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):

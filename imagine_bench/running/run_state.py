@@ -34,7 +34,8 @@ from imagine_bench.running.evaluation import (
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.files import reading
 from imagine_bench.store.results import Checkpoint
-from imagine_bench.store.run_folder import Snapshot, load_newest, pack, save_snapshot, unpack
+from imagine_bench.store.run_folder import Snapshot, load_newest, save_snapshot
+from imagine_bench.values import pack, unpack
 
 _RECENT = 100
 """Training episodes whose success is shown while running."""

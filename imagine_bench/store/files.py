@@ -132,15 +132,6 @@ def read_arrays(path: Path, what: str = "an array file of a run") -> Arrays:
         return dict(arrays)
 
 
-def grouped(arrays: Mapping[str, Array]) -> dict[str, Arrays]:
-    """Arrays by the first part of their slashed names."""
-    groups: dict[str, Arrays] = {}
-    for name, array in arrays.items():
-        group, _, rest = name.partition("/")
-        groups.setdefault(group, {})[rest] = array
-    return groups
-
-
 def read_json(path: Path, what: str, holds: type = dict) -> Any:
     """What a JSON file holds, of type ``holds``. Raises ArtefactError: it is missing, damaged or not ``what``."""
     with reading(path, what):

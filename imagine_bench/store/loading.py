@@ -24,7 +24,7 @@ from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import KEPT, BenchStore, bench_facts, is_archive, read_control
 from imagine_bench.store.files import json_text, reading, table_rows, table_text
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
-from imagine_bench.store.run_folder import unpack
+from imagine_bench.values import unpack
 
 Runs = Mapping[tuple[str, int], RunResult | None]
 """Runs by agent and seed, None where there is nothing yet."""

@@ -7,8 +7,8 @@ with the digests of the others. Finished runs of before 2026-11-28 have more fil
 A checkpoint is a folder ``checkpoint_000007_episode_120`` (the seventh of its run) of ``agent.safetensors``,
 ``runner.safetensors`` and ``state.json``, which has its own digest and those of the other two. It is complete once it
 has its name, so that a ``kill -9`` at any moment damages none; one of another name is none. The newest is kept; the one
-before it goes when the newer is complete. :func:`pack` turns what a runner knows into JSON-like values and named
-arrays, and :func:`unpack` reads it back to the bit: the types of a dataclass's fields decide.
+before it goes when the newer is complete. :func:`.values.pack` turns what a runner knows into JSON-like values and
+named arrays, and :func:`.values.unpack` reads it back to the bit.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ import io
 import json
 import re
 import shutil
-import types
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 from safetensors.numpy import load, save
@@ -38,7 +37,6 @@ from imagine_bench.registry.entries import agent_label
 from imagine_bench.store.files import (
     csv_text,
     first_difference,
-    grouped,
     lock,
     make_folder,
     read_arrays,
@@ -54,7 +52,7 @@ from imagine_bench.store.files import (
     write_json,
 )
 from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RunResult
-from imagine_bench.values import Json
+from imagine_bench.values import Json, grouped, pack, unpack
 
 _SNAPSHOT = "imagine_bench checkpoint 2"
 _NAME = re.compile(r"checkpoint_([0-9]{6,})_episode_([0-9]+)")
@@ -64,55 +62,6 @@ _RUNNER = "runner.safetensors"
 _STATE = "state.json"
 TRAINING = "training"
 """The group of a checkpoint's arrays that holds the training episodes."""
-
-
-def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
-    """Split a dataclass, or a sequence of them, into JSON-like values and arrays named below ``path``.
-
-    Fields may hold dataclasses, sequences, mappings, arrays, numbers, texts or None. A numpy scalar is kept as the
-    Python number of the same value.
-    """
-    if isinstance(value, np.ndarray):
-        return None, {path: value}
-    if isinstance(value, np.generic):
-        return value.item(), {}
-    if dataclasses.is_dataclass(value):
-        return pack(vars(value), path)
-    if not isinstance(value, Mapping | list | tuple):
-        return value, {}
-    parts = value.items() if isinstance(value, Mapping) else enumerate(value)
-    values = {}
-    arrays: Arrays = {}
-    for name, part in parts:
-        values[name], inner = pack(part, f"{path}/{name}" if path else str(name))
-        arrays |= inner
-    return values if isinstance(value, Mapping) else list(values.values()), arrays
-
-
-def unpack(kind: Any, values: Any, arrays: Mapping[str, Array]) -> Any:
-    """Rebuild an object of type ``kind`` from what :func:`pack` gave; ``values`` is None if only arrays were kept.
-
-    A field that files do not have takes its default.
-
-    Raises:
-        KeyError: An array is missing.
-        TypeError: A field without a default is missing.
-    """
-    origin = get_origin(kind)
-    arguments = get_args(kind)
-    if types.NoneType in arguments:  # one type or None; of plain values any may be
-        return unpack(arguments[0], values, arrays) if values is not None or arrays else None
-    if origin is np.ndarray:
-        return arrays[""]
-    parts = grouped(arrays)
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-        given = {**dict.fromkeys(parts), **(values or {})}
-        hints = {name: hint for name, hint in get_type_hints(kind).items() if name in given}
-        return kind(**{name: unpack(hint, given[name], parts.get(name, {})) for name, hint in hints.items()})
-    if origin in (list, tuple) and dataclasses.is_dataclass(arguments[0]):
-        each = [None] * len(parts) if values is None else values
-        return origin(unpack(arguments[0], part, parts.get(str(index), {})) for index, part in enumerate(each))
-    return values
 
 
 def training_arrays(kept: KeptEpisodes) -> Arrays:

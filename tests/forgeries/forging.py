@@ -31,10 +31,11 @@ from imagine_bench.running.run_state import Counters, CountVisits, make_env
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import bench_folder
-from imagine_bench.store.files import grouped, read_json, sealed, write_json
+from imagine_bench.store.files import read_json, sealed, write_json
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import Checkpoint, KeptEpisodes
-from imagine_bench.store.run_folder import Snapshot, pack, training_arrays, unpack
+from imagine_bench.store.run_folder import Snapshot, training_arrays
+from imagine_bench.values import grouped, pack, unpack
 
 LEARNERS = ("dqn", "count_table")
 SEEDS = (0, 1, 2)

@@ -15,7 +15,8 @@ from imagine_bench.arrays import Arrays
 from imagine_bench.protocols.data import digest
 from imagine_bench.store.files import sealed, sha256
 from imagine_bench.store.results import Checkpoint, KeptEpisodes
-from imagine_bench.store.run_folder import load_newest, load_run, pack, save_snapshot, write_metrics
+from imagine_bench.store.run_folder import load_newest, load_run, save_snapshot, write_metrics
+from imagine_bench.values import pack
 
 Forge = Callable[[Path, np.random.Generator], None]
 
