@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import functools
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import numpy as np
 
 from imagine_bench import statistics
 from imagine_bench.arrays import Floats
-from imagine_bench.store.files import csv_text, json_text, make_folder, sweep, write_bytes
+from imagine_bench.store.files import csv_text, make_folder, sweep, write_bytes
 
 DASH = "–"  # printed where there is no number; the table's caption says why
 
@@ -226,7 +227,7 @@ def texts(page: Page, *, images: bool = True) -> dict[str, str]:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["base64"] = lambda image: base64.b64encode(image.png).decode() if images else ""
-    environment.filters["json"] = json_text
+    environment.filters["json"] = functools.partial(json.dumps, indent=1, ensure_ascii=False)
     return {**page.files, "index.html": environment.get_template("page.html.j2").render(page=page)}
 
 
