@@ -165,6 +165,14 @@ def test_the_library_sees_rewards_of_about_one() -> None:
     env.close()
 
 
+@pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS, "sb3_ppo_latents", *IMAGINING])
+def test_an_agent_has_the_settings_that_its_entry_names(agent: str) -> None:
+    """A bench writes those of the entry into its protocol; on frames they are others than on latents."""
+    context = context_of(spec(agent))
+    named = registry.settings(agent, context.hyperparameters, context.overrides, context.config_group)
+    assert registry.make_agent(agent, context).settings == named
+
+
 def test_it_is_never_taken_up_again_half_way() -> None:
     agent = registry.make_agent("sb3_dqn", context_of(spec("sb3_dqn")))
     with pytest.raises(ArtefactError, match="cannot be taken up again; run its bench anew"):

@@ -6,12 +6,14 @@ from imagine_bench.interfaces import OBSERVATIONS
 from imagine_bench.registry import AgentEntry
 
 _SB3_SETTINGS = "imagine_bench_peers.sb3_settings:HYPERPARAMETERS"
+_PIXEL_SETTINGS = "imagine_bench_peers.sb3_settings:PIXELS"
+_QUANTILE_SETTINGS = "imagine_bench_peers.sb3_settings:QUANTILES"
 _IMAGINING_SETTINGS = "imagine_bench_peers.sb3_settings:IMAGINING"
 _DREAMER_SETTINGS = "imagine_bench_peers.dreamer_settings:HYPERPARAMETERS"
 
 SB3_DQN = AgentEntry(
     make="imagine_bench_peers.sb3:make_dqn",
-    settings=_SB3_SETTINGS,
+    settings=_PIXEL_SETTINGS,
     needs_encoder=False,
     observes=OBSERVATIONS,
     external_training_loop=True,
@@ -20,7 +22,7 @@ SB3_DQN = AgentEntry(
 )
 SB3_QRDQN = AgentEntry(
     make="imagine_bench_peers.sb3:make_qrdqn",
-    settings=_SB3_SETTINGS,
+    settings=_QUANTILE_SETTINGS,
     needs_encoder=False,
     observes=OBSERVATIONS,
     external_training_loop=True,
@@ -28,7 +30,7 @@ SB3_QRDQN = AgentEntry(
     description="Stable-Baselines3's QR-DQN, which learns the distribution of the return, on pixels.",
 )
 SB3_DQN_LATENTS = AgentEntry(
-    make="imagine_bench_peers.sb3:make_dqn",
+    make="imagine_bench_peers.sb3:make_dqn_latents",
     settings=_SB3_SETTINGS,
     external_training_loop=True,
     title="SB3 DQN (latents)",

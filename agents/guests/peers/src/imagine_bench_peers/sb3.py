@@ -22,7 +22,7 @@ from imagine_bench.interfaces import AgentContext, AgentState, Observation, Tran
 from imagine_bench.interfaces.capabilities import OnEpisode
 
 from .mixed_experience import MixedExperience
-from .sb3_settings import HYPERPARAMETERS, IMAGINING, PPOSettings
+from .sb3_settings import HYPERPARAMETERS, IMAGINING, PIXELS, QUANTILES, PPOSettings
 
 _SEEDS = 2**31
 """The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
@@ -34,18 +34,19 @@ class LibraryAgent:
     Args:
         context: Of the run. Its seed is that of torch's and numpy's global generators, which the library draws from.
         algorithm: The library's class, such as ``"stable_baselines3:DQN"``.
+        hyperparameters: Its settings, those that the agent's entry names.
 
     Raises:
         SetupError: The library is not installed.
     """
 
-    hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS
-
-    def __init__(self, context: AgentContext, algorithm: str) -> None:
+    def __init__(
+        self, context: AgentContext, algorithm: str, hyperparameters: Hyperparameters[Any] = HYPERPARAMETERS
+    ) -> None:
         prepare_torch(context.device)
         self._algorithm = _load(algorithm)
         self._device = context.device
-        self.settings = self.hyperparameters.of(context)
+        self.settings = hyperparameters.of(context)
         self._keywords = self.settings.ppo if algorithm.endswith(":PPO") else self.settings.sb3
         self._seed = context.seeds.child("library").integer() % _SEEDS
         self._encoder = None if context.encoder is None else load_perception(context).encoder
@@ -58,6 +59,8 @@ class LibraryAgent:
         keywords = dataclasses.asdict(self._keywords)
         explores = keywords.pop("exploration_steps", 0)
         steps = max(episodes * self._steps_an_episode(horizon), explores)  # on_episode ends training before
+        if "n_quantiles" in keywords:
+            keywords["policy_kwargs"] = {"n_quantiles": keywords.pop("n_quantiles")}
         if explores:
             keywords["exploration_fraction"] = explores / steps  # exploration depends on the step alone
         scale = self.settings.reward_scale
@@ -116,10 +119,8 @@ class LibraryAgent:
 class ImaginingLibraryAgent(LibraryAgent):
     """A learner of the library that trains on real and imagined episodes alike, the latter through the filter."""
 
-    hyperparameters = IMAGINING
-
     def __init__(self, context: AgentContext, algorithm: str) -> None:
-        super().__init__(context, algorithm)
+        super().__init__(context, algorithm, IMAGINING)
         self._world_seed = context.seeds.child("imagined").integer()
         self._learner = build(ImaginingAgent, context, filtered=True, hyperparameters=IMAGINING)
 
@@ -147,16 +148,12 @@ def _load(target: str) -> Any:
         ) from error
 
 
-def make_dqn(context: AgentContext) -> LibraryAgent:
-    """The ``sb3_dqn`` agents: DQN (Mnih et al. 2015), on pixels, or on latents where there is an encoder."""
-    return LibraryAgent(context, "stable_baselines3:DQN")
-
-
-def make_qrdqn(context: AgentContext) -> LibraryAgent:
-    """The ``sb3_qrdqn`` agent: QR-DQN (Dabney et al. 2018)."""
-    return LibraryAgent(context, "sb3_contrib:QRDQN")
-
-
+make_dqn = partial(LibraryAgent, algorithm="stable_baselines3:DQN", hyperparameters=PIXELS)
+"""The ``sb3_dqn`` agent: DQN (Mnih et al. 2015)."""
+make_qrdqn = partial(LibraryAgent, algorithm="sb3_contrib:QRDQN", hyperparameters=QUANTILES)
+"""The ``sb3_qrdqn`` agent: QR-DQN (Dabney et al. 2018)."""
+make_dqn_latents = partial(LibraryAgent, algorithm="stable_baselines3:DQN")
+"""The ``sb3_dqn_latents`` agent."""
 make_ppo = partial(LibraryAgent, algorithm="stable_baselines3:PPO")
 """The ``sb3_ppo_latents`` agent: PPO (Schulman et al. 2017)."""
 make_imagining_dqn = partial(ImaginingLibraryAgent, algorithm="stable_baselines3:DQN")
