@@ -132,11 +132,11 @@ def read_arrays(path: Path, what: str = "an array file of a run") -> Arrays:
         return dict(arrays)
 
 
-def read_json(path: Path, what: str, holds: type = dict) -> Any:
-    """What a JSON file holds, of type ``holds``. Raises ArtefactError: it is missing, damaged or not ``what``."""
+def read_json(path: Path, what: str) -> Any:
+    """The object that a JSON file holds. Raises ArtefactError: it is missing, damaged or not ``what``."""
     with reading(path, what):
         found = json.loads(path.read_bytes())
-        if not isinstance(found, holds):
+        if not isinstance(found, dict):
             raise TypeError(f"it holds a {type(found).__name__}")
         return found
 
