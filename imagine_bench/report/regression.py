@@ -101,7 +101,7 @@ def _words(name: str) -> str:
 
 
 def _toy(result: RegressionResult) -> list[Section]:
-    claims = [claim for agent in result.protocol.agents for claim in _claims(result, agent)]
+    claims = _claims(result)
     variants = result.protocol.variants
     return [
         Section(
@@ -165,12 +165,15 @@ _CLAIMS = (
 _SIGNS = {"≥": np.greater_equal, "≤": np.less_equal, ">": np.greater}
 
 
-def _claims(result: RegressionResult, agent: str) -> list[Cells]:
-    pairs = {variant: result.pairs[agent, variant] for variant in result.protocol.variants}
+def _claims(result: RegressionResult) -> list[Cells]:
+    pairs = result.pairs
     rows = []
-    for variant, kind, words, asked in _CLAIMS:
-        if {variant, "base"} <= pairs.keys():
-            rows.append(claim(pairs["base"].title, words, change(pairs[variant], pairs["base"], kind), asked))
+    for agent in result.protocol.agents:
+        base = pairs.get((agent, "base"))
+        for variant, kind, words, asked in _CLAIMS:
+            pair = pairs.get((agent, variant))
+            if base and pair:
+                rows.append(claim(base.title, words, change(pair, base, kind), asked))
     return rows
 
 

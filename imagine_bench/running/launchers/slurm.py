@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -26,6 +27,8 @@ from imagine_bench.store.files import make_folder, write_bytes
 _POLL_S = 1.0
 _LIMIT_MIN = 24 * 60
 """Where ``SBATCH_TIMELIMIT`` says nothing."""
+_QUEUED_AGAIN = 144
+"""Exit code by which submitit's executor for one machine knows a job that is queued again; Slurm needs none."""
 _LOST = 1000
 """Times that a job may reach its limit before its run counts as failed."""
 
@@ -79,13 +82,19 @@ class _Work:
 
     def __init__(self, there: Registered) -> None:
         self._there = there
+        self._queued_again = False
 
     def __call__(self, job: Job) -> str:
+        self._queued_again = False
         os.environ.update(ONE_THREAD)
         register(self._there)
-        return carry_out(job, lambda progress: _tell(job, progress))
+        reason = carry_out(job, lambda progress: _tell(job, progress))
+        if self._queued_again:  # submitit ends this process, which no run may
+            sys.exit(_QUEUED_AGAIN)
+        return reason
 
     def checkpoint(self, job: Job) -> submitit.helpers.DelayedSubmission:
+        self._queued_again = True
         return submitit.helpers.DelayedSubmission(self, job)
 
 
