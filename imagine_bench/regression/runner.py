@@ -100,12 +100,6 @@ class RegressionResult(AllRuns[RegressionProtocol, RegressionRun]):
         }
 
 
-def _write(folder: Path, rows: Sequence[Row], evaluations: Mapping[str, Arrays]) -> None:
-    """Write what a run has measured so far; :func:`_begun` reads it, and the rows are on disk first."""
-    write_bytes(folder / METRICS, table_text(rows).encode())
-    write_arrays(folder / EVALUATION, pack(evaluations)[1])
-
-
 def _begun(folder: Path) -> tuple[list[Row], dict[str, Arrays]]:
     """The rows and measurements of the variants that a run has done, in their order."""
     if not (folder / EVALUATION).exists():
@@ -186,7 +180,8 @@ def _go_on(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgr
         measured, arrays = _learn(spec, folder, variant, tell)
         rows += measured
         evaluations[variant] = arrays
-        _write(folder, rows, evaluations)
+        write_bytes(folder / METRICS, table_text(rows).encode())  # first: the arrays say which variants are done
+        write_arrays(folder / EVALUATION, pack(evaluations)[1])
     recorder = task.recorder or next(iter(spec.observers), None)
     if recorder is not None and protocol.recorded:
         tell("recording", "recording")

@@ -88,7 +88,8 @@ class _Work:
         self._queued_again = False
         os.environ.update(ONE_THREAD)
         register(self._there)
-        reason = carry_out(job, lambda progress: _tell(job, progress))
+        news = _news(job)
+        reason = carry_out(job, lambda progress: write_bytes(news, json.dumps(dataclasses.asdict(progress)).encode()))
         if self._queued_again:  # submitit ends this process, which no run may
             sys.exit(_QUEUED_AGAIN)
         return reason
@@ -101,10 +102,6 @@ class _Work:
 def _news(job: Job) -> Path:
     """Where a node leaves how far it is."""
     return job.folder.parent / "slurm" / f"{job.folder.name}.json"
-
-
-def _tell(job: Job, progress: Progress) -> None:
-    write_bytes(_news(job), json.dumps(dataclasses.asdict(progress)).encode())
 
 
 def _latest(job: Job) -> Progress | None:
