@@ -25,6 +25,7 @@ LEVEL = 0.95  #: coverage of every interval
 POWER = 0.8  #: probability with which :func:`detectable` would be found
 FEWEST = 7  #: runs of an interval: of six, a third of them stuck, 9 % of samples show none that is
 FEWEST_TESTED = 5  #: runs of each of two agents whose difference is tested
+_MOST_RUNS = 100  # nobody trains more of one agent
 _TRIM = 0.25  # of the scores, at each end
 _DIGITS = 12
 """Decimals of differences: success rates lie on a lattice, and two equal sums in another order must not differ."""
@@ -276,6 +277,27 @@ def detectable(treated: ArrayLike, base: ArrayLike, *, cells: int, trials: int |
         quantiles = scipy.stats.t.isf(level / 2.0, freedom) + scipy.stats.t.ppf(POWER, freedom)
         sizes.append(float(error * quantiles))
     return max(sizes)
+
+
+def more_seeds(treated: ArrayLike, base: ArrayLike, *, cells: int, trials: int | None = None) -> int:
+    """How many more runs of each of two agents would show their present difference with probability 80 %, at least 1.
+
+    Were the spread of their runs to stay as it is; in a table of so many ``cells``, at the strictest level of
+    :func:`holm`. 0 where nobody can say: a single run has no spread, and a difference of 0 needs runs without end.
+    """
+    a = _runs(treated)
+    b = _runs(base)
+    now = min(len(a), len(b))
+    if now < 2:
+        return 0
+    level = (1.0 - LEVEL) / max(cells, 1)
+    size = abs(float(differences(a, b, trials=trials)[0]))
+    errors = [float(_contrast(a, b, trials, cut)[1]) * math.sqrt(now) for cut in (0.0, _TRIM)]
+    for count in range(now + 1, _MOST_RUNS):
+        quantiles = scipy.stats.t.isf(level / 2.0, count - 1) + scipy.stats.t.ppf(POWER, count - 1)
+        if can_show((count, count), cells) and max(errors) * float(quantiles) / math.sqrt(count) <= size:
+            return count - now
+    return 0
 
 
 def gain(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None) -> Estimate:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import gymnasium
@@ -13,10 +14,11 @@ from numpy.typing import NDArray
 
 from imagine_bench.arrays import Info, Observed
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_integer, require_known
-from imagine_bench.interfaces import EXECUTIONS, Frame, Outcome, PhysicsSettings, State, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, Floats, Frame, Outcome, PhysicsSettings, State, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.values import Json
 
+from .motion.executor import MacroResult
 from .observations import Observer
 from .parameters.parameters import delivered, hides
 from .rendering.cameras import FRAME_PX, human_camera_view
@@ -31,6 +33,9 @@ Step = tuple[float, bool, bool, Info]
 """Reward, whether the episode has terminated, whether the simulation blew up, and info."""
 _BUILT = PhysicsSettings()
 _WINDOW_HZ = 25.0  # images a second of a window
+_MOST_KEPT = 20_000
+"""Macro-actions whose outcomes a process keeps, some 3 KB each; the oldest go first."""
+_outcomes: OrderedDict[tuple[Hashable, ...], tuple[MacroResult, Floats]] = OrderedDict()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,6 +164,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         self._rendered = self.camera(human_camera_view(camera, width, height))
         self._macrostate = self._starts[0]
         self._observed: tuple[State, ...] = ()
+        self._reuses = False
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
@@ -225,7 +231,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             self._people = self._mocap()
             self.world.executor.capture_motion_hz = self.capture_motion_hz
             try:
-                self.latest = self.world.execute(chosen, intended.macrostate)
+                self.latest = self._execute(chosen, intended.macrostate)
             except DivergedError as error:
                 return self._blown_up(standing, str(error))
             fault = self.latest.fault
@@ -241,6 +247,15 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
         info = self._info(success=outcome.success, legal=outcome.success or not outcome.terminated, fault=fault)
         return float(outcome.reward), outcome.terminated, False, info
+
+    def reuse_outcomes(self) -> None:
+        """From now on, simulate no macro-action twice in this process; results stay the same to the bit.
+
+        A macro-action is a pure function of the scene's state, so one that was carried out before from the same bits
+        only has its outcome set again. Tests of a bench begin alike for all agents, seeds and budgets: most of their
+        motions are repeated. A motion that is captured for a recording is simulated.
+        """
+        self._reuses = True
 
     def observe(self, envs: Sequence[MacroEnv]) -> list[Observed]:
         """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
@@ -342,6 +357,20 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         raise InvalidValueError(
             f"Action {brief(action)} does not exist; give an integer from 0 to {self._n_actions - 1}."
         )
+
+    def _execute(self, action: int, intended: State) -> MacroResult:
+        """Carry out a macro-action in physics, or set what became of it before; see :meth:`reuse_outcomes`."""
+        if not self._reuses or self.capture_motion_hz > 0.0:
+            return self.world.execute(action, intended)
+        before = (self._kind, action, intended, *self.world.decisive())
+        known = _outcomes.get(before)
+        if known is None:
+            known = _outcomes[before] = self.world.execute(action, intended), self.world.physics()
+            if len(_outcomes) > _MOST_KEPT:
+                _outcomes.popitem(last=False)
+        else:
+            self.world.set_physics_state(known[1])
+        return known[0]
 
     def _blown_up(self, standing: WorldState, why: str) -> Step:
         """The result of :meth:`act` if the simulation blew up: the scene stands as before, the episode is over."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -108,20 +108,33 @@ class World(abc.ABC):
 
     def get_state(self) -> WorldState:
         """Everything in the scene that may change, copied."""
-        physics = np.empty(mujoco.mj_stateSize(self.model, _STATE))
-        mujoco.mj_getState(self.model, self.data, physics, _STATE)
         looks = tuple(np.array(each) for each in looks_of(self.model))
-        return WorldState(physics=physics, looks=looks, composite=self._composite, sensing=replace(self.sensing))
+        return WorldState(physics=self.physics(), looks=looks, composite=self._composite, sensing=replace(self.sensing))
 
     def set_state(self, state: WorldState) -> None:
         """Put the scene as it was, to the bit."""
-        mujoco.mj_setState(self.model, self.data, state.physics, _STATE)
         for mine, then in zip(looks_of(self.model), state.looks, strict=True):
             mine[:] = then
         self._composite = state.composite
         self.sensing.aside_m = state.sensing.aside_m
         self.sensing.turned_rad = state.sensing.turned_rad
+        self.set_physics_state(state.physics)
+
+    def physics(self) -> Floats:
+        """MuJoCo's state of the scene, with what starts its solvers, copied."""
+        physics = np.empty(mujoco.mj_stateSize(self.model, _STATE))
+        mujoco.mj_getState(self.model, self.data, physics, _STATE)
+        return physics
+
+    def set_physics_state(self, physics: Floats) -> None:
+        """Put what moves in the scene as :meth:`physics` found it, to the bit."""
+        mujoco.mj_setState(self.model, self.data, physics, _STATE)
         self.update()
+
+    def decisive(self) -> tuple[Hashable, ...]:
+        """All that decides, with the model and the arguments, what :meth:`execute` does."""
+        noise = tuple(each for offset in self._placement_noise for each in offset)
+        return self.physics().tobytes(), noise, self.sensing.aside_m, self.sensing.turned_rad
 
     def place(self, macrostate: State, rng: np.random.Generator) -> None:
         """Start anew, every object a little off its place as the appearance says; nothing from before remains."""

@@ -245,3 +245,18 @@ def test_auroc_and_the_probability_of_improvement_count_pairs() -> None:
     assert math.isnan(statistics.auroc(scores, np.ones(60, dtype=np.bool_)))
     with pytest.raises(InvalidValueError, match="one number a prediction"):
         statistics.auroc(np.array([1.0]), np.array([True, False]))
+
+
+def test_so_many_more_runs_would_show_a_difference_in_four_of_five() -> None:
+    """Of normal runs 20 points apart, with a standard deviation of 15: what more_seeds says of 6 is what they need."""
+    rng = np.random.default_rng(0)
+    pairs = rng.normal([[0.6], [0.4]], 0.15, (200, 2, 6))
+    counts = [6 + statistics.more_seeds(a, b, cells=2) for a, b in pairs if statistics.difference(a, b).p > 0.025]
+    enough = int(np.median(counts))
+    a, b = rng.normal([[0.6], [0.4]], 0.15, (500, 2, enough)).swapaxes(0, 1)
+    assert 0.7 < np.mean(statistics.differences(a, b)[3] < 0.025) < 0.97
+    assert statistics.more_seeds([0.5], [0.7], cells=2) == 0, "a single run has no spread"
+    assert statistics.more_seeds([0.5, 0.6], [0.6, 0.5], cells=2) == 0, "no number of runs shows that nothing differs"
+    assert statistics.more_seeds([0.9, 0.91, 0.92], [0.1, 0.11, 0.12], cells=2) == 2, (
+        "three runs are too few, five are not"
+    )

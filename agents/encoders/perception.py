@@ -13,8 +13,8 @@ from imagine_bench.interfaces import DEVICES, AgentContext, Frame
 from ..networks.allocator import keep_freed_memory
 from .encoder import Encoder
 
-_CACHED = 64
-"""Frames kept: those of the episodes that a learner with memory looks back at."""
+_CACHED = 2_000
+"""Frames kept, 25 MB: those of test episodes, which begin alike at each budget, and those of the latest training."""
 
 
 _OURS = (1, True, True)

@@ -6,7 +6,7 @@ import secrets
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import tyro
 
@@ -34,9 +34,11 @@ from imagine_bench.errors import CheckFailedError, InvalidValueError, RunFailedE
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.judge.judgement import Judgement, judge, kept
 from imagine_bench.judge.verify import Verdict, cost
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import Encoders, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, load_so_far, plan
+from imagine_bench.running.headlines import until_decided
 from imagine_bench.running.launchers.jobs import at_a_time, launcher
 from imagine_bench.running.retraining import Retraining
 from imagine_bench.store import loading
@@ -47,6 +49,9 @@ from imagine_bench.sweep.run import run_study, run_suite
 
 if TYPE_CHECKING:
     from imagine_bench.report.page import Page
+
+_MOST_SEEDS = 15
+"""Where --until-decided stops."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +112,10 @@ class Budget:
     """Of regression tasks: datasets, or numbers of samples, to learn from; by default all."""
     networks: Count = None
     """Of regression tasks: networks a run, by default the preset's, each on data of its own."""
+    until_decided: bool = False
+    """Add seeds, three at a time, until every headline of the preset is decided; p-values allow for all looks."""
+    most_seeds: Count = None
+    """With --until-decided: seeds an agent at most; 15 by default."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,6 +151,8 @@ class Bench:
         overrides = parse_settings(added_up(given.pop("set")))
         given["physics"] = parse_settings(added_up(self.world.physics), "--physics")
         given["variants"] = added_up(self.budget.variants)
+        given.pop("until_decided")
+        given.pop("most_seeds")
         options = {name: value for name, value in given.items() if value not in (None, ())}
         return self.task, self.preset, {"overrides": overrides, **options}
 
@@ -152,9 +163,26 @@ class Bench:
 
     def __call__(self) -> None:
         """Plan, run, report."""
-        wanted, encoders = self.planned()
         launcher = self.launch.chosen()
-        _show(bench(wanted, encoders, root=self.launch.out, launcher=launcher))
+        if self.budget.most_seeds is not None and not self.budget.until_decided:
+            raise InvalidValueError("--most-seeds goes with --until-decided; leave it out, or give both.")
+        if not self.budget.until_decided:
+            wanted, encoders = self.planned()
+            _show(bench(wanted, encoders, root=self.launch.out, launcher=launcher))
+            return
+        task, preset, options = self.asked()
+
+        def staged(**changes: Any) -> BenchResult:
+            wanted, encoders = plan(task, preset, **{**options, **changes})
+            return cast("BenchResult", bench(wanted, encoders, root=self.launch.out, launcher=launcher))
+
+        first, _ = plan(task, preset, **options)
+        if not isinstance(first, Protocol):
+            raise InvalidValueError(f"{task} is a regression task without headlines; leave --until-decided out.")
+        begun, whole = until_decided(staged, first, most=self.budget.most_seeds or _MOST_SEEDS, root=self.launch.out)
+        _show(begun)
+        if whole is not begun:
+            _show(whole)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -98,8 +98,7 @@ def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
     found: list[Verdict] = []
     owners: dict[tuple[str, str, str], int] = {}
     results: dict[str, RunResult] = {}
-    runs = [(agent, seed) for seed in protocol.seeds for agent in protocol.agents]
-    for agent, seed in counted(runs, "runs", total=len(runs)):
+    for agent, seed in counted(protocol.runs, "runs", total=len(protocol.runs)):
         name = f"{agent} seed {seed}"
         check = _RunCheck(BenchStore(folder, protocol).run_folder(agent, seed), protocol, agent, seed, replays)
         try:

@@ -44,6 +44,7 @@ _AT_LEAST = {
     "demonstrations": 0,
     "queries": 0,
     "evaluation_episodes": 1,
+    "most_looks": 1,
     "open_loop_starts": 0,
     "sampled_futures": 0,
     "recorded_episodes": 0,
@@ -181,6 +182,13 @@ class EvaluationSection:
     #: Futures that benches of before 2026-11-25 sampled; nothing reads it now.
     sampled_futures: int = 0
     recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
+    #: Comparisons declared beforehand: an agent, and the agent that it should beat at the last budget. Their p-values
+    #: are corrected for one another alone.
+    headlines: tuple[tuple[str, str], ...] = field(default=(), metadata=LATER)
+    #: How often the headlines are tested at most, with more seeds each time: see :mod:`.running.headlines`.
+    most_looks: int = field(default=1, metadata=LATER)
+    #: Agents of which fewer seeds are run, each with its last seed.
+    few_seeds: tuple[tuple[str, int], ...] = field(default=(), metadata=LATER)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,6 +213,11 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
             _set(self, "test_appearance", appearance_name(self.test_appearance))
         if self.dataset is not None and not self.shows_frames_alone:
             raise InvalidValueError("A dataset holds 64 x 64 frames alone; leave the observation as it is by default.")
+
+    def seeds_of(self, agent: str) -> tuple[int, ...]:
+        """The seeds that an agent is run with."""
+        last = dict(self.few_seeds).get(agent, self.seeds[-1])
+        return tuple(seed for seed in self.seeds if seed <= last)
 
     def work(self, agent: str) -> int:
         """Return the episodes that a run of this agent plays, for training and for tests."""
@@ -247,7 +260,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         "hyperparameters": "minimal", "seeds": (0,), "budgets": (10, 20), "evaluation_episodes": 20,
         "open_loop_starts": 20, "recorded_episodes": 2,
     },
-    "quick": {"agents": (*_ALL_AGENTS, "factored:given")},
+    "quick": {
+        "agents": ("random", "dqn", "dqn_more_updates", *_THESIS_AGENTS[1:], "factored:given", "oracle"),
+        "seeds": tuple(range(6)), "budgets": (100, 250, 400), "few_seeds": {"imagination_uncertainty": 3},
+        "headlines": (("imagination", "dqn"), ("imagination", "dqn_more_updates")),
+    },
     "thesis": {
         "hyperparameters": "published", "agents": _THESIS_AGENTS, "seeds": tuple(range(5)),
         "budgets": _THESIS_BUDGETS, "evaluation_episodes": 1000,
@@ -282,11 +299,21 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     require_known("preset", preset, PRESETS)
     spec = task(task_name)
     values = {"config_group": spec.config_group, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
+    few = values.pop("few_seeds", {})
+    if "agents" in changes:  # what a preset says of agents is about its own
+        few = {}
+        values["headlines"] = changes.get("headlines", ())
     values["execution"] = spec.execution(values.get("execution"))
     values["after"] = tuple(map(canonical, values.get("after", ())))
     if values.get("split") is not None:
         values["split"] = split_of(spec.rules, values["split"]).identity
     wanted = Protocol(task=spec.id, preset=preset, **values)
+    agents = {*wanted.agents}
+    wanted = dataclasses.replace(
+        wanted,
+        headlines=tuple(pair for pair in wanted.headlines if agents.issuperset(pair)),
+        few_seeds=tuple((agent, wanted.seeds[:most][-1]) for agent, most in few.items() if agent in agents),
+    )
     for agent in wanted.agents:  # what is only read may be of a package that is not here
         _require_takes(agent, wanted)
     _require_learner(wanted)

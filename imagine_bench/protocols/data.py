@@ -99,6 +99,16 @@ class ProtocolData(ABC):
         """Twelve hex digits that change when anything in the protocol does."""
         return digest(self.as_dict())
 
+    def seeds_of(self, agent: str) -> tuple[int, ...]:
+        """The seeds that an agent is run with: all, where a protocol says nothing else."""
+        del agent
+        return self.seeds
+
+    @property
+    def runs(self) -> list[tuple[str, int]]:
+        """Agent and seed of every run, seed by seed."""
+        return [(agent, seed) for seed in self.seeds for agent in self.agents if seed in self.seeds_of(agent)]
+
     @abstractmethod
     def work(self, agent: str) -> int:
         """Parts of work of a run of this agent, of whatever the protocol counts."""
@@ -157,6 +167,10 @@ class RunSpec(Generic[P_co]):
         return self.protocol.work(self.agent)
 
 
+RECENT = 50
+"""Training episodes whose success is shown while running."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Progress:
     """How far a run is."""
@@ -168,7 +182,7 @@ class Progress:
     done: int  #: Episodes played, for training and for tests
     work: int  #: Episodes to play
     episode: int = 0  #: Training episodes done
-    #: Share of successes among recent training episodes, or in the running test; None before the first.
+    #: Share of successes among the last :data:`RECENT` training episodes, or in the running test; None before any.
     success: float | None = None
     #: What a run without episodes is doing, or why one failed, in words; None where episodes say it.
     detail: str | None = None

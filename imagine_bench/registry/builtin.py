@@ -72,11 +72,13 @@ AGENTS: dict[str, AgentEntry] = {
     ),
     "imagination": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make",
+        relative_cost=5.0,
         settings=_IMAGINATION_SETTINGS,
         description="DQN that also learns a world model and trains on all transitions that it imagines with it.",
     ),
     "imagination_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make_uncertainty",
+        relative_cost=5.0,
         settings=_IMAGINATION_SETTINGS,
         title="imagination + uncertainty",
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
@@ -84,6 +86,7 @@ AGENTS: dict[str, AgentEntry] = {
     ),
     "factored": AgentEntry(
         make="imagine_bench.agents.factored.learned:make",
+        relative_cost=4.0,
         needs_encoder=False,
         settings="imagine_bench.agents.factored.settings:LEARNED",
         description="Begins with nothing: from its own frames it learns discrete factors, which of them an action "
@@ -91,6 +94,7 @@ AGENTS: dict[str, AgentEntry] = {
     ),
     "factored:given": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
+        relative_cost=3.0,
         encoder_kind="codes",
         settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
         description="Like factored, but it is given an encoder of discrete factors and learns no perception; it can "
@@ -98,18 +102,21 @@ AGENTS: dict[str, AgentEntry] = {
     ),
     "imagination_only": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make",
+        relative_cost=4.0,
         settings=_IMAGINATION_SETTINGS,
         description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
         "world is trained in that model alone, and is what is tested.",
     ),
     "imagination_only_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make_uncertainty",
+        relative_cost=4.0,
         settings=_IMAGINATION_SETTINGS,
         title="imagination only + uncertainty",
         description="Like imagination only, but an imagined episode ends where the model is uncertain.",
     ),
     "dqn_more_updates": AgentEntry(
         make="imagine_bench.agents.dqn:make_more_updates",
+        relative_cost=2.0,
         settings="imagine_bench.agents.dqn_settings:MORE_UPDATES",
         title="DQN, more updates",
         description="A control: the DQN with as many updates a real step as imagination makes of its controller.",

@@ -53,6 +53,8 @@ class AgentEntry:
     observes: tuple[str, ...] = ()
     #: Whether it is a :class:`.interfaces.capabilities.ExternalTrainer`, whose run cannot pause.
     external_training_loop: bool = False
+    #: CPU time of a run, relative to that of ``dqn``: a guess, by which the longest runs come first
+    relative_cost: float = 1.0
     title: str = ""  #: For headings, legends and tables; by default the registered name in plain words
     description: str = "A registered agent."  #: One sentence for a reader who knows none of this
 

@@ -7,7 +7,9 @@ lists them in the order of the page.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -37,22 +39,27 @@ from imagine_bench.report.page import (
     Section,
     Table,
     count,
+    estimate,
     made,
     over_seeds,
-    p_value,
+    p_level,
     percent,
     printed,
     seconds,
     seeds_note,
     signed_percent,
 )
-from imagine_bench.statistics import LEVEL, Estimate, first_lasting
+from imagine_bench.running.headlines import Headline
+from imagine_bench.statistics import LEVEL, Estimate, first_lasting, more_seeds
 from imagine_bench.store import encoders
 from imagine_bench.store.loading import archive_files
 from imagine_bench.store.results import BenchResult
 
+_SOLVED = "solved (%) after"
+_EQUAL_UPDATES = "dqn_more_updates"
+_SEEDS_OPTION = re.compile(r" --seeds(?: \d+)+")
 _AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
-    "against DQN": lambda record: agent_title(record["agent"]),
+    "against dqn": lambda record: agent_title(record["agent"]),
     "real episodes": lambda record: f"{record['episodes']:,}",
     "difference (points)": lambda record: estimated(record, DIFFERENCE, signed_percent),
     "p": lambda record: printed(record["p_holm"], ".3f"),
@@ -70,20 +77,22 @@ def bench_page(result: BenchResult) -> Page:
         files["open_loop.csv"] = open_loop_csv(result)
     dataset = f" · trained first on dataset {protocol.dataset}" if protocol.dataset else ""
     split = f" · tests start where training never does, {protocol.split}" if protocol.split else ""
+    fewer = [f"{agent} {len(protocol.seeds_of(agent))}" for agent, _ in protocol.few_seeds]
+    few = f" ({', '.join(fewer)})" if fewer else ""
     interval = seeds_note(len(protocol.seeds))
     if len(protocol.seeds) == 1:
         interval = "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
     subtitle = (
         f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.looks}” · "
-        f"{len(protocol.seeds)} seed(s), {protocol.evaluation_episodes} test episodes{dataset}{split} · {interval} · "
-        f"protocol {result.protocol_hash}"
+        f"{len(protocol.seeds)} seed(s){few}, {protocol.evaluation_episodes} test episodes{dataset}{split} · "
+        f"{interval} · protocol {result.protocol_hash}"
     )
     return Page(
         title=f"{data.spec.title}: does imagination save real experience?",
         subtitle=subtitle,
         question="Does training on transitions that a learned world model imagines save real episodes? Every agent is "
         "tested without exploring, on the same new episodes, after each number of real training episodes.",
-        table=_scores(data, protocol.budgets),
+        table=_on_terminal(data),
         sections=[section for make in SECTIONS if (section := make(data)) is not None],
         files=files,
         facts=made(result, {agent: agent_title(agent) for agent in protocol.agents}),
@@ -94,30 +103,69 @@ def bench_page(result: BenchResult) -> Page:
 
 
 def verdict(data: ReportData) -> list[str]:
-    """What is missing, and a line a learner: whether it is better or worse than DQN, and where most clearly."""
-    first = [*_unfinished(data.result), *_left_out(data.result), *_not_installed(data), *_misread(data)]
-    lines = [*first, *(_against_dqn(data, agent) for agent in data.compared)]
-    return lines or ["Nothing is compared: that needs dqn and another learner side by side."]
+    """The verdict: headlines first, a line an agent; then every other learner against DQN; then what is amiss."""
+    amiss = [*_unfinished(data.result), *_left_out(data.result), *_not_installed(data), *_misread(data)]
+    by_agent: dict[str, list[str]] = {}
+    for headline in data.headlines:
+        by_agent.setdefault(headline.agent, []).append(_of_headline(data, headline))
+    pairs = {(each.agent, each.base) for each in data.headlines}
+    for agent in data.compared:
+        if (agent, BASE_AGENT) not in pairs:
+            by_agent.setdefault(agent, []).append(_against_dqn(data, agent))
+    lines = [f"{agent}: {'; '.join(found)}." for agent, found in by_agent.items()]
+    lines = lines or ["Nothing is compared: that needs dqn and another learner side by side."]
+    return [*amiss, *lines] if data.result.missing else [*lines, *amiss]
+
+
+def _of_headline(data: ReportData, headline: Headline) -> str:
+    """The verdict on one headline, the better one first where a gain vanishes."""
+    base = headline.base
+    if base == _EQUAL_UPDATES:
+        base += " (as many gradient updates)"
+    budget = data.result.protocol.budgets[-1]
+    found = headline.found
+    size = f"{estimate(found, signed_percent)} points at {budget:,}"
+    if headline.decided:
+        word = "better" if found.value > 0.0 else "worse"
+        return f"{word} than {base}, {size} ({p_level(found.p)})"
+    if math.isnan(found.p):
+        return f"{size} against {base}, {_undecided(data, headline.agent, headline.more)}"
+    return f"no gain over {base} is shown, {size}, {_undecided(data, headline.agent, headline.more)}"
 
 
 def _against_dqn(data: ReportData, agent: str) -> str:
+    """One verdict on an agent against DQN, of all budgets together."""
     rows = data.of(agent)
-    best = min(reversed(rows), key=lambda row: row["p_holm"])
-    (base,) = (row for row in data.of(BASE_AGENT) if row["episodes"] == best["episodes"])
-    clearest = (
-        f"after {best['episodes']:,} episodes {percent(best['success_iqm'])} % of tests, DQN "
-        f"{percent(base['success_iqm'])} %, difference {estimated(best, DIFFERENCE, signed_percent)} points"
-    )
-    if math.isnan(best["detectable_difference"]):
-        return f"“{agent_title(agent)}” against DQN: {clearest}. Too few seeds to say which is better."
-    words = []
+    parts = []
     for word, sign in (("better", 1), ("worse", -1)):
-        if budgets := [f"{row['episodes']:,}" for row in rows if shown(row) == sign]:
-            words.append(f"{word} after {', '.join(budgets)} real episodes")
-    return (
-        f"“{agent_title(agent)}” against DQN: {', '.join(words) or 'no difference is shown'} ({len(rows)} budgets). "
-        f"Clearest {clearest} (95 % interval; {p_value(best['p_holm'])}, Holm-corrected)."
-    )
+        there = [row for row in rows if shown(row) == sign]
+        if there:
+            budgets = [f"{row['episodes']:,}" for row in there]
+            listed = " and ".join(filter(None, [", ".join(budgets[:-1]), budgets[-1]]))
+            parts.append(f"{word} than {BASE_AGENT} at {listed} ({p_level(max(row['p_holm'] for row in there))})")
+    if parts:
+        return ", ".join(parts)
+    last = rows[-1]
+    shares, base = (data.result.success_rates(name)[:, -1] for name in (agent, BASE_AGENT))
+    more = more_seeds(shares, base, cells=data.cells, trials=data.result.protocol.evaluation_episodes)
+    points = signed_percent(last["difference_to_dqn"])
+    return f"{points} points against {BASE_AGENT} at {last['episodes']:,}, {_undecided(data, agent, more)}"
+
+
+def _undecided(data: ReportData, agent: str, more: int) -> str:
+    """How many seeds an agent has, and the command with so many more that they would about decide."""
+    protocol = data.result.protocol
+    seeds = protocol.seeds_of(agent)
+    words = f"undecided with {len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
+    if not more:
+        return words
+    words += f"; about {more} more would decide"
+    every = " ".join(map(str, (*seeds, *range(seeds[-1] + 1, seeds[-1] + 1 + more))))
+    command = str(data.result.environment.get("command", ""))
+    if not command.startswith("imagine-bench bench ") or ";" in command:
+        return words
+    alone = f" --agents {BASE_AGENT} {agent}" if agent in dict(protocol.few_seeds) else ""
+    return f"{words}: {_SEEDS_OPTION.sub('', command)}{alone} --seeds {every}"
 
 
 def shown(record: Record) -> int:
@@ -178,8 +226,9 @@ def success(data: ReportData) -> Section:
     """Success of every agent at every budget, and of every seed."""
     caption = (
         "Test episodes solved after so many real training episodes; the axis is logarithmic. Points are interquartile "
-        "means over seeds (independent trainings); bands are 95 % intervals, or the range of seeds where these are too "
-        "few; dashed: chance level and optimum; diamonds: the thesis, with standard deviations."
+        "means over seeds (independent trainings), and thin lines the seeds. Bands are 95 % intervals, or the range of "
+        "seeds where these are too few. Dashed: chance level and optimum; diamonds: the thesis, with standard "
+        "deviations."
     )
     image = figures.image("success", lambda: success_figure(data), caption)
     budgets = set(data.result.protocol.budgets).union(*data.thesis.values())
@@ -197,12 +246,29 @@ def _scores(data: ReportData, budgets: Sequence[int]) -> Table:
             rows.append((f"{agent_title(agent)}, thesis", cells))
     rows.append(("chance level", dict.fromkeys(budgets, percent(data.facts.chance_level))))
     rows.append(("optimum", dict.fromkeys(budgets, percent(data.facts.optimum))))
-    header = ["solved (%) after", *(f"{budget:,}" for budget in budgets)]
+    header = [_SOLVED, *(f"{budget:,}" for budget in budgets)]
     lines = [[title, *(cells.get(budget, DASH) for budget in budgets)] for title, cells in rows]
     caption = "Columns: real training episodes."
     if any(title.endswith(", thesis") for title, _ in rows):
         caption += f" Thesis: {reference.success_source(str(data.spec.reference))}."
     return Table("scores", header, lines, caption, "not tested")
+
+
+def _on_terminal(data: ReportData) -> Table:
+    """The scores in whole percent."""
+    budgets = data.result.protocol.budgets
+    rows = [[agent, *(_in_short(data, each) for each in data.of(agent))] for agent in data.result.protocol.agents]
+    for name, share in (("chance level", data.facts.chance_level), ("optimum", data.facts.optimum)):
+        rows.append([name, *[printed(100.0 * share, ".0f")] * len(budgets)])
+    return Table("scores", [_SOLVED, *(f"{budget:,}" for budget in budgets)], rows)
+
+
+def _in_short(data: ReportData, record: Record) -> str:
+    """``96 [91, 99]``: a score and its interval, or in parentheses its lowest and highest seed, in whole percent."""
+    found = _band(data, record)
+    value, low, high = (printed(each, ".0f") for each in found[:3])
+    ends = f"({low} to {high})" if math.isnan(record["low_95"]) else f"[{low}, {high}]"
+    return value if low == high else f"{value} {ends}"
 
 
 def _solved(data: ReportData, record: Record) -> str:
@@ -229,7 +295,7 @@ def _seeds(data: ReportData) -> Table:
     asked = data.spec.success_threshold
     rows = []
     for agent in protocol.agents:
-        for seed, shares in zip(protocol.seeds, data.result.success_rates(agent), strict=True):
+        for seed, shares in zip(protocol.seeds_of(agent), data.result.success_rates(agent), strict=True):
             lasting = first_lasting(protocol.budgets, shares, asked)
             rows.append([agent_title(agent), str(seed), *map(percent, shares), count(lasting or math.nan)])
     header = ["agent", "seed", *(f"{budget:,}" for budget in protocol.budgets), f"{percent(asked)} % from"]
@@ -249,13 +315,39 @@ def gain(data: ReportData) -> Section | None:
     sizes = [record["detectable_difference"] for record in records]
     detectable = f"Too few seeds to say: none of {len(sizes)} cells can show a difference."
     if not math.isnan(sizes[0]):
+        families = f"{data.cells} cells"
+        if data.headlines:
+            families += f", those of the {len(data.headlines)} headlines for one another alone"
         detectable = (
-            f"p-values are Holm-corrected for {len(sizes)} cells. The smallest difference that would be shown with "
+            f"p-values are Holm-corrected for {families}. The smallest difference that would be shown with "
             f"probability 80 % is {percent(min(sizes))} to {percent(max(sizes))} points, by cell."
         )
     rows = [{heading: cell(record) for heading, cell in _AGAINST_DQN.items()} for record in records]
     why = "not said by the thesis, too few seeds, or DQN solved nothing to compare with"
-    return Section("Gain over DQN", [words], tables=[Table.of("gains", rows, detectable, why)])
+    tables = [Table.of("gains", rows, detectable, why), *_on_the_same_starts(records)]
+    return Section("Gain over DQN", [words], tables=tables)
+
+
+def _on_the_same_starts(records: Sequence[Record]) -> list[Table]:
+    """These trained agents against these trained DQNs, by who alone solved a test; nothing where that was not kept."""
+    rows = [
+        {
+            "against DQN": agent_title(record["agent"]),
+            "real episodes": f"{record['episodes']:,}",
+            "tests it alone solved": f"{record['alone']:,}",
+            "DQN alone": f"{record['dqn_alone']:,}",
+            "p (McNemar)": printed(record["p_mcnemar_holm"], ".3f"),
+        }
+        for record in records
+        if "alone" in record
+    ]
+    words = (
+        "The verdict says whether other trainings of the two methods would differ, so each seed counts once. This "
+        "table compares these trained agents on the same starts, all seeds together: a small p-value says that they "
+        "differ on such starts, and nothing of the next training."
+    )
+    table = Table.of("starts", rows, words)
+    return [replace(table, folded="These trained agents on the same starts")] if rows else []
 
 
 def cost(data: ReportData) -> Section:
@@ -294,6 +386,9 @@ def success_figure(data: ReportData) -> Figure:
         curves[agent_title(agent)] = {row["episodes"]: _band(data, row) for row in rows}
     figure = figures.lines({"": curves}, figures.colors(agents), "real training episodes (logarithmic)")
     (axes,) = figure.axes
+    for agent in agents:
+        seeds = 100.0 * data.result.success_rates(agent).T  # [budgets, seeds]
+        axes.plot(data.result.protocol.budgets, seeds, color=figures.color(agent), linewidth=0.6, alpha=0.5)
     for level in (data.facts.optimum, data.facts.chance_level):
         axes.axhline(100.0 * level, **figures.REFERENCE)
     for agent, by_budget in data.thesis.items():
@@ -302,7 +397,8 @@ def success_figure(data: ReportData) -> Figure:
             means, stds = 100.0 * np.array([by_budget[budget] for budget in near]).T
             axes.errorbar(near, means, stds, fmt="D:", color=figures.color(agent), fillstyle="none", linewidth=1.0)
     axes.set_xscale("log")
-    axes.set_xticks(sorted(ticks), [f"{tick:,}" for tick in sorted(ticks)], rotation=45, ha="right")
+    crowded = {tick for tick in ticks if any(tick < more < 1.25 * tick for more in ticks)}
+    axes.set_xticks(sorted(ticks), ["" if tick in crowded else f"{tick:,}" for tick in sorted(ticks)])
     axes.minorticks_off()
     axes.set(ylabel="test episodes solved (%)", ylim=(-2, 108))
     return figure

@@ -20,6 +20,7 @@ from imagine_bench.interfaces import RenderMacrostates, RuleFacts, Rules, State,
 from imagine_bench.report.page import estimate, percent
 from imagine_bench.rules import facts as rule_facts
 from imagine_bench.rules import fewest_actions
+from imagine_bench.running.headlines import Headline, headlines
 from imagine_bench.statistics import Estimate
 from imagine_bench.store import encoders
 from imagine_bench.store.files import csv_text
@@ -74,8 +75,8 @@ def known_task(name: str) -> TaskSpec:
 
 
 def agent_title(agent: str) -> str:
-    """The agent's title from its registry line, or its name."""
-    return known_agent(agent).title or agent.replace("_", " ")
+    """The agent's name, as it is typed."""
+    return agent
 
 
 @dataclass(frozen=True)
@@ -88,12 +89,20 @@ class ReportData:
     learners: list[str]  # the agents that learn
     compared: list[str]  # those that are compared with DQN, where it was run
     thesis: dict[str, dict[int, tuple[float, float]]]  # its mean and standard deviation of success by agent and budget
-    records: list[Record]  # one an agent and budget, p-values corrected over all that are compared with DQN
+    #: One an agent and budget; p-values of headlines are corrected for these alone, all others for the others
+    records: list[Record]
+    headlines: list[Headline]  # the comparisons that the protocol declared
 
     @property
     def installed(self) -> bool:
         """Whether the task's package is here."""
         return bool(self.spec.action_names)
+
+    @property
+    def cells(self) -> int:
+        """How many comparisons with DQN there are beside the headlines."""
+        beside = [each for each in self.headlines if each.base == BASE_AGENT]
+        return len(self.compared) * len(self.result.protocol.budgets) - len(beside)
 
     def of(self, agent: str) -> list[Record]:
         """The records of an agent, in the order of budgets."""
@@ -107,16 +116,21 @@ def collect(result: BenchResult) -> ReportData:
     learners = [agent for agent in protocol.agents if known_agent(agent).learns]
     compared = [agent for agent in learners if agent != BASE_AGENT and BASE_AGENT in learners]
     thesis = {agent: reference.success(spec.reference, agent) if spec.reference else {} for agent in protocol.agents}
-    data = ReportData(result, spec, _facts(result, spec), learners, compared, thesis, [])
+    declared = headlines(result)
+    data = ReportData(result, spec, _facts(result, spec), learners, compared, thesis, [], declared)
     fewest = functools.cache(functools.partial(fewest_actions, spec.rules))
     for agent in protocol.agents:
         for place in range(len(protocol.budgets)):
             data.records.append(_record(data, agent, place, fewest))
     tested = [record for record in data.records if record["agent"] in compared]
-    for name in ("p", "p_mcnemar"):
-        adjusted = statistics.holm([record.get(name, math.nan) for record in tested])
-        for record, p in zip(tested, adjusted.tolist(), strict=True):
+    declared_p = {(each.agent, protocol.budgets[-1]): each.found.p for each in declared if each.base == BASE_AGENT}
+    others = [record for record in tested if (record["agent"], record["episodes"]) not in declared_p]
+    for name, family in (("p", others), ("p_mcnemar", tested)):
+        adjusted = statistics.holm([record.get(name, math.nan) for record in family])
+        for record, p in zip(family, adjusted.tolist(), strict=True):
             record[f"{name}_holm"] = p
+    for record in tested:
+        record["p_holm"] = declared_p.get((record["agent"], record["episodes"]), record.get("p_holm"))
     return data
 
 
@@ -172,10 +186,9 @@ def _against_dqn(data: ReportData, agent: str, place: int) -> Record:
     protocol = result.protocol
     trials = protocol.evaluation_episodes
     shares, base = (result.success_rates(name)[:, place] for name in (agent, BASE_AGENT))
-    cells = len(data.compared) * len(protocol.budgets)
     found: Record = {
         **dict(zip(DIFFERENCE, statistics.difference(shares, base, trials=trials), strict=True)),
-        "detectable_difference": statistics.detectable(shares, base, cells=cells, trials=trials),
+        "detectable_difference": statistics.detectable(shares, base, cells=data.cells, trials=trials),
         **dict(zip(GAIN, statistics.gain(shares, base, trials=trials)[:3], strict=True)),
         "probability_of_improvement": statistics.probability_of_improvement(shares, base),
     }

@@ -19,6 +19,7 @@ from imagine_bench import statistics
 from imagine_bench.arrays import Floats
 from imagine_bench.store.files import csv_text, make_folder, sweep, write_bytes
 
+_TERMINAL = 80  # characters
 DASH = "–"  # printed where there is no number; the table's caption says why
 
 
@@ -48,19 +49,32 @@ class Table:
 
     @property
     def text(self) -> str:
-        """The table for a terminal."""
-        rows = [self.header, *self.rows]
-        first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
-        lines = []
-        for name, *others in rows:
-            cells = map(str.rjust, others, widths)
-            lines.append("  ".join([name.ljust(first), *cells]).rstrip())
-        return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
+        """The table for a terminal, at most 80 characters wide: columns that do not fit stand below, in more parts."""
+        names, *columns = zip(self.header, *self.rows, strict=True)
+        first = _padded(names, str.ljust)
+        parts = [[first]]
+        for column in columns:
+            cells = _padded(column, str.rjust)
+            if len(parts[-1]) > 1 and sum(len(each[0]) + 2 for each in (*parts[-1], cells)) - 2 > _TERMINAL:
+                parts.append([first])
+            parts[-1].append(cells)
+        return "\n\n".join(map(_lines, parts))
 
     @property
     def csv(self) -> str:
         """The table as a CSV file."""
         return csv_text([self.header, *self.rows])
+
+
+def _padded(cells: Sequence[str], pad: Callable[[str, int], str]) -> list[str]:
+    width = max(map(len, cells))
+    return [pad(cell, width) for cell in cells]
+
+
+def _lines(columns: Sequence[Sequence[str]]) -> str:
+    """Columns of equally wide cells as text, with a line below the header."""
+    header, *others = ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]
+    return "\n".join([header, "-" * max(map(len, (header, *others))), *others])
 
 
 @dataclass(frozen=True)
@@ -151,6 +165,11 @@ def number(value: float, digits: int = 3) -> str:
 def p_value(p: float) -> str:
     """``p = 0.012``."""
     return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
+
+
+def p_level(p: float) -> str:
+    """``p < .01``: the smallest of the usual levels above a p-value that shows something."""
+    return next(f"p < {level}" for level in (".001", ".01", ".05", "1.01") if p < float(level))
 
 
 def estimate(found: statistics.Estimate, words: Callable[[float], str] = percent) -> str:

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -28,8 +28,9 @@ from imagine_bench.errors import (
     require_modules,
 )
 from imagine_bench.exact.certificate import Certificate, certificate
-from imagine_bench.protocols.control import spec_of
+from imagine_bench.protocols.control import Protocol, spec_of
 from imagine_bench.protocols.data import (
+    RECENT,
     Encoders,
     Failure,
     Job,
@@ -56,23 +57,26 @@ RunKey = tuple[str, str, int]
 
 _LINE_EVERY_S = 15.0
 """Between two lines where nobody watches a terminal."""
+_CURVES_EVERY_S = 60.0
 
 
 class ProgressBar(AbstractContextManager["ProgressBar"]):
     """Shows :class:`~imagine_bench.protocols.data.Progress` on a terminal as a bar, elsewhere as a line now and then.
 
+    Every minute, the first one after a minute, the runs at work show their training so far as a curve of characters.
     ``specs`` are the runs to come.
     """
 
     def __init__(self, specs: Sequence[RunSpec[ProtocolData]]) -> None:
-        self._works = {(spec.protocol.hash, spec.agent, spec.seed): spec.work for spec in specs}
-        self._done = dict.fromkeys(self._works, 0)
-        self._before = dict[RunKey, int]()
+        self._specs = {(spec.protocol.hash, spec.agent, spec.seed): spec for spec in specs}
+        self._costs = {run: expected_cost(spec) for run, spec in self._specs.items()}
+        self._done = dict.fromkeys(self._costs, 0.0)
+        self._before = dict[RunKey, float]()
         self._finished = set[RunKey]()
-        self._began_s = time.monotonic()
-        self._shown_s = self._began_s
+        self._curves = dict[RunKey, dict[int, float]]()
+        self._began_s = self._shown_s = self._drawn_s = time.monotonic()
         form = "{percentage:3.0f} % |{bar:20}| {desc}"
-        total = sum(self._works.values())
+        total = sum(self._costs.values())
         self._bar = tqdm(total=total, bar_format=form, leave=False, disable=not sys.stderr.isatty())
 
     def __exit__(self, *error: object) -> None:
@@ -86,32 +90,64 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
     def _show(self, progress: Progress) -> None:
         run = (progress.bench, progress.agent, progress.seed)
         if progress.phase == "failed":  # what it lacks will not be done
-            self._works[run] = self._done[run]
+            self._costs[run] = self._done[run]
             tqdm.write(plain(f"{progress.agent} seed {progress.seed} failed: {progress.detail}"), file=sys.stderr)
             return
-        self._before.setdefault(run, progress.done)  # what an earlier session did took no time now
-        self._done[run] = progress.done
+        spec = self._specs[run]
+        done = self._costs[run] * progress.done / spec.work
+        self._before.setdefault(run, done)  # what an earlier session did took no time now
+        self._done[run] = done
+        if progress.phase == "training" and progress.success is not None:
+            self._curves.setdefault(run, {})[progress.episode // RECENT] = progress.success
         ended = progress.phase == "done"
         if ended:
             self._finished.add(run)
-        shown = f"{len(self._finished)} of {len(self._works)} runs done, {self._times()}"
-        sentence = plain(f"{shown}; {_sentence(progress, self._works[run])}")
+            self._curves.pop(run, None)
+        sentence = plain(
+            f"{len(self._finished)}/{len(self._costs)} runs · {self._times()} · {_sentence(progress, spec)}"
+        )
+        now_s = time.monotonic()
         if not self._bar.disable:
-            self._bar.total = sum(self._works.values())
+            self._bar.total = sum(self._costs.values())
             self._bar.n = sum(self._done.values())
             self._bar.set_description_str(sentence)
-        elif ended or time.monotonic() - self._shown_s > _LINE_EVERY_S:
-            self._shown_s = time.monotonic()
+        elif ended or now_s - self._shown_s > _LINE_EVERY_S:
+            self._shown_s = now_s
             print(sentence, file=sys.stderr, flush=True)
+        if now_s - self._drawn_s > _CURVES_EVERY_S:
+            self._drawn_s = now_s
+            for (_, agent, seed), curve in self._curves.items():
+                tqdm.write(f"  {_curve(curve)} {agent} seed {seed}: training, each {RECENT} episodes", file=sys.stderr)
 
     def _times(self) -> str:
         """Time gone and, once there is something to judge by, time left."""
         gone_s = time.monotonic() - self._began_s
         done = sum(self._done.values())
         played = done - sum(self._before.values())
-        missing = sum(self._works.values()) - done
-        left = f", {tqdm.format_interval(gone_s * missing / played)} left" if played else ""
-        return f"{tqdm.format_interval(gone_s)} gone{left}"
+        missing = sum(self._costs.values()) - done
+        left = f", about {_roughly(gone_s * missing / played)} left" if played > 0.0 else ""
+        return f"{tqdm.format_interval(gone_s)} elapsed{left}"
+
+
+def expected_cost(spec: RunSpec[ProtocolData]) -> float:
+    """What a run costs in all, in units of its work by an agent of cost 1."""
+    acts = registry.has_task(spec.protocol.task)
+    return spec.work * (registry.agent_entry(spec.agent).relative_cost if acts else 1.0)
+
+
+def _roughly(seconds: float) -> str:
+    """A time to come in whole seconds, minutes or hours."""
+    for unit, size in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _curve(shares: Mapping[int, float]) -> str:
+    """Shares by place as bars of characters, from none to all; a place that was not heard of is a blank."""
+    bars = "▁▂▃▄▅▆▇█"
+    heights = {place: min(int(len(bars) * share), len(bars) - 1) for place, share in shares.items()}
+    return "".join(bars[heights[place]] if place in heights else " " for place in range(max(shares) + 1))
 
 
 class Counted(AbstractContextManager["Counted"]):
@@ -150,11 +186,16 @@ def counted(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:
             counting.step()
 
 
-def _sentence(progress: Progress, work: int) -> str:
-    """What a run is doing, and how far it is of all its ``work``."""
-    doing = progress.detail or f"{progress.phase}, training episode {progress.episode}"
-    success = "" if progress.success is None else f", success {100 * progress.success:.0f} %"
-    return f"{progress.agent} seed {progress.seed}: {doing}, {100 * progress.done / work:.0f} % of its work{success}"
+def _sentence(progress: Progress, spec: RunSpec[ProtocolData]) -> str:
+    """What a run is doing and how far it is."""
+    who = f"{progress.agent} seed {progress.seed}"
+    if progress.detail is not None or not isinstance(spec.protocol, Protocol):
+        return f"{who}: {progress.detail or progress.phase}, {100 * progress.done / spec.work:.0f} % of its work"
+    doing = f"episode {progress.episode:,} of {spec.protocol.budgets[-1]:,}"
+    solved = "" if progress.success is None else f"{100 * progress.success:.0f} %"
+    if progress.phase == "training":
+        return f"{who}: {doing}" + (f", last {RECENT} solved {solved}" if solved else "")
+    return f"{who}: {progress.phase} at {doing}" + (f", solved {solved}" if solved else "")
 
 
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"
@@ -321,16 +362,20 @@ _Bench = tuple[BenchStore, Encoders]
 
 
 def _jobs(store: BenchStore, paths: Encoders) -> list[Job]:
-    """What is missing of a bench, seed by seed; agents that are listed last cost most and come first of each."""
+    """What is missing of a bench, seed by seed, the costliest runs of each first: all cores are busy to the end.
+
+    Of agents that cost alike, those that are listed last come first.
+    """
     protocol = store.protocol
     acts = registry.has_task(protocol.task)  # regressors have no encoder
     jobs = []
-    for agent, seed in sorted(store.missing(), key=lambda pair: (pair[1], -protocol.agents.index(pair[0]))):
+    for agent, seed in store.missing():
         entry = registry.agent_entry(agent) if acts else None
         encoder = paths[entry.encoder_kind] if entry is not None and entry.needs_encoder else None
         spec = RunSpec(protocol=protocol, agent=agent, seed=seed, encoder=encoder, dataset=paths.get("dataset"))
         jobs.append(Job(spec=spec, folder=store.run_folder(agent, seed)))
-    return jobs
+    places = protocol.agents.index
+    return sorted(jobs, key=lambda job: (job.spec.seed, -expected_cost(job.spec), -places(job.spec.agent)))
 
 
 def _warn(changed: Sequence[str], folder: Path) -> None:

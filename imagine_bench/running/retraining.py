@@ -67,7 +67,7 @@ def drawn(protocol: Protocol, count: int, nonce: str) -> list[tuple[str, int]]:
     for agent in protocol.agents:
         root = int.from_bytes(hashlib.sha256(f"{nonce} {protocol.hash} {agent}".encode()).digest())
         rng = np.random.default_rng(root)
-        chosen = rng.permutation(protocol.seeds)[:count]
+        chosen = rng.permutation(protocol.seeds_of(agent))[:count]
         runs += [(agent, int(seed)) for seed in sorted(chosen)]
     return runs
 

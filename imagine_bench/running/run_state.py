@@ -22,7 +22,7 @@ from imagine_bench.interfaces import OBSERVATIONS, Agent, AgentState
 from imagine_bench.interfaces.capabilities import ExternalTrainer, QueryingAgent, TransferLearner
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol, context_of
-from imagine_bench.protocols.data import OnProgress, Phase, Progress, RunSpec
+from imagine_bench.protocols.data import RECENT, OnProgress, Phase, Progress, RunSpec
 from imagine_bench.running.evaluation import (
     EpisodeLog,
     EpisodeRecord,
@@ -37,8 +37,6 @@ from imagine_bench.store.results import Checkpoint
 from imagine_bench.store.run_folder import Snapshot, load_newest, save_snapshot
 from imagine_bench.values import pack, unpack
 
-_RECENT = 100
-"""Training episodes whose success is shown while running."""
 _REPORT_EVERY_S = 0.25
 
 
@@ -150,6 +148,13 @@ def environments(protocol: Protocol, **options: Any) -> Iterator[tuple[Env, Env]
             yield env, test_env
 
 
+def reuse_outcomes(env: Env) -> None:
+    """Let an environment that can set known outcomes again, to the bit, simulate no macro-action twice."""
+    reuse = getattr(env.unwrapped, "reuse_outcomes", None)
+    if reuse is not None:
+        reuse()
+
+
 def require_able(agent: object, name: str, protocol: Protocol) -> None:
     """Raise InvalidValueError where a learner cannot carry over to the next task, watch or ask, as a protocol wants."""
     external = isinstance(agent, ExternalTrainer)
@@ -256,7 +261,7 @@ class Run:
         counters = self.counters
         solved = counters.test.solved if counters.test else ""
         tested = len(counters.rows) if self.entry.learns else min(1, len(counters.rows))
-        recent = [each == "1" for each in solved] or counters.success[-_RECENT:]
+        recent = [each == "1" for each in solved] or counters.success[-RECENT:]
         where = Progress(
             agent=self.spec.agent,
             seed=self.spec.seed,

@@ -35,7 +35,7 @@ from imagine_bench.running.evaluation import (
     play_test_episode,
     training_starts,
 )
-from imagine_bench.running.run_state import CountVisits, Run, environments, make_env
+from imagine_bench.running.run_state import CountVisits, Run, environments, make_env, reuse_outcomes
 from imagine_bench.seeding import episode_seed, evaluation_split
 from imagine_bench.store import run_folder
 from imagine_bench.store.results import Checkpoint, ComparedRollout, OpenLoop, PolicyTable
@@ -81,6 +81,8 @@ def run(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> None:
     with run_folder.unfinished(folder) as left:
         if left:
             with environments(spec.protocol) as (env, test_env):
+                reuse_outcomes(env)
+                reuse_outcomes(test_env)
                 observers = [registry.load(name)() for name in spec.observers]
                 _go_on(Run(spec, folder, on_progress, env, test_env), observers)
 

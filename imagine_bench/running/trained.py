@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -137,7 +136,7 @@ def learners(bench: Path) -> tuple[Path, ...]:
     protocol = read_control(bench)
     store = BenchStore(bench, protocol)
     found = []
-    for agent, seed in itertools.product(protocol.agents, protocol.seeds):
+    for agent, seed in protocol.runs:
         entry = registry.agent_entry(agent)
         if entry.learns and not entry.external_training_loop:
             folder = store.run_folder(agent, seed)

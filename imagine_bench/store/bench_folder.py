@@ -52,7 +52,7 @@ class BenchStore:
     @property
     def pairs(self) -> list[tuple[str, int]]:
         """Agent and seed of every run, seed by seed."""
-        return [(agent, seed) for seed in self.protocol.seeds for agent in self.protocol.agents]
+        return self.protocol.runs
 
     @contextmanager
     def held(self) -> Iterator[None]:

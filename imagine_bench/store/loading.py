@@ -11,7 +11,6 @@ same. The latter is how a bench is shared out among machines that have no disk i
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -113,8 +112,8 @@ def _largest_part(whole: Protocol, runs: Runs, folder: Path) -> BenchResult:
     """
     last = whole.budgets[-1]
     reached = _reached(whole, runs)
-    tried = tuple(agent for agent in whole.agents if any(reached[agent, seed] for seed in whole.seeds))
-    finished = all(reached[agent, seed] == last for agent in tried for seed in whole.seeds)
+    tried = tuple(agent for agent in whole.agents if any(reached[agent, seed] for seed in whole.seeds_of(agent)))
+    finished = all(reached[agent, seed] == last for agent in tried for seed in whole.seeds_of(agent))
     part = _largest_table(dataclasses.replace(whole, agents=tried) if tried and finished else whole, reached)
     missing = tuple(
         f"{agent} seed {seed}: {at:,} of {last:,} real episodes" for (agent, seed), at in reached.items() if at < last
@@ -130,7 +129,7 @@ def _largest_part(whole: Protocol, runs: Runs, folder: Path) -> BenchResult:
 
 def _reached(whole: Protocol, runs: Runs) -> dict[tuple[str, int], int]:
     """The last budget at which each run of a protocol was tested, 0 before the first."""
-    reached = dict.fromkeys(itertools.product(whole.agents, whole.seeds), 0)
+    reached = dict.fromkeys(whole.runs, 0)
     return reached | {pair: run.checkpoints[-1].episodes for pair, run in runs.items() if run and run.checkpoints}
 
 
@@ -138,20 +137,22 @@ def _largest_table(whole: Protocol, reached: Mapping[tuple[str, int], int]) -> P
     """Return the complete protocol that has most results, among all cuts through the budgets."""
     tables = []
     for count, budget in enumerate(whole.budgets, start=1):
-        seeds = tuple(seed for seed in whole.seeds if all(reached[agent, seed] >= budget for agent in whole.agents))
-        tables.append((count * len(seeds), count, seeds))
-    _, count, seeds = max(tables)
-    if not seeds:
+        short = {seed for (_, seed), at in reached.items() if at < budget}
+        seeds = tuple(seed for seed in whole.seeds if seed not in short)
+        if all(set(seeds) & set(whole.seeds_of(agent)) for agent in whole.agents):
+            tables.append((count * len(seeds), count, seeds))
+    if not tables:
         raise ArtefactError(
             f"No seed of this bench has brought every agent to {whole.budgets[0]} real episodes yet, so there is "
             "nothing to compare. Run the same bench command again to go on."
         )
+    _, count, seeds = max(tables)
     return dataclasses.replace(whole, seeds=seeds, budgets=whole.budgets[:count])
 
 
 def _runs_of(part: Protocol, runs: Runs) -> tuple[RunResult, ...]:
     """The runs of a protocol, as far as it goes."""
-    found = [runs.get(pair) for pair in itertools.product(part.agents, part.seeds)]
+    found = [runs.get(pair) for pair in part.runs]
     return tuple(cut(run, part) for run in found if run is not None)
 
 

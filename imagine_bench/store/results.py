@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -178,7 +177,7 @@ class AllRuns(Generic[P, R]):
     left_out: tuple[str, ...] = ()  #: Runs of merged benches that are not shown, for not all agents have their seeds
 
     def __post_init__(self) -> None:
-        wanted = sorted(itertools.product(self.protocol.agents, self.protocol.seeds))
+        wanted = sorted(self.protocol.runs)
         found = sorted((run.agent, run.seed) for run in self.runs)
         if found != wanted:
             raise ArtefactError(
@@ -206,7 +205,7 @@ class AllRuns(Generic[P, R]):
     def of(self, agent: str) -> tuple[R, ...]:
         """The runs of one learner, in the order of the protocol's seeds."""
         by_seed = {run.seed: run for run in self.runs if run.agent == agent}
-        return tuple(by_seed[seed] for seed in self.protocol.seeds)
+        return tuple(by_seed[seed] for seed in self.protocol.seeds_of(agent))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,7 +30,12 @@ _COMPARED = ("random", "oracle", *_CHAPTER_3)
 _FILTERED = "imagination_only_uncertainty"  # not in `quick`: there its filter was seen to discard nothing
 _PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {"agents": (*_COMPARED, _FILTERED)},
-    "quick": {"agents": (*_COMPARED, "factored:given"), "evaluation_episodes": 100},
+    "quick": {
+        "agents": (*_COMPARED, "factored:given"),
+        "evaluation_episodes": 100,
+        "seeds": (0, 1, 2),
+        "budgets": (100, 250, 500),
+    },
     "thesis": {  # section 3.2.3: 10 runs of 1000 episodes, each tested on 100
         "agents": _CHAPTER_3,
         "seeds": tuple(range(10)),

@@ -82,6 +82,24 @@ def test_equal_seeds_give_equal_bits_whatever_was_before(task, execution, appear
 
 
 @pytest.mark.parametrize("task", WORLDS)
+def test_a_reused_outcome_has_the_bits_of_a_simulated_one(task, monkeypatch):
+    """A bench reuses outcomes; whatever repeats an earlier episode then simulates nothing."""
+    env = make(task, execution="physics")
+    runs = []
+    for reuses in (False, True, True):
+        if reuses:
+            env.reuse_outcomes()
+        env.reset(seed=3)
+        runs.append([*walk(env, [0, 4, 2]), env.latest.sim_time_s])
+        if reuses:
+            monkeypatch.setattr("mujoco.rollout.rollout", None)  # the last time nothing can be simulated
+    env.close()
+    assert_same(runs[0], runs[1])
+    assert_same(runs[0], runs[2])
+    assert runs[0][-1] > 1.0
+
+
+@pytest.mark.parametrize("task", WORLDS)
 def test_both_executions_walk_the_same_macrostates(task):
     physics, kinematic = (make(task, execution=execution) for execution in EXECUTIONS)
     generator, moved = np.random.default_rng(5), 0

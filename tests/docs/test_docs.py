@@ -120,7 +120,7 @@ def test_the_twelve_lines_bench_an_agent(twelve_lines: Path) -> None:
     folder = twelve_lines.parent
     done = subprocess.run([sys.executable, twelve_lines], cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "my agent" in done.stdout and "DQN" in done.stdout
+    assert "my_agent" in done.stdout and "dqn" in done.stdout
     assert list(folder.glob("runs/arrow_puzzle/*/my_agent/seed_1/DONE"))
 
 

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import coverage
+import decisions
 import numpy as np
 import pytest
 import scipy
 import speed
+from fake_results import bench_result, rewritten
 
 from imagine_bench import registry, statistics
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.store.loading import archive_files
+from imagine_bench.store.results import Checkpoint, RunResult
 
 DRAWS = 60
 CHANCE = 3.0 * (0.05 * 0.95 / DRAWS) ** 0.5  # three standard errors of a rate of 5 %
@@ -37,6 +43,34 @@ def test_intervals_hold_and_tables_do_not_err_under_any_law(scores: list[Floats]
 def test_a_true_gap_of_40_points_is_shown() -> None:
     five, ten, *_ = coverage.power(DRAWS, np.random.default_rng(0), seeds=(5, 10))
     assert five["alone"] > 0.8 and ten["alone"] > 0.95 and ten["table"] > 0.95
+
+
+def test_looking_again_and_again_claims_no_more() -> None:
+    """Headlines of agents of one law, at four looks; without the allowance two modes would claim too many."""
+    for name, runs in decisions.drawn(300, np.random.default_rng(0)).items():
+        assert decisions.false_claims(runs) <= 0.05 + CHANCE, name
+    modes = coverage.LAWS[coverage.WORST](np.random.default_rng(0), (1000, 3, 40))
+    looks = range(6, 41, 4)
+    assert decisions.false_claims(modes, looks) < 0.05
+    careless = [statistics.differences(*modes[:, :2, :count].swapaxes(0, 1))[3] < 0.05 for count in looks]
+    assert np.any(careless, axis=0).mean() > 0.08
+
+
+def test_repetitions_are_groups_of_six_seeds(tmp_path: Path) -> None:
+    """Of 20 seeds, three disjoint groups; agents that differ by 40 points are told apart in all of them."""
+    agents = ("dqn", "dqn_more_updates", "imagination")
+    protocol = Protocol(task="arrow_puzzle", preset="quick", agents=agents, seeds=tuple(range(20)), budgets=(500,))
+    result = bench_result(tmp_path, protocol=protocol)
+    levels = {"dqn": 100, "dqn_more_updates": 110, "imagination": 190}
+
+    def change(run: RunResult, row: Checkpoint) -> Checkpoint:
+        return dataclasses.replace(row, successes=levels[run.agent] + run.seed % 7)
+
+    for name, text in archive_files(rewritten(result, change)).items():
+        (tmp_path / name).write_text(text)
+    found = decisions.repetitions(tmp_path, 10, np.random.default_rng(0))
+    assert [len(found[name]) for name in ("disjoint", "random")] == [3, 10]
+    assert all(each == [True, True] for each in [*found["disjoint"], *found["random"]])
 
 
 def test_a_mistake_of_these_tests_would_be_seen() -> None:

@@ -93,11 +93,11 @@ def test_tables_show_the_columns_of_the_summary(page: Page) -> None:
 
 def test_the_mean_stands_beside_a_mean_that_leaves_seeds_out(many: BenchResult, result: BenchResult) -> None:
     shares = many.success_rates("dqn")[:, 0]
-    (row,) = (row for row in table(bench_page(many), "scores").rows if row[0] == "DQN")
+    (row,) = (row for row in table(bench_page(many), "scores").rows if row[0] == "dqn")
     assert row[1].startswith(f"{percent(statistics.iqm(shares))} / {percent(shares.mean())} [")
     assert "(2 of 7 seeds left out) / mean of all" in bench_page(many).subtitle
     shares = result.success_rates("dqn")[:, 0]
-    (row,) = (row for row in table(bench_page(result), "scores").rows if row[0] == "DQN")
+    (row,) = (row for row in table(bench_page(result), "scores").rows if row[0] == "dqn")
     assert row[1] == f"{percent(shares.mean())} ({percent(shares.min())} to {percent(shares.max())})"
     assert "too few for an interval" in bench_page(result).subtitle
 
@@ -123,7 +123,7 @@ def test_the_thesis_stands_below_ours(page: Page) -> None:
     found = table(page, "scores")
     assert found.header[1:] == ["250", "2,000", "3,000", "4,000", "5,000", "6,000"]
     rows = {row[0]: row[1:] for row in found.rows}
-    assert [rows["DQN, thesis"][at] for at in (0, 1, -1)] == [DASH, "42.2 (6.0)", "92.2 (2.6)"]
+    assert [rows["dqn, thesis"][at] for at in (0, 1, -1)] == [DASH, "42.2 (6.0)", "92.2 (2.6)"]
     for agent in ("dqn", "imagination", "imagination_uncertainty"):
         printed = [percent(mean) for mean, _ in reference.success("arrow_puzzle", agent).values()]
         assert [cell.split()[0] for cell in rows[f"{agent_title(agent)}, thesis"][1:]] == printed
@@ -134,16 +134,20 @@ def test_chapter_3_is_quoted_without_a_standard_deviation(tmp_path: Path) -> Non
     agents = ("dqn", "imagination_only")
     protocol = Protocol(task="pick_place", preset="quick", agents=agents, seeds=(0, 1), budgets=(500, 1000))
     found = table(bench_page(bench_result(tmp_path, protocol=protocol)), "scores")
-    quoted = [["DQN, thesis", DASH, "98.0"], ["imagination only, thesis", DASH, "78.0"]]
+    quoted = [["dqn, thesis", DASH, "98.0"], ["imagination_only, thesis", DASH, "78.0"]]
     assert [row for row in found.rows if "thesis" in row[0]] == quoted
     assert "mean of 10 runs, 100 test episodes each" in found.caption
 
 
 def test_the_terminal_has_the_scores_and_the_verdict(many: BenchResult, page: Page) -> None:
     lines, result = page.summary.splitlines(), many
-    (line,) = (line for line in lines if line.startswith("DQN ") and "[" in line)
-    assert all(percent(share) in line for share in result.success_rates("dqn").mean(axis=0))
+    (line,) = (line for line in lines if line.startswith("dqn ") and "[" in line)
+    for place in range(len(result.protocol.budgets)):
+        shares = result.success_rates("dqn")[:, place]
+        ends = statistics.interval(shares, trials=result.protocol.evaluation_episodes)
+        assert "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * each for each in (statistics.iqm(shares), *ends))) in line
     assert lines[-len(page.answers) :] == list(page.answers)
+    assert max(map(len, lines[3 : -len(page.answers)])) <= 80
     (header,) = (line for line in lines if line.startswith("solved"))
     budgets = [f"{budget:,}" for budget in result.protocol.budgets]
     assert header.split()[3:] == budgets, "budgets of the thesis alone stand on the page"
@@ -167,22 +171,21 @@ def shifted(result: BenchResult, **shares: list[int]) -> BenchResult:
 @pytest.mark.parametrize(
     ("successes", "sentence"),
     [
-        ([150, 152, 152, 152, 152, 152, 154], "better after 250, 2,000, 6,000 real episodes (3 budgets)"),
-        ([50, 52, 52, 52, 52, 52, 54], "worse after 250, 2,000, 6,000 real episodes (3 budgets)"),
-        ([80, 90, 100, 105, 105, 110, 140], "no difference is shown (3 budgets)"),
+        ([150, 152, 152, 152, 152, 152, 154], "imagination: better than dqn at 250, 2,000 and 6,000 (p < .001)."),
+        ([50, 52, 52, 52, 52, 52, 54], "imagination: worse than dqn at 250, 2,000 and 6,000 (p < .001)."),
+        ([80, 90, 100, 105, 105, 110, 140], "imagination: +0.0 points against dqn at 6,000, undecided with 7 seeds."),
     ],
 )
 def test_the_verdict_says_which_way_it_went(many: BenchResult, successes: list[int], sentence: str) -> None:
     changed = shifted(many, dqn=[100, 102, 102, 102, 102, 102, 104], imagination=successes)
-    (line,) = (line for line in verdict(collect(changed)) if line.startswith("“imagination” "))
-    assert sentence in line
-    assert f"difference {signed_percent((sum(successes[1:-1]) / 5 - 102) / 200)} [" in line
+    assert sentence in verdict(collect(changed))
 
 
 def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult) -> None:
     changed = shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200])
-    (line,) = (line for line in verdict(collect(changed)) if line.startswith("“imagination” "))
-    assert line.endswith("Too few seeds to say which is better.")
+    (line,) = (line for line in verdict(collect(changed)) if line.startswith("imagination: "))
+    assert line.startswith("imagination: +48.5 points against dqn at 6,000, undecided with 3 seeds; about 2 more would")
+    assert line.endswith("decide: imagine-bench bench --task arrow_puzzle --seeds 0 1 7 8 9.")
     page = bench_page(changed)
     assert table(page, "gains").caption.startswith("Too few seeds to say")
     rows = records(page, "summary.csv")
@@ -190,11 +193,29 @@ def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult)
     assert all(row[name] in ("", "nan") for row in rows for name in (*SCORE[1:], *DIFFERENCE[1:], "p_holm"))
 
 
-def test_the_verdict_takes_the_budget_of_the_smallest_corrected_p(many: BenchResult) -> None:
-    data = collect(many)
-    best = min(data.of("imagination_uncertainty"), key=lambda record: record["p_holm"])
-    (line,) = (line for line in verdict(data) if line.startswith("“imagination + uncertainty” "))
-    assert f"after {best['episodes']:,} episodes {percent(best['success_iqm'])} %" in line
+@pytest.mark.parametrize(
+    ("equal", "sentence"),
+    [
+        (100, "better than dqn_more_updates (as many gradient updates), +24.5 ["),
+        (148, "no gain over dqn_more_updates (as many gradient updates) is shown, +0.5 ["),
+    ],
+)
+def test_the_first_line_says_what_equal_updates_leave_of_a_gain(tmp_path: Path, equal: int, sentence: str) -> None:
+    pairs = (("imagination", "dqn"), ("imagination", "dqn_more_updates"))
+    agents = ("dqn", "dqn_more_updates", "imagination")
+    protocol = dataclasses.replace(WIDE, agents=agents, seeds=tuple(range(7)), headlines=pairs)
+    spread = [-2, -1, 0, 0, 0, 1, 2]
+    levels = {"dqn": 60, "dqn_more_updates": equal, "imagination": 149}
+    shares = {agent: [level + each for each in spread] for agent, level in levels.items()}
+    data = collect(shifted(bench_result(tmp_path, protocol=protocol), **shares))
+    first = verdict(data)[0]
+    assert first.startswith("imagination: better than dqn, +44.5 [") and sentence in first
+    raw = [
+        statistics.difference(*(data.result.success_rates(agent)[:, -1] for agent in pair), trials=200).p
+        for pair in pairs
+    ]
+    assert [each.found.p for each in data.headlines] == statistics.holm(raw).tolist(), "for one another alone"
+    assert data.of("imagination")[-1]["p_holm"] == data.headlines[0].found.p
 
 
 def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) -> None:
@@ -216,7 +237,7 @@ def test_one_seed_gets_an_interval_over_episodes_and_no_verdict(tmp_path: Path) 
     page = bench_page(bench_result(tmp_path, protocol=protocol))
     assert {row["interval_over"] for row in records(page, "summary.csv")} == {"episodes"}
     assert all(row["gain_low_95"] in ("", "nan") for row in records(page, "summary.csv"))
-    assert all(line.endswith("Too few seeds to say which is better.") for line in page.answers)
+    assert all(line.endswith("undecided with 1 seed.") for line in page.answers)
     check_page(text_of(page)["index.html"])
 
 

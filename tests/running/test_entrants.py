@@ -66,7 +66,7 @@ def test_one_agent_with_two_settings_in_one_table(tmp_path: Path) -> None:
     trained = load_trained(both.folder / "dqn-controller.discount=0.99" / "seed_0")
     assert trained.agent.settings.controller.discount == 0.99
     assert [both.of(agent)[0].settings["controller"]["discount"] for agent in ("dqn", SLOW)] == [0.95, 0.99]
-    assert summary_table(both).count("DQN (discount 0.99)") >= 1
+    assert summary_table(both).count(SLOW) >= 1
     for name, content in archive_files(both).items():
         (tmp_path / name).write_text(content)
     assert load_so_far(tmp_path).of(SLOW)[0].checkpoints[0].successes == both.of(SLOW)[0].checkpoints[0].successes

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
@@ -15,10 +17,9 @@ PROTOCOL = small(agents=("table", "random"), seeds=(0, 1, 2))
 SPECS = [FakeRunSpec(protocol=PROTOCOL, agent=agent, seed=seed) for agent in PROTOCOL.agents for seed in PROTOCOL.seeds]
 
 
-def far(seed: int, done: int, phase: Phase = "training", detail: str | None = None) -> Progress:
-    return Progress(
-        agent="table", seed=seed, bench=PROTOCOL.hash, phase=phase, done=done, work=WORK, episode=4, detail=detail
-    )
+def far(seed: int, done: int, phase: Phase = "training", **more: Any) -> Progress:
+    known = {"agent": "table", "episode": 4, **more}
+    return Progress(seed=seed, bench=PROTOCOL.hash, phase=phase, done=done, work=WORK, **known)
 
 
 def test_time_left_counts_neither_what_was_done_before_nor_what_a_failed_run_lacks(
@@ -29,9 +30,24 @@ def test_time_left_counts_neither_what_was_done_before_nor_what_a_failed_run_lac
     monkeypatch.setattr("imagine_bench.running.bench.time.monotonic", lambda: now_s[0])
     with ProgressBar(SPECS) as show:
         show(far(0, 9))
-        show(far(1, 0, "failed", "RuntimeError: it broke"))
+        show(far(1, 0, "failed", detail="RuntimeError: it broke"))
         now_s[0] = 36_000.0
         show(far(0, WORK, "done"))
     said, line = capsys.readouterr().err.splitlines()
     assert said == "table seed 1 failed: RuntimeError: it broke"
-    assert line.startswith("1 of 6 runs done, 10:00:00 gone, 34:00:00 left")
+    assert line.startswith("1/6 runs · 10:00:00 elapsed, about 34 h left")
+
+
+def test_a_minute_shows_each_run_and_its_curve(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = [0.0]
+    monkeypatch.setattr("imagine_bench.running.bench.time.monotonic", lambda: now_s[0])
+    with ProgressBar(SPECS) as show:
+        for block, success in enumerate((0.0, 0.5)):
+            show(far(0, 1, episode=50 * block, success=success))
+        now_s[0] = 61.0
+        show(far(0, 4, episode=6, success=1.0))
+    line, curve = capsys.readouterr().err.splitlines()
+    assert line.endswith("left · table seed 0: episode 6 of 9, last 50 solved 100 %")
+    assert curve == "  █▅ table seed 0: training, each 50 episodes"

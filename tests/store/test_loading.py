@@ -171,3 +171,17 @@ def test_a_table_cut_short_leaves_later_imagination_out(tmp_path: Path) -> None:
     assert [row.episodes for row in short.checkpoints] == list(budgets[:-1])
     assert short.imagined == () and short.sampled_rollouts == ()
     assert len(short.training_success) == len(short.training_length) == budgets[-2]
+
+
+def test_an_agent_of_fewer_seeds_is_whole_with_these(tmp_path: Path) -> None:
+    few = (("random", 1),)
+    protocol = dataclasses.replace(small(agents=("table", "random")), seeds=(0, 1, 2), few_seeds=few)
+    made = bench(protocol, {}, root=tmp_path / "runs", launcher=Inline())
+    assert [(run.agent, run.seed) for run in made.runs if run.agent == "random"] == [("random", 0), ("random", 1)]
+    assert "3 seed(s) (random 2)" in summary_table(made)
+    kept = kept_from(made.folder, tmp_path / "kept")
+    assert load_so_far(kept).missing == () and load_so_far(kept).protocol == protocol
+    rows = (kept / "results.csv").read_text().splitlines()
+    (kept / "results.csv").write_text("\n".join(row for row in rows if not row.startswith("table,2")) + "\n")
+    part = load_so_far(kept)
+    assert part.protocol.seeds == (0, 1) and part.missing == ("table seed 2: 0 of 9 real episodes",)

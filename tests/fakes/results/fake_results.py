@@ -16,6 +16,7 @@ LEVELS = {
     "random": (0.045, 0.045),
     "oracle": (1.0, 1.0),
     "dqn": (0.1, 0.6),
+    "dqn_more_updates": (0.1, 0.5),
     "imagination": (0.1, 0.55),
     "imagination_uncertainty": (0.15, 0.85),
     "imagination_only": (0.1, 0.8),
@@ -28,7 +29,7 @@ WIDE = Protocol(task="arrow_puzzle", preset="thesis", budgets=(250, 2000, 6000),
 def bench_result(folder: Path, *, protocol: Protocol | None = None) -> BenchResult:
     """Complete results of a protocol, the quick preset's by default."""
     protocol = protocol or Protocol(task="arrow_puzzle", preset="quick")
-    runs = [run_result(protocol, agent, seed, folder) for agent in protocol.agents for seed in protocol.seeds]
+    runs = [run_result(protocol, agent, seed, folder) for agent, seed in protocol.runs]
     environment = {
         "command": "imagine-bench bench --task arrow_puzzle",
         "commit": "0123456789ab",

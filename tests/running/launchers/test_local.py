@@ -123,11 +123,19 @@ def _carried(item: int, tell: Callable[[int], None]) -> str:
 def test_a_worker_that_dies_costs_one_item_and_others_go_on_in_one_process() -> None:
     workers: list[int] = []
     ends: list[tuple[int, str]] = []
-    work_through(_carried, range(5), workers=1, on_news=workers.append, on_end=lambda *end: ends.append(end))
+    work_through(
+        _carried,
+        range(5),
+        workers=1,
+        on_news=workers.append,
+        on_end=lambda *end: ends.append(end),
+        fresh=lambda item: item == 3,
+    )
     assert [item for item, _ in ends] == [0, 1, 2, 3, 4], "in order, each once"
     assert [bool(why) for _, why in ends] == [False, True, True, False, False]
     assert "exit code -9" in ends[1][1] and ends[2][1] == "2 fails"
-    assert len(set(workers)) == 2, "only a death costs a process"
+    assert workers[0] == workers[1] and workers[2] == workers[4], "one process after another item"
+    assert len(set(workers)) == 3, "a death costs a process, and item 3 has its own"
     assert psutil.wait_procs([child for child in psutil.Process().children() if child.pid in workers], 10)[1] == []
 
 

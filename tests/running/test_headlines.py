@@ -1,0 +1,96 @@
+"""Headlines: how they are declared, corrected and decided, and seeds in stages until they are."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fake_results import bench_result, rewritten
+
+from imagine_bench import statistics
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.running.headlines import decided, headlines, stages, until_decided
+from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
+
+PAIRS = (("imagination", "dqn"), ("imagination", "dqn_more_updates"))
+FIRST = Protocol(
+    task="arrow_puzzle",
+    preset="quick",
+    agents=("random", "dqn", "dqn_more_updates", "imagination"),
+    seeds=(0, 1, 2, 3, 4, 5),
+    budgets=(100, 500),
+    headlines=PAIRS,
+    few_seeds=(("random", 2),),
+)
+
+
+def result_of(wanted: Protocol, root: Path, gap: int) -> BenchResult:
+    """Runs whose imagination solves ``gap`` tests more than both DQNs, with a spread of twelve."""
+
+    def change(run: RunResult, row: Checkpoint) -> Checkpoint:
+        return dataclasses.replace(row, successes=100 + gap * (run.agent == "imagination") + 12 * (run.seed % 3))
+
+    return rewritten(bench_result(root / wanted.hash, protocol=wanted), change)
+
+
+def test_headlines_of_a_preset_are_about_its_own_agents() -> None:
+    assert protocol("arrow_puzzle").headlines == PAIRS and len(protocol("arrow_puzzle").seeds) >= 6
+    assert protocol("arrow_puzzle", seeds=(7, 8)).headlines == PAIRS
+    assert protocol("arrow_puzzle", agents=("dqn", "imagination")).headlines == ()
+    assert protocol("arrow_puzzle", "smoke").headlines == protocol("pick_place").headlines == ()
+
+
+def test_headlines_are_corrected_for_one_another_and_for_all_looks(tmp_path: Path) -> None:
+    found = {}
+    for looks in (1, 4):
+        result = result_of(dataclasses.replace(FIRST, most_looks=looks), tmp_path, 30)
+        runs = [[result.success_rates(agent)[:, -1] for agent in pair] for pair in PAIRS]
+        raw = [statistics.difference(*pair, trials=200).p for pair in runs]
+        found[looks] = [each.found.p for each in headlines(result)]
+        assert found[looks] == pytest.approx((looks * statistics.holm(raw)).clip(max=1.0).tolist())
+        assert decided(result) == (max(found[looks]) < 0.05)
+    assert found[1] < found[4]
+
+
+@pytest.fixture
+def staged(tmp_path: Path) -> Callable[[int, list[Protocol]], Callable[..., BenchResult]]:
+    """A function that stands for running benches, of imagination so many tests ahead; it notes their protocols."""
+
+    def with_gap(gap: int, asked: list[Protocol]) -> Callable[..., BenchResult]:
+        def plan(**changes: Any) -> BenchResult:
+            asked.append(dataclasses.replace(FIRST, **changes))
+            return result_of(asked[-1], tmp_path, gap)
+
+        return plan
+
+    return with_gap
+
+
+@pytest.mark.parametrize(("gap", "seeds"), [(60, 6), (33, 9), (29, 12), (0, 13)])
+def test_stages_end_once_decided_or_at_the_most(staged: Any, tmp_path: Path, gap: int, seeds: int) -> None:
+    asked: list[Protocol] = []
+    begun, whole = until_decided(staged(gap, asked), FIRST, most=13, root=tmp_path)
+    assert whole.protocol.seeds == tuple(range(seeds)) and begun.protocol.agents == FIRST.agents
+    assert decided(whole) == (gap > 0)
+    assert [seed for each in asked for seed in each.seeds] == list(range(seeds)), "each seed once"
+    assert {each.most_looks for each in asked} == {len(stages(6, 13))} == {4}
+    assert all("random" not in each.agents for each in asked[1:])
+    again: list[Protocol] = []
+    assert until_decided(staged(gap, again), FIRST, most=13, root=tmp_path)[1].protocol == whole.protocol
+    assert again == asked, "the same call asks for the same benches, which are then only read"
+
+
+def test_without_headlines_or_with_too_few_seeds_nothing_is_run(tmp_path: Path) -> None:
+    def never(**changes: Any) -> BenchResult:
+        raise AssertionError(changes)
+
+    with pytest.raises(InvalidValueError, match="This bench has no headlines"):
+        until_decided(never, dataclasses.replace(FIRST, headlines=()), most=15, root=tmp_path)
+    with pytest.raises(
+        InvalidValueError, match="--most-seeds 5 is less than the 6 seeds that come first; give at least that"
+    ):
+        until_decided(never, FIRST, most=5, root=tmp_path)
