@@ -25,7 +25,6 @@ from imagine_bench.report.data import (
     SCORE,
     Record,
     ReportData,
-    agent_title,
     collect,
     estimated,
     frames_before,
@@ -59,7 +58,7 @@ _SOLVED = "solved (%) after"
 _EQUAL_UPDATES = "dqn_more_updates"
 _SEEDS_OPTION = re.compile(r" --seeds(?: \d+)+")
 _AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
-    "against dqn": lambda record: agent_title(record["agent"]),
+    "against dqn": lambda record: record["agent"],
     "real episodes": lambda record: f"{record['episodes']:,}",
     "difference (points)": lambda record: estimated(record, DIFFERENCE, signed_percent),
     "p": lambda record: printed(record["p_holm"], ".3f"),
@@ -95,7 +94,7 @@ def bench_page(result: BenchResult) -> Page:
         table=_on_terminal(data),
         sections=[section for make in SECTIONS if (section := make(data)) is not None],
         files=files,
-        facts=made(result, {agent: agent_title(agent) for agent in protocol.agents}),
+        facts=made(result),
     )
 
 
@@ -181,7 +180,7 @@ def _misread(data: ReportData) -> list[str]:
         used = data.result.protocol.encoder_of(entry.encoder_kind) if entry.make and entry.needs_encoder else None
         words = encoders.doubt(None if used is None else encoders.find(used))
         if words:
-            lines.append(f"“{agent_title(agent)}” sees through {words}.")
+            lines.append(f"“{agent}” sees through {words}.")
     return lines
 
 
@@ -217,7 +216,7 @@ def _not_installed(data: ReportData) -> list[str]:
 
 def compared(data: ReportData) -> Section:
     """The task, the agents and the verdict on them."""
-    rows = [[agent_title(agent), known_agent(agent).description] for agent in data.result.protocol.agents]
+    rows = [[agent, known_agent(agent).description] for agent in data.result.protocol.agents]
     table = Table("agents", ["agent", "what it does"], rows, prose=True)
     return Section("What was compared", [data.spec.description], tables=[table], answers=verdict(data))
 
@@ -240,10 +239,10 @@ def _scores(data: ReportData, budgets: Sequence[int]) -> Table:
     """Ours at these budgets, the thesis' below it where it has any of them, and the exact ends of the scale."""
     rows: list[tuple[str, Mapping[int, str]]] = []
     for agent in data.result.protocol.agents:
-        rows.append((agent_title(agent), {each["episodes"]: _solved(data, each) for each in data.of(agent)}))
+        rows.append((agent, {each["episodes"]: _solved(data, each) for each in data.of(agent)}))
         if not data.thesis[agent].keys().isdisjoint(budgets):
             cells = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
-            rows.append((f"{agent_title(agent)}, thesis", cells))
+            rows.append((f"{agent}, thesis", cells))
     rows.append(("chance level", dict.fromkeys(budgets, percent(data.facts.chance_level))))
     rows.append(("optimum", dict.fromkeys(budgets, percent(data.facts.optimum))))
     header = [_SOLVED, *(f"{budget:,}" for budget in budgets)]
@@ -297,7 +296,7 @@ def _seeds(data: ReportData) -> Table:
     for agent in protocol.agents:
         for seed, shares in zip(protocol.seeds_of(agent), data.result.success_rates(agent), strict=True):
             lasting = first_lasting(protocol.budgets, shares, asked)
-            rows.append([agent_title(agent), str(seed), *map(percent, shares), count(lasting or math.nan)])
+            rows.append([agent, str(seed), *map(percent, shares), count(lasting or math.nan)])
     header = ["agent", "seed", *(f"{budget:,}" for budget in protocol.budgets), f"{percent(asked)} % from"]
     return Table("seeds", header, rows, why_dash="the last test is not solved so far", folded="Every seed by itself")
 
@@ -332,7 +331,7 @@ def _on_the_same_starts(records: Sequence[Record]) -> list[Table]:
     """These trained agents against these trained DQNs, by who alone solved a test; nothing where that was not kept."""
     rows = [
         {
-            "against DQN": agent_title(record["agent"]),
+            "against DQN": record["agent"],
             "real episodes": f"{record['episodes']:,}",
             "tests it alone solved": f"{record['alone']:,}",
             "DQN alone": f"{record['dqn_alone']:,}",
@@ -360,7 +359,7 @@ def cost(data: ReportData) -> Section:
         played = round(sum(row.mean_length * row.test_episodes for row in tests))
         rows.append(
             {
-                "one run, mean over seeds": agent_title(agent),
+                "one run, mean over seeds": agent,
                 "real macro-actions": count(last["env_steps"]),
                 "frames its encoder saw before": count(frames_before(data, agent)),
                 "gradient updates": count(last["gradient_updates"]),
@@ -383,7 +382,7 @@ def success_figure(data: ReportData) -> Figure:
     curves = {}
     for agent in agents:
         rows = data.of(agent)
-        curves[agent_title(agent)] = {row["episodes"]: _band(data, row) for row in rows}
+        curves[agent] = {row["episodes"]: _band(data, row) for row in rows}
     figure = figures.lines({"": curves}, figures.colors(agents), "real training episodes (logarithmic)")
     (axes,) = figure.axes
     for agent in agents:

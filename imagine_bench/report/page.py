@@ -250,15 +250,15 @@ def texts(page: Page, *, images: bool = True) -> dict[str, str]:
     return {**page.files, "index.html": environment.get_template("page.html.j2").render(page=page)}
 
 
-def made(result: Any, titles: Mapping[str, str]) -> dict[str, object]:
-    """How a result of any kind was made: the facts of its Page, with the settings of its learners by title.
+def made(result: Any) -> dict[str, object]:
+    """How a result of any kind was made: the facts of its Page, with the settings of its learners by name.
 
     All seeds of a learner have the same settings.
     """
     environment = result.environment
     commit = str(environment.get("commit") or "").partition("+")[0]
     where = f"git checkout {commit} && " if commit else ""
-    settings = {title: result.of(name)[0].settings for name, title in titles.items()}
+    settings = {name: result.of(name)[0].settings for name in result.protocol.agents}
     return {
         "reproduce": f"{where}{environment.get('command', '')}",
         **environment,

@@ -68,7 +68,7 @@ def report_page(result: RegressionResult) -> Page:
         table=tables[0],
         sections=[Section("What was compared", (_COMPARED,)), *sections],
         files={"results.csv": table_text(rows), **{f"{table.name}.csv": table.csv for table in tables}},
-        facts=made(result, {pair.agent: pair.title for pair in result.pairs.values()}),
+        facts=made(result),
     )
 
 

@@ -14,7 +14,7 @@ from imagine_bench.judge.causes import CAUSES
 from imagine_bench.recording.filmstrips import filmstrip, png, sampled_filmstrips
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
-from imagine_bench.report.data import ReportData, agent_title, open_loop_means
+from imagine_bench.report.data import ReportData, open_loop_means
 from imagine_bench.report.page import DASH, Image, Section, Table, percent
 from imagine_bench.store.files import reading
 
@@ -82,7 +82,7 @@ def causes_table(rows: Iterable[Sequence[object]]) -> Table:
         failures = found.total()
         shares = [percent(found[name] / failures) if failures else DASH for name in CAUSES]
         of = f"{failures:,} of {sum(tested[agent, budget].values()):,}"
-        lines.append([agent_title(agent), f"{int(budget):,}", of, *shares])
+        lines.append([agent, f"{int(budget):,}", of, *shares])
     header = ["agent", "real episodes", "failures", *(f"{name}, %" for name in CAUSES)]
     meanings = "; ".join(f"{name}: {words}" for name, words in CAUSES.items())
     return Table("causes", header, lines, f"Shares of the failures. {meanings}.", why_dash="nothing failed")
@@ -114,7 +114,7 @@ def open_loop_figure(loops: Mapping[str, Arrays]) -> Figure:
     for name, title in _MEASURES.items():
         scale = 100.0 if "%" in title else 1.0
         known = {agent: loop[name] for agent, loop in loops.items() if name not in _KINDS or loop[name].any()}
-        panels[title] = {agent_title(agent): dict(enumerate(scale * by_depth, 1)) for agent, by_depth in known.items()}
+        panels[title] = {agent: dict(enumerate(scale * by_depth, 1)) for agent, by_depth in known.items()}
     return figures.lines(panels, figures.colors(loops), "imagined depth (macro-actions)")
 
 
@@ -123,7 +123,7 @@ def rollouts(data: ReportData) -> Section | None:
     images = []
     for agent in data.result.protocol.agents if data.installed else ():
         run = data.result.of(agent)[0]
-        whose = f"{agent_title(agent)}, seed {run.seed}"
+        whose = f"{agent}, seed {run.seed}"
         for start, compared in enumerate(run.imagined[:SHOWN_ROLLOUTS], 1):
             strip = png(filmstrip(compared, data.spec.action_names))
             images.append(Image(f"rollout_{file_name(agent)}_{start}", strip, f"{whose}, start {start}."))

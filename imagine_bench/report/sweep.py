@@ -7,7 +7,6 @@ import itertools
 import math
 from collections.abc import Sequence
 
-from imagine_bench.report.data import agent_title
 from imagine_bench.report.page import (
     DASH,
     Page,
@@ -126,7 +125,7 @@ def _scores(result: SuiteResult) -> Table:
         "epistemic uncertainty tells wrong imagined transitions from right ones, from 0.5 to 1; an agent that does not "
         "say has 0.5."
     )
-    header = ["experiment: dial", *map(agent_title, result.agents)]
+    header = ["experiment: dial", *result.agents]
     return Table("suite", header, [*rows, prices], words, "not run, or no imagined transition was wrong")
 
 

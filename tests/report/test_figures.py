@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from imagine_bench.report import figures
 from imagine_bench.report.bench import success_figure
-from imagine_bench.report.data import ReportData, agent_title, collect, open_loop_means
+from imagine_bench.report.data import ReportData, collect, open_loop_means
 from imagine_bench.report.sections import open_loop_figure
 
 
@@ -59,4 +59,4 @@ def test_no_two_registered_agents_share_a_color() -> None:
     own = ("random", "oracle", "dqn", "imagination", "imagination_uncertainty", "imagination_only", "factored")
     assert len({figures.color(agent) for agent in own}) == len(own)
     assert figures.color("an agent that nobody registered").startswith("#")
-    assert figures.colors(own)[agent_title("dqn")] == figures.color("dqn")
+    assert figures.colors(own)["dqn"] == figures.color("dqn")

@@ -19,7 +19,7 @@ from imagine_bench.errors import ArtefactError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import bench_page, write_report
 from imagine_bench.report.bench import shown, verdict
-from imagine_bench.report.data import DIFFERENCE, GAIN, SCORE, agent_title, collect
+from imagine_bench.report.data import DIFFERENCE, GAIN, SCORE, collect
 from imagine_bench.report.page import DASH, Page, Table, percent, signed_percent, texts
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
@@ -80,7 +80,7 @@ def test_tables_show_the_columns_of_the_summary(page: Page) -> None:
     against = {(row[0], row[1]): row[2:] for row in table(page, "gains").rows}
     assert len(against) > 5
     for row in records(page, "summary.csv"):
-        title, budget = agent_title(row["agent"]), f"{int(row['episodes']):,}"
+        title, budget = row["agent"], f"{int(row['episodes']):,}"
         middle, _, ends = scores[title][budget].partition(" / ")
         assert ends or row["agent"] == "oracle"
         assert (f"{middle} {ends.partition(' ')[2]}" if ends else middle) == worded(row, SCORE, percent)
@@ -105,7 +105,7 @@ def test_the_mean_stands_beside_a_mean_that_leaves_seeds_out(many: BenchResult, 
 def test_every_seed_is_the_one_of_the_csv(page: Page) -> None:
     shares: dict[tuple[str, str], list[str]] = {}
     for row in records(page, "results.csv"):
-        shares.setdefault((agent_title(row["agent"]), row["seed"]), []).append(percent(float(row["success_rate"])))
+        shares.setdefault((row["agent"], row["seed"]), []).append(percent(float(row["success_rate"])))
     assert {(row[0], row[1]): row[2:-1] for row in table(page, "seeds").rows} == shares
     assert len({cell for row in shares.values() for cell in row}) > 10, "a mix-up would show"
 
@@ -126,7 +126,7 @@ def test_the_thesis_stands_below_ours(page: Page) -> None:
     assert [rows["dqn, thesis"][at] for at in (0, 1, -1)] == [DASH, "42.2 (6.0)", "92.2 (2.6)"]
     for agent in ("dqn", "imagination", "imagination_uncertainty"):
         printed = [percent(mean) for mean, _ in reference.success("arrow_puzzle", agent).values()]
-        assert [cell.split()[0] for cell in rows[f"{agent_title(agent)}, thesis"][1:]] == printed
+        assert [cell.split()[0] for cell in rows[f"{agent}, thesis"][1:]] == printed
     assert "+47.4" in [row[-1] for row in table(page, "gains").rows]
 
 

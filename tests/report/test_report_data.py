@@ -15,7 +15,7 @@ from fake_results import WIDE, bench_result, rewritten
 from imagine_bench import reference, registry, statistics
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report.bench import cost, success
-from imagine_bench.report.data import DIFFERENCE, SCORE, agent_title, collect, frames_before, open_loop_means
+from imagine_bench.report.data import DIFFERENCE, SCORE, collect, frames_before, open_loop_means
 from imagine_bench.report.page import DASH, count, seconds
 from imagine_bench.rules import fewest_actions
 from imagine_bench.store import encoders
@@ -50,7 +50,7 @@ def test_costs_are_means_over_seeds(result: BenchResult, agent: str) -> None:
         assert record["gradient_updates"] == pytest.approx(updates, nan_ok=True)
     tests = [row for run in runs for row in run.checkpoints[: 3 if learns else 1]]
     steps = round(sum(row.test_episodes * row.mean_length for row in tests))
-    shown = {row[0]: row[1:] for row in cost(data).tables[0].rows}[agent_title(agent)]
+    shown = {row[0]: row[1:] for row in cost(data).tables[0].rows}[agent]
     faults = f"{sum(row.faults for row in tests)} of {steps:,}"
     counts = map(count, (records[-1]["env_steps"], frames_before(data, agent), records[-1]["gradient_updates"]))
     assert shown == [*counts, seconds(records[-1]["train_cpu_s"]), faults]
@@ -114,7 +114,7 @@ def test_a_seed_solves_the_task_from_where_every_test_reaches_its_threshold(resu
         data = collect(result)
         data = dataclasses.replace(data, spec=dataclasses.replace(data.spec, success_threshold=threshold))
         (seeds,) = (table for table in success(data).tables if table.name == "seeds")
-        assert [row[-1] for row in seeds.rows if row[0] == agent_title(agent)] == [reached] * statistics.FEWEST
+        assert [row[-1] for row in seeds.rows if row[0] == agent] == [reached] * statistics.FEWEST
 
 
 # Start by start ----------------------------------------------------------------------------------------------------
