@@ -54,7 +54,6 @@ from imagine_bench.store import encoders
 from imagine_bench.store.loading import archive_files
 from imagine_bench.store.results import BenchResult
 
-_SOLVED = "solved (%) after"
 _EQUAL_UPDATES = "dqn_more_updates"
 _SEEDS_OPTION = re.compile(r" --seeds(?: \d+)+")
 _AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
@@ -91,7 +90,7 @@ def bench_page(result: BenchResult) -> Page:
         subtitle=subtitle,
         question="Does training on transitions that a learned world model imagines save real episodes? Every agent is "
         "tested without exploring, on the same new episodes, after each number of real training episodes.",
-        table=_on_terminal(data),
+        table=_scores(data, protocol.budgets, short=True),
         sections=[section for make in SECTIONS if (section := make(data)) is not None],
         files=files,
         facts=made(result),
@@ -235,31 +234,26 @@ def success(data: ReportData) -> Section:
     return Section("Success against real experience", images=[image], tables=tables)
 
 
-def _scores(data: ReportData, budgets: Sequence[int]) -> Table:
-    """Ours at these budgets, the thesis' below it where it has any of them, and the exact ends of the scale."""
+def _scores(data: ReportData, budgets: Sequence[int], *, short: bool = False) -> Table:
+    """Ours at these budgets, the thesis' below it where it has any of them, and the exact ends of the scale.
+
+    In short, as on a terminal, scores are whole percent, and the thesis' are left out.
+    """
+    cell = _in_short if short else _solved
     rows: list[tuple[str, Mapping[int, str]]] = []
     for agent in data.result.protocol.agents:
-        rows.append((agent, {each["episodes"]: _solved(data, each) for each in data.of(agent)}))
-        if not data.thesis[agent].keys().isdisjoint(budgets):
+        rows.append((agent, {each["episodes"]: cell(data, each) for each in data.of(agent)}))
+        if not short and not data.thesis[agent].keys().isdisjoint(budgets):
             cells = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
             rows.append((f"{agent}, thesis", cells))
-    rows.append(("chance level", dict.fromkeys(budgets, percent(data.facts.chance_level))))
-    rows.append(("optimum", dict.fromkeys(budgets, percent(data.facts.optimum))))
-    header = [_SOLVED, *(f"{budget:,}" for budget in budgets)]
+    for name, share in (("chance level", data.facts.chance_level), ("optimum", data.facts.optimum)):
+        rows.append((name, dict.fromkeys(budgets, printed(100.0 * share, ".0f" if short else ".1f"))))
+    header = ["solved (%) after", *(f"{budget:,}" for budget in budgets)]
     lines = [[title, *(cells.get(budget, DASH) for budget in budgets)] for title, cells in rows]
     caption = "Columns: real training episodes."
     if any(title.endswith(", thesis") for title, _ in rows):
         caption += f" Thesis: {reference.success_source(str(data.spec.reference))}."
     return Table("scores", header, lines, caption, "not tested")
-
-
-def _on_terminal(data: ReportData) -> Table:
-    """The scores in whole percent."""
-    budgets = data.result.protocol.budgets
-    rows = [[agent, *(_in_short(data, each) for each in data.of(agent))] for agent in data.result.protocol.agents]
-    for name, share in (("chance level", data.facts.chance_level), ("optimum", data.facts.optimum)):
-        rows.append([name, *[printed(100.0 * share, ".0f")] * len(budgets)])
-    return Table("scores", [_SOLVED, *(f"{budget:,}" for budget in budgets)], rows)
 
 
 def _in_short(data: ReportData, record: Record) -> str:
