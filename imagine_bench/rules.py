@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Floats, State
+from imagine_bench.arrays import Bools, Floats, Ints, State
 from imagine_bench.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -69,6 +69,10 @@ class Rules(Protocol):
         """An action of an optimal policy (the lowest index among equals)."""
 
 
+Dynamics = Callable[[State, int], Sequence[Outcome]]
+"""What may come of a macro-action in a macrostate, as :meth:`Rules.outcomes` says it."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RuleFacts:
     """What the rules alone say about a task, computed by enumeration."""
@@ -77,6 +81,20 @@ class RuleFacts:
     optimum: float  #: largest success probability of any policy within the horizon
     optimal_return: float  #: mean undiscounted return of an optimal agent over the start states
     mean_plan_length: float  #: mean number of actions of an optimal agent over the start states
+
+
+class OutcomeTable(NamedTuple):
+    """N outcomes, all that every macro-action has in some macrostates: by macrostate, by macro-action, as they come."""
+
+    index: dict[State, int]  #: macrostate to row, in the order in which they come up
+    asked: Ints  #: rows of the macrostates whose outcomes these are, in their order
+    before: Ints  #: row of the macrostate before. Shape (N,).
+    action: Ints  #: shape (N,)
+    after: Ints  #: row of the macrostate after. Shape (N,).
+    probability: Floats  #: shape (N,)
+    reward: Floats  #: shape (N,)
+    terminated: Bools  #: whether the episode ends. Shape (N,).
+    success: Bools  #: whether it ends as a success. Shape (N,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,45 +144,63 @@ def tabulate(rules: Rules, depth: int | None = None) -> RuleTables:
     from scipy.sparse import csr_array  # noqa: PLC0415 - loads for long
 
     listed = getattr(rules, "states", None)
-    index = {state: row for row, state in enumerate(dict.fromkeys(listed or rules.start_states))}
+    found = every_outcome(listed or rules.start_states, rules.n_actions, rules.outcomes, follow=not listed, depth=depth)
+    states = list(found.index)
+    pair = found.action * len(states) + found.before
+    shape = (rules.n_actions, len(states))
+
+    def summed(values: Floats) -> Floats:  # [A, S]
+        return np.bincount(pair, found.probability * values, minlength=shape[0] * shape[1]).reshape(shape)
+
+    total = summed(np.ones(len(pair)))
+    for row, action in np.argwhere(np.abs(total[:, found.asked].T - 1.0) > _TIE_TOLERANCE):
+        which = f"action {action} in macrostate {states[found.asked[row]]}"
+        raise InvalidValueError(f"Outcomes of {which} sum to {total[action, found.asked[row]]}, not 1.")
+    for outcome in np.flatnonzero(found.after >= len(listed)) if listed else ():
+        which = f"Action {found.action[outcome]} in macrostate {states[found.before[outcome]]}"
+        raise InvalidValueError(f"{which} leads to {states[found.after[outcome]]}; list it, too.")
+    on = ~found.terminated
+    alive = csr_array((found.probability[on], (pair[on], found.after[on])), shape=(total.size, len(states)))
+    starts = np.array([found.index[state] for state in rules.start_states], dtype=np.int64)
+    reward = summed(found.reward)
+    success = summed(found.success.astype(np.float64))
+    return RuleTables(index=found.index, starts=starts, alive=alive, reward=reward, success=success)
+
+
+def every_outcome(
+    states: Iterable[State], n_actions: int, outcomes: Dynamics, *, follow: bool, depth: int | None = None
+) -> OutcomeTable:
+    """Write out what every macro-action may bring.
+
+    Args:
+        states: Macrostates to ask about.
+        n_actions: Macro-actions.
+        outcomes: The dynamics.
+        follow: Whether macrostates in which the episode goes on are asked about, too, as they come up.
+        depth: Most macro-actions after which they are; None for any number.
+    """
+    index = {state: row for row, state in enumerate(dict.fromkeys(states))}
     queue = list(index)
-    steps = dict.fromkeys(index, 0)
-    pairs: list[tuple[int, int, float, float]] = []  # action, row, reward, success
-    goes_on: list[tuple[float, int, int, int]] = []  # probability, action, row, next row
+    steps = dict.fromkeys(queue, 0)
+    rows: list[tuple[float, ...]] = []
+    asked = []
     for state in queue:  # grows
-        row = index[state]
         if steps[state] == depth:
             break
-        for action in range(rules.n_actions):
-            total = reward = success = 0.0
-            for outcome in rules.outcomes(state, action):
-                after = outcome.macrostate
-                share = outcome.probability
-                total = total + share
-                reward = reward + share * outcome.reward
-                success += share * outcome.success
-                if listed and after not in index:
-                    raise InvalidValueError(f"Action {action} in macrostate {state} leads to {after}; list it, too.")
+        asked.append(index[state])
+        for action in range(n_actions):
+            for each in outcomes(state, action):
+                after = each.macrostate
                 column = index.setdefault(after, len(index))
-                if not outcome.terminated:
-                    goes_on.append((share, action, row, column))
-                    if after not in steps:
-                        steps[after] = steps[state] + 1
-                        queue.append(after)
-            if abs(total - 1.0) > _TIE_TOLERANCE:
-                raise InvalidValueError(f"Outcomes of action {action} in macrostate {state} sum to {total}, not 1.")
-            pairs.append((action, row, reward, success))
-    shape = (rules.n_actions, len(index))
-    facts_of = np.array(pairs).reshape(-1, 4)
-    shares = np.array(goes_on).reshape(-1, 4)
-    where = tuple(facts_of[:, :2].astype(np.int64).T)
-    reward_of = np.zeros(shape)
-    success_of = np.zeros(shape)
-    reward_of[where], success_of[where] = facts_of[:, 2], facts_of[:, 3]
-    action_of, row_of, column_of = shares[:, 1:].astype(np.int64).T
-    alive = csr_array((shares[:, 0], (action_of * len(index) + row_of, column_of)), shape=(reward_of.size, len(index)))
-    starts = np.array([index[state] for state in rules.start_states], dtype=np.int64)
-    return RuleTables(index=index, starts=starts, alive=alive, reward=reward_of, success=success_of)
+                place = (index[state], action, column)
+                rows.append((*place, each.probability, each.reward, each.terminated, each.success))
+                if follow and not each.terminated and after not in steps:
+                    steps[after] = steps[state] + 1
+                    queue.append(after)
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 7).T
+    places = columns[:3].astype(np.int64)
+    ends = columns[5:].astype(np.bool_)
+    return OutcomeTable(index, np.array(asked, dtype=np.int64), *places, *columns[3:5], *ends)
 
 
 def optimal_values(tables: RuleTables) -> Floats:

@@ -19,7 +19,7 @@ import numpy as np
 
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Outcome, Rules, Sight, State, TaskSpec
-from imagine_bench.rules import horizon_optimum, tabulate
+from imagine_bench.rules import RuleTables, horizon_optimum, states_of, tabulate
 
 Window = tuple[State, ...]
 """The macrostates whose frames are still to come, the newest last; without a lag the macrostate now."""
@@ -51,21 +51,29 @@ class BeliefRules:
     Args:
         rules: The machine that is seen.
         sight: What frames show.
-        play: Its macrostates that an episode may be in.
         horizon: Macro-actions of an episode.
     """
 
     states = None
 
-    def __init__(self, rules: Rules, sight: Sight, play: Iterable[State], horizon: int) -> None:
+    def __init__(self, rules: Rules, sight: Sight, horizon: int) -> None:
         self._rules = rules
         self._sight = sight
         self.n_actions = rules.n_actions
-        self._settled = last_step_that_matters(sight, play, horizon)
+        self._horizon = horizon
+        self.play = [state for state in states_of(rules) if not rules.is_terminal(state)]
+        """Macrostates of the seen machine that an episode may be in."""
+        self._settled = last_step_that_matters(sight, self.play, horizon)
         self._met: set[Belief] = set()
         share = 1.0 / len(rules.start_states)
         #: probability and belief by the first frame
         self.starts = self._split(0, {(start,): share for start in rules.start_states}, shown_step=0)
+
+    def tables(self) -> RuleTables | None:
+        """All beliefs within the horizon as arrays; None if there are more than :data:`MOST`."""
+        with suppress(TooManyBeliefsError):
+            return tabulate(cast(Rules, self), depth=self._horizon)
+        return None
 
     @property
     def start_states(self) -> tuple[Belief, ...]:
@@ -88,6 +96,11 @@ class BeliefRules:
         """The belief after an action, given what the frame then shows; None where that is impossible."""
         reached = self._reach(belief, self._advance(belief, action)[0])
         return reached.get(shown, reached.get(None, (0.0, None)))[1]
+
+    def anything_like(self, seen: State, step: int) -> Belief:
+        """Every macrostate whose frame may show this, each equally likely, as if it had stood there for long."""
+        like = [s for s in self.play if any(what == seen for _, what in self._sight.seen(s, step))] or self.play
+        return step, tuple(((state,) * max(self._sight.lag, 1), 1.0 / len(like)) for state in like)
 
     def _advance(
         self, belief: Belief, action: int
@@ -146,11 +159,9 @@ class OptimalPolicy:
         self._beliefs: BeliefRules | None = None
         self._rows: dict[State, int] = {}
         if sight is not None:
-            self._sight = sight
-            self._play = [state for state in self._tables.index if not rules.is_terminal(state)]
-            self._beliefs = BeliefRules(rules, sight, self._play, horizon)
-            with suppress(TooManyBeliefsError):
-                known = tabulate(cast(Rules, self._beliefs), depth=horizon)
+            self._beliefs = BeliefRules(rules, sight, horizon)
+            known = self._beliefs.tables()
+            if known is not None:
                 self._rows = known.index
                 self._belief_best = horizon_optimum(known, horizon).actions
         self._episode: list[tuple[Belief, int]] = []
@@ -168,16 +179,11 @@ class OptimalPolicy:
         else:
             belief = self._beliefs.follow(*self._episode[step - 1], seen) if step == len(self._episode) else None
         if belief is None:  # what the rules call impossible: anything that would look so
-            belief = self._anything_like(seen, step)
+            belief = self._beliefs.anything_like(seen, step)
         row = self._rows.get(belief)
         action = self._vote(belief, left) if row is None else int(self._belief_best[left - 1, row])
         self._episode.append((belief, action))
         return action
-
-    def _anything_like(self, seen: State, step: int) -> Belief:
-        """Every macrostate whose frame may show this, each equally likely, as if it had stood there for long."""
-        like = [s for s in self._play if any(what == seen for _, what in self._sight.seen(s, step))] or self._play
-        return step, tuple(((state,) * max(self._sight.lag, 1), 1.0 / len(like)) for state in like)
 
     def _vote(self, belief: Belief, left: int) -> int:
         votes = np.zeros(self._rules.n_actions)

@@ -6,17 +6,16 @@ import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from imagine_bench.exact.beliefs import BeliefRules, TooManyBeliefsError
-from imagine_bench.exact.factors import FactorGraph, Scope, factor_graph
+from imagine_bench.exact.beliefs import BeliefRules
+from imagine_bench.exact.factors import FactorGraph, Machine, Scope, factor_graph, machine
 from imagine_bench.exact.learner import LearnerRun, learn
-from imagine_bench.exact.machine import Machine, machine
 from imagine_bench.exact.memoryless import best_without_memory
-from imagine_bench.interfaces import Floats, Rules, TaskSpec
-from imagine_bench.rules import RuleTables, evaluate, horizon_optimum, shortest_plans, tabulate
+from imagine_bench.interfaces import Floats, Rules, Sight, TaskSpec
+from imagine_bench.rules import evaluate, horizon_optimum, shortest_plans, tabulate
 
 _LARGE = 5_000
 _A_SECOND = 1_500
@@ -78,7 +77,7 @@ def certificate(spec: TaskSpec) -> Certificate:
     beliefs: int | None = 0
     memoryless = bound = None
     if spec.sight is not None:
-        optimum, beliefs = _with_memory(spec, tables, seen_optimum)
+        optimum, beliefs = _with_memory(spec.rules, spec.sight, spec.horizon, seen_optimum)
         found = best_without_memory(spec.rules, spec.sight, spec.horizon, bound=optimum)
         memoryless = found.value
         bound = found.bound
@@ -117,7 +116,9 @@ def optimum(spec: TaskSpec) -> float:
     """The largest success probability with memory; where there are too many beliefs, a bound on it."""
     tables = tabulate(spec.rules)
     seen_optimum = float(horizon_optimum(tables, spec.horizon).success[tables.starts].mean())
-    return seen_optimum if spec.sight is None else _with_memory(spec, tables, seen_optimum)[0]
+    if spec.sight is None:
+        return seen_optimum
+    return _with_memory(spec.rules, spec.sight, spec.horizon, seen_optimum)[0]
 
 
 def certificate_rows(found: Certificate) -> dict[str, str]:
@@ -154,16 +155,13 @@ def _percent(share: float) -> str:
     return f"{np.floor(share * 1e4 + 1e-3) / 100:.2f} %"
 
 
-def _with_memory(spec: TaskSpec, tables: RuleTables, seen_optimum: float) -> tuple[float, int | None]:
+def _with_memory(rules: Rules, sight: Sight, horizon: int, seen_optimum: float) -> tuple[float, int | None]:
     """The optimum with memory and the number of beliefs, or the bound that everything seen at once gives."""
-    assert spec.sight is not None
-    play = [state for state in tables.index if not spec.rules.is_terminal(state)]
-    beliefs = BeliefRules(spec.rules, spec.sight, play, spec.horizon)
-    try:
-        known = tabulate(cast(Rules, beliefs), depth=spec.horizon)
-    except TooManyBeliefsError:
+    beliefs = BeliefRules(rules, sight, horizon)
+    known = beliefs.tables()
+    if known is None:
         return seen_optimum, None
-    success: Floats = horizon_optimum(known, spec.horizon).success[known.starts]
+    success: Floats = horizon_optimum(known, horizon).success[known.starts]
     shares = np.array([share for share, _ in beliefs.starts.values()])
     return min(float((success * shares).sum()), seen_optimum), len(known.index)
 

@@ -1,4 +1,6 @@
-"""The factor graph of a machine: which coordinates decide which, by exact tests over everything that is reached.
+"""A macrostate machine as arrays, and its factor graph: which coordinates decide which.
+
+The graph is found by exact tests over everything that is reached.
 
 A coordinate's next value, given the action, depends on the smallest set of coordinates of which it is a function in
 every macrostate of play (of equal sets, the one with the coordinate itself, then the first). Coordinates that are drawn
@@ -16,8 +18,40 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.exact.machine import Ints, Machine
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats, Ints
+from imagine_bench.rules import Rules, every_outcome
+
+Class = tuple[float, bool, bool]
+"""What a macro-action gave: the reward, whether the episode ended, whether as a success."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """Every macro-action out of every macrostate of play that is reached from the starts, and each of its outcomes.
+
+    Shapes: ``S`` macrostates, those of play first, ``P`` of play, ``A`` actions, ``N`` outcomes, ``M`` coordinates.
+    """
+
+    coordinates: Ints  #: Shape (S, M).
+    n_play: int  #: P
+    n_actions: int  #: A
+    starts: Ints  #: Rows an episode may start in.
+    classes: tuple[Class, ...]
+    pair: Ints  #: ``action * P + row`` of each outcome, ascending. Shape (N,).
+    after: Ints  #: Row of its macrostate. Shape (N,).
+    probability: Floats  #: Shape (N,).
+    class_: Ints  #: Index in ``classes``. Shape (N,).
+
+    @property
+    def action(self) -> Ints:
+        """The action of each outcome. Shape (N,)."""
+        return self.pair // self.n_play
+
+    @property
+    def before(self) -> Ints:
+        """The row that each outcome comes from. Shape (N,)."""
+        return self.pair % self.n_play
+
 
 Scope = tuple[int, ...]
 """Coordinates, ascending."""
@@ -67,6 +101,30 @@ class FactorGraph:
         """Local entries of the dynamics and conditions of classes: all that there is to know."""
         entries = sum(int(factor.entry.max()) + 1 for factor in self.factors)
         return entries + sum(claim.conditions for claim in self.claims)
+
+
+def machine(rules: Rules) -> Machine:
+    """Follow the rules from their starts."""
+    found = every_outcome(rules.start_states, rules.n_actions, rules.outcomes, follow=True)
+    states = np.array(list(found.index), dtype=np.int64)
+    ends = np.setdiff1d(np.arange(len(states)), found.asked)
+    order = np.concatenate([found.asked, ends])
+    row = np.argsort(order)  # of each in this order
+    pair = found.action * len(found.asked) + row[found.before]
+    by_pair = np.argsort(pair, kind="stable")
+    kinds = list(zip(found.reward.tolist(), found.terminated.tolist(), found.success.tolist(), strict=True))
+    classes = {kind: number for number, kind in enumerate(dict.fromkeys(kinds))}
+    return Machine(
+        coordinates=states[order],
+        n_play=len(found.asked),
+        n_actions=rules.n_actions,
+        starts=row[[found.index[state] for state in rules.start_states]],
+        classes=tuple(classes),
+        pair=pair[by_pair],
+        after=row[found.after][by_pair],
+        probability=found.probability[by_pair],
+        class_=np.array([classes[kind] for kind in kinds])[by_pair],
+    )
 
 
 def keys(values: Ints, scope: Iterable[int]) -> Ints:

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imagine_bench.exact.factors import FactorGraph, keys, numbered
-from imagine_bench.exact.machine import Ints, Machine, Mask
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Bools, Floats, Ints
+from imagine_bench.exact.factors import FactorGraph, Machine, keys, numbered
 
 _SUCCESS = 10_000.0  # of return: success comes first
 _EPS = 1e-6
@@ -109,7 +108,7 @@ class _Learner:
         self.clauses = open_
         return learned
 
-    def possible(self) -> Mask:
+    def possible(self) -> Bools:
         """Which classes each point may have. Shape (C, Q)."""
         found = np.zeros((len(self.machine.classes), len(self.alike)), dtype=np.bool_)
         free = np.ones(len(self.alike), dtype=np.bool_)  # of every claim above
@@ -153,7 +152,7 @@ class _Learner:
         self._want(np.unique(open_starts), known, settled, sure, sure & alive)
         return not len(open_starts)
 
-    def _imagined(self, worth: Floats, known: Mask) -> Floats:
+    def _imagined(self, worth: Floats, known: Bools) -> Floats:
         """The best that an unknown entry may lead to: any values of all the coordinates that the action moves."""
         machine = self.machine
         if self.graph.read != "next" or math.prod(self.box) > _CELLS:
@@ -171,10 +170,10 @@ class _Learner:
     def _want(
         self,
         front: Ints,
-        known: Mask,
-        settled: Mask,
-        sure: Mask,
-        goes_on: Mask,
+        known: Bools,
+        settled: Bools,
+        sure: Bools,
+        goes_on: Bools,
     ) -> None:
         """Find the unknown facts that the plans from some rows touch."""
         self.wanted = np.zeros(len(self.known), dtype=np.bool_)

@@ -23,7 +23,8 @@ from imagine_bench.interfaces import Floats, Outcome, Rules, State, TaskSpec
 from imagine_bench.judge.predictions import Predictions
 from imagine_bench.judge.questions import FRAMES, EvalSet
 from imagine_bench.judge.truth import added_up
-from imagine_bench.judge.values import Dynamics, branches
+from imagine_bench.judge.values import branches
+from imagine_bench.rules import Dynamics
 from imagine_bench.seeding import SeedTree
 
 STREAMS = 1_000  # streams of random macro-actions of each world

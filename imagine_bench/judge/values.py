@@ -5,18 +5,17 @@ Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.arrays import Bools, Ints
-from imagine_bench.interfaces import Floats, Outcome, Rules, State
+from imagine_bench.interfaces import Floats, Rules, State
+from imagine_bench.rules import Dynamics, every_outcome
 
 _TIE = 1e-9
-Dynamics = Callable[[State, int], Sequence[Outcome]]
-"""What may come of a macro-action in a macrostate, as :meth:`.Rules.outcomes` says it."""
 
 
 class Branches(NamedTuple):
@@ -31,15 +30,13 @@ class Branches(NamedTuple):
 
 def branches(states: Sequence[State], n_actions: int, dynamics: Dynamics) -> Branches:
     """Write out what may come of macro-actions in some macrostates."""
-    index = {state: row for row, state in enumerate(states)}
-    every = [dynamics(state, action) for state in states for action in range(n_actions)]
-    table = np.zeros((4, len(every), max(map(len, every))))
-    for pair, outcomes in enumerate(every):
-        for branch, each in enumerate(outcomes):
-            row = index.setdefault(each.macrostate, len(index))
-            table[:, pair, branch] = row, each.probability, each.reward, each.terminated
+    found = every_outcome(states, n_actions, dynamics, follow=False)
+    pair = found.before * n_actions + found.action
+    branch = np.arange(len(pair)) - np.searchsorted(pair, pair)
+    table = np.zeros((4, len(states) * n_actions, 1 + int(branch.max())))
+    table[:, pair, branch] = found.after, found.probability, found.reward, found.terminated
     following, probability, reward, terminated = table.reshape(4, len(states), n_actions, -1)
-    return Branches(tuple(index), following.astype(np.int64), probability, reward, terminated.astype(np.bool_))
+    return Branches(tuple(found.index), following.astype(np.int64), probability, reward, terminated.astype(np.bool_))
 
 
 class Model(NamedTuple):

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.arrays import Info, Observed
+from imagine_bench.arrays import Action, Info, Observed
 from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Rules, State, Transition
@@ -41,28 +41,14 @@ class EpisodeRecord:
     """The record of an episode, while it is played; see :class:`.KeptEpisodes`."""
 
     start: list[int]
+    at: list[int]  #: The newest macrostate
     fingerprint: int
     actions: list[int] = field(default_factory=list)
     total: float = 0.0
     faults: int = 0
     success: bool = False
     sim_time_s: float = 0.0
-
-    @classmethod
-    def begun(cls, env: Env, info: Info) -> EpisodeRecord:
-        """One that has just been reset."""
-        start = [int(value) for value in info["macrostate"]]
-        return cls(start, zlib.crc32(f"{start} {env.unwrapped.np_random.bit_generator.state}".encode()))
-
-    def add(self, action: int, reward: float, info: Info) -> None:
-        """Take in one macro-action."""
-        self.actions.append(int(action))
-        self.total += reward
-        self.faults += bool(info["fault"])
-        self.success = bool(info["is_success"])
-        self.sim_time_s += float(info.get("sim_time_s", 0.0))
-        happened = np.array([*info["macrostate"], reward], dtype=np.float64)
-        self.fingerprint = zlib.crc32(happened.tobytes(), self.fingerprint)
+    over: bool = False
 
 
 class TestFigures(TypedDict):
@@ -204,31 +190,53 @@ def _require_sound(env: Env, seen: Observed, reward: SupportsFloat) -> None:
         raise InvalidValueError(f"{env} gave the reward {reward}; rewards are finite.")
 
 
+class RecordedEnv(Wrapper):
+    """Keeps the record of its newest episode as ``episode``."""
+
+    episode: EpisodeRecord
+
+    def reset(self, *, seed: int | None = None, options: Options = None) -> tuple[Observed, Info]:
+        """As the environment's; begins a new record."""
+        seen, info = self.env.reset(seed=seed, options=options)
+        start = [int(value) for value in info["macrostate"]]
+        draws = self.env.unwrapped.np_random.bit_generator.state
+        self.episode = EpisodeRecord(start, start, zlib.crc32(f"{start} {draws}".encode()))
+        return seen, info
+
+    def step(self, action: Action) -> tuple[Observed, SupportsFloat, bool, bool, Info]:
+        """As the environment's; adds to the record."""
+        after = self.env.step(action)
+        _, reward, terminated, truncated, info = after
+        played = self.episode
+        played.at = np.asarray(info["macrostate"]).tolist()
+        played.actions.append(int(action))
+        played.total += float(reward)
+        played.faults += bool(info["fault"])
+        played.success = bool(info["is_success"])
+        played.sim_time_s += float(info.get("sim_time_s", 0.0))
+        played.over = bool(terminated or truncated)
+        happened = np.array([*played.at, reward], dtype=np.float64)
+        played.fingerprint = zlib.crc32(happened.tobytes(), played.fingerprint)
+        return after
+
+
 def play_test_episode(env: Env, agent: Agent, *, seed: int, privileged: bool) -> EpisodeRecord:
     """Play a test episode greedily."""
-    begun = list[EpisodeRecord]()
-
-    def begin(observation: Observation, info: Info) -> None:
-        if not begun:
-            begun.append(EpisodeRecord.begun(env, info))
-
-    for transition, info in play(env, agent, seed=seed, explore=False, privileged=privileged, before_acting=begin):
-        begun[0].add(transition.action, transition.reward, info)
-    return begun[0]
+    recorded = RecordedEnv(env)
+    for _ in play(recorded, agent, seed=seed, explore=False, privileged=privileged):
+        pass
+    return recorded.episode
 
 
 def replay(env: Env, seed: int, actions: Sequence[int]) -> tuple[EpisodeRecord, bool]:
     """Play the macro-actions of an episode again, as far as it goes, and whether it ends with the last of them."""
-    _, info = env.reset(seed=seed)
-    played = EpisodeRecord.begun(env, info)
-    over = False
+    recorded = RecordedEnv(env)
+    recorded.reset(seed=seed)
     for action in actions:
-        if over or action not in env.action_space:
-            return played, False
-        _, reward, terminated, truncated, info = env.step(action)
-        played.add(action, float(reward), info)
-        over = terminated or truncated
-    return played, bool(over)
+        if recorded.episode.over or action not in env.action_space:
+            return recorded.episode, False
+        recorded.step(action)
+    return recorded.episode, recorded.episode.over
 
 
 class ResetBy(Wrapper):

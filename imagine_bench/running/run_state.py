@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any, SupportsFloat
 
 import gymnasium
-import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.arrays import Action, Info, Observed, State
+from imagine_bench.arrays import Action, Info, Observed
 from imagine_bench.data.folder import read_dataset
-from imagine_bench.environments import Env, Wrapper
+from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import OBSERVATIONS, Agent, AgentState
 from imagine_bench.interfaces.capabilities import ExternalTrainer, QueryingAgent, TransferLearner
@@ -25,8 +24,9 @@ from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import RECENT, OnProgress, Phase, Progress, RunSpec
 from imagine_bench.running.evaluation import (
     EpisodeLog,
-    EpisodeRecord,
     EvaluationCounts,
+    Options,
+    RecordedEnv,
     Teacher,
     demonstrator,
     start_from,
@@ -89,36 +89,34 @@ class Counters:
         return counters
 
 
-class CountVisits(Wrapper):
+class CountVisits(RecordedEnv):
     """Keeps training episodes, and counts which macro-actions are tried where; the agent is told nothing."""
 
     def __init__(self, env: Env, counters: Counters) -> None:
         super().__init__(env)
         self._counters = counters
-        self._at = list[int]()
-        self._episode: EpisodeRecord | None = None
+        self._is_open = False
 
-    def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
+    def reset(self, *, seed: int | None = None, options: Options = None) -> tuple[Observed, Info]:
         """As the environment's; an episode that was left before its end is kept as far as it came."""
-        if self._episode is not None:
-            self._counters.training.add(self._episode)
-        seen, info = self.env.reset(seed=seed, options=options)
-        self._episode = EpisodeRecord.begun(self.env, info)
-        self._at = self._episode.start
-        return seen, info
+        self._close()
+        self._is_open = True
+        return super().reset(seed=seed, options=options)
 
     def step(self, action: Action) -> tuple[Observed, SupportsFloat, bool, bool, Info]:
         """As the environment's."""
-        after = self.env.step(action)
-        _, reward, terminated, truncated, info = after
-        self._counters.try_out(self._at, int(action))
-        self._at = np.asarray(info["macrostate"]).tolist()
-        if self._episode is not None:
-            self._episode.add(int(action), float(reward), info)
-            if terminated or truncated:
-                self._counters.training.add(self._episode)
-                self._episode = None
+        before = self.episode.at
+        after = super().step(action)
+        self._counters.try_out(before, int(action))
+        if self.episode.over:
+            self._close()
         return after
+
+    def _close(self) -> None:
+        """Keep the newest episode, unless it was kept."""
+        if self._is_open:
+            self._counters.training.add(self.episode)
+        self._is_open = False
 
 
 def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options: Any) -> Env:

@@ -12,9 +12,8 @@ from scipy import stats
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate, certificate_rows
-from imagine_bench.exact.factors import factor_graph
+from imagine_bench.exact.factors import factor_graph, machine
 from imagine_bench.exact.learner import learn
-from imagine_bench.exact.machine import machine
 
 
 def test_the_thesis_puzzle_has_39_facts():

@@ -55,7 +55,7 @@ def test_the_oracle_reaches_what_the_certificate_says(name):
 def test_what_is_shown_is_possible_by_the_sight(name):
     """Every episode's frames, late or hiding, are among those that the belief machine expects."""
     spec, rng = registry.task(name), np.random.default_rng(3)
-    beliefs = BeliefRules(spec.rules, spec.sight, spec.rules.start_states, spec.horizon)
+    beliefs = BeliefRules(spec.rules, spec.sight, spec.horizon)
     hidden = late = 0
     with closing(gymnasium.make(spec.env_id, execution="kinematic", disable_env_checker=True)) as env:
         for seed in range(20):
