@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from imagine_bench.arrays import Ints
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.seeding import SeedTree
@@ -140,7 +141,7 @@ class DQN:
         """Values of every macro-action at the mean latents. Shape (A,)."""
         return self._values(self.tested, observation)
 
-    def read_frames(self, frames: Frame) -> NDArray[np.int64]:
+    def read_frames(self, frames: Frame) -> Ints:
         """Read macrostates with the encoder's probe; see :class:`imagine_bench.interfaces.capabilities.FrameReader`."""
         encoder = self.perception.encoder
         return encoder.read_macrostate(encoder.encode(frames)[0])

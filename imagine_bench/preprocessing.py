@@ -14,6 +14,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Ints
 from imagine_bench.errors import require_known
 
 STRIP_WIDTH = 22
@@ -35,7 +36,7 @@ def gray_name(cubes: int) -> str:
 
 
 @cache
-def _windows(cubes: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _windows(cubes: int) -> list[tuple[Ints, Ints]]:
     """Rows (H, 1) and columns (W,) of each cube's channel in a frame, left to right."""
     if cubes in _STRIP_STARTS:
         return [(np.arange(64)[:, None], start + np.arange(STRIP_WIDTH)) for start in _STRIP_STARTS[cubes]]

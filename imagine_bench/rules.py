@@ -102,13 +102,13 @@ class RuleTables:
     """A macrostate machine as arrays; a terminated outcome leaves the machine, so rows may sum to less than 1."""
 
     index: dict[State, int]  #: macrostate to row
-    starts: NDArray[np.int64]  #: rows an episode may start in, equally likely
+    starts: Ints  #: rows an episode may start in, equally likely
     alive: csr_array  #: probability of going on in each next macrostate, sparse. Shape (A S, S).
     reward: Floats  #: expected reward. Shape (A, S).
     success: Floats  #: probability of ending here as a success. Shape (A, S).
 
 
-def require_macrostates(rules: Rules, macrostates: NDArray[np.int64]) -> NDArray[np.int64]:
+def require_macrostates(rules: Rules, macrostates: Ints) -> Ints:
     """Rows of macrostates (N, M), checked, as an array.
 
     Raises:
@@ -223,13 +223,13 @@ def optimal_values(tables: RuleTables) -> Floats:
     )
 
 
-def optimal_actions(tables: RuleTables) -> NDArray[np.bool_]:
+def optimal_actions(tables: RuleTables) -> Bools:
     """Which actions an optimal agent may choose in each macrostate. Shape (A, S)."""
     action_values = optimal_values(tables)
     return np.asarray(action_values >= action_values.max(axis=0) - _TIE_TOLERANCE)
 
 
-def optimal_policy(tables: RuleTables) -> NDArray[np.int64]:
+def optimal_policy(tables: RuleTables) -> Ints:
     """The action of an optimal agent in each macrostate, the lowest index among equals. Shape (S,)."""
     return np.asarray(optimal_actions(tables).argmax(axis=0), dtype=np.int64)
 
@@ -262,7 +262,7 @@ def horizon_optimum(tables: RuleTables, horizon: int) -> HorizonOptimum:
     return HorizonOptimum(success=success, returns=returns, actions=actions)
 
 
-def shortest_plans(tables: RuleTables) -> NDArray[np.int64]:
+def shortest_plans(tables: RuleTables) -> Ints:
     """The fewest macro-actions after which a success is possible from each macrostate, -1 where none is. Shape (S,)."""
     n_states = tables.reward.shape[1]
     links = tables.alive.tocoo()
@@ -336,7 +336,7 @@ def fewest_actions(rules: Rules, start: State) -> int:
     raise InvalidValueError(f"The rules allow no success from {start}.")
 
 
-def greedy(policy: NDArray[np.int64], n_actions: int) -> Floats:
+def greedy(policy: Ints, n_actions: int) -> Floats:
     """A deterministic policy (S,) as action probabilities (A, S)."""
     return np.asarray(np.eye(n_actions)[:, policy])
 

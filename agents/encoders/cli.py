@@ -10,14 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Arrays, Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, TaskSpec, appearance_of_tests, bundled_name
 from imagine_bench.preprocessing import preprocess
@@ -121,7 +119,7 @@ def summary(card: EncoderCard) -> str:
 
 
 def sample_sheet(
-    encoder: Encoder, spec: TaskSpec, frames: Frame, macrostates: NDArray[np.int64], generator: torch.Generator
+    encoder: Encoder, spec: TaskSpec, frames: Frame, macrostates: Ints, generator: torch.Generator
 ) -> Figure:
     """A figure of what an encoder keeps, one column a frame: camera, network input, decoded mean and decoded sample.
 

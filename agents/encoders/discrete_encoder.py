@@ -17,10 +17,10 @@ import itertools
 import numpy as np
 import scipy  # its parts load, slowly, when first used: an agent that only sees with an encoder needs none
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from imagine_bench.arrays import Bools, Floats, Ints
 from imagine_bench.errors import InvalidValueError
 
 from .network import CERTAIN, EncoderNetwork
@@ -138,7 +138,7 @@ def discover(images: Tensor, generator: torch.Generator) -> DiscreteEncoder:
     return network
 
 
-def pixel_groups(pixels: NDArray[np.float64]) -> list[NDArray[np.bool_]]:
+def pixel_groups(pixels: Floats) -> list[Bools]:
     """Groups of pixels (N, X) that depend on one another, by average linkage, but for those that hardly vary.
 
     Masks of shape (X,), the most varied first.
@@ -157,7 +157,7 @@ def pixel_groups(pixels: NDArray[np.float64]) -> list[NDArray[np.bool_]]:
     return [np.isin(np.arange(pixels.shape[1]), moving[label == index]) for index in kept]
 
 
-def dependence(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+def dependence(pixels: Floats) -> Floats:
     """How much columns (N, X) depend on one another: the largest absolute correlation among each and its square.
 
     The squares catch pixels that are uncorrelated but not independent. Shape (X, X), in [0, 1], ones on the diagonal.
@@ -173,7 +173,7 @@ def dependence(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(largest, largest.T)
 
 
-def clouds(points: NDArray[np.float64]) -> NDArray[np.int64]:
+def clouds(points: Floats) -> Ints:
     """Which separate cloud each point (N, F) belongs to, numbered by size from 0; -1 for none. Shape (N,).
 
     Two points are linked if each is among the other's nearest, and equal points always are; clouds are the connected
@@ -194,7 +194,7 @@ def clouds(points: NDArray[np.float64]) -> NDArray[np.int64]:
     return _merge_close(shifted, _by_size(label, _LEAST_SHARE * count))
 
 
-def _by_size(label: NDArray[np.int64], least: float = 0.0) -> NDArray[np.int64]:
+def _by_size(label: Ints, least: float = 0.0) -> Ints:
     """Labels (N,), -1 for none, numbered by size from 0; those of at most ``least`` points become -1."""
     sizes = np.bincount(label[label >= 0])
     number = np.append(np.argsort(-sizes, kind="stable").argsort(), -1)
@@ -202,7 +202,7 @@ def _by_size(label: NDArray[np.int64], least: float = 0.0) -> NDArray[np.int64]:
     return number[label]
 
 
-def _merge_close(points: NDArray[np.float64], label: NDArray[np.int64]) -> NDArray[np.int64]:
+def _merge_close(points: Floats, label: Ints) -> Ints:
     """Clouds (N,) of points (N, F), -1 for none, with narrow gaps closed; numbered by size anew.
 
     Pixels turn smooth motion into steps, and another factor behind this one changes its pixels: either splits a value.
@@ -221,7 +221,7 @@ def _merge_close(points: NDArray[np.float64], label: NDArray[np.int64]) -> NDArr
     return _by_size(np.append(whole, -1)[label])
 
 
-def _directions(pixels: NDArray[np.float64], group: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _directions(pixels: Floats, group: Bools) -> Floats:
     """The principal directions of a group of pixels (X,), among all pixels (N, X). Shape (F, X)."""
     own = pixels[:, group]
     centred = own - own.mean(axis=0)
@@ -231,14 +231,14 @@ def _directions(pixels: NDArray[np.float64], group: NDArray[np.bool_]) -> NDArra
     return basis
 
 
-def _balanced(value: NDArray[np.int64], generator: torch.Generator) -> NDArray[np.int64]:
+def _balanced(value: Ints, generator: torch.Generator) -> Ints:
     """Rows of exemplars, drawn with replacement, as many of each value but for one."""
     rows = [np.flatnonzero(value == index) for index in range(int(value.max()) + 1)]
     picks = [rows[index % len(rows)] for index in range(EXEMPLARS)]
     return np.concatenate([own[torch.randint(len(own), (1,), generator=generator).numpy()] for own in picks])
 
 
-def _fit_appearance(network: DiscreteEncoder, images: Tensor, groups: list[NDArray[np.bool_]]) -> None:
+def _fit_appearance(network: DiscreteEncoder, images: Tensor, groups: list[Bools]) -> None:
     """Take the mean image as background, and of each value how the factor's own pixels differ from it."""
     channels, height, width = images.shape[1:]
     grid = (channels, -(-height // POOL), -(-width // POOL))

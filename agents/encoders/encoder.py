@@ -17,6 +17,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from imagine_bench.arrays import Ints
 from imagine_bench.errors import ArtefactError, InvalidValueError, brief, why, writing
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import content_hash
@@ -123,7 +124,7 @@ class Encoder:
         _, height, width = image_shape(self.card.preprocessing)
         return view(self.network.decode(latents, height, width).cpu().numpy(), self.card.preprocessing)
 
-    def read_macrostate(self, latents: Tensor) -> NDArray[np.int64]:
+    def read_macrostate(self, latents: Tensor) -> Ints:
         """What the evaluation-only probe reads from ``latents`` (N, Z); agents must not use it. Shape (N, M)."""
         return self.probe.read(latents.to(self.device))
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
+
+from imagine_bench.arrays import Ints
 
 from ..networks.mlp import initialise, relu_layers
 
@@ -59,14 +59,12 @@ class Probe(nn.Module):
         return torch.split(joined, list(self.cardinalities), dim=1)
 
     @torch.no_grad()
-    def read(self, latents: Tensor) -> NDArray[np.int64]:
+    def read(self, latents: Tensor) -> Ints:
         """The most likely macrostates of ``latents`` (N, Z). Shape (N, M)."""
         return torch.stack([part.argmax(dim=1) for part in self.logits(latents)], dim=1).cpu().numpy()
 
 
-def train_probe(
-    probe: Probe, latents: Latents, macrostates: NDArray[np.int64], *, steps: int, generator: torch.Generator
-) -> None:
+def train_probe(probe: Probe, latents: Latents, macrostates: Ints, *, steps: int, generator: torch.Generator) -> None:
     """Fit ``probe`` in place, on the CPU, by cross-entropy to freshly sampled latents: it must read imagined ones too.
 
     ``macrostates`` (N, M) are the labels of ``latents`` (N, Z); ``generator`` draws weights, batches and latent noise.
@@ -88,6 +86,6 @@ def train_probe(
         schedule.step()
 
 
-def accuracy(probe: Probe, latents: Tensor, macrostates: NDArray[np.int64]) -> float:
+def accuracy(probe: Probe, latents: Tensor, macrostates: Ints) -> float:
     """Fraction of ``latents`` (N, Z) whose whole macrostate (N, M) is read right."""
     return float((probe.read(latents) == macrostates).all(axis=1).mean())

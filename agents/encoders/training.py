@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.appearance import appearance_name
+from imagine_bench.arrays import Ints
 from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.interfaces import Frame, TaskSpec, appearance_of_tests
 from imagine_bench.preprocessing import preprocess
@@ -54,14 +55,14 @@ class FrameSet(NamedTuple):
     """Labelled frames: images (N, C, H, W), preprocessed, uint8 to quarter the memory; macrostates (N, M)."""
 
     images: Tensor
-    macrostates: NDArray[np.int64]
+    macrostates: Ints
 
     def batch(self, rows: Tensor) -> Tensor:
         """The images of ``rows`` (B,) in [0, 1]. Shape (B, C, H, W)."""
         return self.images[rows].float() / 255.0
 
 
-def shown_states(spec: TaskSpec) -> NDArray[np.int64]:
+def shown_states(spec: TaskSpec) -> Ints:
     """Return everything that frames of a task may show: every macrostate, with -1 for hidden coordinates."""
     states = states_of(spec.rules)
     sight = spec.sight
@@ -75,7 +76,7 @@ def classes_of(spec: TaskSpec) -> tuple[int, ...]:
     return tuple(len(values) + also for values, also in zip(spec.macrostate_values, hidden, strict=True))
 
 
-def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator) -> tuple[Frame, NDArray[np.int64]]:
+def draw_frames(spec: TaskSpec, appearance: str, n: int, rng: np.random.Generator) -> tuple[Frame, Ints]:
     """Frames (n, 64, 64, 3) of macrostates drawn uniformly from all that frames show, and their classes (n, M)."""
     states = shown_states(spec)
     macrostates = states[rng.integers(len(states), size=n)]
@@ -93,7 +94,7 @@ def frame_set(
     """Render ``n`` labelled frames of uniformly drawn macrostates, preprocessed as the task declares or else."""
     prepare = prepare or preprocess(spec.preprocessing)
     images: list[Tensor] = []
-    labels: list[NDArray[np.int64]] = []
+    labels: list[Ints] = []
     for start in range(0, n, _CHUNK):
         frames, macrostates = draw_frames(spec, appearance, min(_CHUNK, n - start), rng)
         images.append(torch.from_numpy(np.rint(prepare(frames) * 255.0).astype(np.uint8)))

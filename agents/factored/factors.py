@@ -11,15 +11,13 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Arrays, Bools, Ints
 
 Code = tuple[int, ...]
-Ints = NDArray[np.int64]
 Codes = Ints
 """Codes as rows. Shape (..., P)."""
-Mask = NDArray[np.bool_]
+Mask = Bools
 
 
 def table_size(factors: Sequence[int], sizes: Sequence[int]) -> int:

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout, planned_actions
 from imagine_bench.interfaces.model import UNCERTAINTIES
@@ -154,9 +155,7 @@ class ImaginingAgent(DQN):
         generator = torch.Generator(z.device).manual_seed(int(rng.integers(2**63)))
         return self.imagination.ignorance(z, torch.arange(self.n_actions, device=z.device), generator).cpu().numpy()
 
-    def imagine(
-        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
-    ) -> ImaginedRollout:
+    def imagine(self, frame: Frame, *, actions: Ints | None, depth: int, rng: np.random.Generator) -> ImaginedRollout:
         """Imagine up to ``depth`` transitions from ``frame``; see :class:`.capabilities.Imaginer`.
 
         InvalidValueError if there is no depth to imagine, or actions are none.

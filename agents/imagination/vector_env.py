@@ -11,7 +11,7 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Info, State
+from imagine_bench.arrays import Bools, Info, Ints, State
 from imagine_bench.errors import InvalidValueError, brief, require_integer
 from imagine_bench.interfaces import Floats, Frame
 from imagine_bench.interfaces.model import UNCERTAINTIES
@@ -20,12 +20,11 @@ from .agent import ImaginingAgent
 from .rollouts import LATENT_LIMIT, Imagination, ImaginedStep
 
 Latents = NDArray[np.float32]
-Switches = NDArray[np.bool_]
 VERDICT = ("accepted", *UNCERTAINTIES)
 """What an info says of a transition."""
 
 
-class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic]]):
+class ImaginedVectorEnv(VectorEnv[Latents, Ints, NDArray[np.generic]]):
     """N imagined episodes side by side; observations are latents (N, Z), float32, actions (N,) in [0, A).
 
     An episode starts at a latent of the pool, ends where the model says so (``terminated``), and is cut after
@@ -83,7 +82,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
         self._gathered.zero_()
         return self._z.copy(), {}
 
-    def step(self, actions: NDArray[np.int64]) -> tuple[Latents, Floats, Switches, Switches, Info]:
+    def step(self, actions: Ints) -> tuple[Latents, Floats, Bools, Bools, Info]:
         """Imagine one transition of each episode: observations, rewards, terminated, truncated, info.
 
         InvalidValueError before :meth:`reset`, or for actions that are none; DivergedError if the model predicts NaN.
@@ -115,7 +114,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, NDArray[np.int64], NDArray[np.generic
         self._z = reached
         return self._z.copy(), reward, terminated, truncated, info
 
-    def _info(self, step: ImaginedStep, accepted: Switches, reached: Latents, ended: Switches) -> Info:
+    def _info(self, step: ImaginedStep, accepted: Bools, reached: Latents, ended: Bools) -> Info:
         scores = self.imagination.uncertainties(step)
         values = {"accepted": accepted, **{name: scores[name].cpu().numpy() for name in UNCERTAINTIES}}
         info: Info = {}

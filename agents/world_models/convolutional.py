@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import AgentContext, Frame
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined
@@ -77,7 +77,7 @@ class Convolutional:
             optimiser.step()
 
     @torch.no_grad()
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """One future, fed its own pictures; see :class:`.interfaces.model.WorldModel`."""
         del samples, rng
         asked = torch.tensor(actions[:, frames.shape[1] - 1 :])

@@ -13,10 +13,9 @@ from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.arrays import Array, Arrays
+from imagine_bench.arrays import Array, Arrays, Ints
 from imagine_bench.interfaces import AgentContext, Frame
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined
@@ -75,13 +74,13 @@ class LatentModel:
         for _ in range(UPDATES):
             yield memory.sample(model.batch_size, generator, spread=model.spread, balance=model.balance)
 
-    def states(self, frames: Frame, actions: NDArray[np.int64]) -> Tensor:
+    def states(self, frames: Frame, actions: Ints) -> Tensor:
         """What is imagined from: here the latents (N, Z) of the latest of frames (N, K, 64, 64, 3)."""
         del actions
         return self.encoder.encode(frames[:, -1])[0]
 
     @torch.no_grad()
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """Futures in closed loop through latents; see :class:`.interfaces.model.WorldModel`."""
         generator = self._generator(rng)
         rows = len(frames)

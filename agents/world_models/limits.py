@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Frame, State, TaskSpec
 from imagine_bench.interfaces.episodes import Episodes
@@ -34,7 +35,7 @@ class Copy:
         """Learn nothing."""
         del dataset, rng
 
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """The last frame, whatever is done; see :class:`imagine_bench.interfaces.model.WorldModel`."""
         del samples, rng
         rows = len(frames)
@@ -58,7 +59,7 @@ class Exact:
         """Learn nothing: it knows."""
         del dataset, rng
 
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """Every outcome with its probability; see :class:`imagine_bench.interfaces.model.WorldModel`."""
         del samples, rng
         depth = actions.shape[1] - frames.shape[1] + 1
@@ -80,7 +81,7 @@ class Exact:
         unknown = np.zeros((len(frames), depth))
         return Imagined(pictures=images, probabilities=weights, rewards=rewards, p_ended=ended, epistemic=unknown)
 
-    def _outcomes(self, frame: Frame, actions: NDArray[np.int64]) -> tuple[Outcomes, ...]:
+    def _outcomes(self, frame: Frame, actions: Ints) -> tuple[Outcomes, ...]:
         state = self.renderer.shows(frame)
         if state is None:
             raise InvalidValueError("The exact model was given a frame that the judge did not render.")

@@ -84,7 +84,7 @@ class Patches:
             found[:, index] = patch.looks(gray)
         return list(map(tuple, found.tolist()))
 
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """Futures drawn from the table; see :class:`imagine_bench.interfaces.model.WorldModel`.
 
         ``epistemic`` is 1 / (1 + n) of the patch that the table knows least of, seen n times.

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imagine_bench.arrays import Array
+from imagine_bench.arrays import Array, Ints
 from imagine_bench.interfaces import State, TaskSpec, appearance_of_tests
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
@@ -53,12 +52,12 @@ class Reader:
         self.network = network.to_empty(device="cpu")
 
     @torch.no_grad()
-    def read(self, pictures: Array) -> NDArray[np.int64]:
+    def read(self, pictures: Array) -> Ints:
         """Macrostates (N, M) of pictures (N, H, W) or (N, H, W, 3), uint8 or in [0, 1]; -1 where one shows nothing."""
         parts = [self._read(images_of(pictures[at : at + _CHUNK])) for at in range(0, len(pictures), _CHUNK)]
         return np.concatenate(parts) if parts else np.zeros((0, len(self.sizes)), dtype=np.int64)
 
-    def _read(self, images: Tensor) -> NDArray[np.int64]:
+    def _read(self, images: Tensor) -> Ints:
         *coordinates, nothing = self.network(centred(images)).split([*self.sizes, 1], dim=1)
         read = torch.stack([logits.argmax(dim=1) for logits in coordinates], dim=1)
         read[(nothing[:, 0] > self.limits[0]) | (self.likeness(images) < self.limits[1])] = NO_PICTURE
@@ -138,20 +137,20 @@ def train_reader(spec: TaskSpec, appearance: str, *, frames: int = FRAMES, steps
 class _Partners:
     """Frames of other macrostates: often of one that differs in a single coordinate, since such blends are hardest."""
 
-    def __init__(self, states: tuple[State, ...], shown: NDArray[np.int64]) -> None:
+    def __init__(self, states: tuple[State, ...], shown: Ints) -> None:
         self._states = np.array(states)
         self._shown = shown
         order = np.argsort(shown, kind="stable")
         self._rows = np.split(order, np.searchsorted(shown[order], np.arange(1, len(states))))
 
-    def averaged(self, images: Tensor, rows: NDArray[np.int64], rng: np.random.Generator) -> Tensor:
+    def averaged(self, images: Tensor, rows: Ints, rng: np.random.Generator) -> Tensor:
         """Images of rows, every second one the mean of four of its macrostate: decoders know no jitter."""
         alike = np.array([rng.choice(self._rows[self._shown[row]], 3) for row in rows[::2]])  # [B / 2, 3]
         found = images[torch.from_numpy(rows)]
         found[::2] = (found[::2] + images[torch.from_numpy(alike)].sum(dim=1)) / 4.0
         return found
 
-    def of(self, rows: NDArray[np.int64], rng: np.random.Generator) -> Tensor:
+    def of(self, rows: Ints, rng: np.random.Generator) -> Tensor:
         """A partner of each row."""
         return torch.tensor([self._one(int(row), rng) for row in rows])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import AgentContext, Floats, Frame
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined
@@ -35,7 +36,7 @@ class StructuredModel:
             self.model.add(CodeTransition(codes[row], action, codes[row + 1], reward, terminated))
         self.model.outcomes.fit()
 
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """Futures drawn code by code; see :class:`.interfaces.model.WorldModel`.
 
         ``epistemic`` is the probability that something untested decides, ``modal`` that something else happens than
@@ -66,7 +67,7 @@ class StructuredModel:
         )  # fmt: skip
 
     def _step(
-        self, codes: Codes, action: NDArray[np.int64], rng: np.random.Generator
+        self, codes: Codes, action: Ints, rng: np.random.Generator
     ) -> tuple[Codes, Floats, Floats, Floats, Floats]:
         """Next codes (R, P), and of each row reward, P(end), P(untested) and P(other), (R,)."""
         following = np.zeros_like(codes)

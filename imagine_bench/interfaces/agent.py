@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Arrays, Frame, State
+from imagine_bench.arrays import Arrays, Frame, Ints, State
 from imagine_bench.interfaces.observation import FRAME_PX, Observation, Transition
 from imagine_bench.interfaces.task import TaskSpec
 from imagine_bench.rules import Rules
@@ -30,7 +30,7 @@ class ExactWorld:
 
     rules: Rules  #: the macrostate machine
     #: frames (N, 64, 64, 3) of macrostates (N, M), as training shows them
-    render: Callable[[NDArray[np.int64], np.random.Generator], Frame]
+    render: Callable[[Ints, np.random.Generator], Frame]
 
     @classmethod
     def of(cls, spec: TaskSpec, appearance: str) -> ExactWorld | None:

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Frame
+from imagine_bench.arrays import Bools, Floats, Frame, Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.observation import Observation
 
@@ -22,7 +22,7 @@ from imagine_bench.interfaces.observation import Observation
 class ImaginedRollout:
     """An imagined rollout from one real frame; index d is the imagined result of ``actions[d]``."""
 
-    actions: NDArray[np.int64]  #: macro-actions imagined. Shape (D,), int64.
+    actions: Ints  #: macro-actions imagined. Shape (D,), int64.
     #: decoded latents as images of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3)
     frames: NDArray[np.float32]
     #: the decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
@@ -35,8 +35,8 @@ class ImaginedRollout:
     aleatoric: NDArray[np.float32]  #: the same for aleatoric. Shape (D,).
     modal: NDArray[np.float32]  #: the same for modal. Shape (D,).
     #: whether the filter keeps the transition (False from the first rejected one on). Shape (D,).
-    accepted: NDArray[np.bool_]
-    macrostates: NDArray[np.int64]  #: the macrostate a probe reads from each imagined latent. Shape (D, M).
+    accepted: Bools
+    macrostates: Ints  #: the macrostate a probe reads from each imagined latent. Shape (D, M).
 
 
 @runtime_checkable
@@ -60,7 +60,7 @@ def begin_episode(agent: object) -> None:
 class MemoryReader(Protocol):
     """An agent of which can be said what it remembers of an episode; it changes nothing in the agent."""
 
-    def read_memory(self, frame: Frame, sizes: Sequence[int]) -> NDArray[np.int64]:
+    def read_memory(self, frame: Frame, sizes: Sequence[int]) -> Ints:
         """What a linear read-out finds in the memory after the frame that was acted on last, or the next. Shape (M,).
 
         It is fitted on frames that the agent learned from: what a probe saw last of each coordinate of the macrostate,
@@ -154,13 +154,13 @@ class Label:
 class QueryingAgent(Protocol):
     """An agent that can query an oracle about actions that it only imagines."""
 
-    def query(self, observation: Observation) -> NDArray[np.int64] | None:
+    def query(self, observation: Observation) -> Ints | None:
         """Before it acts: macro-actions (D >= 1,) from the frame seen, whose last is asked about; None asks nothing.
 
         The scene is imagined to go on through ends of episodes. Nothing changes but the agent's measurements.
         """
 
-    def learn_label(self, observation: Observation, actions: NDArray[np.int64], label: Label | None) -> None:
+    def learn_label(self, observation: Observation, actions: Ints, label: Label | None) -> None:
         """Take in the label of :meth:`query`; None says that it is a matter of chance, so that there is none."""
 
 
@@ -168,9 +168,7 @@ class QueryingAgent(Protocol):
 class Imaginer(Protocol):
     """An agent that can show what it imagines; it changes nothing in the agent."""
 
-    def imagine(
-        self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
-    ) -> ImaginedRollout:
+    def imagine(self, frame: Frame, *, actions: Ints | None, depth: int, rng: np.random.Generator) -> ImaginedRollout:
         """Imagine up to ``depth`` transitions from a real ``frame``; ``rng`` draws components, noise, dropout masks.
 
         Given ``actions``, (D,) with D <= depth, are never stopped early; None lets the greedy controller choose and
@@ -182,7 +180,7 @@ class Imaginer(Protocol):
 class FrameReader(Protocol):
     """An agent that can say what it takes a frame for."""
 
-    def read_frames(self, frames: Frame) -> NDArray[np.int64]:
+    def read_frames(self, frames: Frame) -> Ints:
         """Macrostates (N, M), as a probe reads them from how frames (N, 64, 64, 3) are encoded; it changes nothing."""
 
 
@@ -190,9 +188,9 @@ class FrameReader(Protocol):
 class ExpectedOutcomes:
     """What a model expects of every macro-action in N frames; what is missing to probability 1 ends the episode."""
 
-    macrostates: NDArray[np.int64]  #: what may follow, B branches, as a probe reads it. Shape (N, A, B, M).
-    p_continues: NDArray[np.float64]  #: probability that this follows and the episode goes on. Shape (N, A, B).
-    reward: NDArray[np.float64]  #: expected reward. Shape (N, A).
+    macrostates: Ints  #: what may follow, B branches, as a probe reads it. Shape (N, A, B, M).
+    p_continues: Floats  #: probability that this follows and the episode goes on. Shape (N, A, B).
+    reward: Floats  #: expected reward. Shape (N, A).
 
 
 @runtime_checkable
@@ -203,7 +201,7 @@ class OutcomePredictor(Protocol):
         """What its model expects from frames (N, 64, 64, 3); ``rng`` draws components, noise, dropout masks."""
 
 
-def planned_actions(actions: NDArray[np.int64] | None, depth: int, n_actions: int) -> list[int] | None:
+def planned_actions(actions: Ints | None, depth: int, n_actions: int) -> list[int] | None:
     """What an :class:`Imaginer` is to imagine: the first ``depth`` of the actions, or None for its own choice.
 
     Raises:

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imagine_bench.arrays import Array, Arrays, Frame, read_only
+from imagine_bench.arrays import Array, Arrays, Bools, Floats, Frame, Ints, read_only
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.observation import Observation, Transition
 
@@ -40,14 +40,14 @@ class Episodes:
             or an episode that ends too early or not at all.
     """
 
-    lengths: NDArray[np.int64]  #: macro-actions of each episode, at least 1. Shape (E,).
+    lengths: Ints  #: macro-actions of each episode, at least 1. Shape (E,).
     frames: Frame  #: before each macro-action, and after the last of an episode. Shape (N + E, 64, 64, 3).
     action_masks: NDArray[np.int8]  #: 1 where a macro-action can be carried out there. Shape (N + E, A).
-    actions: NDArray[np.int64]  #: macro-actions, in [0, A). Shape (N,).
-    rewards: NDArray[np.float64]  #: rewards. Shape (N,).
-    terminated: NDArray[np.bool_]  #: whether the episode ended there in a terminal macrostate. Shape (N,).
-    truncated: NDArray[np.bool_]  #: whether it was cut off there. Shape (N,).
-    success: NDArray[np.bool_]  #: whether each episode ended in success. Shape (E,).
+    actions: Ints  #: macro-actions, in [0, A). Shape (N,).
+    rewards: Floats  #: rewards. Shape (N,).
+    terminated: Bools  #: whether the episode ended there in a terminal macrostate. Shape (N,).
+    truncated: Bools  #: whether it was cut off there. Shape (N,).
+    success: Bools  #: whether each episode ended in success. Shape (E,).
 
     def __post_init__(self) -> None:
         for name, dtype in _TYPES.items():
@@ -85,7 +85,7 @@ class Episodes:
         return self.action_masks.shape[1]
 
     @property
-    def rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def rows(self) -> tuple[Ints, Ints]:
         """Rows of the frames before each transition (N,), and of those that episodes end with (E,)."""
         last = np.cumsum(self.lengths + 1) - 1
         return np.delete(np.arange(len(self.frames)), last), last

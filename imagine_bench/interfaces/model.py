@@ -9,9 +9,8 @@ from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Array, Arrays, Floats, Frame, Images
+from imagine_bench.arrays import Array, Arrays, Floats, Frame, Images, Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.episodes import Episodes
 
@@ -43,7 +42,7 @@ class WorldModel(Protocol):
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Learn from real episodes; everything random is drawn from ``rng``."""
 
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """Imagine D macro-actions from each of N histories, in S = ``samples`` futures.
 
         Args:

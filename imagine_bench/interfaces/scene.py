@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
-from imagine_bench.arrays import Frame
+from imagine_bench.arrays import Floats, Frame, Ints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,11 +17,11 @@ class Shape3D:
     #: ``"box"`` (half sizes), ``"sphere"`` (radius), ``"capsule"`` / ``"cylinder"`` (radius, half length),
     #: ``"ellipsoid"`` (radii) or ``"mesh"``
     kind: str
-    size: NDArray[np.float64]  #: as ``kind`` says, in metres. Shape (3,), unused entries 0.
-    pose_in_body: NDArray[np.float64]  #: position (m) and quaternion (w, x, y, z). Shape (7,).
-    rgba: NDArray[np.float64]  #: in [0, 1]. Shape (4,).
-    vertices: NDArray[np.float64] | None = None  #: for meshes, (V, 3) in metres; else None
-    faces: NDArray[np.int64] | None = None  #: for meshes, (F, 3) vertex indices; else None
+    size: Floats  #: as ``kind`` says, in metres. Shape (3,), unused entries 0.
+    pose_in_body: Floats  #: position (m) and quaternion (w, x, y, z). Shape (7,).
+    rgba: Floats  #: in [0, 1]. Shape (4,).
+    vertices: Floats | None = None  #: for meshes, (V, 3) in metres; else None
+    faces: Ints | None = None  #: for meshes, (F, 3) vertex indices; else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +29,8 @@ class Motion:
     """How the bodies of a scene moved during one macro-action."""
 
     body_names: tuple[str, ...]  #: one a body. Length B.
-    time_s: NDArray[np.float64]  #: seconds since the macro-action began, ascending. Shape (K,).
-    poses_in_world: NDArray[np.float64]  #: position (m) and quaternion (w, x, y, z). Shape (K, B, 7).
+    time_s: Floats  #: seconds since the macro-action began, ascending. Shape (K,).
+    poses_in_world: Floats  #: position (m) and quaternion (w, x, y, z). Shape (K, B, 7).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,14 +40,14 @@ class ArmMotion:
     Rows are the samples of :class:`Motion`: ``capture_motion_hz`` a second, and the last moment.
     """
 
-    time_s: NDArray[np.float64]  #: seconds since the macro-action began, ascending. Shape (K,).
-    joint_rad: NDArray[np.float64]  #: Shape (K, 7).
-    joint_rad_s: NDArray[np.float64]  #: Shape (K, 7).
-    gripper_m: NDArray[np.float64]  #: each finger's distance from the grip's middle. Shape (K, 2).
-    joint_command_rad: NDArray[np.float64]  #: what the servos are told, feed-forward included. Shape (K, 7).
-    gripper_command_m: NDArray[np.float64]  #: the same of the fingers. Shape (K, 2).
+    time_s: Floats  #: seconds since the macro-action began, ascending. Shape (K,).
+    joint_rad: Floats  #: Shape (K, 7).
+    joint_rad_s: Floats  #: Shape (K, 7).
+    gripper_m: Floats  #: each finger's distance from the grip's middle. Shape (K, 2).
+    joint_command_rad: Floats  #: what the servos are told, feed-forward included. Shape (K, 7).
+    gripper_command_m: Floats  #: the same of the fingers. Shape (K, 2).
     #: the point between the fingers: position (m) and quaternion (w, x, y, z). Shape (K, 7).
-    tcp_in_world: NDArray[np.float64]
+    tcp_in_world: Floats
 
 
 @runtime_checkable

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Frame, Macrostate, State
+from imagine_bench.arrays import Frame, Ints, Macrostate, State
 from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
 from imagine_bench.rules import RuleFacts, Rules
 from imagine_bench.values import Setting
@@ -86,7 +85,7 @@ class Sight(Protocol):
 class RenderMacrostates(Protocol):
     """Frames of given macrostates in the kinematic mode, for encoders, probes and comparisons."""
 
-    def __call__(self, macrostates: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> Frame:
+    def __call__(self, macrostates: Ints, appearance: str, rng: np.random.Generator) -> Frame:
         """Render ``macrostates`` (N, M) at an appearance level to frames (N, 64, 64, 3), uint8."""
 
 

@@ -16,10 +16,9 @@ from dataclasses import dataclass, field
 from typing import Self, SupportsFloat, TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.arrays import Action, Info, Observed
+from imagine_bench.arrays import Action, Bools, Info, Ints, Observed
 from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Rules, State, Transition
@@ -115,7 +114,7 @@ class EpisodeLog:
         )
 
 
-def _digits(success: NDArray[np.bool_]) -> str:
+def _digits(success: Bools) -> str:
     return "".join("1" if each else "0" for each in success)
 
 
@@ -290,7 +289,7 @@ class LabelOracle:
     def __init__(self, rules: Rules) -> None:
         self._rules = rules
 
-    def label(self, macrostate: tuple[int, ...], actions: NDArray[np.int64]) -> Label | None:
+    def label(self, macrostate: tuple[int, ...], actions: Ints) -> Label | None:
         """What the last of ``actions`` (D,) from ``macrostate`` would bring.
 
         The scene goes on obeying its dynamics through the ends of episodes. Where chance decides on the way, all that
