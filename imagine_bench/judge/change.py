@@ -22,8 +22,7 @@ from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import Floats, Outcome, Rules, State, TaskSpec
 from imagine_bench.judge.predictions import Predictions
 from imagine_bench.judge.questions import FRAMES, EvalSet
-from imagine_bench.judge.truth import added_up
-from imagine_bench.judge.values import branches
+from imagine_bench.judge.truth import added_up, branches
 from imagine_bench.rules import Dynamics
 from imagine_bench.seeding import SeedTree
 

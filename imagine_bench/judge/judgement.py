@@ -6,14 +6,12 @@ import copy
 import dataclasses
 import functools
 import hashlib
-import inspect
 import json
 import math
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,25 +23,17 @@ from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_d
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.interfaces.episodes import content_hash
-from imagine_bench.interfaces.model import WorldModel, require_imagined
+from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.change import Streams, change_detection_delay, counterfactual_error, streams_of
-from imagine_bench.judge.models import JudgedModel, model_entry, one_name, opened, runs_of
-from imagine_bench.judge.predictions import (
-    ImageReader,
-    Predictions,
-    RenderedFrameIndex,
-    ask_together,
-    call,
-    evaluate,
-    reader_errors,
-)
+from imagine_bench.judge.models import JudgedModel, model_entry, one_name, opened, runs_of, source_of
+from imagine_bench.judge.predictions import Predictions, ask_together, call, evaluate, imagined_by
 from imagine_bench.judge.questions import EvalSet
+from imagine_bench.judge.reading import READER_FILE, ImageReader, RenderedFrameIndex, making, reader_in
 from imagine_bench.judge.scores import after_the_end_scores, by_depth, one_step_scores, ranking_scores
 from imagine_bench.judge.truth import Distribution, shares
 from imagine_bench.registry.entries import file_name
 from imagine_bench.registry.machine import describe_environment
-from imagine_bench.rules import states_of
 from imagine_bench.running.bench import Counted
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.isolation import why_open
@@ -51,16 +41,13 @@ from imagine_bench.running.launchers.jobs import work_through
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import (
-    lock,
     make_folder,
     read_arrays,
     read_sealed,
-    reading,
     sealed,
     sha256,
     with_null,
     write_arrays,
-    write_bytes,
     write_json,
 )
 
@@ -68,9 +55,6 @@ SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8
 _FORMAT = 4  # 3 asked every model in the order of the macrostates
 _AFTER = 6  # transitions after the end whose images are kept
-_PATIENCE_S = 1_800.0  # seconds that a process waits while another makes the data or the reader
-_READER_FILE = "reader.safetensors"
-_READER = "imagine_bench.agents.world_models.reader"
 Costs = dict[str, str | float]
 
 
@@ -214,7 +198,7 @@ def carry_out(judgement: Judgement, folder: Path, cell: ModelFit, tell: Callable
         found, images = judge_cell(judgement, folder, cell)
     except ImagineBenchError as error:
         return str(error)
-    with _making(folder):  # so that a cell and its images are of the same fit
+    with making(folder):  # so that a cell and its images are of the same fit
         if cell.transitions == judgement.sizes[-1]:
             write_arrays(folder / cell.images, images)
             found["images"] = content_hash(images)
@@ -238,9 +222,9 @@ def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict
     seeds = SeedTree(cell.seed).child("judge", judgement.task, cell.transitions)
     name = str(runs_of(cell.model).get(cell.seed, cell.model))
     log = folder / f"{cell.file.removesuffix('.json')}.log"
-    given = (name, world.spec, world.index, judgement.appearance, seeds, judgement.encoder)
     try:
-        with opened(*given, folder=folder, log=log) as judged:
+        source = source_of(name, world.spec, world.index, judgement.appearance, seeds, judgement.encoder)
+        with opened(source, judgement.task, folder=folder, log=log) as judged:
             return _judged(judgement, folder, cell, world, judged, seeds)
     finally:
         with suppress(OSError):  # there is none, another judgement removed it, or the disk refuses: it stays, empty
@@ -322,13 +306,8 @@ def _named(spec: TaskSpec, outcomes: Distribution) -> dict[str, float]:
 def data_of(judgement: Judgement, folder: Path, seed: int) -> Dataset:
     """The data of a seed, made in the kinematic execution where it is not there yet."""
     place = folder / f"data-seed{seed}"
-    with _making(folder):
+    with making(folder):
         return read_dataset(place) if place.exists() else _collected(judgement, place, seed)
-
-
-def _making(folder: Path) -> AbstractContextManager[None]:
-    """Let one process at a time make what all cells of a folder share; the others wait and find it made."""
-    return lock(folder / ".lock", f"The folder {folder}", patience_s=_PATIENCE_S)
 
 
 def _collected(judgement: Judgement, place: Path, seed: int) -> Dataset:
@@ -359,45 +338,10 @@ def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
     asked = {name: make(spec, index.render) for name, make in questions.SETS.items()}
     there = {name: each for name, each in asked.items() if each is not None}
     again = questions.counterfactuals(spec, index.render)
-    reader = _reader(spec, judgement.appearance, folder)
-    file = folder / _READER_FILE
+    reader = reader_in(spec, judgement.appearance, folder)
+    file = folder / READER_FILE
     digest = sha256(file)[:12] if file.exists() else ""
     return AskedWorld(spec, index, reader, digest, there, again, streams_of(spec, there["one_step"]))
-
-
-def _reader(spec: TaskSpec, appearance: str, folder: Path) -> ImageReader:
-    """The reader of a folder; where there is none, that of the world from the user's cache."""
-    path = folder / _READER_FILE
-    code = registry.load(_READER)
-    with _making(folder):
-        if not path.exists():
-            content, errors = _reader_of_world(spec, appearance, code)
-            write_json(folder / "reader.json", errors)
-            write_bytes(path, content)
-    with reading(path, "the judge's reader; remove it, and the same command trains a new one"):
-        return code.load_reader(spec, path)
-
-
-def _reader_of_world(spec: TaskSpec, appearance: str, code: ModuleType) -> tuple[bytes, dict[str, float]]:
-    """The reader of a world as a file, and its errors; trained and measured where the cache has none."""
-    states = states_of(spec.rules)
-    looks = spec.render_macrostates(np.array(states[:8]), appearance, np.random.default_rng(0)).tobytes()
-    made_of = (spec.id, appearance, states, inspect.getsource(code))
-    name = hashlib.sha256(repr(made_of).encode() + looks).hexdigest()[:12]
-    path = make_folder(encoders.cache_folder() / "readers" / name) / _READER_FILE
-    card = path.with_name("reader.json")
-    with _making(path.parent):
-        if not card.exists():
-            print(f"The reader of images of {spec.id} is trained into {path.parent}, once: about a minute.", flush=True)
-            reader = code.train_reader(spec, appearance)
-            write_bytes(path, reader.content())
-            errors = reader_errors(reader, spec, appearance)
-            print(f"It misreads {errors['misread']:.1%} of new frames and reads nothing in {errors['refused']:.1%}.")
-            write_json(card, sealed({"sha256": sha256(path), "errors": errors}))
-        facts = read_sealed(card, "a reader's card")
-        if sha256(path) != facts["sha256"]:
-            raise ArtefactError(f"{path} is damaged; remove {path.parent}, and the same command trains it anew.")
-        return path.read_bytes(), facts["errors"]
 
 
 def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], rng: np.random.Generator) -> Arrays:
@@ -413,9 +357,7 @@ def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], r
     for what, (kind, rows) in chosen.items():
         asked = world.asked[kind]
         own = np.random.default_rng(int(rng.integers(2**63)))
-        answer = call(name, "imagine", model.imagine, asked.frames[rows], asked.actions[rows], 1, own)
-        depth = asked.asked.shape[1]
-        imagined = require_imagined(answer, name=name, rows=len(rows), depth=depth, samples=1).pictures
+        imagined = imagined_by(model, name, asked.frames[rows], asked.actions[rows], 1, own).pictures
         read = world.index.read(imagined, world.reader)[:, 0].tolist()
         truth = [[shares(outcomes) for outcomes in asked.truth[row]] for row in rows]
         real = [[world.index.frame(max(each, key=each.__getitem__)) for each in steps] for steps in truth]

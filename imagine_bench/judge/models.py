@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -20,8 +20,9 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, Floats, Frame, State, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined
-from imagine_bench.judge.predictions import RenderedFrameIndex
+from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel
+from imagine_bench.judge.predictions import imagined_by
+from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.registry.entries import WorldModelEntry, entrant
 from imagine_bench.registry.scripts import importable
 from imagine_bench.running.isolation import Isolated
@@ -93,25 +94,13 @@ class ServedModel:
 
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Arrays:
         """The fields of the model's :class:`Imagined`, by name. Raises InvalidValueError: one has wrong values."""
-        found = self._model.imagine(frames, actions, samples, rng)
-        depth = actions.shape[1] - frames.shape[1] + 1
-        require_imagined(found, name=self._name, rows=len(frames), depth=depth, samples=samples)
+        found = imagined_by(self._model, self._name, frames, actions, samples, rng)
         offered = {field.name: getattr(found, field.name) for field in fields(Imagined)}
         return {name: np.ascontiguousarray(array) for name, array in offered.items() if array is not None}
 
     def parameters(self) -> Arrays:
         """Their number."""
         return {"parameters": np.array(int(self._model.parameters()))}
-
-
-def serve_model(name: str, make: str, context: AgentContext) -> ServedModel:
-    """A registered world model."""
-    return ServedModel(name, registry.made(f"World model {name}", make, context))
-
-
-def serve_agent(name: str, kept: KeptAgent) -> ServedModel:
-    """The agent of a run. Raises InvalidValueError: it does not imagine."""
-    return ServedModel(name, AgentModel(imaginer_of(agent_of(kept), kept)))
 
 
 class IsolatedModel:
@@ -133,6 +122,77 @@ class IsolatedModel:
         return int(self._process.call("parameters")["parameters"])
 
 
+@dataclass(frozen=True, kw_only=True)
+class ModelSource:
+    """Where a model comes from: the registry, or a run, whose agent is one."""
+
+    name: str
+    make: str  #: ``"module:attr"`` of the registered factory
+    given: tuple[AgentContext] | tuple[TaskSpec, RenderedFrameIndex] | None = None  #: arguments of it
+    kept: KeptAgent | None = None  #: the agent of a run
+    privileged: bool
+    encoder: Path | None = None
+
+    def model(self) -> WorldModel:
+        """The model, in this process. Raises InvalidValueError: an agent that does not imagine."""
+        if self.kept is not None:
+            return AgentModel(imaginer_of(agent_of(self.kept), self.kept))
+        return registry.made(f"World model {self.name}", self.make, *self.given or ())
+
+    @property
+    def cost(self) -> dict[str, str | int]:
+        """What was spent beforehand: the encoder's name, and the frames that it was trained on."""
+        if self.encoder is None:
+            return {"encoder": "", "encoder_frames": 0}
+        card = read_json(self.encoder.with_suffix(".json"), "an encoder's card")
+        return {"encoder": self.encoder.stem, "encoder_frames": card.get("recipe", {}).get("frames", 0)}
+
+
+def serve(source: ModelSource) -> ServedModel:
+    """The model of a source, for another process."""
+    return ServedModel(source.name, source.model())
+
+
+def source_of(
+    name: str, spec: TaskSpec, index: RenderedFrameIndex, appearance: str, seeds: SeedTree, encoder: str | None = None
+) -> ModelSource:
+    """The source of a registered model, or of the agent of the run in a folder.
+
+    Args:
+        name: The model's name, or the folder.
+        spec: The task.
+        index: Given to privileged models.
+        appearance: How frames vary.
+        seeds: The model's node of the seed tree.
+        encoder: A bundled name or a file, for models that read what it gives; the others see through the task's own.
+
+    Raises:
+        UnknownNameError: No such model.
+        InvalidValueError: The agent of the run learned another task.
+        ArtefactError: The run, or the encoder, cannot be read.
+    """
+    entry = model_entry(name)
+    if Path(name) in runs_of(name).values():
+        kept = read_agent(Path(name))
+        learned = kept.spec.protocol.task
+        if registry.task(learned).id != spec.id:
+            raise InvalidValueError(f"{name} learned {learned}, not {spec.id}; give a run of {spec.id}.")
+        seen_through = kept.spec.encoder
+        return ModelSource(name=name, make=entry.make, kept=kept, privileged=entry.privileged, encoder=seen_through)
+    if entry.privileged:
+        return ModelSource(name=name, make=entry.make, given=(spec, index), privileged=True)
+    path = None if entry.encoder_kind is None else _encoder(spec, appearance, entry.encoder_kind, encoder)
+    context = AgentContext(
+        n_actions=spec.n_actions,
+        preprocessing=spec.preprocessing,
+        encoder=path,
+        seeds=seeds,
+        config_group=spec.config_group,
+        overrides=entrant(name).settings,
+    )
+    return ModelSource(name=name, make=entry.make, given=(context,), privileged=False, encoder=path)
+
+
 @dataclass(frozen=True)
 class JudgedModel:
     """A world model, ready to be fitted and asked."""
@@ -144,17 +204,7 @@ class JudgedModel:
 
 
 @contextmanager
-def opened(
-    name: str,
-    spec: TaskSpec,
-    index: RenderedFrameIndex,
-    appearance: str,
-    seeds: SeedTree,
-    encoder: str | None = None,
-    *,
-    folder: Path,
-    log: Path,
-) -> Iterator[JudgedModel]:
+def opened(source: ModelSource, task: str, *, folder: Path, log: Path) -> Iterator[JudgedModel]:
     """A new model, or a trained agent, in a process of its own; a privileged one in this process.
 
     The output of that process is added to ``log``. ``folder`` is the judgement's, which is hidden from models as its
@@ -163,30 +213,18 @@ def opened(
     Raises:
         ImagineBenchError: It cannot be made.
     """
-    run = Path(name)
-    entry = model_entry(name)
-    visited = None
-    given: tuple[str | AgentContext | KeptAgent, ...]
-    if run in runs_of(name).values():
-        kept = read_agent(run)
-        _require_task(kept, spec.id)
-        visited = _visited(run)
-        cost = _encoder_cost(kept.spec.encoder)
-        target, given = "serve_agent", (name, kept)
-    elif not entry.privileged:
-        context, cost = _context(name, spec, appearance, seeds, encoder)
-        target, given = "serve_model", (name, importable(entry.make), context)
-    if entry.privileged:
-        model, cost = make(name, spec, index, appearance, seeds, encoder)
-        yield JudgedModel(model, cost, visited, time.process_time)
+    visited = None if source.kept is None else _visited(source.kept.folder)
+    if source.privileged:
+        yield JudgedModel(source.model(), source.cost, visited, time.process_time)
         return
     hidden = [place.parent for place in folder.parent.glob("*/.lock")]
-    closed = closed_modules(spec.id, entry.make)
     tasks = find_spec(_TASKS)
     if tasks is not None:
         hidden += map(Path, tasks.submodule_search_locations or ())
-    with Isolated(f"{__name__}:{target}", *given, log=log, forbidden=closed, hidden=hidden) as process:
-        yield JudgedModel(IsolatedModel(process), cost, visited, lambda: process.cpu_s)
+    served = replace(source, make=importable(source.make))
+    closed = closed_modules(task, source.make)
+    with Isolated(f"{__name__}:{serve.__name__}", served, log=log, forbidden=closed, hidden=hidden) as process:
+        yield JudgedModel(IsolatedModel(process), source.cost, visited, lambda: process.cpu_s)
 
 
 def closed_modules(task: str, make: str) -> list[str]:
@@ -231,53 +269,12 @@ def one_name(model: str) -> str:
     return str(Path(model).resolve()) if runs_of(model) else str(entrant(model))
 
 
-def _require_task(kept: KeptAgent, task: str) -> None:
-    """Raise InvalidValueError for a run of an agent that learned another task."""
-    learned = kept.spec.protocol.task
-    if registry.task(learned).id != task:
-        raise InvalidValueError(f"{kept.folder} learned {learned}, not {task}; give a run of {task}.")
-
-
 def _visited(run: Path) -> set[tuple[State, int]]:
     """Every macrostate and macro-action of a run's training."""
     tried = load_run(run).tried
     if tried is None:
         raise ArtefactError(f"{run} was written by a version that kept no experience; run it anew.")
     return {(tuple(row[:-2]), row[-2]) for row in tried.tolist()}
-
-
-def make(
-    name: str, spec: TaskSpec, index: RenderedFrameIndex, appearance: str, seeds: SeedTree, encoder: str | None = None
-) -> tuple[WorldModel, dict[str, str | int]]:
-    """A new model, or a trained agent, in this process, and the cost of its encoder.
-
-    The cost is the encoder's name and the number of frames that it was trained on.
-    """
-    if Path(name) in runs_of(name).values():
-        kept = read_agent(Path(name))
-        _require_task(kept, spec.id)
-        return AgentModel(imaginer_of(agent_of(kept), kept)), _encoder_cost(kept.spec.encoder)
-    if registry.world_model_entry(name).privileged:
-        return registry.make_world_model(name, spec, index), _encoder_cost(None)
-    context, cost = _context(name, spec, appearance, seeds, encoder)
-    return registry.make_world_model(name, context), cost
-
-
-def _context(
-    name: str, spec: TaskSpec, appearance: str, seeds: SeedTree, encoder: str | None
-) -> tuple[AgentContext, dict[str, str | int]]:
-    """The context from which a registered model is made, and the cost of its encoder."""
-    entry = registry.world_model_entry(name)
-    path = None if entry.encoder_kind is None else _encoder(spec, appearance, entry.encoder_kind, encoder)
-    context = AgentContext(
-        n_actions=spec.n_actions,
-        preprocessing=spec.preprocessing,
-        encoder=path,
-        seeds=seeds,
-        config_group=spec.config_group,
-        overrides=entrant(name).settings,
-    )
-    return context, _encoder_cost(path)
 
 
 def _encoder(spec: TaskSpec, appearance: str, kind: str, given: str | None) -> Path:
@@ -287,11 +284,3 @@ def _encoder(spec: TaskSpec, appearance: str, kind: str, given: str | None) -> P
         if encoders.kind(path) == kind:
             return path
     return encoders.own(spec, appearance, kind)
-
-
-def _encoder_cost(path: Path | None) -> dict[str, str | int]:
-    """The encoder's name, and the frames that it was trained on."""
-    if path is None:
-        return {"encoder": "", "encoder_frames": 0}
-    card = read_json(path.with_suffix(".json"), "an encoder's card")
-    return {"encoder": path.stem, "encoder_frames": card.get("recipe", {}).get("frames", 0)}

@@ -2,107 +2,28 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ParamSpec, Protocol, TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Arrays, Images, Ints
+from imagine_bench.arrays import Arrays, Ints
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
-from imagine_bench.interfaces import Floats, Frame, State, TaskSpec
+from imagine_bench.interfaces import Floats, Frame, State
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 from imagine_bench.judge.questions import EvalSet
+from imagine_bench.judge.reading import ImageReader, RenderedFrameIndex
 from imagine_bench.judge.truth import Distribution, added_up
-from imagine_bench.rules import states_of
 from imagine_bench.running.isolation import GuestError
-from imagine_bench.seeding import SeedTree
 
-_READ = 1_000  # frames that a reader is measured on
 _AT_ONCE = 96  # questions handed to a model at a time, to bound memory
 P = ParamSpec("P")
 T = TypeVar("T")
 N = TypeVar("N", bound=np.generic)
 _OFFERED = ("rewards", "p_ended", "accepted", *UNCERTAINTIES)
-
-
-class ImageReader(Protocol):
-    """What reads images; see :mod:`imagine_bench.agents.world_models.reader`."""
-
-    def read(self, pictures: Images) -> Ints:
-        """Macrostates (N, M) of images (N, H, W) or (N, H, W, 3); -1 where one shows nothing of this world."""
-
-
-def reader_errors(reader: ImageReader, spec: TaskSpec, appearance: str) -> dict[str, float]:
-    """Error rates of a reader, on frames that it was not trained on and on images that show nothing of this world.
-
-    Shares of real frames: ``misread``, taken for another macrostate, and ``refused``; the others are shares taken for
-    an image of this world of black and gray fog, noise, and blends of two frames of different macrostates.
-    """
-    rng = SeedTree(1).child("encoder_probe", "judge", spec.id, appearance).generator()
-    states = np.array(states_of(spec.rules), dtype=np.int64)
-    macrostates, others = (states[rng.integers(len(states), size=_READ)] for _ in range(2))
-    frames, blended = (spec.render_macrostates(each, appearance, rng) for each in (macrostates, others))
-    differ = (macrostates != others).any(axis=1)
-    of_nothing = {
-        "black": np.zeros_like(frames[:1]),
-        "gray": np.full_like(frames[:1], 128),
-        "noise": rng.integers(0, 256, frames.shape, dtype=np.uint8),
-        "blends": ((frames[differ].astype(np.uint16) + blended[differ]) // 2).astype(np.uint8),
-    }
-    read = reader.read(frames)
-    refused = read[:, 0] < 0
-    wrong = (read != macrostates).any(axis=1) & ~refused
-    found = {"misread": float(wrong.mean()), "refused": float(refused.mean())}
-    for name, images in of_nothing.items():
-        found[f"{name}_read"] = float((reader.read(images)[:, 0] >= 0).mean())
-    return found
-
-
-class RenderedFrameIndex:
-    """Frames of macrostates that were rendered for one judgement, and what each of them shows, to the pixel."""
-
-    def __init__(self, spec: TaskSpec, appearance: str) -> None:
-        self._spec = spec
-        self._appearance = appearance
-        self._shows: dict[bytes, State] = {}
-        self._frames: dict[State, Frame] = {}
-
-    def render(self, states: Sequence[State], rng: np.random.Generator) -> Frame:
-        """A new frame of each of N macrostates, which is remembered. Shape (N, 64, 64, 3)."""
-        frames = self._spec.render_macrostates(np.array(states, dtype=np.int64), self._appearance, rng)
-        for frame, state in zip(frames, states, strict=True):
-            self._shows[_key(frame)] = state
-        return frames
-
-    def frame(self, state: State) -> Frame:
-        """One frame of a macrostate, always the same."""
-        if state not in self._frames:
-            rng = SeedTree(0).child("evaluation", "judge", "gallery", self._spec.id, *state).generator()
-            self._frames[state] = self.render([state], rng)[0]
-        return self._frames[state]
-
-    def shows(self, image: NDArray[np.uint8]) -> State | None:
-        """The macrostate of an image that is a rendered frame to the pixel; None for any other."""
-        return self._shows.get(_key(image))
-
-    def read(self, images: Images, reader: ImageReader) -> Ints:
-        """Macrostates (N, S, D, M) of images (N, S, D, ...); a reader reads what was not rendered, equal ones once."""
-        flat = images.reshape(-1, *images.shape[3:])
-        keys = [_key(image) for image in flat]
-        unknown = {key: row for row, key in enumerate(keys) if key not in self._shows}
-        read = reader.read(flat[list(unknown.values())]).tolist() if unknown else []
-        shown = dict(zip(unknown, map(tuple, read), strict=True))
-        states = [self._shows.get(key) or shown[key] for key in keys]
-        return np.array(states, dtype=np.int64).reshape(*images.shape[:3], -1)
-
-
-def _key(image: Images) -> bytes:
-    """A digest of an image (H, W, 3) or (H, W)."""
-    return hashlib.sha256(f"{image.shape}".encode() + np.ascontiguousarray(image).tobytes()).digest()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,8 +84,7 @@ def evaluate(
     handed copies, so that it cannot change the questions of other models. ``order`` shuffles the questions; without it
     they are asked in their own order. ``cpu_clock`` is that of the process in which the model is.
 
-    Raises:
-        InvalidValueError: The model fails, or hands in what it must not; the message names model and method.
+    Raises InvalidValueError as :func:`imagined_by`.
     """
     answers: list[Imagined] = []
     cpu_s = 0.0
@@ -174,13 +94,10 @@ def evaluate(
     places = np.argsort(shuffled)
     for at in range(0, len(questions.frames), _AT_ONCE):
         rows = shuffled[at : at + _AT_ONCE]
-        frames = questions.frames[rows]
         own = np.random.default_rng(int(rng.integers(2**63)))  # a model elsewhere cannot draw on from the same
         begun_s = cpu_clock()
-        imagined = call(name, "imagine", model.imagine, frames, questions.actions[rows], samples, own)
+        answers.append(imagined_by(model, name, questions.frames[rows], questions.actions[rows], samples, own))
         cpu_s += cpu_clock() - begun_s
-        depth = questions.asked.shape[1]
-        answers.append(require_imagined(imagined, name=name, rows=len(frames), depth=depth, samples=samples))
     drawn = [0 if each.probabilities is not None else each.pictures.shape[1] for each in answers]
     given = {name: [getattr(each, name) for each in answers] for name in _OFFERED}
     return Predictions(
@@ -193,6 +110,19 @@ def evaluate(
         cpu_s=cpu_s,
         steps=sum(int(np.prod(each.pictures.shape[:3])) for each in answers),
     )
+
+
+def imagined_by(
+    model: WorldModel, name: str, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator
+) -> Imagined:
+    """What a model imagines, see :class:`.interfaces.model.WorldModel`, if it is what it has to be.
+
+    Raises:
+        InvalidValueError: The model fails, or hands in what it must not; the message names model and method.
+    """
+    depth = actions.shape[1] - frames.shape[1] + 1
+    found = call(name, "imagine", model.imagine, frames, actions, samples, rng)
+    return require_imagined(found, name=name, rows=len(frames), depth=depth, samples=samples)
 
 
 def ask_together(ask: Callable[[EvalSet, str], Predictions], sets: Mapping[str, EvalSet]) -> dict[str, Predictions]:

@@ -22,9 +22,10 @@ from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, ExactWorld, Frame, Observation, State, TaskSpec
 from imagine_bench.interfaces.capabilities import begin_episode
 from imagine_bench.interfaces.episodes import Episodes, content_hash
-from imagine_bench.interfaces.model import Imagined, WorldModel, require_imagined
-from imagine_bench.judge.models import make
-from imagine_bench.judge.predictions import RenderedFrameIndex, call
+from imagine_bench.interfaces.model import Imagined, WorldModel
+from imagine_bench.judge.models import source_of
+from imagine_bench.judge.predictions import call, imagined_by
+from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.rules import facts, states_of
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.evaluation import play
@@ -291,7 +292,7 @@ class CheckedModel(NamedTuple):
         """A new one."""
         spec = registry.task(self.task)
         seeds = SeedTree(_SEED).child("judge", self.task)
-        return make(self.name, spec, RenderedFrameIndex(spec, "clean"), "clean", seeds)[0]
+        return source_of(self.name, spec, RenderedFrameIndex(spec, "clean"), "clean", seeds).model()
 
     def fitted(self) -> WorldModel:
         """A new one that has seen the episodes."""
@@ -301,9 +302,7 @@ class CheckedModel(NamedTuple):
 
     def imagine(self, model: WorldModel, frames: Frame, actions: Ints, samples: int) -> Imagined:
         """What a model imagines with a generator that is always the same, if it is what it has to be."""
-        imagined = call(self.name, "imagine", model.imagine, frames, actions, samples, np.random.default_rng(1))
-        depth = actions.shape[1] - frames.shape[1] + 1
-        return require_imagined(imagined, name=self.name, rows=len(frames), depth=depth, samples=samples)
+        return imagined_by(model, self.name, frames, actions, samples, np.random.default_rng(1))
 
     def answer(self, model: WorldModel) -> dict[str, bytes]:
         """What it imagines when it is asked the longest questions."""

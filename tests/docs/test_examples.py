@@ -19,9 +19,9 @@ from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate
-from imagine_bench.judge.models import make
-from imagine_bench.judge.predictions import RenderedFrameIndex
+from imagine_bench.judge.models import source_of
 from imagine_bench.judge.questions import one_step
+from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.judge.truth import expected_reward
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
@@ -83,7 +83,7 @@ def test_the_world_model_keeps_the_contract_and_knows_what_it_has_seen(example: 
     truth = np.array([expected_reward(steps[0]) for steps in asked.truth])
     chosen = policy_of("random", spec, 0)
     played, _, _ = collect(spec, chosen, episodes=150, seed=0, execution="kinematic", appearance="clean")
-    model, _ = make("own_model", spec, index, "clean", seeds)
+    model = source_of("own_model", spec, index, "clean", seeds).model()
     model.fit(played, seeds.generator())
     imagined = model.imagine(asked.frames, asked.actions, 8, seeds.generator())
     away = np.abs(imagined.rewards[:, :, 0].mean(axis=1) - truth)

@@ -17,8 +17,9 @@ from imagine_bench.interfaces import Frame, TaskSpec
 from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.change import Streams, counterfactual_error, streams_of
-from imagine_bench.judge.predictions import Predictions, RenderedFrameIndex, evaluate
+from imagine_bench.judge.predictions import Predictions, evaluate
 from imagine_bench.judge.questions import EvalSet
+from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.judge.scores import one_step_scores, ranking_scores
 
 STILL = Copy(context())

@@ -14,7 +14,7 @@ from imagine_bench import registry
 from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, drawn_by, place
-from imagine_bench.judge.values import true_model
+from imagine_bench.judge.truth import true_model
 from imagine_bench.rules import fewest_actions, states_of
 from imagine_bench.store.results import PolicyTable
 

@@ -33,8 +33,8 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
-from imagine_bench.judge.models import JudgedModel, make, model_entry, opened
-from imagine_bench.judge.predictions import RenderedFrameIndex
+from imagine_bench.judge.models import JudgedModel, model_entry, opened, source_of
+from imagine_bench.judge.reading import RenderedFrameIndex, reader_in
 from imagine_bench.report.judge import COLUMNS, Judged, judged, judgement_page
 from imagine_bench.report.page import DASH
 from imagine_bench.running import bench as benches
@@ -139,7 +139,6 @@ LATE = WorldModelEntry(make="their_models:late", title="late")
 
 
 _MODELS = ("nearest", "spy", "cheat", "raises", "late", "unmade", "exits", "dies", "copy", "exact")
-_OWN_READER = judgement._reader
 
 
 class Said(NamedTuple):
@@ -161,7 +160,7 @@ def _read_nothing(spec: object, appearance: str, folder: Path) -> BlindReader:
 def _blind() -> Iterator[None]:
     """A reader that costs nothing."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(judgement, "_reader", _read_nothing)
+        patch.setattr(judgement, "reader_in", _read_nothing)
         yield
     judgement.prepare.cache_clear()
     judgement.data_of.cache_clear()
@@ -400,7 +399,8 @@ def test_the_folder_of_an_agent_stands_for_all_its_runs(runs: dict[str, Path], t
 def _open(run: Path, task: str, folder: Path) -> AbstractContextManager[JudgedModel]:
     spec = registry.task(task)
     index = RenderedFrameIndex(spec, "clean")
-    return opened(str(run), spec, index, "clean", SeedTree(0), folder=folder, log=folder / "log")
+    source = source_of(str(run), spec, index, "clean", SeedTree(0))
+    return opened(source, task, folder=folder, log=folder / "log")
 
 
 def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Path) -> None:
@@ -445,7 +445,7 @@ def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> No
     judged = Judgement(task="pick_place", models=("gaussian", "structured"), encoder="pick_place-mild")
     spec = registry.task("pick_place")
     index = RenderedFrameIndex(spec, "clean")
-    costs = [make(name, spec, index, "clean", SeedTree(1000), judged.encoder)[1] for name in judged.models]
+    costs = [source_of(name, spec, index, "clean", SeedTree(0), judged.encoder).cost for name in judged.models]
     assert [cost["encoder"] for cost in costs] == ["pick_place-mild", "pick_place-clean-codes"]
     assert judged.folder_name != dataclasses.replace(judged, encoder=None).folder_name
 
@@ -467,22 +467,22 @@ def test_judges_at_once_train_one_reader_of_a_world_and_see_it_whole(
     code = ModuleType("reader")
     vars(code).update(__file__=__file__, train_reader=train, load_reader=lambda spec, path: path.read_bytes())
     monkeypatch.setattr(registry, "load", lambda name: code)
-    monkeypatch.setattr(judgement, "reader_errors", lambda *_: {"misread": 0.0, "refused": 0.0})
+    monkeypatch.setattr("imagine_bench.judge.reading.reader_errors", lambda *_: {"misread": 0.0, "refused": 0.0})
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
     folders = [tmp_path / name for name in ("one", "one", "other")]
     for folder in folders:
         folder.mkdir(exist_ok=True)
     with ThreadPoolExecutor(3) as pool:
-        jobs = [pool.submit(_OWN_READER, spec, "clean", folder) for folder in folders]
+        jobs = [pool.submit(reader_in, spec, "clean", folder) for folder in folders]
     assert [job.result() for job in jobs] == [b"whole"] * 3
     assert len(trained) == 1, "the reader of a world serves every folder"
     (cached,) = (tmp_path / "cache").rglob("reader.safetensors")
     cached.write_bytes(b"other")
     with pytest.raises(ArtefactError, match=r"reader\.safetensors is damaged; remove .* trains it anew"):
-        _OWN_READER(spec, "clean", make_folder(tmp_path / "third"))
+        reader_in(spec, "clean", make_folder(tmp_path / "third"))
 
 
 def test_a_half_written_reader_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "reader.safetensors").write_bytes(b"half")
     with pytest.raises(ArtefactError, match=r"reader\.safetensors is not the judge's reader; remove it, and the same"):
-        _OWN_READER(registry.task("pick_place"), "clean", tmp_path)
+        reader_in(registry.task("pick_place"), "clean", tmp_path)

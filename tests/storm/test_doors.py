@@ -110,7 +110,7 @@ def _cheap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     names = ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read")
     monkeypatch.setattr(code, "train_reader", trained)
-    monkeypatch.setattr("imagine_bench.judge.judgement.reader_errors", lambda *_: dict.fromkeys(names, 0.0))
+    monkeypatch.setattr("imagine_bench.judge.reading.reader_errors", lambda *_: dict.fromkeys(names, 0.0))
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
 
 

@@ -97,7 +97,7 @@ class _Drawn(_Wrong):
 def test_wrong_models_are_found(
     monkeypatch: pytest.MonkeyPatch, made: Callable[[Any], Any], holds: str, words: str
 ) -> None:
-    monkeypatch.setattr(registry, "make_world_model", lambda name, context: made(context))
+    monkeypatch.setattr(registry, "made", lambda what, target, context: made(context))
     found = checks(task="arrow_puzzle_easy", model="copy")
     for what, check in found.items():
         if what.startswith(holds):

@@ -18,7 +18,7 @@ from imagine_bench.agents.world_models.reader import (
 )
 
 from imagine_bench import registry
-from imagine_bench.judge.judgement import reader_errors
+from imagine_bench.judge.reading import reader_errors
 
 
 def some_frames(count: int) -> tuple[np.ndarray, np.ndarray]:
