@@ -14,7 +14,7 @@ from torch.nn import functional
 from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import AgentContext, Frame
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import Imagined
+from imagine_bench.interfaces.model import Imagined, until_the_end
 
 from ..encoders.perception import prepare_torch
 from ..networks.mlp import initialise
@@ -22,7 +22,6 @@ from ..networks.mlp import initialise
 _STEPS = 1_200
 _BATCH = 32
 _RATE = 2e-3
-_CHUNK = 256
 _REWARD = 10.0  # units of reward that the network's output is in
 
 
@@ -80,27 +79,16 @@ class Convolutional:
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """One future, fed its own pictures; see :class:`.interfaces.model.WorldModel`."""
         del samples, rng
-        asked = torch.tensor(actions[:, frames.shape[1] - 1 :])
-        pieces = zip(torch.tensor(frames[:, -1]).split(_CHUNK), asked.split(_CHUNK), strict=True)
-        rolled = [self._roll(*piece) for piece in pieces]
-        pictures, rewards, ended = (torch.cat(column).numpy()[:, None] for column in zip(*rolled, strict=True))
-        certain = np.ones((len(frames), 1, asked.shape[1]))
-        return Imagined(pictures=pictures, probabilities=certain, rewards=rewards, p_ended=ended)
-
-    def _roll(self, frames: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Pictures (N, D, 64, 64, 3), rewards and P(ended) (N, D) of one piece."""
-        images = _images(frames)
-        alive = torch.ones(len(frames))
-        drawn = []
-        earned = []
-        over = []
-        for action in actions.unbind(dim=1):
+        images = _images(torch.tensor(frames[:, -1]))
+        steps = []
+        for action in torch.tensor(actions[:, frames.shape[1] - 1 :]).unbind(dim=1):
             images, reward, logit = self.network(images, action)
-            drawn.append((images.permute(0, 2, 3, 1) * 255.0).round().to(torch.uint8))
-            earned.append(alive * reward * _REWARD)
-            alive = alive * (1.0 - logit.sigmoid())
-            over.append(1.0 - alive)
-        return torch.stack(drawn, dim=1), torch.stack(earned, dim=1), torch.stack(over, dim=1)
+            drawn = (images.permute(0, 2, 3, 1) * 255.0).round().to(torch.uint8)
+            steps.append((drawn, reward, logit.sigmoid()))
+        pictures, rewards, ends = (torch.stack(each, dim=1).numpy()[:, None] for each in zip(*steps, strict=True))
+        counted, p_ended = until_the_end(rewards, ends)
+        certain = np.ones(counted.shape)
+        return Imagined(pictures=pictures, probabilities=certain, rewards=counted * _REWARD, p_ended=p_ended)
 
     def parameters(self) -> int:
         """Weights and biases."""

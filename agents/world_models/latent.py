@@ -18,7 +18,7 @@ from torch import Tensor
 from imagine_bench.arrays import Array, Arrays, Ints
 from imagine_bench.interfaces import AgentContext, Frame
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import Imagined
+from imagine_bench.interfaces.model import Imagined, until_the_end
 from imagine_bench.values import Setting
 
 from ..encoders.encoder import Encoder
@@ -88,7 +88,6 @@ class LatentModel:
         turns = iter(asked.unbind(dim=1))
         z = self.states(frames, actions).repeat_interleave(samples, dim=0)  # [N S, Z]
         weights = self.imagination.draw_weights(generator)
-        alive = torch.ones(len(z))
         kept = torch.ones(len(z), dtype=torch.bool)
         steps: defaultdict[str, list[Array]] = defaultdict(list)
         depth = asked.shape[1]
@@ -96,9 +95,8 @@ class LatentModel:
             step = each.step
             images = self.encoder.decode(step.next_z[:, : self.encoder.latent_size])
             steps["pictures"].append((images * 255.0).round().astype(np.uint8))
-            steps["rewards"].append((alive * step.reward).numpy())
-            alive = alive * (1.0 - step.p_terminated)
-            steps["p_ended"].append((1.0 - alive).numpy())
+            steps["rewards"].append(step.reward.numpy())
+            steps["p_ended"].append(step.p_terminated.numpy())
             kept = kept & each.kept  # what follows a discarded step is discarded
             steps["accepted"].append(kept.view(rows, samples).float().mean(dim=1).numpy() >= _MOST)
             for name, values in self.imagination.uncertainties(step).items():
@@ -106,6 +104,7 @@ class LatentModel:
         found: Arrays = {name: np.stack(each, axis=1) for name, each in steps.items()}
         for name in ("pictures", "rewards", "p_ended"):
             found[name] = found[name].reshape(rows, samples, *found[name].shape[1:])
+        found["rewards"], found["p_ended"] = until_the_end(found["rewards"], found["p_ended"])
         if not self.compares:
             del found["epistemic"], found["accepted"]  # not offered, which is another thing than 0
         return Imagined(**found)

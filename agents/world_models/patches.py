@@ -22,7 +22,7 @@ from scipy.spatial.distance import squareform
 from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import AgentContext, Floats, Frame
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import Imagined
+from imagine_bench.interfaces.model import Imagined, until_the_end
 
 _CHANGED = 40  # a pixel has changed if one of its colors differs by more, of 255
 _OFTEN = 0.1  # share of the transitions of a macro-action in which it changes the pixels of a patch
@@ -92,25 +92,23 @@ class Patches:
         asked = actions[:, frames.shape[1] - 1 :]
         shape = (len(frames), samples, asked.shape[1])
         images = np.empty((*shape, *frames.shape[2:]), dtype=np.uint8)
-        rewards, over, unknown = np.zeros((3, *shape))
+        rewards, ends, unknown = np.zeros((3, *shape))
         starts = self._looks(_gray(frames[:, -1]))
         for row, sample in np.ndindex(shape[:2]):
             looks = starts[row]
             image = frames[row, -1].reshape(-1, 3).copy()
-            alive = 1.0
             for step, action in enumerate(asked[row].tolist()):
                 after, seen = self._drawn(looks, action, rng)
-                reward, ends = self._outcome((looks, action, after))
-                rewards[row, sample, step] = alive * reward
-                alive *= 1.0 - ends
-                over[row, sample, step] = 1.0 - alive
-                unknown[row, sample, step] = 1.0 / (1.0 + seen)
+                place = (row, sample, step)
+                rewards[place], ends[place] = self._outcome((looks, action, after))
+                unknown[place] = 1.0 / (1.0 + seen)
                 for patch, old, new in zip(self.patches, looks, after, strict=True):
                     if new != old:
                         image[patch.pixels] = patch.colors[new]
-                images[row, sample, step] = image.reshape(frames.shape[2:])
+                images[place] = image.reshape(frames.shape[2:])
                 looks = after
-        return Imagined(pictures=images, rewards=rewards, p_ended=over, epistemic=unknown.mean(axis=1))
+        rewards, p_ended = until_the_end(rewards, ends)
+        return Imagined(pictures=images, rewards=rewards, p_ended=p_ended, epistemic=unknown.mean(axis=1))
 
     def _drawn(self, looks: Looks, action: int, rng: np.random.Generator) -> tuple[Looks, int]:
         """The next looks, and how often that patch was seen of which least is known; unseen looks stay."""

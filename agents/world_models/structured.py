@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import AgentContext, Floats, Frame
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import Imagined
+from imagine_bench.interfaces.model import Imagined, until_the_end
 
 from ..encoders.perception import prepare_torch
 from ..factored.factors import Codes, CodeTransition
@@ -46,24 +46,16 @@ class StructuredModel:
         rows, depth = asked.shape
         shape = (rows, samples, depth)
         codes = np.repeat(np.array(self.perception.codes(frames[:, -1])), samples, axis=0)
-        alive = np.ones(rows * samples)
-        drawn = []
-        rewards = np.zeros(shape)
-        ended = np.zeros(shape)
-        unknown = np.zeros(shape)
-        other = np.zeros(shape)
-        for step in range(depth):
-            action = np.repeat(asked[:, step], samples)
-            codes, reward, ends, untested, p_other = self._step(codes, action, rng)
-            drawn.append(codes)
-            rewards[:, :, step] = (alive * reward).reshape(rows, samples)
-            alive = alive * (1.0 - ends)
-            for array, values in ((ended, 1.0 - alive), (unknown, untested), (other, p_other)):
-                array[:, :, step] = values.reshape(rows, samples)
-        pictures = self._pictures(np.stack(drawn, axis=1))
+        steps = []
+        for action in asked.repeat(samples, axis=0).T:
+            steps.append(self._step(codes, action, rng))
+            codes = steps[-1][0]
+        drawn, rewards, ends, unknown, other = (np.stack(each, axis=1) for each in zip(*steps, strict=True))
+        pictures = self._pictures(drawn)
+        counted, p_ended = until_the_end(rewards.reshape(shape), ends.reshape(shape))
         return Imagined(
-            pictures=pictures.reshape(*shape, *pictures.shape[1:]), rewards=rewards, p_ended=ended,
-            epistemic=unknown.mean(axis=1), modal=other.mean(axis=1),
+            pictures=pictures.reshape(*shape, *pictures.shape[1:]), rewards=counted, p_ended=p_ended,
+            epistemic=unknown.reshape(shape).mean(axis=1), modal=other.reshape(shape).mean(axis=1),
         )  # fmt: skip
 
     def _step(

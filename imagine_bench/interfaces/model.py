@@ -6,14 +6,16 @@ Shapes: ``N`` questions, ``K`` frames of history, ``D`` imagined depth, ``S`` im
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imagine_bench.arrays import Array, Arrays, Floats, Frame, Images, Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.episodes import Episodes
 
+R = TypeVar("R", bound=np.floating)
 UNCERTAINTIES = ("epistemic", "aleatoric", "modal")
 _SUM_TOLERANCE = 1e-4
 
@@ -111,6 +113,21 @@ def _require_ranges(offered: Arrays, said: str) -> None:
         worst = sums.flat[int(np.abs(sums - 1.0).argmax())]
         if abs(worst - 1.0) > _SUM_TOLERANCE:
             raise InvalidValueError(f"{said} gave probabilities that sum to {worst:.4g} over S; they must sum to 1.")
+
+
+def until_the_end(rewards: NDArray[R], ends: NDArray[R]) -> tuple[NDArray[R], NDArray[R]]:
+    """Rewards that count, and whether the episode has ended, of futures that were imagined beyond its end.
+
+    Args:
+        rewards: Reward of each action as if the episode went on before it. Shape (N, S, D).
+        ends: Probability that the episode ends with it, likewise. Shape (N, S, D).
+
+    Returns:
+        ``rewards`` and ``p_ended`` of :class:`Imagined`.
+    """
+    survived = np.cumprod(1.0 - ends, axis=2)
+    before = np.pad(survived[:, :, :-1], ((0, 0), (0, 0), (1, 0)), constant_values=1.0)
+    return before * rewards, 1.0 - survived
 
 
 def weights_of(imagined: Imagined) -> Floats:

@@ -20,7 +20,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, Floats, Frame, State, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel
+from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, until_the_end
 from imagine_bench.judge.predictions import imagined_by
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.registry.entries import WorldModelEntry, entrant
@@ -65,12 +65,11 @@ class AgentModel:
         uncertain = {name: stacked(name).mean(axis=1) for name in UNCERTAINTIES}
         if not uncertain["aleatoric"].any():  # a rollout has to hold something; a model that has none says 0
             del uncertain["aleatoric"]
-        survived = np.cumprod(1.0 - stacked("p_terminated"), axis=2)
-        before = np.pad(survived[:, :, :-1], ((0, 0), (0, 0), (1, 0)), constant_values=1.0)
+        rewards, p_ended = until_the_end(stacked("rewards"), stacked("p_terminated"))
         return Imagined(
             pictures=(stacked("frames").clip(0.0, 1.0) * 255.0).round().astype(np.uint8),
-            rewards=before * stacked("rewards"),
-            p_ended=1.0 - survived,
+            rewards=rewards,
+            p_ended=p_ended,
             accepted=stacked("accepted").mean(axis=1) >= _MOST,
             **uncertain,
         )
