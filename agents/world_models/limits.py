@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from imagine_bench.arrays import Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, Frame, State, TaskSpec
-from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import Imagined
+from imagine_bench.interfaces.model import Imagined, Untaught
 from imagine_bench.rules import Outcomes, outcomes_by_depth
 
 
@@ -25,15 +24,11 @@ class MacrostateRenderer(Protocol):
         """The macrostate of a rendered frame; None for any other image."""
 
 
-class Copy:
+class Copy(Untaught):
     """Says that nothing ever changes, is rewarded or ends."""
 
     def __init__(self, context: AgentContext) -> None:
         del context
-
-    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
-        """Learn nothing."""
-        del dataset, rng
 
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """The last frame, whatever is done; see :class:`imagine_bench.interfaces.model.WorldModel`."""
@@ -43,21 +38,13 @@ class Copy:
         images = np.broadcast_to(frames[:, None, -1:], (rows, 1, depth, *frames.shape[2:]))
         return Imagined(pictures=images, probabilities=np.ones((rows, 1, depth)))
 
-    def parameters(self) -> int:
-        """None."""
-        return 0
 
-
-class Exact:
+class Exact(Untaught):
     """The rules, and a rendered frame of each outcome; it knows what each frame of the judge shows."""
 
     def __init__(self, spec: TaskSpec, renderer: MacrostateRenderer) -> None:
         self._rules = spec.rules
         self.renderer = renderer
-
-    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
-        """Learn nothing: it knows."""
-        del dataset, rng
 
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """Every outcome with its probability; see :class:`imagine_bench.interfaces.model.WorldModel`."""
@@ -86,7 +73,3 @@ class Exact:
         if state is None:
             raise InvalidValueError("The exact model was given a frame that the judge did not render.")
         return outcomes_by_depth(self._rules, state, actions.tolist())
-
-    def parameters(self) -> int:
-        """None."""
-        return 0

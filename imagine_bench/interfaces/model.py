@@ -58,6 +58,17 @@ class WorldModel(Protocol):
         """Numbers that were fitted."""
 
 
+class Untaught:
+    """What a world model that learns nothing has in common with others."""
+
+    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
+        """Learn nothing."""
+
+    def parameters(self) -> int:
+        """None were fitted."""
+        return 0
+
+
 def require_imagined(imagined: object, *, name: str, rows: int, depth: int, samples: int) -> Imagined:
     """What a model handed in, if it is what it has to be.
 

@@ -20,7 +20,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, Floats, Frame, State, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, until_the_end
+from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, Untaught, WorldModel, until_the_end
 from imagine_bench.judge.predictions import imagined_by
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.registry.entries import WorldModelEntry, entrant
@@ -38,15 +38,11 @@ _TASKS = "imagine_bench.tasks"
 _MOST = 0.5  # share of its futures that a filter keeps of a step that counts as kept
 
 
-class AgentModel:
+@dataclass(frozen=True)
+class AgentModel(Untaught):
     """An agent that imagines, as a world model; the agent learns elsewhere and is not changed."""
 
-    def __init__(self, agent: Imaginer) -> None:
-        self.agent = agent
-
-    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
-        """Learn nothing more."""
-        del dataset, rng
+    agent: Imaginer
 
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """Rollouts of the agent, one after another; see :class:`imagine_bench.interfaces.model.WorldModel`."""
@@ -74,51 +70,47 @@ class AgentModel:
             **uncertain,
         )
 
-    def parameters(self) -> int:
-        """Not known."""
-        return 0
 
-
+@dataclass(frozen=True)
 class ServedModel:
     """A world model as :class:`.running.isolation.Isolated` serves it: its methods return arrays by name."""
 
-    def __init__(self, name: str, model: WorldModel) -> None:
-        self._name = name
-        self._model = model
+    name: str
+    model: WorldModel
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> Arrays:
         """Nothing."""
-        self._model.fit(dataset, rng)
+        self.model.fit(dataset, rng)
         return {}
 
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Arrays:
         """The fields of the model's :class:`Imagined`, by name. Raises InvalidValueError: one has wrong values."""
-        found = imagined_by(self._model, self._name, frames, actions, samples, rng)
+        found = imagined_by(self.model, self.name, frames, actions, samples, rng)
         offered = {field.name: getattr(found, field.name) for field in fields(Imagined)}
         return {name: np.ascontiguousarray(array) for name, array in offered.items() if array is not None}
 
     def parameters(self) -> Arrays:
         """Their number."""
-        return {"parameters": np.array(int(self._model.parameters()))}
+        return {"parameters": np.array(int(self.model.parameters()))}
 
 
+@dataclass(frozen=True)
 class IsolatedModel:
     """A world model in a process of its own."""
 
-    def __init__(self, process: Isolated) -> None:
-        self._process = process
+    process: Isolated
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """As of the model."""
-        self._process.call("fit", dataset, rng)
+        self.process.call("fit", dataset, rng)
 
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """As of the model; how far ``rng`` was drawn from there is not known here."""
-        return Imagined(**self._process.call("imagine", frames, actions, samples, rng))
+        return Imagined(**self.process.call("imagine", frames, actions, samples, rng))
 
     def parameters(self) -> int:
         """As of the model."""
-        return int(self._process.call("parameters")["parameters"])
+        return int(self.process.call("parameters")["parameters"])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -287,7 +287,7 @@ class LabelOracle:
     """Labels what actions would bring, from the rules and the true macrostate, where these allow one outcome."""
 
     def __init__(self, rules: Rules) -> None:
-        self._rules = rules
+        self.rules = rules
 
     def label(self, macrostate: tuple[int, ...], actions: Ints) -> Label | None:
         """What the last of ``actions`` (D,) from ``macrostate`` would bring.
@@ -297,17 +297,17 @@ class LabelOracle:
         InvalidValueError: no action, or one that does not exist.
         """
         planned = [int(action) for action in actions]
-        if not planned or not all(0 <= action < self._rules.n_actions for action in planned):
+        if not planned or not all(0 <= action < self.rules.n_actions for action in planned):
             raise InvalidValueError(
-                f"Asked about the actions {planned}; give at least one, each from 0 to {self._rules.n_actions - 1}."
+                f"Asked about the actions {planned}; give at least one, each from 0 to {self.rules.n_actions - 1}."
             )
         possible = {macrostate}
         for action in planned[:-1]:
-            possible = {each.macrostate for state in possible for each in self._rules.outcomes(state, action)}
+            possible = {each.macrostate for state in possible for each in self.rules.outcomes(state, action)}
         labels = {
             Label(outcome.reward, outcome.terminated)
             for state in possible
-            for outcome in self._rules.outcomes(state, planned[-1])
+            for outcome in self.rules.outcomes(state, planned[-1])
         }
         return labels.pop() if len(labels) == 1 else None
 
@@ -342,21 +342,21 @@ class Teacher:
         )
 
 
+@dataclass
 class QueryBudget:
     """The ``queries`` that ``learner`` may ask in one episode, before each of its macro-actions."""
 
-    def __init__(self, learner: Agent, oracle: LabelOracle, queries: int) -> None:
-        self._learner = learner
-        self._oracle = oracle
-        self._queries = queries
-        self.asked = 0
+    learner: Agent
+    oracle: LabelOracle
+    queries: int
+    asked: int = 0
 
     def __call__(self, observation: Observation, info: Info) -> None:
         """Let the learner ask at a real frame until it has nothing to ask or may not any more."""
-        while self.asked < self._queries and isinstance(self._learner, QueryingAgent):
-            actions = self._learner.query(observation)
+        while self.asked < self.queries and isinstance(self.learner, QueryingAgent):
+            actions = self.learner.query(observation)
             if actions is None:
                 return
             macrostate = tuple(int(value) for value in info["macrostate"])
-            self._learner.learn_label(observation, actions, self._oracle.label(macrostate, actions))
-            self.asked = self.asked + 1
+            self.learner.learn_label(observation, actions, self.oracle.label(macrostate, actions))
+            self.asked += 1
