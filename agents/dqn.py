@@ -6,15 +6,13 @@ import copy
 import math
 from functools import partial
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imagine_bench.arrays import Ints
+from imagine_bench.arrays import Floats32, Frame, Ints
 from imagine_bench.errors import DivergedError
-from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Observation, Transition
 from imagine_bench.seeding import SeedTree
 
 from . import snapshot
@@ -137,7 +135,7 @@ class DQN:
         """The controller used in tests. A DQN has only one."""
         return self.controller
 
-    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+    def q_values(self, observation: Observation) -> Floats32:
         """Values of every macro-action at the mean latents. Shape (A,)."""
         return self._values(self.tested, observation)
 
@@ -146,7 +144,7 @@ class DQN:
         encoder = self.perception.encoder
         return encoder.read_macrostate(encoder.encode(frames)[0])
 
-    def _values(self, controller: Controller, observation: Observation) -> NDArray[np.float32]:
+    def _values(self, controller: Controller, observation: Observation) -> Floats32:
         return controller.values(self.perceive(observation.frame).unsqueeze(0))[0].cpu().numpy()
 
     def perceive(self, frame: Frame) -> Tensor:

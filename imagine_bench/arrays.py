@@ -15,6 +15,8 @@ State = tuple[int, ...]
 """A macrostate that can be a key. Length M."""
 Floats = NDArray[np.float64]
 """Numbers of double precision, of any shape."""
+Floats32 = NDArray[np.float32]
+"""Numbers of single precision, of any shape."""
 Ints = NDArray[np.int64]
 """Whole numbers, of any shape."""
 Bools = NDArray[np.bool_]

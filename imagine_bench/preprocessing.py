@@ -14,7 +14,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Ints
+from imagine_bench.arrays import Floats32, Ints
 from imagine_bench.errors import require_known
 
 STRIP_WIDTH = 22
@@ -27,7 +27,7 @@ _NEAR_ROWS = np.arange(46, 64)
 _GRAY = "gray_strips"
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
-Preprocess = Callable[[NDArray[np.uint8]], NDArray[np.float32]]
+Preprocess = Callable[[NDArray[np.uint8]], Floats32]
 
 
 def gray_name(cubes: int) -> str:
@@ -46,13 +46,13 @@ def _windows(cubes: int) -> list[tuple[Ints, Ints]]:
 
 
 @cache
-def _stretch(pixels: int) -> NDArray[np.float32]:
+def _stretch(pixels: int) -> Floats32:
     """Linear interpolation that makes cubes as large as in strips. Shape (pixels, 4/3 pixels)."""
     at = (np.arange(pixels * 4 // 3) + 0.5) * 0.75 - 0.5
     return np.stack([np.interp(at, np.arange(pixels), row) for row in np.eye(pixels)]).astype(np.float32)
 
 
-def gray_cells(frames: NDArray[np.uint8], cubes: int = 3) -> NDArray[np.float32]:
+def gray_cells(frames: NDArray[np.uint8], cubes: int = 3) -> Floats32:
     """Cut frames into a gray channel a cube: (N, 64, 64, 3) uint8 to (N, cubes, H, W) float32 in [0, 1]."""
     gray = (frames.astype(np.float32) @ _LUMA) / 255.0  # [N, 64, 64]
     cells = np.stack([gray[:, rows, columns] for rows, columns in _windows(cubes)], axis=1)
@@ -62,7 +62,7 @@ def gray_cells(frames: NDArray[np.uint8], cubes: int = 3) -> NDArray[np.float32]
     return _stretch(height).T @ cells @ _stretch(width)
 
 
-def join_cells(cells: NDArray[np.float32]) -> NDArray[np.float32]:
+def join_cells(cells: Floats32) -> Floats32:
     """Undo :func:`gray_cells` for pictures: (..., cubes, H, W) to (..., 64, 64).
 
     What several channels show is the left one's, and what none does is gray.
@@ -77,12 +77,12 @@ def join_cells(cells: NDArray[np.float32]) -> NDArray[np.float32]:
     return whole
 
 
-def whole_rgb(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+def whole_rgb(frames: NDArray[np.uint8]) -> Floats32:
     """Channels first: (N, 64, 64, 3) uint8 to (N, 3, 64, 64) float32 in [0, 1]."""
     return np.moveaxis(frames, -1, 1).astype(np.float32) / 255.0
 
 
-def small_rgb(frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+def small_rgb(frames: NDArray[np.uint8]) -> Floats32:
     """Half the resolution, 2 x 2 pixels averaged: (N, 64, 64, 3) uint8 to (N, 3, 32, 32) float32 in [0, 1]."""
     n, height, width, _ = frames.shape
     blocks = frames.reshape(n, height // 2, 2, width // 2, 2, 3).sum(axis=(2, 4), dtype=np.uint16)

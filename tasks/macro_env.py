@@ -12,9 +12,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Info, Observed
+from imagine_bench.arrays import Floats, Frame, Info, Observed, State
 from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_integer, require_known
-from imagine_bench.interfaces import EXECUTIONS, Floats, Frame, Outcome, PhysicsSettings, State, TaskSpec
+from imagine_bench.interfaces import EXECUTIONS, Outcome, PhysicsSettings, TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.values import Json
 

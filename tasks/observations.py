@@ -15,9 +15,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Observed
+from imagine_bench.arrays import Frame, Observed, State
 from imagine_bench.errors import InvalidValueError, brief, require_known
-from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Frame, Rules, State
+from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Rules
 from imagine_bench.rules import require_macrostates, states_of
 
 from .parameters.parameters import HIDDEN

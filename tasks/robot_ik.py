@@ -13,9 +13,9 @@ from importlib import resources
 import mujoco
 import numpy as np
 
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Arrays, Floats
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Floats, Motion, Shape3D
+from imagine_bench.interfaces import Motion, Shape3D
 from imagine_bench.interfaces.regression import Predict, Prediction, RegressionData, RegressionSpec
 from imagine_bench.seeding import SeedTree
 

@@ -19,10 +19,9 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Info, Observed
+from imagine_bench.arrays import Floats, Frame, Info, Observed
 from imagine_bench.cores import usable_cores
 from imagine_bench.errors import InvalidValueError, brief, require_integer, require_known
-from imagine_bench.interfaces import Floats, Frame
 
 from .macro_env import MacroEnv, Step, options_of
 

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Arrays, Ints
+from imagine_bench.arrays import Arrays, Frame, Ints
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Frame, TaskSpec, appearance_of_tests, bundled_name
+from imagine_bench.interfaces import TaskSpec, appearance_of_tests, bundled_name
 from imagine_bench.preprocessing import preprocess
 from imagine_bench.seeding import SeedTree
 

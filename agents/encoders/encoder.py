@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from imagine_bench.arrays import Ints
+from imagine_bench.arrays import Floats32, Frame, Ints
 from imagine_bench.errors import ArtefactError, InvalidValueError, brief, why, writing
-from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import content_hash
 from imagine_bench.preprocessing import join_cells, preprocess
 
@@ -108,12 +106,12 @@ class Encoder:
         means, deviations = zip(*chunks, strict=True)
         return torch.cat(means), torch.cat(deviations)
 
-    def latents(self, frame: Frame) -> NDArray[np.float32]:
+    def latents(self, frame: Frame) -> Floats32:
         """Posterior means (Z,) of one frame (64, 64, 3)."""
         return self.encode(frame[None])[0][0].cpu().numpy()
 
     @torch.no_grad()
-    def decode(self, latents: Tensor) -> NDArray[np.float32]:
+    def decode(self, latents: Tensor) -> Floats32:
         """One image of the whole view for every row of ``latents`` (N, Z), as :func:`view` shapes it, in [0, 1].
 
         Those of another package's encoder are as it draws them, or gray (N, 64, 64).
@@ -222,7 +220,7 @@ def _begun(path: Path) -> Path:
     return path.with_name(f".{path.name}.begun")
 
 
-def view(images: NDArray[np.float32], preprocessing: str) -> NDArray[np.float32]:
+def view(images: Floats32, preprocessing: str) -> Floats32:
     """One image of the whole view from preprocessed images: (N, C, H, W) to gray (N, H', W') or RGB (N, H, W, 3)."""
     if preprocessing.startswith("gray"):
         return join_cells(images)

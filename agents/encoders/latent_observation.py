@@ -6,16 +6,14 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Action
+from imagine_bench.arrays import Action, Floats32, Frame
 from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.interfaces import Frame
 
 from .encoder import Encoder, bundled_encoder
 
 
-class LatentObservation(gymnasium.ObservationWrapper[NDArray[np.float32], Action, Frame]):
+class LatentObservation(gymnasium.ObservationWrapper[Floats32, Action, Frame]):
     """Replace each camera frame by the mean of its latents, float32 of shape (Z,).
 
     Args:
@@ -40,7 +38,7 @@ class LatentObservation(gymnasium.ObservationWrapper[NDArray[np.float32], Action
             )
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.encoder.latent_size,), np.float32)
 
-    def observation(self, observation: Frame) -> NDArray[np.float32]:
+    def observation(self, observation: Frame) -> Floats32:
         """Latents (Z,) of one frame (64, 64, 3)."""
         return self.encoder.latents(observation)
 

@@ -7,9 +7,9 @@ import importlib
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from imagine_bench.arrays import Floats32
 from imagine_bench.interfaces import Frame, FrameEncoder
 from imagine_bench.preprocessing import preprocess
 
@@ -83,7 +83,7 @@ class OfferedNetwork(EncoderNetwork):
         return torch.from_numpy(np.asarray(draw(raw.cpu().numpy()), dtype=np.float32))
 
 
-def read_whole(frames: Frame) -> NDArray[np.float32]:
+def read_whole(frames: Frame) -> Floats32:
     """Frames in [0, 1], which the encoders of other packages read."""
     return frames.astype(np.float32) / 255.0
 

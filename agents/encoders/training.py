@@ -17,13 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Ints
+from imagine_bench.arrays import Floats32, Frame, Ints
 from imagine_bench.errors import ArtefactError, DivergedError
-from imagine_bench.interfaces import Frame, TaskSpec, appearance_of_tests
+from imagine_bench.interfaces import TaskSpec, appearance_of_tests
 from imagine_bench.preprocessing import preprocess
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
@@ -89,7 +88,7 @@ def frame_set(
     n: int,
     rng: np.random.Generator,
     progress: Progress,
-    prepare: Callable[[Frame], NDArray[np.float32]] | None = None,
+    prepare: Callable[[Frame], Floats32] | None = None,
 ) -> FrameSet:
     """Render ``n`` labelled frames of uniformly drawn macrostates, preprocessed as the task declares or else."""
     prepare = prepare or preprocess(spec.preprocessing)

@@ -8,8 +8,8 @@ episodes too, that which is most probably decided by something untested. This is
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from imagine_bench.arrays import Floats32
 from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout, Label, planned_actions
 from imagine_bench.seeding import SeedTree
@@ -140,11 +140,11 @@ class CodeAgent:
         self.model.outcomes.reset_for_new_task()
         self.planner.learned()
 
-    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+    def q_values(self, observation: Observation) -> Floats32:
         """Value of every macro-action, in units of reward; zeros before anything was seen. Shape (A,)."""
         return self._values(self.perception.code(observation.frame)).astype(np.float32)
 
-    def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
+    def novelty(self, observation: Observation, rng: np.random.Generator) -> Floats32 | None:
         """Where it would explore; see :class:`.capabilities.NoveltyReader`. None before it learned."""
         del rng
         if not self._ready:

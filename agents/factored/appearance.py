@@ -23,13 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Floats, Frame
+from imagine_bench.arrays import Floats, Floats32, Frame
 
 from .factors import Codes, Ints, Mask
 
-Images = NDArray[np.float32]
+Images = Floats32
 
 SHIFT_PX = 5
 """Crops are compared at all shifts of so many pixels up, down, left and right."""

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 from .factors import Codes, Ints, strides, table_size
 from .settings import DynamicsSettings

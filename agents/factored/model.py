@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 from .dynamics import Dynamics
 from .factors import Code, Codes, CodeTransition, Memory, contradictions, remembering

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 from .factors import Code, CodeTransition, Ints, strides, table_size
 from .settings import OutcomeSettings

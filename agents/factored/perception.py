@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Arrays, Frame
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, AgentState, Frame
+from imagine_bench.interfaces import AgentContext, AgentState
 from imagine_bench.values import Json
 
 from ..encoders.encoder import Encoder

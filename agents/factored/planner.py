@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 from .factors import Code, Ints
 from .model import FactoredModel

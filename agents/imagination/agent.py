@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.arrays import Ints
-from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation
+from imagine_bench.arrays import Floats32, Frame, Ints
+from imagine_bench.interfaces import AgentContext, AgentState, Observation
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout, planned_actions
 from imagine_bench.interfaces.model import UNCERTAINTIES
 from imagine_bench.seeding import SeedTree
@@ -144,7 +144,7 @@ class ImaginingAgent(DQN):
         self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
         self.steps = self.updates = 0
 
-    def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
+    def novelty(self, observation: Observation, rng: np.random.Generator) -> Floats32 | None:
         """Return the curiosity reward of every macro-action; see :class:`.capabilities.NoveltyReader`.
 
         A single network has no disagreement to measure, so the result is None there.

@@ -11,15 +11,14 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Bools, Info, Ints, State
+from imagine_bench.arrays import Bools, Floats, Floats32, Frame, Info, Ints, State
 from imagine_bench.errors import InvalidValueError, brief, require_integer
-from imagine_bench.interfaces import Floats, Frame
 from imagine_bench.interfaces.model import UNCERTAINTIES
 
 from .agent import ImaginingAgent
 from .rollouts import LATENT_LIMIT, Imagination, ImaginedStep
 
-Latents = NDArray[np.float32]
+Latents = Floats32
 VERDICT = ("accepted", *UNCERTAINTIES)
 """What an info says of a transition."""
 

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from imagine_bench.arrays import Floats
 from imagine_bench.errors import DivergedError
-from imagine_bench.interfaces import Floats
 from imagine_bench.interfaces.regression import Prediction, RegressorContext
 
 from ..encoders.perception import prepare_torch

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imagine_bench.arrays import Ints
-from imagine_bench.interfaces import AgentContext, Frame
+from imagine_bench.arrays import Frame, Ints
+from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, until_the_end
 

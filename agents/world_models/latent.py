@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from imagine_bench.arrays import Array, Arrays, Ints
-from imagine_bench.interfaces import AgentContext, Frame
+from imagine_bench.arrays import Array, Arrays, Frame, Ints
+from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, until_the_end
 from imagine_bench.values import Setting

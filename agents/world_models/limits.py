@@ -7,9 +7,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Ints
+from imagine_bench.arrays import Frame, Ints, State
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import AgentContext, Frame, State, TaskSpec
+from imagine_bench.interfaces import AgentContext, TaskSpec
 from imagine_bench.interfaces.model import Imagined, Untaught
 from imagine_bench.rules import Outcomes, outcomes_by_depth
 

@@ -19,8 +19,8 @@ from scipy.cluster import hierarchy
 from scipy.ndimage import uniform_filter
 from scipy.spatial.distance import squareform
 
-from imagine_bench.arrays import Ints
-from imagine_bench.interfaces import AgentContext, Floats, Frame
+from imagine_bench.arrays import Floats, Frame, Ints
+from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, until_the_end
 

@@ -15,8 +15,8 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn import functional
 
-from imagine_bench.arrays import Array, Ints
-from imagine_bench.interfaces import State, TaskSpec, appearance_of_tests
+from imagine_bench.arrays import Array, Ints, State
+from imagine_bench.interfaces import TaskSpec, appearance_of_tests
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Ints
-from imagine_bench.interfaces import AgentContext, Floats, Frame
+from imagine_bench.arrays import Floats, Frame, Ints
+from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, until_the_end
 

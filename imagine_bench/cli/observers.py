@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import replace
 from typing import TypedDict
 
-from imagine_bench.interfaces import Frame
+from imagine_bench.arrays import Frame
 from imagine_bench.interfaces.capabilities import Imaginer
 from imagine_bench.judge.causes import MOST_STATES, beliefs, frames_to_ask_with
 from imagine_bench.judge.open_loop import (

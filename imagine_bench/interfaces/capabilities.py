@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Bools, Floats, Frame, Ints
+from imagine_bench.arrays import Bools, Floats, Floats32, Frame, Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.observation import Observation
 
@@ -24,16 +24,16 @@ class ImaginedRollout:
 
     actions: Ints  #: macro-actions imagined. Shape (D,), int64.
     #: decoded latents as images of the whole view in [0, 1], gray (D, H', W') or RGB (D, H', W', 3)
-    frames: NDArray[np.float32]
+    frames: Floats32
     #: the decoded encoding of the real frame it started from. Shape (H', W') or (H', W', 3).
-    start_frame: NDArray[np.float32]
-    rewards: NDArray[np.float32]  #: predicted rewards. Shape (D,).
-    p_terminated: NDArray[np.float32]  #: predicted probability that the episode ended there. Shape (D,).
-    q_values: NDArray[np.float32]  #: the controller's values in the state *before* each action. Shape (D, A).
+    start_frame: Floats32
+    rewards: Floats32  #: predicted rewards. Shape (D,).
+    p_terminated: Floats32  #: predicted probability that the episode ended there. Shape (D,).
+    q_values: Floats32  #: the controller's values in the state *before* each action. Shape (D, A).
     #: epistemic uncertainty of each imagined transition, reduced as the filter does. Shape (D,).
-    epistemic: NDArray[np.float32]
-    aleatoric: NDArray[np.float32]  #: the same for aleatoric. Shape (D,).
-    modal: NDArray[np.float32]  #: the same for modal. Shape (D,).
+    epistemic: Floats32
+    aleatoric: Floats32  #: the same for aleatoric. Shape (D,).
+    modal: Floats32  #: the same for modal. Shape (D,).
     #: whether the filter keeps the transition (False from the first rejected one on). Shape (D,).
     accepted: Bools
     macrostates: Ints  #: the macrostate a probe reads from each imagined latent. Shape (D, M).
@@ -89,7 +89,7 @@ class SeeingLearner(Protocol):
 class ValueReader(Protocol):
     """An agent that has action values."""
 
-    def q_values(self, observation: Observation) -> NDArray[np.float32]:
+    def q_values(self, observation: Observation) -> Floats32:
         """Values of every macro-action. Shape (A,)."""
 
 
@@ -97,7 +97,7 @@ class ValueReader(Protocol):
 class NoveltyReader(Protocol):
     """An agent that can say how much of each macro-action it does not know: what its curiosity goes by."""
 
-    def novelty(self, observation: Observation, rng: np.random.Generator) -> NDArray[np.float32] | None:
+    def novelty(self, observation: Observation, rng: np.random.Generator) -> Floats32 | None:
         """How unknown every macro-action is, in [0, 1] by the agent's own measure; None where it has none. Shape (A,).
 
         ``rng`` draws weight samples; nothing changes in the agent.

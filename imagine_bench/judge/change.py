@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imagine_bench.arrays import Ints
-from imagine_bench.interfaces import Floats, Outcome, Rules, State, TaskSpec
+from imagine_bench.arrays import Floats, Ints, State
+from imagine_bench.interfaces import Outcome, Rules, TaskSpec
 from imagine_bench.judge.predictions import Predictions
 from imagine_bench.judge.questions import FRAMES, EvalSet
 from imagine_bench.judge.truth import added_up, branches

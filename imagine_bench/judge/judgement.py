@@ -18,10 +18,10 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Arrays
+from imagine_bench.arrays import Arrays, State
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, brief
-from imagine_bench.interfaces import State, TaskSpec
+from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.episodes import content_hash
 from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge import questions

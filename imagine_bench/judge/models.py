@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.arrays import Arrays, Ints
+from imagine_bench.arrays import Arrays, Floats, Frame, Ints, State
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import AgentContext, Floats, Frame, State, TaskSpec
+from imagine_bench.interfaces import AgentContext, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, Untaught, WorldModel, until_the_end

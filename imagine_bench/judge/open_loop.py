@@ -13,8 +13,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from imagine_bench.arrays import Floats, Ints, read_only
-from imagine_bench.interfaces import Frame, Sight, State, TaskSpec
+from imagine_bench.arrays import Floats, Frame, Ints, State, read_only
+from imagine_bench.interfaces import Sight, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer, begin_episode
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.truth import added_up, expected_reward, shares

@@ -10,9 +10,8 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Arrays, Ints
+from imagine_bench.arrays import Arrays, Floats, Frame, Ints, State
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
-from imagine_bench.interfaces import Floats, Frame, State
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.reading import ImageReader, RenderedFrameIndex

@@ -12,8 +12,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from imagine_bench.arrays import Ints
-from imagine_bench.interfaces import Frame, Rules, State, TaskSpec
+from imagine_bench.arrays import Frame, Ints, State
+from imagine_bench.interfaces import Rules, TaskSpec
 from imagine_bench.rules import Outcomes, advance, outcomes_by_depth, states_of
 from imagine_bench.seeding import SeedTree
 

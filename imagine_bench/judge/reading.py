@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.arrays import Images, Ints
+from imagine_bench.arrays import Frame, Images, Ints, State
 from imagine_bench.errors import ArtefactError
-from imagine_bench.interfaces import Frame, State, TaskSpec
+from imagine_bench.interfaces import TaskSpec
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench.arrays import Bools
-from imagine_bench.interfaces import Floats, Rules, State, TaskSpec
+from imagine_bench.arrays import Bools, Floats, State
+from imagine_bench.interfaces import Rules, TaskSpec
 from imagine_bench.judge.predictions import Predictions
 from imagine_bench.judge.questions import FRAMES, RANKED, EvalSet
 from imagine_bench.judge.truth import (

@@ -16,8 +16,8 @@ import numpy as np
 import scipy  # its parts load, slowly, when they are first used
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Bools, Floats, Ints
-from imagine_bench.interfaces import Rules, State
+from imagine_bench.arrays import Bools, Floats, Ints, State
+from imagine_bench.interfaces import Rules
 from imagine_bench.rules import Dynamics, Outcomes, every_outcome
 
 MODE = 0.05  # least probability of an outcome that counts as a mode

@@ -18,9 +18,9 @@ import scipy  # its parts load, slowly, when they are first used
 
 from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Bools
+from imagine_bench.arrays import Bools, Floats, State
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import APPEARANCES, SENSES, Floats, PhysicsSettings, State, TaskSpec
+from imagine_bench.interfaces import APPEARANCES, SENSES, PhysicsSettings, TaskSpec
 from imagine_bench.registry.machine import describe_environment, gl_renderer
 from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree, episode_seed

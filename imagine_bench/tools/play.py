@@ -19,9 +19,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from imagine_bench import registry
-from imagine_bench.arrays import Action, Info, State
+from imagine_bench.arrays import Action, Frame, Info, State
 from imagine_bench.errors import InvalidValueError, SetupError
-from imagine_bench.interfaces import Frame, TaskSpec
+from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import episode_seed

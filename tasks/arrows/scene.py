@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 from ..parameters.distractors import add_distractors
 from ..scenes import constants as c

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from imagine_bench.interfaces import State
+from imagine_bench.arrays import State
 
 from ..motion import orientation
 from ..motion.executor import MacroResult

@@ -8,7 +8,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 from ..scenes.arm import TCP_SITE, tcp_in_world
 from ..scenes.constants import OBSERVATION_QPOS_RAD

@@ -14,8 +14,8 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
+from imagine_bench.arrays import Floats
 from imagine_bench.errors import DivergedError
-from imagine_bench.interfaces import Floats
 
 from ..scenes.arm import ARM_JOINTS, arm_columns
 from ..scenes.constants import OBSERVATION_QPOS_RAD

@@ -12,8 +12,8 @@ import mink
 import mujoco
 import numpy as np
 
+from imagine_bench.arrays import Floats
 from imagine_bench.errors import ImagineBenchError
-from imagine_bench.interfaces import Floats
 
 from ..scenes.arm import ARM_JOINTS, FINGER_JOINTS, JOINT_SPEED_LIMITS_RAD_S, TCP_SITE, arm_spec
 from ..scenes.constants import HOME_QPOS_RAD

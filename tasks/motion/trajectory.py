@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 from .ik import ArmModel
 

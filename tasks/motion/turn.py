@@ -9,7 +9,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 from ..scenes.constants import CUBE_EDGE_M, CUBE_REST_Z_M, HOME_QPOS_RAD
 from .executor import BLEND_S, REST_OPENING_M, MacroExecutor, MacroResult, back_to_rest

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from imagine_bench.interfaces import State
+from imagine_bench.arrays import State
 
 from ..motion import orientation
 from ..motion.executor import REST_OPENING_M, MacroResult

@@ -28,8 +28,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from imagine_bench.arrays import State
 from imagine_bench.errors import SetupError, require_known
-from imagine_bench.interfaces import State
 
 _OFFSCREEN = mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value
 _ALL_OBJECTS = mujoco.mjtCatBit.mjCAT_ALL.value

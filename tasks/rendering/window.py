@@ -9,8 +9,8 @@ import sys
 from types import ModuleType
 from typing import Any, cast
 
+from imagine_bench.arrays import Frame
 from imagine_bench.errors import SetupError
-from imagine_bench.interfaces import Frame
 
 HAS_PYGAME = importlib.util.find_spec("pygame") is not None
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 ARM_JOINTS = tuple(f"right_j{index}" for index in range(7))
 """From the base to the wrist."""

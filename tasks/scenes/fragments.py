@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imagine_bench.interfaces import Floats, Frame, State
+from imagine_bench.arrays import Floats, Frame, State
 from imagine_bench.seeding import SeedTree
 
 from .appearance import Appearance

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imagine_bench.interfaces import Floats
+from imagine_bench.arrays import Floats
 
 from .constants import Point
 
