@@ -9,7 +9,7 @@ import functools
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +83,8 @@ class RuleFacts:
     mean_plan_length: float  #: mean number of actions of an optimal agent over the start states
 
 
-class OutcomeTable(NamedTuple):
+@dataclass(frozen=True)
+class OutcomeTable:
     """N outcomes, all that every macro-action has in some macrostates: by macrostate, by macro-action, as they come."""
 
     index: dict[State, int]  #: macrostate to row, in the order in which they come up
@@ -132,6 +133,11 @@ def states_of(rules: Rules) -> tuple[State, ...]:
     return getattr(rules, "states", None) or tuple(tabulate(rules).index)
 
 
+def states_of_play(rules: Rules) -> list[State]:
+    """Every macrostate from which an episode goes on."""
+    return [state for state in states_of(rules) if not rules.is_terminal(state)]
+
+
 def tabulate(rules: Rules, depth: int | None = None) -> RuleTables:
     """Write the machine out as arrays: what it lists, or what is reached from its starts, where ends have empty rows.
 
@@ -150,7 +156,8 @@ def tabulate(rules: Rules, depth: int | None = None) -> RuleTables:
     shape = (rules.n_actions, len(states))
 
     def summed(values: Floats) -> Floats:  # [A, S]
-        return np.bincount(pair, found.probability * values, minlength=shape[0] * shape[1]).reshape(shape)
+        sums = np.bincount(pair, found.probability * values, minlength=shape[0] * shape[1])
+        return np.asarray(sums, dtype=np.float64).reshape(shape)
 
     total = summed(np.ones(len(pair)))
     for row, action in np.argwhere(np.abs(total[:, found.asked].T - 1.0) > _TIE_TOLERANCE):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imagine_bench.arrays import Floats32
+from imagine_bench.arrays import Floats32, Ints
 from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout, Label, planned_actions
 from imagine_bench.seeding import SeedTree
@@ -18,7 +18,7 @@ from .. import snapshot
 from ..encoders.perception import prepare_torch
 from ..meters import Meters
 from ..settings import flatten
-from .factors import Code, CodeTransition, Ints, as_arrays, from_arrays
+from .factors import Code, CodeTransition, as_arrays, from_arrays
 from .model import FactoredModel
 from .perception import CodePerception, LearnedPerception, load_code_perception
 from .planner import TIE, Objective, Planner

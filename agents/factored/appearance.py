@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from imagine_bench.arrays import Floats, Floats32, Frame
+from imagine_bench.arrays import Floats, Floats32, Frame, Ints
 
-from .factors import Codes, Ints, Mask
+from .factors import Codes, Mask
 
 Images = Floats32
 

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from imagine_bench.arrays import Floats
+from imagine_bench.arrays import Floats, Ints
 
-from .factors import Codes, Ints, strides, table_size
+from .factors import Codes, strides, table_size
 from .settings import DynamicsSettings
 
 _LARGEST_TABLE = 1 << 16

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Floats
+from imagine_bench.arrays import Floats, Ints
 
-from .factors import Code, CodeTransition, Ints, strides, table_size
+from .factors import Code, CodeTransition, strides, table_size
 from .settings import OutcomeSettings
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from imagine_bench.arrays import Arrays, Frame
+from imagine_bench.arrays import Arrays, Frame, Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState
 from imagine_bench.values import Json
@@ -17,7 +17,7 @@ from imagine_bench.values import Json
 from ..encoders.encoder import Encoder
 from ..encoders.perception import load_perception
 from . import appearance
-from .factors import Code, Codes, Ints, Mask, Memory
+from .factors import Code, Codes, Mask, Memory
 from .settings import LearnedPerceptionSettings
 
 _FIRST = 4

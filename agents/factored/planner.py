@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from imagine_bench.arrays import Floats
+from imagine_bench.arrays import Floats, Ints
 
-from .factors import Code, Ints
+from .factors import Code
 from .model import FactoredModel
 from .settings import PlanningSettings
 

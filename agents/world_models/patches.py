@@ -107,8 +107,8 @@ class Patches:
                         image[patch.pixels] = patch.colors[new]
                 images[place] = image.reshape(frames.shape[2:])
                 looks = after
-        rewards, p_ended = until_the_end(rewards, ends)
-        return Imagined(pictures=images, rewards=rewards, p_ended=p_ended, epistemic=unknown.mean(axis=1))
+        counted, p_ended = until_the_end(rewards, ends)
+        return Imagined(pictures=images, rewards=counted, p_ended=p_ended, epistemic=unknown.mean(axis=1))
 
     def _drawn(self, looks: Looks, action: int, rng: np.random.Generator) -> tuple[Looks, int]:
         """The next looks, and how often that patch was seen of which least is known; unseen looks stay."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Outcome, Rules, Sight, State, TaskSpec
-from imagine_bench.rules import RuleTables, horizon_optimum, states_of, tabulate
+from imagine_bench.rules import RuleTables, horizon_optimum, states_of_play, tabulate
 
 Window = tuple[State, ...]
 """The macrostates whose frames are still to come, the newest last; without a lag the macrostate now."""
@@ -61,7 +61,7 @@ class BeliefRules:
         self._sight = sight
         self.n_actions = rules.n_actions
         self._horizon = horizon
-        self.play = [state for state in states_of(rules) if not rules.is_terminal(state)]
+        self.play = states_of_play(rules)
         """Macrostates of the seen machine that an episode may be in."""
         self._settled = last_step_that_matters(sight, self.play, horizon)
         self._met: set[Belief] = set()

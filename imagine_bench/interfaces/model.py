@@ -6,7 +6,7 @@ Shapes: ``N`` questions, ``K`` frames of history, ``D`` imagined depth, ``S`` im
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from imagine_bench.arrays import Array, Arrays, Floats, Frame, Images, Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.episodes import Episodes
 
-R = TypeVar("R", bound=np.floating)
+Reals = NDArray[np.floating]
 UNCERTAINTIES = ("epistemic", "aleatoric", "modal")
 _SUM_TOLERANCE = 1e-4
 
@@ -126,7 +126,7 @@ def _require_ranges(offered: Arrays, said: str) -> None:
             raise InvalidValueError(f"{said} gave probabilities that sum to {worst:.4g} over S; they must sum to 1.")
 
 
-def until_the_end(rewards: NDArray[R], ends: NDArray[R]) -> tuple[NDArray[R], NDArray[R]]:
+def until_the_end(rewards: Reals, ends: Reals) -> tuple[Reals, Reals]:
     """Rewards that count, and whether the episode has ended, of futures that were imagined beyond its end.
 
     Args:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-import hashlib
-import json
 import math
 from collections.abc import Callable
 from contextlib import suppress
@@ -32,6 +30,7 @@ from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.reading import READER_FILE, ImageReader, RenderedFrameIndex, making, reader_in
 from imagine_bench.judge.scores import after_the_end_scores, by_depth, one_step_scores, ranking_scores
 from imagine_bench.judge.truth import Distribution, shares
+from imagine_bench.protocols.data import digest
 from imagine_bench.registry.entries import file_name
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.running.bench import Counted
@@ -50,6 +49,7 @@ from imagine_bench.store.files import (
     write_arrays,
     write_json,
 )
+from imagine_bench.values import Json
 
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8
@@ -92,10 +92,17 @@ class Judgement:
                 f"Frames of task {self.task!r} hide or delay a part of the macrostate, and the exact answers are about "
                 "all of it. Judge a task without the dials gesture and lag."
             )
-        if self.encoder is not None:
-            gives = encoders.kind(encoders.resolve(registry.task(self.task), self.appearance, self.encoder))
+        if self.encoder_file is not None:
+            gives = encoders.kind(self.encoder_file)
             if gives not in {model_entry(name).encoder_kind for name in self.models}:
                 raise InvalidValueError(f"No model of {self.models} reads {gives}, which {self.encoder} gives.")
+
+    @property
+    def encoder_file(self) -> Path | None:
+        """The given encoder."""
+        if self.encoder is None:
+            return None
+        return encoders.resolve(registry.task(self.task), self.appearance, self.encoder)
 
     @property
     def cells(self) -> list[ModelFit]:
@@ -111,12 +118,10 @@ class Judgement:
     @property
     def folder_name(self) -> str:
         """Where it is kept: the same for all that can be compared."""
-        same: tuple[int | str, ...] = (_FORMAT, self.task, self.appearance, self.policy, self.samples, self.sizes[-1])
-        same += (self.order,)
-        if self.encoder is not None:
-            same += (encoders.identity(encoders.resolve(registry.task(self.task), self.appearance, self.encoder)),)
-        digest = hashlib.sha256(json.dumps(same).encode()).hexdigest()[:8]
-        return f"{file_name(self.task)}-{self.appearance}-{digest}"
+        same: list[Json] = [_FORMAT, self.task, self.appearance, self.policy, self.samples, self.sizes[-1], self.order]
+        if self.encoder_file is not None:
+            same.append(encoders.identity(self.encoder_file))
+        return f"{file_name(self.task)}-{self.appearance}-{digest(same)[:8]}"
 
 
 class ModelFit(NamedTuple):

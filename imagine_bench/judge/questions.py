@@ -14,7 +14,7 @@ import numpy as np
 
 from imagine_bench.arrays import Frame, Ints, State
 from imagine_bench.interfaces import Rules, TaskSpec
-from imagine_bench.rules import Outcomes, advance, outcomes_by_depth, states_of
+from imagine_bench.rules import Outcomes, advance, outcomes_by_depth, states_of, states_of_play
 from imagine_bench.seeding import SeedTree
 
 STATES = 400  # macrostates asked about at most; of more, values are not computed
@@ -125,7 +125,7 @@ def _generator(spec: TaskSpec, name: str) -> np.random.Generator:
 
 def _going_on(rules: Rules, rng: np.random.Generator) -> Sequence[State]:
     """Every macrostate that an episode can be in; where there are too many, :data:`STATES` that are drawn."""
-    alive = [state for state in states_of(rules) if not rules.is_terminal(state)]
+    alive = states_of_play(rules)
     return _some(alive, STATES, rng) if len(alive) > STATES else alive
 
 

@@ -23,7 +23,7 @@ from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.interfaces import Agent, AgentContext, ArmMotion, ArmReader, TaskSpec, Transition
 from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.registry.machine import describe_environment
-from imagine_bench.rules import states_of
+from imagine_bench.rules import states_of_play
 from imagine_bench.running.evaluation import play
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SEEDS, SeedTree, episode_seed
@@ -93,7 +93,7 @@ def collect(
         allowed = f"1 to {MOST_EPISODES:,} episodes and a seed from 0 to {SEEDS - 1}"
         raise InvalidValueError(f"episodes is {episodes} and seed {seed}; give {allowed}.")
     starts = SeedTree(seed).child("dataset", "starts").generator()
-    open_states = [state for state in states_of(spec.rules) if not spec.rules.is_terminal(state)]
+    open_states = states_of_play(spec.rules)
     seeds = [episode_seed("dataset", seed, index) for index in range(episodes)]
     parts = []
     motion = list[ArmMotion]()

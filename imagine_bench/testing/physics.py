@@ -22,7 +22,7 @@ from imagine_bench.arrays import Bools, Floats, State
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, SENSES, PhysicsSettings, TaskSpec
 from imagine_bench.registry.machine import describe_environment, gl_renderer
-from imagine_bench.rules import states_of
+from imagine_bench.rules import states_of_play
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.files import require_writable, write_json
 
@@ -197,7 +197,7 @@ def measure_fidelity(spec: TaskSpec, actions: int, appearance: str = _CLEAN) -> 
     found = Fidelity(actions=actions)
     rng = SeedTree(0).child("speed", "physics", spec.id).generator()
     walk_actions = _ACTIONS_A_WALK if appearance == _CLEAN else _ACTIONS_A_VARIED_WALK
-    play = [state for state in states_of(spec.rules) if not spec.rules.is_terminal(state)]
+    play = states_of_play(spec.rules)
     real.reset(seed=episode_seed("tuning", 0, actions))
     standing_m = _poses(real, objects)[:, 2]  # every start has all objects on the table
     fresh = True
