@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import numpy as np
@@ -43,3 +45,13 @@ def read_only(array: NDArray[D]) -> NDArray[D]:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def content_hash(arrays: Mapping[str, Array]) -> str:
+    """64 hex digits of the names, types, shapes and bytes of arrays."""
+    sha = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        sha.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        sha.update(array.data)
+    return sha.hexdigest()

@@ -16,9 +16,8 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from imagine_bench.arrays import Floats32, Frame, Ints
+from imagine_bench.arrays import Floats32, Frame, Ints, content_hash
 from imagine_bench.errors import ArtefactError, InvalidValueError, brief, why, writing
-from imagine_bench.interfaces.episodes import content_hash
 from imagine_bench.preprocessing import join_cells, preprocess
 
 from .discrete_encoder import DiscreteEncoder

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.arrays import Array, Arrays
+from imagine_bench.arrays import Array, Arrays, content_hash
 from imagine_bench.errors import ArtefactError, InvalidValueError, require_known, writing
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.interfaces.episodes import Episodes, content_hash
+from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.store.files import make_folder, read_arrays, read_sealed, sealed, write_arrays, write_json
 from imagine_bench.values import Json
 

@@ -23,10 +23,10 @@ import PIL.Image
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from imagine_bench.arrays import Array, Arrays, Bools, Ints
+from imagine_bench.arrays import Array, Arrays, Bools, Ints, content_hash
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame
-from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes, content_hash
+from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes
 from imagine_bench.store.files import make_folder, read_json, reading, write_json
 from imagine_bench.values import Json
 

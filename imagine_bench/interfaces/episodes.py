@@ -6,7 +6,6 @@ actions, ``M`` coordinates of a macrostate.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -14,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imagine_bench.arrays import Array, Arrays, Bools, Floats, Frame, Ints, read_only
+from imagine_bench.arrays import Array, Arrays, Bools, Floats, Frame, Ints, content_hash, read_only
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.observation import Observation, Transition
 
@@ -146,16 +145,6 @@ class Episodes:
     def hash(self) -> str:
         """64 hex digits that change when anything in any array does, and with nothing else."""
         return content_hash(self.arrays())
-
-
-def content_hash(arrays: Mapping[str, Array]) -> str:
-    """64 hex digits of the names, types, shapes and bytes of arrays."""
-    sha = hashlib.sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        sha.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        sha.update(array.data)
-    return sha.hexdigest()
 
 
 def joined(parts: Sequence[Mapping[str, ArrayLike]]) -> Episodes:

@@ -16,11 +16,10 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Arrays, State
+from imagine_bench.arrays import Arrays, State, content_hash
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.interfaces.episodes import content_hash
 from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.change import Streams, change_detection_delay, counterfactual_error, streams_of

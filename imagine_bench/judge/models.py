@@ -24,7 +24,7 @@ from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, Untaught, Wo
 from imagine_bench.judge.predictions import imagined_by
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.registry.entries import WorldModelEntry, entrant
-from imagine_bench.registry.scripts import importable
+from imagine_bench.registry.loading import importable
 from imagine_bench.running.isolation import Isolated
 from imagine_bench.running.trained import KeptAgent, agent_of, imaginer_of, read_agent
 from imagine_bench.seeding import SeedTree

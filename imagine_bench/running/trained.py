@@ -14,7 +14,7 @@ from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import Result, RunSpec
 from imagine_bench.registry.entries import agent_label, entrant
-from imagine_bench.registry.scripts import importable
+from imagine_bench.registry.loading import importable
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
 from imagine_bench.store.files import reading

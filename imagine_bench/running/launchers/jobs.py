@@ -24,7 +24,7 @@ from imagine_bench import registry
 from imagine_bench.cores import ONE_THREAD, usable_cores
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupError, require_known, writing
 from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress
-from imagine_bench.registry.scripts import Registered, register, registered, script_left_out
+from imagine_bench.registry.loading import Registered, register, registered, script_left_out
 from imagine_bench.running.bench import task_type
 from imagine_bench.store.files import make_folder
 

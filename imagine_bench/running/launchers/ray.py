@@ -19,7 +19,7 @@ from ray.actor import ActorHandle
 from imagine_bench.cores import ONE_THREAD
 from imagine_bench.errors import BusyError, SetupError
 from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
-from imagine_bench.registry.scripts import Registered, register, registered
+from imagine_bench.registry.loading import Registered, register, registered
 from imagine_bench.running.launchers.jobs import absolute, carry_out, run_job
 
 _LOST = 20

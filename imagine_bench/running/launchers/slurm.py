@@ -20,7 +20,7 @@ import submitit
 
 from imagine_bench.cores import ONE_THREAD
 from imagine_bench.protocols.data import Failure, Job, OnProgress, Progress
-from imagine_bench.registry.scripts import Registered, register, registered
+from imagine_bench.registry.loading import Registered, register, registered
 from imagine_bench.running.launchers.jobs import absolute, carry_out
 from imagine_bench.store.files import make_folder, write_bytes
 

@@ -14,7 +14,7 @@ from small_runs import small
 from imagine_bench.errors import SetupError
 from imagine_bench.protocols.data import Job
 from imagine_bench.registry import AGENTS, load
-from imagine_bench.registry.scripts import register, registered
+from imagine_bench.registry.loading import register, registered
 from imagine_bench.running.launchers.jobs import LocalPool
 from imagine_bench.store import run_folder
 
