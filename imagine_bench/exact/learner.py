@@ -41,8 +41,6 @@ class _Learner:
     """One learner in the machine. ``E`` dynamics entries, of which the first is always known; ``Q`` points."""
 
     def __init__(self, machine: Machine, graph: FactorGraph, horizon: int) -> None:
-        from scipy.sparse import csr_array  # noqa: PLC0415 - loads for long
-
         self.machine = machine
         self.graph = graph
         self.sweeps = _SWEEPS * horizon
@@ -72,11 +70,7 @@ class _Learner:
         read = sorted({i for claim in graph.claims for scope in claim.scopes for i in scope})
         self.alike = numbered(keys(graph.points, read))  # points that are one
         self.class_of = np.full(int(self.alike.max()) + 1, -1)  # what was observed
-        n_outcomes = len(machine.pair)
-        ends_at = np.arange(machine.n_actions * machine.n_play + 1)
-        self.first = np.searchsorted(machine.pair, ends_at)
-        cells = (machine.probability, (machine.pair, np.arange(n_outcomes)))
-        self.outcomes = csr_array(cells, shape=(len(ends_at) - 1, n_outcomes))
+        self.first = np.searchsorted(machine.pair, np.arange(machine.n_actions * machine.n_play + 1))
         self.pay = np.array([reward + _SUCCESS * success for reward, _, success in machine.classes])
         self.ends = np.array([ended for _, ended, _ in machine.classes])
         self.box = tuple((machine.coordinates.max(axis=0) + 1).tolist())
@@ -134,7 +128,7 @@ class _Learner:
         value = np.zeros(len(machine.coordinates))
         for _ in range(self.sweeps):
             worth = np.maximum(ended, going + value[machine.after])
-            q = np.where(known, (self.outcomes @ worth).reshape(self.shape), self._imagined(worth, known))
+            q = np.where(known, self._expected(worth), self._imagined(worth, known))
             change = np.abs(q.max(axis=0) - value[:n]).max()
             value[:n] = q.max(axis=0)
             if change < _EPS:
@@ -145,12 +139,16 @@ class _Learner:
         while settled.sum() != count:
             count = settled.sum()
             bad = ~sure | (alive & ~settled[machine.after])
-            safe = optimal & known & ~((self.outcomes @ bad).reshape(self.shape) > 0)
+            safe = optimal & known & (self._expected(bad) == 0)
             settled[:n] = safe.any(axis=0)
         self.plan = np.where(settled[:n], safe.argmax(axis=0), optimal.argmax(axis=0))
         open_starts = machine.starts[~settled[machine.starts]]
         self._want(np.unique(open_starts), known, settled, sure, sure & alive)
         return not len(open_starts)
+
+    def _expected(self, values: Floats | Bools) -> Floats:
+        """The mean of the values of outcomes (N,) of each macro-action in each macrostate of play. Shape (A, P)."""
+        return np.add.reduceat(self.machine.probability * values, self.first[:-1]).reshape(self.shape)
 
     def _imagined(self, worth: Floats, known: Bools) -> Floats:
         """The best that an unknown entry may lead to: any values of all the coordinates that the action moves."""
@@ -198,8 +196,8 @@ class _Learner:
         found = np.unique(np.concatenate(every))
         return found[~(self.true | self.false)[found]]
 
-    def _outcomes_of(self, actions: Ints, rows: Ints) -> Ints:
-        pairs = actions * self.machine.n_play + rows
+    def _outcomes_of(self, actions: Ints | int, rows: Ints | int) -> Ints:
+        pairs = np.atleast_1d(actions * self.machine.n_play + rows)
         ranges = [np.arange(self.first[pair], self.first[pair + 1]) for pair in pairs]
         return np.concatenate([np.empty(0, dtype=np.int64), *ranges])
 
@@ -215,7 +213,7 @@ class _Learner:
         entries = self.entries[action, row]
         if not self.known[entries].all():
             return int((self.wanted & ~self.known)[entries].sum())
-        points = self.graph.point[self._outcomes_of(np.array([action]), np.array([row]))]
+        points = self.graph.point[self._outcomes_of(action, row)]
         unseen = points[self.class_of[self.alike[points]] < 0]
         return int(self.wanted_conditions[self._open_conditions(unseen)].sum())
 
@@ -244,7 +242,7 @@ class _Learner:
         """Actions of known effect, each with a macrostate that it may lead to and that was not met, which is now."""
         found = []
         for action in np.flatnonzero(self.known[self.entries[:, here]].all(axis=1)).tolist():
-            for outcome in self._outcomes_of(np.array([action]), np.array([here])):
+            for outcome in self._outcomes_of(action, here):
                 after = int(self.machine.after[outcome])
                 class_ = self.class_of[self.alike[self.graph.point[outcome]]]
                 if after not in met and class_ >= 0 and not self.ends[class_]:
