@@ -81,18 +81,16 @@ class OfBench:
         """
         word = self.folder
         task = self.task
-        if word is not None and task is None and not word.exists() and _is_task(str(word)):
+        name = str(word)
+        is_task = registry.has_task(name) or name in registry.regressions()
+        if word is not None and task is None and not word.exists() and is_task:
             word = None
-            task = str(self.folder)
+            task = name
         require_either(word, task)
         if task is not None:
             task_type(task)  # knows every name
             task = registry.task_name(task)
         return word, task
-
-
-def _is_task(word: str) -> bool:
-    return registry.has_task(word) or word in registry.regressions()
 
 
 def require_values(command: object) -> None:

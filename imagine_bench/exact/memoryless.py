@@ -82,8 +82,8 @@ def _next(rules: Rules, sight: Sight, now: _Seen, action: int, step: int) -> Ite
                 yield outcome.probability * share, (longer[1:] if sight.lag else longer, what)
 
 
-def best_without_memory(rules: Rules, sight: Sight, horizon: int, *, bound: float, nodes: int = NODES) -> Memoryless:
-    """Solve the programme, or say after so many nodes of the search what was found and what is proved.
+def best_without_memory(rules: Rules, sight: Sight, horizon: int, *, bound: float) -> Memoryless:
+    """Solve the programme, or say after :data:`NODES` of the search what was found and what is proved.
 
     ``bound`` is the optimum with memory: a policy without it that reaches it is the best, and where the programme is
     too large, no other bound is proved. A value of 0 says that none was looked for.
@@ -96,7 +96,7 @@ def best_without_memory(rules: Rules, sight: Sight, horizon: int, *, bound: floa
     choices = _choices(layers)
     value = _climb(layers, choices, {})
     if value < bound - _GAIN and sum(len(each.links) for each in layers) <= SOLVED:
-        policy, proved = _solve(layers, choices, nodes)
+        policy, proved = _solve(layers, choices)
         value = max(value, _climb(layers, choices, policy))
         bound = min(bound, proved)
     return Memoryless(value=value, bound=float(max(bound, value)))
@@ -132,7 +132,7 @@ def _choices(layers: list[_Layer]) -> dict[tuple[State, int], int]:
     return {pair: column for column, pair in enumerate(pairs)}
 
 
-def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int], nodes: int) -> tuple[dict[State, int], float]:
+def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int]) -> tuple[dict[State, int], float]:
     """The best policy found and the bound proved."""
     from scipy import optimize, sparse  # noqa: PLC0415 - loads for long
 
@@ -171,7 +171,7 @@ def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int], nodes: i
         integrality=np.arange(total) < len(choices),
         bounds=optimize.Bounds(0.0, most),
         constraints=optimize.LinearConstraint(matrix, np.array(low), np.array(high)),
-        options={"node_limit": nodes, "mip_rel_gap": 0.0},
+        options={"node_limit": NODES, "mip_rel_gap": 0.0},
     )
     policy = {} if found.x is None else {shown: action for (shown, action), at in choices.items() if found.x[at] > 0.5}
     bound = 1.0 if found.mip_dual_bound is None else min(1.0, -found.mip_dual_bound)

@@ -123,27 +123,25 @@ def change_detection_delay(streams: Mapping[str, Streams] | None, predictions: P
     names = ("notice_slip", "notice_coupling")
     if streams is None:
         return dict.fromkeys(names, math.nan)
-    _, *found = alarms([streams[name] for name in ("usual", "slip", "coupling")], predictions)
-    means = [float(np.minimum(first, LENGTH).mean()) for first in found]
-    return dict(zip(names, means, strict=True))
+    found = alarms([streams[name] for name in ("usual", "slip", "coupling")], predictions)
+    return dict(zip(names, np.minimum(found[1:], LENGTH).mean(axis=1).tolist(), strict=True))
 
 
-def alarms(streams: Sequence[Streams], predictions: Predictions) -> list[Ints]:
-    """Transitions until the first alarm of each of R streams, more than :data:`LENGTH` where there is none. Each (R,).
+def alarms(streams: Sequence[Streams], predictions: Predictions) -> Ints:
+    """Transitions until the first alarm, more than :data:`LENGTH` where there is none. Shape (W, R) for W worlds.
 
     Level and threshold are those of the first of ``streams``.
     """
-    surprise = [_surprise(each, predictions) for each in streams]
+    surprise = np.stack([_surprise(each, predictions) for each in streams])  # [W, R, T]
     level = float(surprise[0].mean())
     spread = max(float(surprise[0].std()), _LEAST)
-    evidence = [np.zeros((STREAMS, 1 + LENGTH)) for _ in streams]
-    for each, total in zip(surprise, evidence, strict=True):
-        for step in range(LENGTH):
-            so_far = total[:, step] + (each[:, step] - level) / spread - _ALLOWANCE
-            total[:, step + 1] = np.maximum(0.0, so_far)
+    evidence = np.zeros((len(streams), STREAMS, 1 + LENGTH))
+    for step in range(LENGTH):
+        so_far = evidence[..., step] + (surprise[..., step] - level) / spread - _ALLOWANCE
+        evidence[..., step + 1] = np.maximum(0.0, so_far)
     threshold = np.quantile(evidence[0].max(axis=1), 1.0 - FALSE_ALARMS, method="higher")
-    raised = [each > threshold for each in evidence]
-    return [np.where(each.any(axis=1), each.argmax(axis=1), LENGTH + 1) for each in raised]
+    raised = evidence > threshold
+    return np.where(raised.any(axis=2), raised.argmax(axis=2), LENGTH + 1)
 
 
 def _surprise(streams: Streams, predictions: Predictions) -> Floats:

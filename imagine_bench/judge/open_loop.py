@@ -16,7 +16,7 @@ import numpy as np
 from imagine_bench.arrays import Floats, Frame, Ints, State, read_only
 from imagine_bench.interfaces import Sight, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer, begin_episode
-from imagine_bench.judge.questions import EvalSet
+from imagine_bench.judge.questions import EvalSet, some_starts
 from imagine_bench.judge.truth import added_up, expected_reward, shares
 from imagine_bench.rules import Outcomes, advance, is_random
 from imagine_bench.seeding import Purpose, SeedTree
@@ -239,10 +239,8 @@ def examples(
     The starts are the same for every agent and seed, the real frames kinematic. The agent, which draws from the
     generators of ``seeds``, is not changed.
     """
-    starts = spec.rules.start_states
     rng = SeedTree(0).child(purpose, "examples", spec.id).generator()
-    picks = [starts[index] for index in rng.choice(len(starts), size=EXAMPLES, replace=len(starts) < EXAMPLES)]
-    moments = _first_moments(spec, picks, appearance, rng)
+    moments = _first_moments(spec, some_starts(spec.rules, EXAMPLES, rng), appearance, rng)
     begin_episode(agent)
     rollouts = imagined_from(agent, [moment.frame for moment in moments], seeds, depth=spec.horizon)
     return tuple(moment.beside(rollout, rng) for moment, rollout in zip(moments, rollouts, strict=True))

@@ -84,7 +84,7 @@ def rollouts(spec: TaskSpec, render: Render) -> EvalSet:
     """Macro-actions that keep the episode going as surely as the rules allow, after a short real history."""
     rng = _generator(spec, "rollouts")
     asked: list[Asked] = []
-    for start in _some_starts(spec.rules, rng):
+    for start in some_starts(spec.rules, ROLLOUTS, rng):
         actions = _lasting_actions(spec.rules, start, HISTORY, rng)
         states = [start]
         for action in actions:
@@ -98,7 +98,7 @@ def rollouts(spec: TaskSpec, render: Render) -> EvalSet:
 def ranked(spec: TaskSpec, render: Render) -> EvalSet:
     """:data:`RANKED` random sequences from each start, one start behind another."""
     rng = _generator(spec, "ranked")
-    starts = [start for start in _some_starts(spec.rules, rng) for _ in range(RANKED)]
+    starts = [start for start in some_starts(spec.rules, ROLLOUTS, rng) for _ in range(RANKED)]
     asked = [((start,), rng.integers(spec.n_actions, size=RANKED_DEPTH).tolist()) for start in starts]
     return _eval_set(spec, render, asked, rng)
 
@@ -134,10 +134,10 @@ def _some(choices: Sequence[T], most: int, rng: np.random.Generator) -> list[T]:
     return [choices[row] for row in np.sort(rng.choice(len(choices), min(most, len(choices)), replace=False))]
 
 
-def _some_starts(rules: Rules, rng: np.random.Generator) -> list[State]:
-    """:data:`ROLLOUTS` start macrostates; different ones where there are as many."""
+def some_starts(rules: Rules, count: int, rng: np.random.Generator) -> list[State]:
+    """So many start macrostates; different ones where there are as many."""
     starts = rules.start_states
-    return [starts[row] for row in rng.choice(len(starts), ROLLOUTS, replace=len(starts) < ROLLOUTS)]
+    return [starts[row] for row in rng.choice(len(starts), count, replace=len(starts) < count)]
 
 
 def _lasting_actions(rules: Rules, state: State, depth: int, rng: np.random.Generator) -> list[int]:

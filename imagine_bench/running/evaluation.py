@@ -18,7 +18,7 @@ from typing import Self, SupportsFloat, TypedDict
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.arrays import Action, Bools, Info, Ints, Observed, State
+from imagine_bench.arrays import Action, Info, Ints, Observed, State
 from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Rules, Transition
@@ -79,7 +79,7 @@ class EpisodeLog:
         """The inverse of :meth:`kept`."""
         lists = {name: getattr(kept, name).tolist() for name in (*_INTEGERS, "returns")}
         sim_times_s = [] if kept.sim_times_s is None else kept.sim_times_s.tolist()
-        return cls(**lists, sim_times_s=sim_times_s, solved=_digits(kept.success))
+        return cls(**lists, sim_times_s=sim_times_s, solved="".join(map(str, kept.success.astype(int))))
 
     @property
     def episodes(self) -> int:
@@ -97,7 +97,7 @@ class EpisodeLog:
         self.lengths.append(len(played.actions))
         self.actions += played.actions
         self.returns.append(played.total)
-        self.solved += "1" if played.success else "0"
+        self.solved += str(int(played.success))
         self.faults.append(played.faults)
         self.fingerprints.append(played.fingerprint)
         self.sim_times_s.append(played.sim_time_s)
@@ -112,10 +112,6 @@ class EpisodeLog:
             success=np.array([each == "1" for each in self.solved], dtype=np.bool_),
             sim_times_s=np.array(self.sim_times_s, dtype=np.float64) if is_whole else None,
         )
-
-
-def _digits(success: Bools) -> str:
-    return "".join("1" if each else "0" for each in success)
 
 
 @dataclass

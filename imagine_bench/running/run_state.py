@@ -226,11 +226,6 @@ class Run:
         """See :func:`.evaluation.demonstrator`; it holds nothing from one episode to the next."""
         return demonstrator(self.spec)
 
-    @property
-    def budgets_left(self) -> tuple[int, ...]:
-        """Budgets to come before the run ends."""
-        return self.protocol.budgets[len(self.counters.rows) :]
-
     @contextmanager
     def training_time(self) -> Iterator[None]:
         """Count the CPU seconds of the block as training."""

@@ -94,7 +94,7 @@ def _go_on(run: Run, observers: Sequence[RunObserver]) -> None:
             train_externally(run, run.agent, lambda budget: _at_budget(run, budget, observers))
         else:
             transfer(run)
-            for budget in run.budgets_left:
+            for budget in run.protocol.budgets[len(run.counters.rows) :]:
                 if run.entry.learns:
                     train(run, budget)
                 _at_budget(run, budget, observers)
@@ -235,10 +235,10 @@ def test(run: Run) -> EvaluationCounts:
     """
     counters = run.counters
     if counters.test is None:
-        more = isinstance(run.agent, ModelOnlyTrainer)
-        while more and isinstance(run.agent, ModelOnlyTrainer):
+        goes_on = True
+        while goes_on and isinstance(run.agent, ModelOnlyTrainer):
             with run.training_time():
-                more = run.agent.train_in_model()
+                goes_on = run.agent.train_in_model()
             run.made_progress("training in the model")
         counters.test = EvaluationCounts(diagnostics=run.agent.diagnostics())
     purpose = evaluation_split(run.spec.seed)

@@ -7,7 +7,7 @@ grasp hold may go before macro-actions fail.
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -84,9 +84,8 @@ def check_physics(
     turns: int = 2_000,
     trials: int = 200,
     appearances: Sequence[str] = (_CLEAN,),
-    show: Callable[[str], None] = print,
 ) -> bool:
-    """Measure fidelity and margins of a task, show Markdown tables, and keep the figures and the machine's description.
+    """Measure fidelity and margins of a task, print Markdown tables, keep the figures and the machine's description.
 
     Args:
         task: Registered task, this suite's or an installed package's.
@@ -94,7 +93,6 @@ def check_physics(
         turns: Macro-actions of the fidelity measurement at each appearance; 0 for none.
         trials: Macro-actions of each value of each physics setting; 0 for none.
         appearances: Appearance levels at which fidelity is measured.
-        show: Takes one line of text.
 
     Returns:
         Whether every target of the task was met; a task without targets is only measured.
@@ -117,14 +115,14 @@ def check_physics(
     kept: dict[str, Any] = {"task": task, "seed": 0}
     figures = []
     if turns:
-        show(HEAD)
+        print(HEAD)
         for level in levels:
             for figure in fidelity_figures(spec, turns, level):
                 figures.append(figure)
-                show(figure.row)
+                print(figure.row)
         kept["figures"] = [asdict(figure) for figure in figures]
     if trials:
-        kept |= measure_margins(spec, trials, show)
+        kept |= measure_margins(spec, trials)
     write_json(out, {**kept, "environment": describe_environment()})
     return all(figure.met for figure in figures)
 
@@ -283,8 +281,8 @@ def slips(world: str, found: Fidelity) -> Iterator[Figure]:
 # Margins -----------------------------------------------------------------------------------------------------------
 
 
-def measure_margins(spec: TaskSpec, trials: int, show: Callable[[str], None]) -> dict[str, Any]:
-    """Sweep each setting alone, walk with true and nominal poses, show a Markdown table and return the figures.
+def measure_margins(spec: TaskSpec, trials: int) -> dict[str, Any]:
+    """Sweep each setting alone, walk with true and nominal poses, print a Markdown table and return the figures.
 
     A task whose environment takes no ``physics`` has none. A trial is one macro-action from a start that moves an
     object if it succeeds. The same starts, actions and seeds serve every value.
@@ -292,9 +290,9 @@ def measure_margins(spec: TaskSpec, trials: int, show: Callable[[str], None]) ->
     try:
         make_env(spec, physics=PhysicsSettings()).close()
     except TypeError:  # Gymnasium's, for a keyword that the environment does not take
-        show(f"No margins: the environment of {spec.id} takes no physics settings.")
+        print(f"No margins: the environment of {spec.id} takes no physics settings.")
         return {}
-    show("| setting | value | as ruled | 95 % (Wilson) |\n|---|---|---|---|")
+    print("| setting | value | as ruled | 95 % (Wilson) |\n|---|---|---|---|")
     curves: dict[str, list[dict[str, float]]] = {name: [] for name in SWEEPS}
     for name, values in SWEEPS.items():
         for value in values:
@@ -302,10 +300,10 @@ def measure_margins(spec: TaskSpec, trials: int, show: Callable[[str], None]) ->
             low, high = statistics.wilson(right, trials)
             point = {"value": float(value), "as_ruled": right, "trials": trials, "low": low, "high": high}
             curves[name].append(point)
-            show(f"| {name} | {value:g} | {right} of {trials} | {low:.3f} to {high:.3f} |")
+            print(f"| {name} | {value:g} | {right} of {trials} | {low:.3f} to {high:.3f} |")
     walks = [walk(spec, sense) for sense in SENSES]
     for each in walks:
-        show(f"| sense | {each['sense']} | {each['as_ruled']} of {each['actions']} | {len(each['faults'])} faults |")
+        print(f"| sense | {each['sense']} | {each['as_ruled']} of {each['actions']} | {len(each['faults'])} faults |")
     return {"built": asdict(PhysicsSettings()), "curves": curves, "walks": walks}
 
 
