@@ -206,7 +206,7 @@ def every_outcome(
                     queue.append(after)
     columns = np.array(rows, dtype=np.float64).reshape(-1, 7).T
     places = columns[:3].astype(np.int64)
-    ends = columns[5:].astype(np.bool_)
+    ends = columns[5:].astype(bool)
     return OutcomeTable(index, np.array(asked, dtype=np.int64), *places, *columns[3:5], *ends)
 
 
@@ -233,12 +233,12 @@ def optimal_values(tables: RuleTables) -> Floats:
 def optimal_actions(tables: RuleTables) -> Bools:
     """Which actions an optimal agent may choose in each macrostate. Shape (A, S)."""
     action_values = optimal_values(tables)
-    return np.asarray(action_values >= action_values.max(axis=0) - _TIE_TOLERANCE)
+    return action_values >= action_values.max(axis=0) - _TIE_TOLERANCE
 
 
 def optimal_policy(tables: RuleTables) -> Ints:
     """The action of an optimal agent in each macrostate, the lowest index among equals. Shape (S,)."""
-    return np.asarray(optimal_actions(tables).argmax(axis=0), dtype=np.int64)
+    return optimal_actions(tables).argmax(axis=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -345,7 +345,7 @@ def fewest_actions(rules: Rules, start: State) -> int:
 
 def greedy(policy: Ints, n_actions: int) -> Floats:
     """A deterministic policy (S,) as action probabilities (A, S)."""
-    return np.asarray(np.eye(n_actions)[:, policy])
+    return np.eye(n_actions)[:, policy]
 
 
 def facts(rules: Rules, horizon: int) -> RuleFacts:

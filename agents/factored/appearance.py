@@ -120,7 +120,7 @@ def find(frames: Frame, begins: Mask | None = None, actions: Ints | None = None)
     """
     images = relative(frames)
     shapes = contours(images)
-    begins = np.zeros(len(frames), dtype=np.bool_) if begins is None else begins
+    begins = np.zeros(len(frames), dtype=bool) if begins is None else begins
     actions = np.full(len(frames), -1) if actions is None else actions
     factors = [SeenFactor((part,), values[:, None]) for part, values in _parts(images, shapes, begins, actions)]
     while (pair := _first_bound([factor.joint for factor in factors])) is not None:
@@ -181,7 +181,7 @@ def quiet(images: Images, rests: Images) -> Images:
     """
     noise = ~np.isnan(rests[0, ..., 0])
     colors = images[:, noise]
-    shown = np.ones(images.shape[:3], dtype=np.bool_)
+    shown = np.ones(images.shape[:3], dtype=bool)
     shown[:, noise] = np.any([(np.abs(colors - one[noise]) <= _CHANGE).all(axis=-1) for one in rests], axis=0)
     shown |= scipy.ndimage.binary_closing(shown, np.ones((1, 3, 3)))
     return np.where(shown[..., None], images, np.float32(_MEDIAN_COLOR))
@@ -241,7 +241,7 @@ def changes(images: Images) -> Mask:
     after = images[1:]
     change = np.maximum(_beyond(before, after), _beyond(after, before)).max(axis=-1) > _CHANGE
     change = np.pad(change, ((0, 0), (2, 2), (2, 2)))
-    return np.asarray(scipy.ndimage.binary_closing(change, np.ones((1, 3, 3)))[:, 2:-2, 2:-2])
+    return scipy.ndimage.binary_closing(change, np.ones((1, 3, 3)))[:, 2:-2, 2:-2]
 
 
 def regions(change: Mask, pixels: Mask) -> list[Mask]:

@@ -50,7 +50,7 @@ class _Templates:
 
     def numbers(self, codes: Ints) -> Ints:
         """Those that hold in codes (N, P). Shape (N, T)."""
-        return np.asarray((codes @ self._multipliers).astype(np.int64) + self._first)  # floats are fast, and exact here
+        return (codes @ self._multipliers).astype(np.int64) + self._first  # floats are fast, and exact here
 
 
 class Conjunctions:
@@ -95,7 +95,7 @@ class _Cases(NamedTuple):
     def responsibility(self, strength: Floats, leak: float) -> Floats:
         """How many of the transitions each of them, so strong (M,), is held to have decided. Shape (M,)."""
         caused = 1.0 - (1.0 - leak) * np.exp(self.holds @ np.log1p(-strength))
-        return np.asarray(strength * (self.holds.T @ (self.times / caused)))
+        return strength * (self.holds.T @ (self.times / caused))
 
 
 class _Evidence:
@@ -121,7 +121,7 @@ class _Evidence:
 
     def tests(self, weight: Floats) -> Floats:
         """Sum of the weights (U,) of the transitions in which each conjunction holds. Shape (M,)."""
-        return np.asarray(self.all.holds.T @ (weight * self.all.times))
+        return self.all.holds.T @ (weight * self.all.times)
 
 
 class _Explanation(NamedTuple):

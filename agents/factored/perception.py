@@ -155,7 +155,7 @@ class LearnedPerception:
     def codes(self, frames: Frame) -> tuple[list[Code], Mask]:
         """The codes of frames (N, 64, 64, 3), and which values are known, (N, P)."""
         if not self.found:
-            return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=np.bool_)
+            return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=bool)
         codes, known = appearance.read(self.found, frames)
         return _rows(codes, [len(factor.joint) for factor in self.found], factored=self._factored), known
 
@@ -203,7 +203,7 @@ class LearnedPerception:
         return {
             "replay/frames": np.array(self.frames, dtype=np.uint8).reshape(-1, 64, 64, 3),
             "replay/frame_pairs": np.array(self.transitions, dtype=np.int64).reshape(-1, 2),
-            "replay/begins": np.array(self.begins, dtype=np.bool_),
+            "replay/begins": np.array(self.begins, dtype=bool),
         }
 
     def values(self) -> dict[str, Json]:

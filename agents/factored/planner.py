@@ -65,7 +65,7 @@ class Planner:
 
     def learned(self) -> None:
         """The model has learned something: plan anew."""
-        self._predicted = np.zeros(len(self._reward), dtype=np.bool_)
+        self._predicted = np.zeros(len(self._reward), dtype=bool)
         """Whether the model predicts this now. Shape (rows,)."""
         self._plans: dict[tuple[Objective, int], dict[int, Floats]] = {}
         """Action values (A,) by row, of each objective and depth."""

@@ -249,7 +249,7 @@ def _next_claim(points: Ints, label: Ints, left: Ints) -> LocalClass:
 
 def _cover(class_: int, forced: list[tuple[Scope, Ints]]) -> LocalClass:
     """A small set of scopes: again and again the one that covers the most of what is left."""
-    covered = np.zeros(len(forced[0][1]), dtype=np.bool_)
+    covered = np.zeros(len(forced[0][1]), dtype=bool)
     scopes = []
     conditions = 0
     wanted = np.logical_or.reduce([key >= 0 for _, key in forced])

@@ -64,8 +64,8 @@ class _Learner:
                 numbers.append(numbered(keys(graph.points, scope)) + count)
                 count = int(numbers[-1].max()) + 1
             self.conditions.append(np.stack(numbers, axis=1))
-        self.true = np.zeros(count, dtype=np.bool_)
-        self.false = np.zeros(count, dtype=np.bool_)
+        self.true = np.zeros(count, dtype=bool)
+        self.false = np.zeros(count, dtype=bool)
         self.clauses: list[Ints] = []  # conditions of which one at least is true
         read = sorted({i for claim in graph.claims for scope in claim.scopes for i in scope})
         self.alike = numbered(keys(graph.points, read))  # points that are one
@@ -104,8 +104,8 @@ class _Learner:
 
     def possible(self) -> Bools:
         """Which classes each point may have. Shape (C, Q)."""
-        found = np.zeros((len(self.machine.classes), len(self.alike)), dtype=np.bool_)
-        free = np.ones(len(self.alike), dtype=np.bool_)  # of every claim above
+        found = np.zeros((len(self.machine.classes), len(self.alike)), dtype=bool)
+        free = np.ones(len(self.alike), dtype=bool)  # of every claim above
         for claim, conditions in zip(self.graph.claims, self.conditions, strict=True):
             found[claim.class_] = free & ~self.false[conditions].all(axis=1)
             free &= ~self.true[conditions].any(axis=1)
@@ -134,7 +134,7 @@ class _Learner:
             if change < _EPS:
                 break
         optimal = (q >= q.max(axis=0) - _EPS) & np.isfinite(q)
-        settled = np.ones(len(value), dtype=np.bool_)
+        settled = np.ones(len(value), dtype=bool)
         count = -1
         while settled.sum() != count:
             count = settled.sum()
@@ -174,8 +174,8 @@ class _Learner:
         goes_on: Bools,
     ) -> None:
         """Find the unknown facts that the plans from some rows touch."""
-        self.wanted = np.zeros(len(self.known), dtype=np.bool_)
-        self.wanted_conditions = np.zeros(len(self.true), dtype=np.bool_)
+        self.wanted = np.zeros(len(self.known), dtype=bool)
+        self.wanted_conditions = np.zeros(len(self.true), dtype=bool)
         self.unsure = np.empty(0, dtype=np.int64)  # the points that those decide
         met = settled.copy()
         while len(front):

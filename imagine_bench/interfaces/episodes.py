@@ -151,7 +151,7 @@ def joined(parts: Sequence[Mapping[str, ArrayLike]]) -> Episodes:
     """Episodes from one mapping each: ``frames``, ``action_masks``, ``actions``, ... and one ``success``."""
     if not parts:
         raise InvalidValueError("there is no episode")
-    arrays: Arrays = {"success": np.array([part["success"] for part in parts], dtype=np.bool_)}
+    arrays: Arrays = {"success": np.array([part["success"] for part in parts], dtype=bool)}
     arrays["lengths"] = np.array([len(np.asarray(part["actions"])) for part in parts], dtype=np.int64)
     for name in set(_TYPES) - set(arrays):
         arrays[name] = np.concatenate([np.asarray(part[name]) for part in parts])

@@ -91,9 +91,9 @@ def frames_to_ask_with(agent: Agent, spec: TaskSpec, *, appearance: str, purpose
 def misread(agent: Agent, frames: Frame, states: Ints) -> Bools:
     """Which frames (N, 64, 64, 3) of macrostates (N, M) an agent misreads; none of one that cannot say. Shape (N,)."""
     if not isinstance(agent, FrameReader):
-        return np.zeros(len(frames), dtype=np.bool_)
+        return np.zeros(len(frames), dtype=bool)
     begin_episode(agent)
-    return np.asarray((agent.read_frames(frames) != states).any(axis=1))
+    return (agent.read_frames(frames) != states).any(axis=1)
 
 
 def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator, *, privileged: bool) -> PolicyTable:
@@ -130,7 +130,7 @@ class Attribution:
         states = states_of(spec.rules)
         self._rows = {state: row for row, state in enumerate(states)}
         truth = true_model(spec.rules, states)
-        known = np.zeros((len(states) + 1, spec.n_actions), dtype=np.bool_)
+        known = np.zeros((len(states) + 1, spec.n_actions), dtype=bool)
         known[rows_of(tried[:, :-1], states), tried[:, -1]] = True
         known = known[:-1]  # physics can leave a scene that is no macrostate
         model = held.model

@@ -365,7 +365,7 @@ def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], r
         read = world.index.read(imagined, world.reader)[:, 0].tolist()
         truth = [[shares(outcomes) for outcomes in asked.truth[row]] for row in rows]
         real = [[world.index.frame(max(each, key=each.__getitem__)) for each in steps] for steps in truth]
-        right = np.zeros((len(rows), len(truth[0])), dtype=np.bool_)
+        right = np.zeros((len(rows), len(truth[0])), dtype=bool)
         for row, step in np.ndindex(*right.shape):
             right[row, step] = tuple(read[row][step]) in truth[row][step]
         images = imagined[:, 0] if imagined.dtype == np.uint8 else (np.asarray(imagined[:, 0]) * 255.0).round()

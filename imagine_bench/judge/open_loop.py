@@ -135,7 +135,7 @@ def open_loop(agent: Imaginer, questions: EvalSet, seeds: SeedTree) -> OpenLoop:
     def stacked(name: str) -> Floats:  # [starts, D]
         return np.array([getattr(rollout, name) for rollout in rollouts], dtype=np.float64)
 
-    correct = np.zeros(shape, dtype=np.bool_)
+    correct = np.zeros(shape, dtype=bool)
     rewards = np.zeros(shape)
     for row, step in np.ndindex(*shape):
         outcomes = questions.truth[row][step]
@@ -287,5 +287,5 @@ def beside_reality(rollout: ImaginedRollout, frame: Frame, macrostate: State, re
         real_frames=np.array(frames, dtype=np.uint8).reshape(done, *frame.shape),
         real_macrostates=np.array(states, dtype=np.int64).reshape(done, len(macrostate)),
         real_rewards=np.array(rewards, dtype=np.float64),
-        real_terminated=np.array(over, dtype=np.bool_),
+        real_terminated=np.array(over, dtype=bool),
     )

@@ -57,7 +57,7 @@ class PlanResult:
         """Whether each macro-action that was carried out led where it was imagined to. Shape (done,)."""
         read = self.compared.rollout.macrostates
         real = self.compared.real_macrostates
-        return np.asarray((read[: self.done] == real[: self.done]).all(axis=-1), dtype=np.bool_)
+        return (read[: self.done] == real[: self.done]).all(axis=-1)
 
     @property
     def outcome(self) -> str:

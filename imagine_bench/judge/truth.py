@@ -132,7 +132,7 @@ def branches(states: Sequence[State], n_actions: int, dynamics: Dynamics) -> Bra
     table = np.zeros((4, len(states) * n_actions, 1 + int(branch.max())))
     table[:, pair, branch] = found.after, found.probability, found.reward, found.terminated
     following, probability, reward, terminated = table.reshape(4, len(states), n_actions, -1)
-    return Branches(tuple(found.index), following.astype(np.int64), probability, reward, terminated.astype(np.bool_))
+    return Branches(tuple(found.index), following.astype(np.int64), probability, reward, terminated.astype(bool))
 
 
 class Model(NamedTuple):

@@ -109,7 +109,7 @@ class EpisodeLog:
         return KeptEpisodes(
             **counts,
             returns=np.array(self.returns, dtype=np.float64),
-            success=np.array([each == "1" for each in self.solved], dtype=np.bool_),
+            success=np.array([each == "1" for each in self.solved], dtype=bool),
             sim_times_s=np.array(self.sim_times_s, dtype=np.float64) if is_whole else None,
         )
 

@@ -232,7 +232,7 @@ def _poses(env: Any, objects: Sequence[str]) -> Floats:
     if not objects:
         return np.empty((0, 7))
     motion = env.motion()
-    return np.asarray(motion.poses_in_world[-1][[motion.body_names.index(name) for name in objects]])
+    return motion.poses_in_world[-1][[motion.body_names.index(name) for name in objects]]
 
 
 def _compare(found: Fidelity, moved: Bools, can_move: Bools, standing_m: Floats, poses: Floats) -> None:
