@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,25 +33,25 @@ class _FixedPolicy:
             )
 
 
+@dataclass
 class RandomAgent(_FixedPolicy):
     """Uniformly random macro-actions, when it is tested too."""
 
-    def __init__(self, n_actions: int, rng: np.random.Generator) -> None:
-        self._n_actions = n_actions
-        self._rng = rng
+    n_actions: int
+    rng: np.random.Generator
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """Any action, each equally likely."""
-        return int(self._rng.integers(self._n_actions))
+        return int(self.rng.integers(self.n_actions))
 
     def state(self) -> AgentState:
         """The generator's state."""
-        return AgentState(arrays={}, values={"generator": self._rng.bit_generator.state})
+        return AgentState(arrays={}, values={"generator": self.rng.bit_generator.state})
 
     def restore(self, state: AgentState) -> None:
         """Take up a generator's state; ArtefactError if the snapshot is of another agent."""
         super().restore(state)
-        self._rng.bit_generator.state = state.values["generator"]
+        self.rng.bit_generator.state = state.values["generator"]
 
 
 class OracleAgent(_FixedPolicy):

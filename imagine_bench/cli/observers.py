@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypedDict
 
 from imagine_bench.arrays import Frame
@@ -113,13 +113,13 @@ def observers_of(protocol: ProtocolData) -> tuple[str, ...]:
     return (RECORDERS[protocol.task],) if protocol.task in RECORDERS else ()
 
 
+@dataclass(frozen=True)
 class Observed:
     """A launcher whose runs are looked at, as :func:`observers_of` says."""
 
-    def __init__(self, launcher: Launcher) -> None:
-        self._launcher = launcher
+    launcher: Launcher
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job by the launcher within; see :class:`.Launcher`."""
         observed = [replace(job, spec=replace(job.spec, observers=observers_of(job.spec.protocol))) for job in jobs]
-        return self._launcher.launch(observed, on_progress)
+        return self.launcher.launch(observed, on_progress)

@@ -43,15 +43,15 @@ class Split:
         return f"{self.name}@{self.hash}"
 
 
+@dataclass(frozen=True, eq=False)
 class StartingFrom:
     """Rules as they are, with some of their starts."""
 
-    def __init__(self, rules: Rules, starts: tuple[State, ...]) -> None:
-        self._rules = rules
-        self.start_states = starts
+    rules: Rules
+    start_states: tuple[State, ...]
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._rules, name)
+        return getattr(self.rules, name)
 
 
 def split_of(rules: Rules, text: str) -> Split:

@@ -279,11 +279,11 @@ def as_seen(transition: Transition) -> Transition:
     return dataclasses.replace(transition, observation=before, next_observation=after)
 
 
+@dataclass(frozen=True)
 class LabelOracle:
     """Labels what actions would bring, from the rules and the true macrostate, where these allow one outcome."""
 
-    def __init__(self, rules: Rules) -> None:
-        self.rules = rules
+    rules: Rules
 
     def label(self, macrostate: tuple[int, ...], actions: Ints) -> Label | None:
         """What the last of ``actions`` (D,) from ``macrostate`` would bring.
