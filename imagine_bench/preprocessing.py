@@ -12,9 +12,8 @@ from collections.abc import Callable
 from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Floats32, Ints
+from imagine_bench.arrays import Floats32, Ints, Pixels
 from imagine_bench.errors import require_known
 
 STRIP_WIDTH = 22
@@ -27,7 +26,7 @@ _NEAR_ROWS = np.arange(46, 64)
 _GRAY = "gray_strips"
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
-Preprocess = Callable[[NDArray[np.uint8]], Floats32]
+Preprocess = Callable[[Pixels], Floats32]
 
 
 def gray_name(cubes: int) -> str:
@@ -52,7 +51,7 @@ def _stretch(pixels: int) -> Floats32:
     return np.stack([np.interp(at, np.arange(pixels), row) for row in np.eye(pixels)]).astype(np.float32)
 
 
-def gray_cells(frames: NDArray[np.uint8], cubes: int = 3) -> Floats32:
+def gray_cells(frames: Pixels, cubes: int = 3) -> Floats32:
     """Cut frames into a gray channel a cube: (N, 64, 64, 3) uint8 to (N, cubes, H, W) float32 in [0, 1]."""
     gray = (frames.astype(np.float32) @ _LUMA) / 255.0  # [N, 64, 64]
     cells = np.stack([gray[:, rows, columns] for rows, columns in _windows(cubes)], axis=1)
@@ -77,12 +76,12 @@ def join_cells(cells: Floats32) -> Floats32:
     return whole
 
 
-def whole_rgb(frames: NDArray[np.uint8]) -> Floats32:
+def whole_rgb(frames: Pixels) -> Floats32:
     """Channels first: (N, 64, 64, 3) uint8 to (N, 3, 64, 64) float32 in [0, 1]."""
     return np.moveaxis(frames, -1, 1).astype(np.float32) / 255.0
 
 
-def small_rgb(frames: NDArray[np.uint8]) -> Floats32:
+def small_rgb(frames: Pixels) -> Floats32:
     """Half the resolution, 2 x 2 pixels averaged: (N, 64, 64, 3) uint8 to (N, 3, 32, 32) float32 in [0, 1]."""
     n, height, width, _ = frames.shape
     blocks = frames.reshape(n, height // 2, 2, width // 2, 2, 3).sum(axis=(2, 4), dtype=np.uint16)

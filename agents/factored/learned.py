@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from itertools import compress
 
 import numpy as np
-from numpy.typing import NDArray
 
+from imagine_bench.arrays import Pixels
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.interfaces.capabilities import Perceived
 
@@ -159,7 +159,7 @@ def _flat(state: AgentState) -> AgentState:
     return AgentState(arrays={**state.arrays, **codes}, values=state.values)
 
 
-def image(found: Sequence[appearance.SeenFactor], frames: Frame) -> NDArray[np.uint8]:
+def image(found: Sequence[appearance.SeenFactor], frames: Frame) -> Pixels:
     """The mean of ``frames`` (N, 64, 64, 3) in gray, with a color a factor that was found. Shape (320, 320, 3)."""
     drawn = np.repeat(frames.mean(axis=(0, 3))[..., None], 3, axis=2)
     for factor, color in zip(found, _COLORS, strict=False):

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Frame, Ints, State
+from imagine_bench.arrays import Frame, Ints, Pixels, State
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, TaskSpec
 from imagine_bench.interfaces.model import Imagined, Untaught
@@ -20,7 +19,7 @@ class MacrostateRenderer(Protocol):
     def frame(self, state: State) -> Frame:
         """One frame (64, 64, 3) of a macrostate, always the same."""
 
-    def shows(self, image: NDArray[np.uint8]) -> State | None:
+    def shows(self, image: Pixels) -> State | None:
         """The macrostate of a rendered frame; None for any other image."""
 
 

@@ -14,12 +14,11 @@ from collections.abc import Hashable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.cluster import hierarchy
 from scipy.ndimage import uniform_filter
 from scipy.spatial.distance import squareform
 
-from imagine_bench.arrays import Floats, Frame, Ints
+from imagine_bench.arrays import Floats, Frame, Ints, Pixels
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, until_the_end
@@ -43,7 +42,7 @@ class Patch(NamedTuple):
 
     pixels: Ints  # shape (P,)
     gray: Floats  # shape (L, P)
-    colors: NDArray[np.uint8]  # shape (L, P, 3)
+    colors: Pixels  # shape (L, P, 3)
 
     def looks(self, gray: Floats) -> Ints:
         """The look of each of N gray frames (N, 4096). Shape (N,)."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Floats, Frame, Ints
+from imagine_bench.arrays import Floats, Frame, Ints, Pixels
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, until_the_end
@@ -76,7 +75,7 @@ class StructuredModel:
         ends = outcomes @ self.model.outcomes.ends
         return following, reward, ends, 1.0 - known * (1.0 - untested), 1.0 - likeliest
 
-    def _pictures(self, codes: Codes) -> NDArray[np.uint8]:
+    def _pictures(self, codes: Codes) -> Pixels:
         """Pictures of codes (..., P), each different code drawn once. Shape (rows, H, W) or (rows, H, W, 3)."""
         different, which = np.unique(codes.reshape(-1, codes.shape[-1]), axis=0, return_inverse=True)
         drawn = self.perception.images(different)

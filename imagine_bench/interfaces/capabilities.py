@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from imagine_bench.arrays import Bools, Floats, Floats32, Frame, Ints
+from imagine_bench.arrays import Bools, Floats, Floats32, Frame, Ints, Pixels
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.observation import Observation
 
@@ -74,7 +73,7 @@ class Perceived:
 
     episodes: int  #: training episodes that had begun
     sizes: tuple[int, ...]  #: numbers of values of what it told apart
-    picture: NDArray[np.uint8]  #: for people. Shape (H, W, 3).
+    picture: Pixels  #: for people. Shape (H, W, 3).
 
 
 @runtime_checkable

@@ -14,10 +14,9 @@ from types import ModuleType
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imagine_bench import registry
-from imagine_bench.arrays import Frame, Images, Ints, State
+from imagine_bench.arrays import Frame, Images, Ints, Pixels, State
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.rules import states_of
@@ -96,7 +95,7 @@ class RenderedFrameIndex:
             self._frames[state] = self.render([state], rng)[0]
         return self._frames[state]
 
-    def shows(self, image: NDArray[np.uint8]) -> State | None:
+    def shows(self, image: Pixels) -> State | None:
         """The macrostate of an image that is a rendered frame to the pixel; None for any other."""
         return self._shows.get(_key(image))
 
