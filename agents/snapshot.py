@@ -6,7 +6,9 @@ import json
 from collections.abc import Collection, Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from imagine_bench.arrays import Array, Arrays
@@ -53,6 +55,16 @@ def load_training(module: nn.Module, optimiser: Adam | torch.optim.Optimizer, ar
             optimiser.state[weight] = {k: torch.tensor(arrays[f"{name}/{k}"], device=weight.device) for k in kinds}
 
 
+def generator_array(generator: torch.Generator) -> NDArray[np.uint8]:
+    """A torch generator's state."""
+    return generator.get_state().numpy().copy()
+
+
+def load_generator(generator: torch.Generator, array: NDArray[np.uint8]) -> None:
+    """Take up the result of :func:`generator_array`."""
+    generator.set_state(torch.tensor(array))
+
+
 def jsonable(values: Mapping[str, Any]) -> dict[str, Json]:
     """The values as JSON would give them back."""
     return json.loads(json.dumps(values))
@@ -63,7 +75,7 @@ def arrays_of(parts: Mapping[str, Part]) -> Arrays:
     found: Arrays = {}
     for name, part in parts.items():
         if isinstance(part, torch.Generator):
-            found[name] = part.get_state().numpy().copy()
+            found[name] = generator_array(part)
         elif isinstance(part, TrainedModule):
             found |= prefixed(name, training_arrays(part, part.optimiser))
         else:
@@ -75,7 +87,7 @@ def load_parts(parts: Mapping[str, Part], arrays: Arrays) -> None:
     """Take up the result of :func:`arrays_of`; how many rows memories ever held is the caller's to say."""
     for name, part in parts.items():
         if isinstance(part, torch.Generator):
-            part.set_state(torch.tensor(arrays[name]))
+            load_generator(part, arrays[name])
         elif isinstance(part, TrainedModule):
             load_training(part, part.optimiser, below(name, arrays))
         else:
