@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.arrays import Arrays, Floats, Frame, Ints, State
-from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain
+from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.reading import ImageReader, RenderedFrameIndex
 from imagine_bench.judge.truth import Distribution, added_up
+from imagine_bench.registry.loading import fault
 from imagine_bench.running.isolation import GuestError
 
 _AT_ONCE = 96  # questions handed to a model at a time, to bound memory
@@ -156,8 +157,7 @@ def call(name: str, method: str, function: Callable[P, T], *arguments: P.args, *
         known = str(error).startswith(said)
         raise InvalidValueError(str(error) if known else f"{said} failed: {error}") from error
     except Exception as error:  # whatever a model does wrong is one sentence
-        why = f"{type(error).__name__}: {plain(error)}".partition("\n")[0]
-        raise InvalidValueError(f"World model {name}: {method}() failed ({why}).") from error
+        raise InvalidValueError(f"World model {name}: {method}() failed ({fault(error)}).") from error
 
 
 def _joined(parts: Sequence[NDArray[N]], missing: int = 0) -> NDArray[N]:

@@ -38,6 +38,7 @@ from imagine_bench import registry
 from imagine_bench.arrays import Arrays
 from imagine_bench.cores import ONE_THREAD
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain, writing
+from imagine_bench.registry.loading import fault
 
 _PATIENCE_S = 5.0
 _POLL_S = 0.05
@@ -266,7 +267,7 @@ def _answer(pipe: Connection, *, closed: bool, forbidden: Sequence[str], memory:
             except ImagineBenchError as error:
                 kind, content = _SENTENCE, str(error).encode()
             except BaseException as error:  # sys.exit too
-                kind, content = _RAISED, f"{type(error).__name__}: {error}".partition("\n")[0].encode()
+                kind, content = _RAISED, fault(error).encode()
             sys.stdout.flush()
             pipe.send_bytes(kind)
             pipe.send_bytes(content)
