@@ -169,7 +169,7 @@ class FactorDynamics:
 
     def _rows(self, codes: Codes) -> Ints:
         """The row of each table T that holds for each code (N, P). Shape (N, T)."""
-        return (codes @ self._strides).astype(np.int64) + self._first  # floats are fast, and exact here
+        return np.asarray((codes @ self._strides).astype(np.int64) + self._first)  # floats are fast, and exact here
 
     def _pool_turns(self) -> None:
         """Learn how it changes by itself, from each value to each, (K, K), and the weight of the prior, (K,)."""

@@ -50,7 +50,7 @@ class _Templates:
 
     def numbers(self, codes: Ints) -> Ints:
         """Those that hold in codes (N, P). Shape (N, T)."""
-        return (codes @ self._multipliers).astype(np.int64) + self._first  # floats are fast, and exact here
+        return np.asarray((codes @ self._multipliers).astype(np.int64) + self._first)  # floats are fast, and exact here
 
 
 class Conjunctions:
