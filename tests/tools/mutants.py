@@ -61,6 +61,7 @@ ROOMS: dict[str, dict[str, Sequence[str]]] = {
     "statistics": {"imagine_bench/statistics.py": ("tests/test_statistics.py",)},
     "resume": {
         "imagine_bench/store/run_folder.py": _CHECKPOINTS,
+        "imagine_bench/values.py": _CHECKPOINTS,
         "imagine_bench/running/evaluation.py": _CHECKPOINTS,
         "imagine_bench/running/run_state.py": _CHECKPOINTS[::-1],
     },
