@@ -1,13 +1,27 @@
 """imagine_bench: how far can imagination cut the real interaction a robot needs?
 
-Importing it registers the Gymnasium environments and loads neither MuJoCo nor torch.
+``bench`` compares agents on a task, ``load`` reads results, ``register_agent`` adds an agent of your own. Importing the
+package registers the Gymnasium environments and loads neither MuJoCo nor torch.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from imagine_bench.registry import TASKS, register_env
 from imagine_bench.registry.moved import keep_old_paths
 from imagine_bench.version import __version__ as __version__
+
+if TYPE_CHECKING:
+    from imagine_bench.api import bench, load, register_agent
+
+__all__ = ["bench", "load", "register_agent"]
+LAZY = {
+    "bench": "imagine_bench.api:bench",
+    "load": "imagine_bench.api:load",
+    "register_agent": "imagine_bench.api:register_agent",
+}
+"""The functions of the Python API, which are loaded when they are first used."""
 
 MOVED = {
     "imagine_bench.agents.factored.learned_perception": "imagine_bench.agents.factored.perception",

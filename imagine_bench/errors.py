@@ -15,6 +15,9 @@ from pathlib import Path
 from typing import Self, SupportsIndex
 
 _LONGEST = 200
+_FEW = 8
+LISTED = ("task", "agent", "regressor", "world model", "encoder", "grid")
+"""Kinds of names that 'imagine-bench list' lists; a message has the nearest alone if there are many."""
 _LONGEST_REASON = 1000
 """Characters of a library's own complaint that are handed on."""
 _OF_CONSTRUCTORS = re.compile(
@@ -89,12 +92,16 @@ class UnknownNameError(ImagineBenchError, ValueError):
     def __str__(self) -> str:
         kind, given, names = self.args
         word = str(given) if isinstance(given, str | int | float | None) else brief(given)
-        return f"No {kind} {brief(word)}.{_nearest(word, names)}"
+        return f"No {kind} {brief(word)}.{_nearest(word, names, kind in LISTED and len(names) > _FEW)}"
 
 
-def _nearest(word: str, names: list[str]) -> str:
-    closest = difflib.get_close_matches(word, names, n=1, cutoff=0.4) if len(word) <= _LONGEST else []
+def _nearest(word: str, names: list[str], are_listed: bool = False) -> str:
+    """The nearest name and all names, or of many that are listed elsewhere the five nearest."""
+    closest = difflib.get_close_matches(word[:_LONGEST], names, n=1, cutoff=0.4)
     hint = f" Did you mean {closest[0]!r}?" if closest else ""
+    if are_listed:
+        near = difflib.get_close_matches(word[:_LONGEST], names, n=5, cutoff=0.0)
+        return f"{hint} The five nearest: {', '.join(near)}. 'imagine-bench list' names all {len(names)}."
     return f"{hint} Known: {', '.join(names) or 'none'}."
 
 
@@ -160,6 +167,7 @@ EXTRAS = {
     "matplotlib": "report",
     "PIL": "report",
     "rerun": "rerun",
+    "rerun_notebook": "notebook",
     "ray": "ray",
     "pygame": "play",
     "minari": "data",

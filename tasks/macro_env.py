@@ -65,7 +65,7 @@ def options_of(options: Info | None) -> Info:
 class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
     """Macro-actions on a real scene, seen by the wrist camera.
 
-    Action Space: ``Discrete(A)``, the macro-actions in the order of ``TaskSpec.action_names``.
+    Action Space: ``Discrete(A)``, the macro-actions. Their names, in this order, are ``env.unwrapped.action_names``.
 
     Observation Space: ``Box(0, 255, (64, 64, 3), uint8)``, one upright RGB frame with the human at the top, unless
     ``observation`` says otherwise.
@@ -142,6 +142,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         self._id = spec.id
         self._rules = spec.rules
         self.preprocessing = spec.preprocessing
+        self.action_names = spec.action_names
         self._starts = spec.rules.start_states
         self.horizon = spec.horizon
         self._sight = spec.sight

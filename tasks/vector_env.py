@@ -89,6 +89,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         self.render_mode = None if mode is None else require_known("render mode", mode, ("rgb_array",))
         self.single_observation_space = lanes[0].observation_space
         self.single_action_space = lanes[0].action_space
+        self.action_names = lanes[0].action_names
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._seen: list[Observed | None] = [None] * self.num_envs

@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import re
 import shlex
 import signal
 import subprocess
 import sys
-from importlib.metadata import version
 from pathlib import Path
 
 import bench_fakes  # noqa: F401 - registers the fakes
@@ -19,15 +17,17 @@ import torch
 from imagine_bench.agents.encoders.perception import prepare_torch
 from small_runs import Inline
 
-from imagine_bench import cli, errors
+from imagine_bench import cli, errors, registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.registry import AGENTS, TASKS, WORLD_MODELS
 from imagine_bench.running.bench import task_types
 from imagine_bench.running.launchers.jobs import LAUNCHERS
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.encoders import bundled
 from imagine_bench.sweep.grid import GRIDS
+from imagine_bench.version import __version__
 
 DRAWING = {"MUJOCO_GL", "LP_NUM_THREADS", "PYOPENGL_PLATFORM"}
 """Variables that MuJoCo, PyOpenGL and Mesa read as long as the process draws (docs/reference/api.md)."""
@@ -43,7 +43,7 @@ def bench_words(out: Path, *more: str) -> list[str]:
     [
         ("--task=pick", "Both arrow_puzzle and --task pick were given; leave one of them out."),
         ("--preset quik", "No preset 'quik'. Did you mean 'quick'? Known: smoke, quick, thesis, full, "),
-        ("--agents dqnn", "No agent 'dqnn'. Did you mean 'dqn'? Known: random, oracle, dqn, imagination"),
+        ("--agents dqnn", "No agent 'dqnn'. Did you mean 'dqn'? The five nearest: dqn, drqn, "),
         ("--budgets 10 5", "budgets (10, 5) must be one or more different integers from 1 to 10,000,000"),
         (
             "--encoder pick_place-clean",
@@ -99,18 +99,17 @@ def test_wrong_words_of_other_commands(
 @pytest.mark.parametrize(
     ("words", "now", "sentence"),
     [
-        (["list"], "describe", None),
         (["study", "--task", "arrow_puzzle", "--file", "x.toml"], "sweep --task arrow_puzzle --file x.toml", "x.toml"),
         (["film", "--task", "arrow_puzzle", "--out", "x"], "play --film --task arrow_puzzle --out x", "end in .gif"),
     ],
 )
 def test_a_former_command_runs_the_new_one(
-    words: list[str], now: str, sentence: str | None, capsys: pytest.CaptureFixture[str]
+    words: list[str], now: str, sentence: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(words) == (0 if sentence is None else 2)
+    assert main(words) == 2
     first, *others = capsys.readouterr().err.splitlines()
     assert first == f"imagine-bench: '{words[0]}' is now: imagine-bench {now}"
-    assert sentence is None or sentence in others[0]
+    assert sentence in others[0]
 
 
 def test_a_task_is_the_first_word_or_an_option(capsys: pytest.CaptureFixture[str]) -> None:
@@ -200,18 +199,49 @@ def test_a_bench_ends_with_a_table_a_report_and_recordings(
     assert capsys.readouterr().out.splitlines()[-4:] == said.out.splitlines()[-4:]
 
 
-def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["describe"]) == 0
+def test_list_describes_everything_in_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
     out = capsys.readouterr().out
-    words = set(re.split(r"[\s,]+", out))
+    named = {line.split()[0] for line in out.splitlines() if line.startswith("  ") and len(line.split()) > 1}
     for kind in task_types().values():
-        assert words >= {*kind.tasks(), *kind.learners(), *kind.presets}
-    assert words >= {*GRIDS, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *bundled()}
+        assert named >= {*kind.tasks(), *kind.learners(), *kind.presets}
+    assert named >= {*GRIDS, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *WORLD_MODELS, *bundled()}
+    assert main(["describe"]) == 0
+    assert capsys.readouterr() == (out, "")
+
+
+@pytest.mark.parametrize("group", [registry.TASK_GROUP, registry.AGENT_GROUP, registry.WORLD_MODEL_GROUP])
+def test_a_misspelt_name_is_answered_by_the_nearest(group: str) -> None:
+    """By its own right spelling first, of all names that there are; those that are few are all named."""
+    own = {registry.TASK_GROUP: TASKS, registry.AGENT_GROUP: AGENTS, registry.WORLD_MODEL_GROUP: WORLD_MODELS}[group]
+    for name in own:
+        with pytest.raises(UnknownNameError) as found:
+            registry.offered(f"{name[:-1]}{name[-1] * 2}", own, group)
+        said = str(found.value)
+        known = found.value.args[2]
+        assert f"Did you mean {name!r}?" in said
+        assert f"The five nearest: {name}, " in said if len(known) > 8 else f"Known: {', '.join(known)}." in said
+
+
+@pytest.mark.parametrize("command", ["bench", "sweep"])
+def test_whoever_launches_names_every_launcher(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    said = capsys.readouterr().out
+    assert f"--launcher {{{','.join(LAUNCHERS)}}}" in said
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_can_complete_every_command(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--tyro-print-completion", shell])
+    said = capsys.readouterr().out
+    assert all(name in said for name in ("bench", "describe", "--evaluation-episodes", "sample_efficiency"))
 
 
 def test_the_program_says_which_version_it_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"imagine-bench {version('imagine-bench')}\n"
+    assert capsys.readouterr().out == f"imagine-bench {__version__}\n"
 
 
 def test_who_stops_reading_gets_no_traceback() -> None:

@@ -10,6 +10,7 @@ import ast
 import importlib
 import pkgutil
 import re
+import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
@@ -18,13 +19,13 @@ from pathlib import Path
 import pytest
 
 import imagine_bench
-from imagine_bench import MOVED
+from imagine_bench import MOVED, api
 
 _TOP = Path(__file__).parent.parent
 LOOSE = "loose modules"
 """The modules that lie in ``imagine_bench/`` itself count as one folder."""
 PACKAGE = "the package itself"
-"""``imagine_bench/__init__.py`` and ``__main__.py``: what ``import imagine_bench`` and ``python -m`` run."""
+"""``__init__.py``, ``api.py`` and ``__main__.py`` of ``imagine_bench``: what its import and ``python -m`` offer."""
 FOLDERS = (
     LOOSE,
     "imagine_bench/reference",
@@ -140,7 +141,7 @@ def folder_of(path: Path) -> str:
     folder = path.relative_to(_TOP).parent.as_posix()
     if folder != "imagine_bench":
         return folder
-    return PACKAGE if path.name in ("__init__.py", "__main__.py") else LOOSE
+    return PACKAGE if path.name in ("__init__.py", "__main__.py", "api.py") else LOOSE
 
 
 def arrows(path: Path, source: str) -> dict[str, str]:
@@ -304,16 +305,48 @@ def test_a_path_that_never_was_is_not_found() -> None:
         importlib.import_module("imagine_bench.never_was")
 
 
-def test_an_old_path_hides_no_function_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    """``imagine_bench.bench`` may become a function: the import of a module that was called so leaves it."""
-
-    def bench() -> None: ...
-
-    monkeypatch.setattr(imagine_bench, "bench", bench, raising=False)
+@pytest.mark.parametrize("again", [False, True])
+def test_an_old_path_hides_no_function_of_the_package(again: bool) -> None:
+    """``imagine_bench.bench`` was a package: the import of a module by its old path leaves the function."""
     for old in ("imagine_bench.bench", "imagine_bench.bench.bench"):
         sys.modules.pop(old, None)
+    if not again:
+        vars(imagine_bench).pop("bench", None)
     with pytest.warns(DeprecationWarning):
         module = importlib.import_module("imagine_bench.bench.bench")
-    assert imagine_bench.bench is bench and module.plan is importlib.import_module(MOVED[module.__name__]).plan
+    assert imagine_bench.bench is api.bench and module.plan is importlib.import_module(MOVED[module.__name__]).plan
     names = [module.name for module in pkgutil.iter_modules(imagine_bench.__path__)]
     assert "bench" not in names and not set(names) & {old.split(".")[1] for old in MOVED if old.count(".") == 1}
+
+
+def test_the_package_loads_its_functions_when_they_are_used() -> None:
+    probe = """
+import sys
+import imagine_bench
+assert not {"imagine_bench.api", "imagine_bench.cli", "scipy", "torch", "mujoco"} & set(sys.modules)
+assert set(dir(imagine_bench)) >= {"bench", "load", "register_agent", "registry"}
+from imagine_bench import bench, load
+assert bench is imagine_bench.api.bench and load is imagine_bench.load
+assert not {"torch", "mujoco", "matplotlib", "rerun"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", probe], check=True)
+
+
+@pytest.mark.slow
+def test_the_functions_of_the_package_outlive_the_import_of_all_of_its_modules() -> None:
+    rooms = ("imagine_bench.agents", "imagine_bench.tasks", "imagine_bench.__main__")
+    modules = [name for name in _MODULES if not name.startswith(rooms)]
+    probe = f"""
+import importlib
+import imagine_bench
+for _ in range(2):
+    for name in {modules}:
+        importlib.import_module(name)
+    for call in (imagine_bench.bench, imagine_bench.load):
+        try:
+            call("nowhere")
+        except imagine_bench.errors.ImagineBenchError as error:
+            print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=False)
+    assert done.stdout.count("No task 'nowhere'") == done.stdout.count("nowhere holds no results") == 2, done.stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 from imagine_bench.errors import EXTRAS
+from imagine_bench.version import __version__
 
 _TOP = Path(__file__).parent.parent
 _PROJECT = tomllib.loads((_TOP / "pyproject.toml").read_text())
@@ -174,6 +176,31 @@ def test_the_container_installs_what_drawing_needs() -> None:
     assert gl_packages is not None
     (installs,) = re.findall(r"apt-get install (.*)", steps)
     assert {"make", "git", *gl_packages[1].split()} <= set(installs.split())
+
+
+def test_the_development_container_is_that_image_and_sets_up_its_own_checkout() -> None:
+    """Its checkout is mounted, without an environment; the environment of the editor is the one that setup makes."""
+    folder = _TOP / ".devcontainer"
+    said = json.loads((folder / "devcontainer.json").read_text())
+    assert (folder / said["build"]["dockerfile"]).resolve() == _TOP / ".ci/Dockerfile"
+    assert (folder / said["build"]["context"]).resolve() == _TOP
+    assert said["postCreateCommand"] == "make setup"
+    left_out = (_TOP / ".dockerignore").read_text().split()
+    assert {".venv/", "runs/", "datasets/"} <= set(left_out), "what a checkout has made stays out of the image"
+    interpreter = said["customizations"]["vscode"]["settings"]["python.defaultInterpreterPath"]
+    assert interpreter == "${containerWorkspaceFolder}/.venv/bin/python"
+
+
+def test_version_and_authors_are_those_of_changelog_and_citation() -> None:
+    """A version that is not released yet is a development version of the one that the changelog announces."""
+    newest = re.findall(r"^## (.*)$", (_TOP / "CHANGELOG.md").read_text(), re.MULTILINE)[0]
+    announced = re.search(r"\d+\.\d+\.\d+", newest)
+    version = Version(__version__)
+    assert announced is not None and version.base_version == announced[0]
+    assert version.is_devrelease == newest.startswith("Unreleased")
+    citation = (_TOP / "CITATION.cff").read_text().partition("references:")[0]
+    assert f"\nversion: {__version__}\n" in citation
+    assert re.findall(r'- name: "(.*)"', citation) == [each["name"] for each in _PROJECT["project"]["authors"]]
 
 
 def test_whatever_ci_fetches_is_named_by_its_digest() -> None:

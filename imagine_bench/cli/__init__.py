@@ -8,8 +8,8 @@ import re
 import shlex
 import sys
 import unicodedata
-from collections.abc import Sequence
-from contextlib import ExitStack, redirect_stderr, redirect_stdout, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -58,13 +58,14 @@ _LONGEST_WORD = 1000
 _SETS_UP_TORCH = "imagine_bench.agents.encoders.perception"
 FORMER = {
     "film": ("play", "--film"),
-    "list": ("describe",),
     "margins": ("check", "--physics"),
     "study": ("sweep",),
     "suite": ("sweep",),
     "why": ("verify", "--causes"),
 }
 """Commands of former versions, and the words that replace each."""
+ALSO = {"list": "describe"}
+"""Second names of commands."""
 ELSEWHERE = {
     "coverage": "python tests/measure/coverage.py",
     "speed": "make speed",
@@ -80,16 +81,25 @@ def parsed(words: Sequence[str]) -> Command:
     Raises:
         SystemExit: The words are no command, or ask for help, which is then printed.
         InvalidValueError: As :func:`understood`.
+        SetupError: A shell's completion is asked for that needs a package which is not installed.
     """
+    try:
+        command = _parsed(understood(words))
+    except ImportError as error:  # the completion of some shells needs another package
+        raise SetupError(f"{plain(error)}.") from error
+    require_values(command)
+    return command
+
+
+def _parsed(words: Sequence[str]) -> Command:
     command: Command = tyro.cli(
         Command,
         prog="imagine-bench",
         description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs. "
-        "--version says which this is.",
-        args=understood(words),
+        "'imagine-bench list' names all tasks, agents, presets and models; --version says which version this is.",
+        args=words,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
-    require_values(command)
     return command
 
 
@@ -102,6 +112,7 @@ def understood(words: Sequence[str]) -> list[str]:
     """
     given = [_readable(word) for word in words]
     command = given[0] if given else ""
+    given[:1] = [ALSO.get(command, command)] if given else []
     if command in ELSEWHERE:
         raise InvalidValueError(
             f"'{command}' is no command any more. In a checkout type: {ELSEWHERE[command]}. "
@@ -163,8 +174,7 @@ def exit_code(words: Sequence[str]) -> int:
     """
     registry.refuse_while_loading()
     with ExitStack() as scope:
-        _of_torch("keep_torch")
-        scope.callback(_of_torch, "restore_torch")
+        scope.enter_context(torch_as_it_was())
         if sys.stderr is None:
             scope.enter_context(redirect_stderr(scope.enter_context(Path(os.devnull).open("w"))))
         return _carried_out(list(words))
@@ -190,11 +200,18 @@ class _Printable(io.StringIO):
         return self._output.isatty()
 
 
-def _of_torch(function: str) -> None:
-    """Call ``keep_torch`` or ``restore_torch`` if torch's settings may have been changed.
+@contextmanager
+def torch_as_it_was() -> Iterator[None]:
+    """After the block torch has the settings that it had before, which hold for the whole process."""
+    _of_torch("keep_torch")
+    try:
+        yield
+    finally:
+        _of_torch("restore_torch")
 
-    The settings hold for the whole process.
-    """
+
+def _of_torch(function: str) -> None:
+    """Call ``keep_torch`` or ``restore_torch`` if torch's settings may have been changed."""
     if _SETS_UP_TORCH in sys.modules:
         registry.load(f"{_SETS_UP_TORCH}:{function}")()
 

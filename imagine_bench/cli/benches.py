@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -11,12 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import tyro
 
 from imagine_bench import registry
-from imagine_bench.adapters.tracking import track
+from imagine_bench.adapters.tracking import TOOLS, Tracked, track
 from imagine_bench.cli.observers import Observed
 from imagine_bench.cli.options import (
     Count,
     Counts,
+    DeviceWord,
     EncoderWord,
+    ExecutionWord,
     File,
     Launch,
     ManyWords,
@@ -28,16 +31,18 @@ from imagine_bench.cli.options import (
     Word,
     Words,
     added_up,
+    one_of,
     shown,
 )
 from imagine_bench.errors import CheckFailedError, InvalidValueError, RunFailedError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.judge.judgement import Judgement, judge, kept
 from imagine_bench.judge.verify import Verdict, cost
-from imagine_bench.protocols.control import Protocol
-from imagine_bench.protocols.data import Encoders, ProtocolData, Result, digest
+from imagine_bench.protocols.control import PRESETS, Protocol
+from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, load_so_far, plan
+from imagine_bench.running.collect import POLICIES
 from imagine_bench.running.headlines import until_decided
 from imagine_bench.running.launchers.jobs import at_a_time, launcher
 from imagine_bench.running.retraining import Retraining
@@ -54,11 +59,14 @@ _MOST_SEEDS = 15
 """Where --until-decided stops."""
 
 
+TrackWord = Annotated[str | None, shown(f"{{{','.join(TOOLS)}}}")]
+
+
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions:
     """Options of the world."""
 
-    execution: Word = None
+    execution: ExecutionWord = None
     """How macro-actions happen: physics (the default), or kinematic (their outcome is set)."""
     appearance: Word = None
     """How much frames vary: clean (the default), mild, strong, photo (a finite pool), or factors such as
@@ -96,7 +104,7 @@ class Learner:
     """Reward that a teacher adds for an optimal macro-action, and takes off for another, in training; 0 by default."""
     feedback_error: Number = None
     """Probability with which the teacher says the opposite; 0 by default."""
-    device: str = DEVICES[0]
+    device: DeviceWord = DEVICES[0]
     """Where agents compute: cpu or cuda."""
 
 
@@ -135,14 +143,16 @@ class Bench:
     """Train and compare agents on a task; leaves a report and recordings. The same command again goes on."""
 
     task: TaskWord
-    """Task to compare on, also as --task TASK; 'imagine-bench describe' names them."""
-    preset: str = "quick"
-    """Size of the comparison; 'imagine-bench describe' names them."""
+    """Task to compare on, also as --task TASK; 'imagine-bench list' names them."""
+    preset: Annotated[str, one_of(*PRESETS)] = "quick"
+    """Size of the comparison; 'imagine-bench list' says how large each is."""
     world: WorldOptions
     learner: Learner
     budget: Budget
     tests: Tests
     launch: Launch
+    track: TrackWord = None
+    """Also write metrics for a tool, as the runs go, into a folder of its name in the bench's; wandb offline."""
 
     def asked(self) -> tuple[str, str, dict[str, Any]]:
         """The task, the preset and the options that replace values of the preset, by name."""
@@ -164,25 +174,55 @@ class Bench:
     def __call__(self) -> None:
         """Plan, run, report."""
         launcher = self.launch.chosen()
-        if self.budget.most_seeds is not None and not self.budget.until_decided:
-            raise InvalidValueError("--most-seeds goes with --until-decided; leave it out, or give both.")
-        if not self.budget.until_decided:
-            wanted, encoders = self.planned()
-            _show(bench(wanted, encoders, root=self.launch.out, launcher=launcher))
-            return
-        task, preset, options = self.asked()
+        if self.track is not None:
+            launcher = Tracked(launcher, self.track, self.task)
+        until, most = self.budget.until_decided, self.budget.most_seeds
+        for result in carry_out(*self.asked(), root=self.launch.out, launcher=launcher, until=until, most=most):
+            _show(result)
 
-        def staged(**changes: Any) -> BenchResult:
-            wanted, encoders = plan(task, preset, **{**options, **changes})
-            return cast("BenchResult", bench(wanted, encoders, root=self.launch.out, launcher=launcher))
 
-        first, _ = plan(task, preset, **options)
-        if not isinstance(first, Protocol):
-            raise InvalidValueError(f"{task} is a regression task without headlines; leave --until-decided out.")
-        begun, whole = until_decided(staged, first, most=self.budget.most_seeds or _MOST_SEEDS, root=self.launch.out)
-        _show(begun)
-        if whole is not begun:
-            _show(whole)
+def carry_out(
+    task: str,
+    preset: str,
+    options: Mapping[str, Any],
+    *,
+    root: Path,
+    launcher: Launcher,
+    until: bool = False,
+    most: int | None = None,
+) -> list[Result]:
+    """Run what is missing of a bench, or with ``until`` of its stages, and read it.
+
+    Args:
+        task: The task.
+        preset: The preset.
+        options: Fields of the protocol that differ from the preset's, as :func:`.running.bench.plan` takes them.
+        root: The folder of all benches.
+        launcher: Carries out the runs.
+        until: Whether seeds are added until the headlines are decided.
+        most: With it, seeds an agent at most; 15 by default.
+
+    Returns:
+        The bench; or the bench of the first stage and, if there were more, that of all seeds.
+
+    Raises:
+        InvalidValueError: ``most`` without ``until``, or ``until`` for a task without headlines.
+        ImagineBenchError: As :func:`.running.bench.plan` and :func:`.running.bench.bench`.
+    """
+    if most is not None and not until:
+        raise InvalidValueError("--most-seeds goes with --until-decided; leave it out, or give both.")
+    wanted, encoders = plan(task, preset, **options)
+    if not until:
+        return [bench(wanted, encoders, root=root, launcher=launcher)]
+    if not isinstance(wanted, Protocol):
+        raise InvalidValueError(f"{task} is a regression task without headlines; leave --until-decided out.")
+
+    def staged(**changes: Any) -> BenchResult:
+        stage, paths = plan(task, preset, **{**options, **changes})
+        return cast("BenchResult", bench(stage, paths, root=root, launcher=launcher))
+
+    begun, whole = until_decided(staged, wanted, most=most or _MOST_SEEDS, root=root)
+    return [begun] if whole is begun else [begun, whole]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,8 +232,8 @@ class Report(OfBench):
     merge: Annotated[Repeated[Path], shown("PATH [PATH ...]")] = ()
     """Folders of other benches, or of results that were kept, whose agents are added, or where those are the same,
     whose seeds; all else in their protocols must be the same."""
-    track: Word = None
-    """Write the metrics so far for a tool instead: tensorboard, or wandb (offline)."""
+    track: TrackWord = None
+    """Write the metrics so far for a tool instead; wandb offline."""
 
     def __call__(self) -> None:
         """Load and write."""
@@ -219,7 +259,7 @@ class Sweep:
         str | None,
         tyro.conf.arg(metavar="NAME|FILE", aliases=["--file"], help_behavior_hint="(optional)"),
     ] = None
-    """Which grid, by default the study factors, or the suite; 'imagine-bench describe' names them. Or one of your own,
+    """Which grid, by default the study factors, or the suite; 'imagine-bench list' names them. Or one of your own,
     a .toml or .json file."""
     variants: ManyWords = ()
     """Of a study: only these variants, by default all, and those they are compared with."""
@@ -275,7 +315,7 @@ class Plan(OfBench):
     """Plans."""
     recorded: int = 5
     """Plans that are recorded too; 0 for none."""
-    execution: Word = None
+    execution: ExecutionWord = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     max_epistemic: Number = None
     """A plan with an imagined step of more epistemic uncertainty is refused; by default the agent's filter decides."""
@@ -308,7 +348,7 @@ class Judge:
     task: TaskWord = "arrow_puzzle"
     """Task whose world is imagined, also as --task TASK."""
     models: Words = None
-    """World models, as 'imagine-bench describe' names them, or folders of a finished run or of all of an agent's; by
+    """World models, as 'imagine-bench list' names them, or folders of a finished run or of all of an agent's; by
     default all of this suite but slow ones."""
     sizes: tuple[int, ...] = (100, 300, 1000, 3000, 10000)
     """Transitions of the same data after which models are compared, ascending."""
@@ -318,8 +358,8 @@ class Judge:
     """Futures imagined of each question."""
     appearance: str = APPEARANCES[0]
     """How much frames vary: a level, or factors such as light=0.5,camera=0.2."""
-    policy: str = "random"
-    """Who collects the data: random, uniform, oracle or mixed."""
+    policy: Annotated[str, one_of(*POLICIES)] = "random"
+    """Who collects the data."""
     order: int = 0
     """Seed of the order in which models are asked."""
     encoder: EncoderWord = None
@@ -430,11 +470,16 @@ _PAGES = {
 
 def _show(result: Result) -> None:
     """Report a bench, and say where its recordings lie."""
-    page = registry.load(_PAGES["control" if isinstance(result, BenchResult) else "regression"])(result)
-    _write(page, result.folder / "report")
+    _write(page_of(result), result.folder / "report")
     recordings = [run.recording for run in result.runs if run.recording is not None]
     if recordings:
         print(f"Recordings: {len(recordings)}, such as {recordings[-1]} (imagine-bench view opens the newest)")
+
+
+def page_of(result: Result) -> Page:
+    """The report of a bench of any type of task."""
+    page: Page = registry.load(_PAGES["control" if isinstance(result, BenchResult) else "regression"])(result)
+    return page
 
 
 def _write(page: Page, folder: Path) -> None:

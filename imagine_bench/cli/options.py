@@ -13,9 +13,10 @@ import tyro
 from imagine_bench import registry
 from imagine_bench.cli.observers import Observed
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import DEVICES, EXECUTIONS
 from imagine_bench.protocols.data import Launcher
 from imagine_bench.running.bench import task_type
-from imagine_bench.running.launchers.jobs import launcher
+from imagine_bench.running.launchers.jobs import LAUNCHERS, launcher
 from imagine_bench.store.bench_folder import require_either
 
 T = TypeVar("T")
@@ -26,6 +27,11 @@ Repeated = tyro.conf.UseAppendAction[tuple[tuple[T, ...], ...]]
 def shown(metavar: str) -> object:
     """How the help shows an option that may be left out; its description says what happens then."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="(optional)")
+
+
+def one_of(*choices: str) -> object:
+    """How the help shows an option with few possible values."""
+    return tyro.conf.arg(metavar=f"{{{','.join(choices)}}}")
 
 
 TaskWord = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
@@ -41,6 +47,8 @@ Number = Annotated[float | None, shown("FLOAT")]
 Count = Annotated[int | None, shown("INT")]
 Counts = Annotated[tuple[int, ...] | None, shown("INT [INT ...]")]
 File = Annotated[Path | None, shown("PATH")]
+ExecutionWord = Annotated[str | None, shown(f"{{{','.join(EXECUTIONS)}}}")]
+DeviceWord = Annotated[str, one_of(*DEVICES)]
 EncoderWord = Annotated[str | None, shown("NAME|FILE")]
 """Options that may be left out."""
 
@@ -51,8 +59,9 @@ class Launch:
 
     workers: Count = None
     """Processes at a time; one a core by default."""
-    launcher: str = "local"
-    """Where runs are carried out: local, ray (the cluster at RAY_ADDRESS, else one started here) or slurm."""
+    launcher: Annotated[str, one_of(*LAUNCHERS)] = "local"
+    """Where runs are carried out: in processes of this machine, on a Ray cluster (that at RAY_ADDRESS, else one started
+    here), on a Slurm cluster, or one after another in this process (for a debugger)."""
     out: Path = Path("runs")
     """Folder of all benches."""
 

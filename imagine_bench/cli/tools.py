@@ -9,8 +9,19 @@ from typing import Annotated
 import tyro
 
 from imagine_bench import registry
-from imagine_bench.cli.options import Count, EncoderWord, File, MaybeTaskWord, OfBench, TaskWord, Word
-from imagine_bench.data.folder import read_dataset, require_format, require_new, write_dataset
+from imagine_bench.cli.options import (
+    Count,
+    DeviceWord,
+    EncoderWord,
+    ExecutionWord,
+    File,
+    MaybeTaskWord,
+    OfBench,
+    TaskWord,
+    Word,
+    one_of,
+)
+from imagine_bench.data.folder import FORMATS, read_dataset, require_format, require_new, write_dataset
 from imagine_bench.errors import CheckFailedError, InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.registry.entries import file_name
@@ -33,13 +44,13 @@ class DatasetCommand:
     turn); or a run's folder, whose trained agent acts greedily."""
     episodes: int = 200
     """Episodes."""
-    format: str = "npz"
-    """Format of the files: npz, lerobot, or minari (both of the extra 'data')."""
+    format: Annotated[str, one_of(*FORMATS)] = "npz"
+    """Format of the files; lerobot and minari need the extra 'data'."""
     out: File = None
     """Folder of the dataset, by default datasets/TASK-POLICY; never overwritten."""
     seed: int = 0
     """Seed of starts and of chance."""
-    execution: Word = None
+    execution: ExecutionWord = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: str = APPEARANCES[0]
     """How much frames vary: clean, mild, strong, photo, or factors such as light=0.5,camera=0.2."""
@@ -89,7 +100,7 @@ class EncoderCommand:
     """Task whose frames it learns, also as --task TASK."""
     appearance: str = APPEARANCES[0]
     """Appearance of the frames: a level, or factors such as light=0.5,camera=0.2."""
-    recipe: str = "default"
+    recipe: Annotated[str, one_of("default", "thesis", "joint", "codes")] = "default"
     """How it is trained: default, thesis, joint (the arrow puzzles: eight latents of the whole image), or codes,
     for agents that read factors and their values."""
     seed: int = 0
@@ -100,7 +111,7 @@ class EncoderCommand:
     """Images a gradient step, at least 1; by default the recipe's."""
     latents: Count = None
     """Latents of the image, or of each strip, at least 1; by default the recipe's."""
-    device: str = DEVICES[0]
+    device: DeviceWord = DEVICES[0]
     """Where gradient steps are made: cpu, or cuda (an NVIDIA GPU)."""
     out: Path = Path("encoders")
     """Folder for artefact, card and figure; never overwritten."""
@@ -150,7 +161,7 @@ class Play:
     """Task to play, also as --task TASK; by default that of --model."""
     model: File = None
     """A run's folder, whose agent imagines the same keys beside the real scene."""
-    execution: Word = None
+    execution: ExecutionWord = None
     """physics or kinematic; by default the model's, else the task's."""
     appearance: Word = None
     """Appearance: a level, or factors; by default likewise."""
@@ -218,8 +229,8 @@ class CheckCommand:
 class New:
     """Write a package of your own with a task, an agent or a world model in it, ready to be changed."""
 
-    kind: Annotated[str, tyro.conf.Positional]
-    """task, agent or model."""
+    kind: Annotated[str, tyro.conf.Positional, one_of("task", "agent", "model")]
+    """What the package holds."""
     name: Annotated[str, tyro.conf.Positional]
     """Name of the package and of what it offers."""
     out: Path = Path()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import secrets
 import shutil
 from collections.abc import Mapping
@@ -14,7 +15,15 @@ from imagine_bench.arrays import Array, Arrays, content_hash
 from imagine_bench.errors import ArtefactError, InvalidValueError, require_known, writing
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.store.files import make_folder, read_arrays, read_sealed, sealed, write_arrays, write_json
+from imagine_bench.store.files import (
+    make_folder,
+    read_arrays,
+    read_sealed,
+    sealed,
+    write_arrays,
+    write_bytes,
+    write_json,
+)
 from imagine_bench.values import Json
 
 FORMATS = {name: f"imagine_bench.data.{name}" for name in ("npz", "lerobot", "minari")}
@@ -27,6 +36,9 @@ _MARKS = {
 }
 """Files by which formats are known; their modules read from there."""
 _CARD = "card.json"
+_README = "README.md"
+_SHOWN = ("task", "policy", "episodes", "transitions", "successes", "mean_return", "execution", "appearance", "seed")
+"""Facts of the card that the page for readers shows, too."""
 Apart = Mapping[str, Mapping[str, Array]]
 """Named arrays that no learner is given, by the file they are in."""
 
@@ -70,10 +82,32 @@ def write_dataset(folder: Path, episodes: Episodes, apart: Apart, card: Mapping[
             for name, arrays in apart.items():
                 write_arrays(partial / f"{name}.npz", arrays)
             write_json(partial / _CARD, sealed(whole))
+            write_bytes(partial / _README, _readme(whole).encode())
             partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return Dataset(folder=folder, format=format, episodes=episodes, card=whole)
+
+
+def _readme(card: Mapping[str, Json]) -> str:
+    """The page of a dataset for readers. Its head, in YAML, is what LeRobot and the Hugging Face hub expect."""
+    format = card["format"]
+    head: dict[str, Json] = {
+        "license": "apache-2.0",
+        "task_categories": ["robotics", "reinforcement-learning"],
+        "tags": ["imagine_bench", "LeRobot" if format == "lerobot" else format],
+    }
+    if format == "lerobot":
+        head["configs"] = [{"config_name": "default", "data_files": "data/*/*.parquet"}]
+    rows = [f"| {name.replace('_', ' ')} | {card[name]} |" for name in _SHOWN if name in card]
+    lines = [
+        *("---", *(f"{name}: {json.dumps(value)}" for name, value in head.items()), "---", ""),
+        *(f"# Episodes of {card.get('task', 'a task')}", "", str(card.get("description", "")), ""),
+        *("| fact | value |", "|---|---|", *rows, ""),
+        f"Made with imagine_bench: `{card.get('command', '')}`. `{_CARD}` has all facts and the episodes' digest.",
+        "`imagine_bench.data.folder.read_dataset(folder)` reads and checks them.",
+    ]
+    return "\n".join([*lines, ""])
 
 
 def require_format(format: str) -> None:

@@ -252,7 +252,7 @@ def model_entry(model: str) -> WorldModelEntry:
     title = entry.title or agent
     if folder == Path(model):
         title = f"{title}, seed {seed}"
-    return WorldModelEntry(make=entry.make, title=title, privileged=entry.privileged)
+    return WorldModelEntry(make=str(entry.make), title=title, privileged=entry.privileged)
 
 
 def one_name(model: str) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, cast
 
 from imagine_bench.appearance import appearance_name
-from imagine_bench.errors import InvalidValueError, brief, require_known
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief, require_known
 from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.exact.splits import StartingFrom, split_of
 from imagine_bench.interfaces import (
@@ -32,6 +33,8 @@ from imagine_bench.protocols.data import (
 )
 from imagine_bench.registry import agent_entry, own_settings, task, task_entry
 from imagine_bench.registry import task_name as canonical
+from imagine_bench.registry.by_value import CodeByValue
+from imagine_bench.registry.entries import entrant
 from imagine_bench.seeding import SeedTree
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
@@ -116,6 +119,8 @@ class LearnerSection:
     encoder: str | None = None
     #: That of the encoder for the agents that see codes of parts; None if there is no such agent.
     codes: str | None = None
+    #: Digest of the code of each agent that was registered as a class or a function (:mod:`.by_value`), by its name.
+    code: tuple[tuple[str, str], ...] = field(default=(), metadata=LATER)
 
     def encoder_of(self, kind: str) -> str | None:
         """Return the identity of the encoder for the agents that take this kind."""
@@ -314,11 +319,30 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
         headlines=tuple(pair for pair in wanted.headlines if agents.issuperset(pair)),
         few_seeds=tuple((agent, wanted.seeds[:most][-1]) for agent, most in few.items() if agent in agents),
     )
+    wanted = dataclasses.replace(wanted, code=registered_code(wanted.agents))
     for agent in wanted.agents:  # what is only read may be of a package that is not here
         _require_takes(agent, wanted)
     _require_learner(wanted)
     require_same_world(wanted.task, wanted.after)
     return wanted
+
+
+def registered_code(agents: Iterable[str]) -> tuple[tuple[str, str], ...]:
+    """The digests of the agents' code, as :attr:`LearnerSection.code` has them."""
+    made_by = {entrant(agent).agent: agent_entry(agent).make for agent in agents}
+    return tuple(sorted((name, make.digest) for name, make in made_by.items() if isinstance(make, CodeByValue)))
+
+
+def _require_same_code(agent: str, protocol: Protocol) -> None:
+    """Raise ArtefactError if an agent's class is not the one of the protocol."""
+    name = entrant(agent).agent
+    wanted = dict(protocol.code).get(name)
+    found = dict(registered_code([agent])).get(name)
+    if wanted != found:
+        raise ArtefactError(
+            f"The code of agent {name} is not that of this bench (digest {wanted}, now {found}). Run the bench command "
+            "again to begin a new bench, or register the agent as it was."
+        )
 
 
 def _require_learner(wanted: Protocol) -> None:
@@ -366,6 +390,7 @@ def context_of(spec: RunSpec[Protocol]) -> AgentContext:
     """What a run's agent is built from."""
     protocol = spec.protocol
     entry = agent_entry(spec.agent)
+    _require_same_code(spec.agent, protocol)
     world = task(protocol.task)
     size = (protocol.observation_size, protocol.observation_size, 3)
     shapes = {"state": (sum(map(len, world.macrostate_values)),), "proprio": (PROPRIO_SIZE,)}

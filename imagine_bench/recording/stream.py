@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+import rerun.notebook
 
 from imagine_bench.arrays import Floats, Frame, Pixels
 from imagine_bench.environments import Env
-from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, require_modules
 from imagine_bench.interfaces import Motion, SceneReader, Shape3D
 from imagine_bench.recording.filmstrips import png, rgb
 from imagine_bench.store.files import make_folder
@@ -262,6 +263,19 @@ def recording_file(
         stream.flush()
         stream.disconnect()
     partial.replace(path)
+
+
+def show_in_notebook(path: Path) -> None:
+    """Show a recording in the viewer below the cell of a notebook that calls this.
+
+    Raises:
+        SetupError: The extra ``notebook`` is not installed.
+    """
+    require_modules("rerun_notebook")
+    stream = rr.RecordingStream("imagine_bench")
+    rerun.notebook.Viewer(recording=stream).display()
+    stream.log_file_from_path(path)
+    stream.flush()
 
 
 def open_in_viewer(path: Path) -> None:

@@ -25,6 +25,7 @@ from imagine_bench.registry.builtin import (
     Guest,
     guests,
 )
+from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import (
     LABEL_OF_OLD_AGENT,
     AgentEntry,
@@ -217,7 +218,9 @@ def task_entry(name: str) -> TaskEntry:
             options = {**line.options, **_options(base, line, said)}
             spec: TaskSpec = load(line.spec)(**options)
             horizon = line.horizon and spec.horizon
+            threshold = line.reward_threshold if options == dict(line.options) else None
             entry = dataclasses.replace(line, options=options, env_id=spec.env_id, horizon=horizon)
+            entry = dataclasses.replace(entry, reward_threshold=threshold)
     register_env(entry)
     return entry
 
@@ -249,11 +252,18 @@ def register_env(entry: TaskEntry) -> None:
     """Register a task's environment with Gymnasium, unless its id is known already; a suite's own also as a vector."""
     if entry.env_id in gymnasium.registry:
         return
-    gymnasium.register(entry.env_id, entry.env, max_episode_steps=entry.horizon, kwargs=dict(entry.options))
+    gymnasium.register(
+        entry.env_id,
+        entry.env,
+        reward_threshold=entry.reward_threshold,
+        max_episode_steps=entry.horizon,
+        kwargs=dict(entry.options),
+    )
     if entry.env.startswith("imagine_bench."):
         gymnasium.register(
             vector_id(entry.env_id),
             vector_entry_point="imagine_bench.tasks.vector_env:make",
+            reward_threshold=entry.reward_threshold,
             max_episode_steps=entry.horizon,
             kwargs={"env": entry.env, **entry.options},
         )
@@ -357,9 +367,9 @@ def make_agent(name: str, context: AgentContext) -> Agent:
     return made(f"Agent {name}", agent_entry(name).make, context)
 
 
-def made(what: str, target: str, *given: Any) -> Any:
+def made(what: str, target: str | CodeByValue, *given: Any) -> Any:
     """The object that a package's target makes; ``what`` names it in an error. Raises as :func:`make_agent`."""
-    with guests_faults(what, target):
+    with guests_faults(what, str(target)):
         return load(target)(*given)
 
 

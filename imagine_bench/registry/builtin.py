@@ -27,22 +27,24 @@ TASKS: dict[str, TaskEntry] = {
             env_id=f"imagine_bench/{gymnasium_name}-v0",
             horizon=horizon,
             options={"horizon": horizon, **options},
+            reward_threshold=threshold,
         )
-        for name, gymnasium_name, horizon, options in (
-            ("arrow_puzzle", "ArrowPuzzle", 10, {}),
-            ("arrow_puzzle_hard", "ArrowPuzzleHard", 10, {"forbid": "equal+agent"}),
-            ("arrow_puzzle_toward", "ArrowPuzzleToward", 10, {"goal": "toward_agent"}),
-            ("arrow_puzzle_clockwise", "ArrowPuzzleClockwise", 10, {"goal": "clockwise"}),
-            ("arrow_puzzle_easy", "ArrowPuzzleEasy", 2, {"cubes": 1}),
+        for name, gymnasium_name, horizon, threshold, options in (
+            ("arrow_puzzle", "ArrowPuzzle", 10, 45.8, {}),
+            ("arrow_puzzle_hard", "ArrowPuzzleHard", 10, 45.3, {"forbid": "equal+agent"}),
+            ("arrow_puzzle_toward", "ArrowPuzzleToward", 10, 45.8, {"goal": "toward_agent"}),
+            ("arrow_puzzle_clockwise", "ArrowPuzzleClockwise", 10, 45.3, {"goal": "clockwise"}),
+            ("arrow_puzzle_easy", "ArrowPuzzleEasy", 2, 47.1, {"cubes": 1}),
         )
     },
-    "arrows": _ARROWS,
+    "arrows": dataclasses.replace(_ARROWS, reward_threshold=45.8),
     "pick_place": TaskEntry(
         spec="imagine_bench.tasks.pick_place.spec:spec_of",
         env="imagine_bench.tasks.pick_place.spec:make_env",
         env_id="imagine_bench/PickPlace-v0",
         horizon=50,
         world="imagine_bench.tasks.pick_place.rules:PickPlace",
+        reward_threshold=7.8,
     ),
 }
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from imagine_bench.errors import ArtefactError, InvalidValueError, brief, plain
+from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.values import Setting
 
 _BETWEEN = re.compile(r",(?=[\w.]+=)")
@@ -35,13 +36,16 @@ class TaskEntry:
     #: ``"module:attr"`` of the frozen dataclass of all such arguments; with it, ``NAME:key=value,...`` is a task, too,
     #: whose TaskSpec has a name and an ``env_id`` of its own.
     world: str = ""
+    #: Mean return at which Gymnasium counts it as solved; None where nobody says. Of this suite's tasks it is the
+    #: TaskSpec's ``success_threshold`` times the exact optimal mean return, rounded down to a tenth.
+    reward_threshold: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class AgentEntry:
     """A registered agent."""
 
-    make: str  #: ``"module:attr"`` of a function from AgentContext to Agent
+    make: str | CodeByValue  #: ``"module:attr"`` of a function from AgentContext to Agent, or the function itself
     learns: bool = True  #: Whether training changes it; others are only evaluated
     needs_encoder: bool = True  #: Whether it sees what an encoder gives
     encoder_kind: str = "latents"  #: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``

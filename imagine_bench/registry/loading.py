@@ -18,6 +18,7 @@ from typing import Any
 
 from imagine_bench.errors import EXTRAS, ImagineBenchError, SetupError, lacking, plain
 from imagine_bench.registry.builtin import AGENTS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
+from imagine_bench.registry.by_value import CodeByValue
 
 _TABLES: Sequence[dict[str, Any]] = (AGENTS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS)
 _HERE = "__main__:"
@@ -25,18 +26,32 @@ Registered = Sequence[dict[str, Any]]
 _LOADING: ContextVar[str] = ContextVar("_LOADING", default="")
 
 
-def load(target: str) -> Any:
-    """The object that ``"module:attr"`` names, or the module that ``"module"`` names.
+def load(target: str | CodeByValue) -> Any:
+    """The object that ``"module:attr"`` names, the module that ``"module"`` names, or one that was sent by value.
 
     Raises:
         SetupError: It needs an extra of this package that is not installed.
         ImportError: Its import ends Python, as ``sys.exit`` does.
         AttributeError: The module has no such object; the message says where a folder is taken for the module.
     """
+    if isinstance(target, CodeByValue):
+        with _importing(target.name):
+            return target.load()
     module, _, attribute = target.partition(":")
+    with _importing(module):
+        found = importlib.import_module(module)
+    try:
+        return attrgetter(attribute)(found) if attribute else found
+    except AttributeError as error:
+        raise AttributeError(f"module {module} has no attribute {attribute!r}{_hidden(found)}") from error
+
+
+@contextmanager
+def _importing(module: str) -> Iterator[None]:
+    """The block imports a module. Errors as of :func:`load`; a command that begins meanwhile is refused."""
     before = _LOADING.set(module)
     try:
-        found = importlib.import_module(module)
+        yield
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
@@ -47,10 +62,6 @@ def load(target: str) -> Any:
         raise ImportError(f"it ends Python when it is imported: {error!r}") from error
     finally:
         _LOADING.reset(before)
-    try:
-        return attrgetter(attribute)(found) if attribute else found
-    except AttributeError as error:
-        raise AttributeError(f"module {module} has no attribute {attribute!r}{_hidden(found)}") from error
 
 
 def _hidden(module: ModuleType) -> str:
@@ -89,7 +100,8 @@ def guests_faults(what: str, target: str) -> Iterator[None]:
         if target.startswith("imagine_bench."):
             raise
         why = fault(error)
-        raise SetupError(f"{what} ({target}) cannot be used ({why}); mend or uninstall its package.") from error
+        remedy = "mend or uninstall its package" if ":" in target else "mend it, and register it again"
+        raise SetupError(f"{what} ({target}) cannot be used ({why}); {remedy}.") from error
 
 
 def registered() -> Registered:

@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterable
+from contextvars import ContextVar
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ PACKAGES = ("daqp", "gymnasium", "mink", "mujoco", "numpy", "rerun-sdk", "safete
 OPTIONAL_PACKAGES = ("dm-control", "sb3-contrib", "sheeprl", "stable-baselines3", "torch-world")
 """Of adapters and of the extra ``peers``; named where they are installed."""
 GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
+CALL: ContextVar[str | None] = ContextVar("CALL", default=None)
+"""The command line of the call of the Python API that is carried out."""
 _CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")
 """What decides results, in a checkout."""
 
@@ -45,7 +48,10 @@ def describe_environment() -> dict[str, Json]:
 
 
 def command() -> str:
-    """The command line of this process, with the program's bare name, as a shell takes it."""
+    """The command line of this process, with the program's bare name, or that of the call that runs."""
+    call = CALL.get()
+    if call is not None:
+        return call
     name = Path(sys.argv[0]).name
     program = ["python", "-m", "imagine_bench"] if name == "__main__.py" else [name]
     return shlex.join([*program, *sys.argv[1:]])

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from types import FunctionType, ModuleType
+from types import ModuleType
 
 
 class _OldPaths(MetaPathFinder, Loader):
@@ -48,11 +48,27 @@ class _OldPaths(MetaPathFinder, Loader):
 
 
 class _Package(ModuleType):
-    """A package whose functions stay when a module is imported by an old path of the same name."""
+    """A package whose functions are loaded when they are first used.
+
+    They stay when a module is imported by an old path of the same name.
+    """
+
+    LAZY: Mapping[str, str]  #: the ``"module:name"`` of each, which the package itself says
+
+    def __getattr__(self, name: str) -> object:
+        if name not in self.LAZY:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        module, _, function = self.LAZY[name].partition(":")
+        found = getattr(importlib.import_module(module), function)
+        setattr(self, name, found)
+        return found
 
     def __setattr__(self, name: str, value: object) -> None:
-        if not (isinstance(value, ModuleType) and isinstance(vars(self).get(name), FunctionType)):
+        if not (isinstance(value, ModuleType) and name in self.LAZY):
             super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*vars(self), *self.LAZY})
 
 
 def keep_old_paths(package: str, moved: Mapping[str, str]) -> None:

@@ -51,13 +51,17 @@ REFERENCE: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (4
 def image(name: str, draw: Callable[[], Figure], caption: str) -> Image:
     """A figure in the style of all reports, drawn when it is first asked for."""
 
+    def styled() -> Figure:
+        with mpl.rc_context(STYLE):
+            return draw()
+
     def png() -> bytes:
         content = io.BytesIO()
         with mpl.rc_context(STYLE):
             draw().savefig(content, format="png", dpi=160, facecolor="white", metadata={"Software": None})
         return content.getvalue()
 
-    return Image(name, png, caption)
+    return Image(name, png, caption, styled)
 
 
 def color(name: str) -> str:

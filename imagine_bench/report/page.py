@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
@@ -18,6 +18,9 @@ import numpy as np
 from imagine_bench import statistics
 from imagine_bench.arrays import Floats
 from imagine_bench.store.files import csv_text, make_folder, sweep, write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _TERMINAL = 80  # characters
 DASH = "–"  # printed where there is no number; the table's caption says why
@@ -84,6 +87,7 @@ class Image:
     name: str  # file name without ending
     content: bytes | Callable[[], bytes]  # the PNG, or what draws it
     caption: str  # the text below it
+    draw: Callable[[], Figure] | None = None  # what draws it as a matplotlib figure, if it is one
 
     @cached_property
     def png(self) -> bytes:

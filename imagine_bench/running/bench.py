@@ -49,6 +49,7 @@ from imagine_bench.store.bench_folder import (
     is_archive,
     read_protocol_as,
     read_protocol_values,
+    with_other_code,
 )
 
 Item = TypeVar("Item")
@@ -302,6 +303,9 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
     artefacts = [path for kind, path in paths.items() if kind != "dataset"]
     for words in filter(None, map(encoders.doubt, artefacts)):
         print(f"Note: agents see through {words}.")
+    if isinstance(wanted, Protocol) and wanted.code and not folder.exists():
+        for other in with_other_code(folder, wanted):
+            print(f"Note: the code of an agent was changed since {other}, which stays as it is; all runs begin anew.")
     failures, missing = carry_out([(wanted, paths)], root=root, launcher=launcher)
     require_done(failures, missing)
     if not missing:

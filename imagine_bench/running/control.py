@@ -77,7 +77,9 @@ def _require_sound(wanted: Protocol) -> None:
 
 def _rests_on_others(agent: str) -> bool:
     """Whether code decides that may not be there: a library that is an extra, or a package that offers the agent."""
-    return registry.agent_entry(agent).external_training_loop or entrant(agent).agent not in registry.AGENTS
+    entry = registry.agent_entry(agent)
+    is_foreign = entrant(agent).agent not in registry.AGENTS or not isinstance(entry.make, str)
+    return entry.external_training_loop or is_foreign
 
 
 def _check_abilities(wanted: Protocol, paths: Encoders) -> None:

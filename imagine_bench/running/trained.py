@@ -13,6 +13,7 @@ from imagine_bench.interfaces import Agent, AgentContext, AgentState, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import Result, RunSpec
+from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import agent_label, entrant
 from imagine_bench.registry.loading import importable
 from imagine_bench.store import encoders, run_folder
@@ -42,7 +43,7 @@ class Trained:
 class KeptAgent(NamedTuple):
     """The factory, the context and the last checkpoint of a run's agent, with the settings it ran with."""
 
-    make: str  #: ``"module:attr"`` of the factory
+    make: str | CodeByValue  #: the factory, as :class:`.AgentEntry` has it
     context: AgentContext
     state: AgentState
     spec: RunSpec[Protocol]  #: Protocol, agent, seed and encoder of its run
@@ -109,9 +110,10 @@ def read_agent(folder: Path, *, encoder: str | None = None) -> KeptAgent:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
     as_it_ran = registry.own_settings(entrant(name).agent, settings)  # whatever presets say by now
     context = dataclasses.replace(context_of(spec), overrides=as_it_ran)
-    return KeptAgent(
-        importable(registry.agent_entry(name).make), context, snapshot.agent, spec, snapshot.episode, folder
-    )
+    make = registry.agent_entry(name).make
+    if isinstance(make, str):
+        make = importable(make)
+    return KeptAgent(make, context, snapshot.agent, spec, snapshot.episode, folder)
 
 
 def require_control(task: str, what: str) -> None:

@@ -143,6 +143,17 @@ def bench_folder(root: Path, protocol: ProtocolData) -> Path:
     return Path(root / file_name(protocol.task) / f"{protocol.preset}-{protocol.hash}")
 
 
+def with_other_code(folder: Path, protocol: Protocol) -> list[Path]:
+    """Return the benches beside ``folder`` that differ from this protocol in the code of their agents alone."""
+    wanted = {**protocol.as_dict(), "code": None}
+    found = []
+    for path in sorted(folder.parent.glob(f"{protocol.preset}-*/{_PROTOCOL}")):
+        values = read_json(path, "a bench's protocol")
+        if path.parent != folder and {**values, "code": None} == wanted:
+            found.append(path.parent)
+    return found
+
+
 def bench_facts(folder: Path) -> dict[str, Any]:
     """Return ``environment``, ``folder``, ``wall_s`` and, where kept, ``certificate`` and ``made_with`` of a bench.
 

@@ -34,7 +34,7 @@ _COLUMNS = (
     *("mean_return", "mean_length", "faults", "train_cpu_s", "eval_cpu_s", "solved"),
 )
 """Columns of every table of results; those of diagnostics follow."""
-_OWN = ("agents", "seeds", "budgets", "agent_names")
+_OWN = ("agents", "seeds", "budgets", "agent_names", "code")
 """Fields in which merged benches may differ; their encoders must agree where both have one."""
 
 
@@ -220,10 +220,14 @@ def _merged(results: Sequence[BenchResult]) -> Protocol:
                     "benches that are merged differ in their agents or in their seeds only."
                 )
     digests = [protocol.settings_digest for protocol in protocols]
+    code = sorted({pair for protocol in protocols for pair in protocol.code})
+    if len(dict(code)) < len(code):
+        raise InvalidValueError("An agent's code was another one in each of the benches; they cannot be merged.")
     return dataclasses.replace(
         first,
         agent_names=max(protocol.agent_names for protocol in protocols),
         agents=tuple(dict.fromkeys(agent for protocol in protocols for agent in protocol.agents)),
+        code=tuple(code),
         settings_digest=first.settings_digest if same_agents else digest(digests),
         seeds=tuple(sorted({seed for protocol in protocols for seed in protocol.seeds})),
         budgets=tuple(sorted(set.intersection(*(set(protocol.budgets) for protocol in protocols)))),

@@ -114,6 +114,7 @@ WITHOUT_ROW: Mapping[str, str] = {
     "config_group": "settings of an agent, named by the task",
     "hyperparameters": "settings of an agent, each tested with it",
     "settings_digest": "follows from the settings",
+    "code": "follows from the code of the agents",
     "device": "where is computed",
 }
 """Why no pair of runs is compared for the other fields of a protocol."""

@@ -2,20 +2,47 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from imagine_bench import registry
+from imagine_bench.errors import ImagineBenchError
 from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, TaskSpec, bundled_name
+from imagine_bench.protocols.data import ProtocolData, TaskType
+from imagine_bench.registry.entries import AgentEntry, EncoderEntry, RegressorEntry, WorldModelEntry
 from imagine_bench.rules import evaluate, greedy, is_random, optimal_policy, states_of, tabulate
 from imagine_bench.running.bench import task_types
 from imagine_bench.running.launchers.jobs import LAUNCHERS
 from imagine_bench.store.encoders import bundled
-from imagine_bench.sweep.grid import all_grids
+from imagine_bench.sweep.grid import Study, all_grids
 
+_EXECUTIONS = (
+    "The arm moves in contact physics: the default.",
+    "The outcome of a macro-action is set: quicker, and without faults.",
+)
+_APPEARANCES = (
+    "The same light, colors and camera in every frame: the default.",
+    "Light and the poses of objects and of the hand vary a little.",
+    "Light, colors, camera and the poses of objects and of the hand vary much.",
+    "Each frame is patched from fragments of a finite pool.",
+)
+_REGRESSIONS = {
+    "toy_regression": "A number x leads to one of three curves, plus noise; is it known where data lack?",
+    "robot_ik": "A planar arm learns by moving at random which joint angles lead to a place.",
+}
+"""What the regression tasks of this suite are; loading one loads MuJoCo."""
+_LAUNCHERS = (
+    "Processes of this machine: the default.",
+    "The cluster at RAY_ADDRESS, else one that is started here; needs the extra ray.",
+    "Jobs of a Slurm cluster; needs the extra slurm.",
+    "One run after another in this process, for a debugger.",
+)
+"""What each execution, appearance and launcher is, in their order."""
 _MOST = 10
 """Plan lengths that are listed one by one."""
 
@@ -54,23 +81,76 @@ def describe_task(name: str) -> str:
 
 
 def names() -> str:
-    """The names of all tasks, agents, presets and so on, one kind a line; then what packages offer in vain."""
-    kinds: dict[str, Iterable[str]] = {}
-    for name, kind in task_types().items():
-        kinds[f"{name} tasks"] = kind.tasks()
-        kinds[f"{name} learners"] = kind.learners()
-        kinds[f"{name} presets"] = kind.presets
-    kinds["grids"] = all_grids()
-    kinds["world models"] = registry.world_models()
-    kinds["executions"] = EXECUTIONS
-    kinds["launchers"] = LAUNCHERS
-    kinds["appearances"] = APPEARANCES
-    kinds["encoders"] = {**bundled(), **registry.usable(registry.ENCODER_GROUP)}
-    lines = [f"{kind:22}{', '.join(members)}" for kind, members in kinds.items()]
-    for guest in registry.absent_guests():
-        absent = [name for each in guest.names.values() for name in each]
-        lines.append(f"{'not installed':22}{', '.join(absent)} ({guest.install})")
-    return "\n".join([*lines, *(f"\n{error}" for error in registry.refused_offers())])
+    """All tasks, agents, presets and so on, one a line with a description, by kind; then what cannot be used, and why.
+
+    The first line of each kind says in which words of a command its names stand.
+    """
+    groups: dict[str, Mapping[str, str]] = {
+        "Control tasks, in which agents act (bench TASK)": _tasks(),
+        "Agents (bench TASK --agents)": _described(registry.agents()),
+        "Presets of their benches (--preset)": _presets(task_types()["control"]),
+        "Regression tasks, learned from data (bench TASK)": _regressions(),
+        "Regressors (bench TASK --agents)": _described(registry.regressors()),
+        "Presets of their benches (bench TASK --preset)": _presets(task_types()["regression"]),
+        "World models (judge TASK --models)": _described(registry.world_models()),
+        "Studies, and suites of experiments (sweep --name)": {
+            name: grid.question if isinstance(grid, Study) else f"{len(grid.experiments)} experiments."
+            for name, grid in all_grids().items()
+        },
+        "Executions (--execution)": dict(zip(EXECUTIONS, _EXECUTIONS, strict=True)),
+        "Appearances (--appearance)": dict(zip(APPEARANCES, _APPEARANCES, strict=True)),
+        "Launchers (--launcher)": dict(zip(LAUNCHERS, _LAUNCHERS, strict=True)),
+        "Encoders (--encoder)": {
+            **{name: "Gives codes." if name.endswith("-codes") else "Gives latents." for name in bundled()},
+            **_described(registry.usable(registry.ENCODER_GROUP)),
+        },
+        "Not installed": {
+            name: guest.install for guest in registry.absent_guests() for each in guest.names.values() for name in each
+        },
+    }
+    pages = []
+    for title, members in groups.items():
+        width = max(map(len, members), default=0) + 2
+        lines = [f"  {name:{width}}{' '.join(words.split())}" for name, words in members.items()]
+        pages += ["\n".join([title, *lines])] if lines else []
+    return "\n\n".join([*pages, *map(str, registry.refused_offers())])
+
+
+def _described(entries: Mapping[str, AgentEntry | EncoderEntry | RegressorEntry | WorldModelEntry]) -> dict[str, str]:
+    return {name: entry.description for name, entry in entries.items()}
+
+
+def _tasks() -> dict[str, str]:
+    """What each control task is, or why it cannot be used."""
+    found = {}
+    for name in registry.tasks():
+        try:
+            found[name] = registry.task(name).description
+        except ImagineBenchError as error:
+            found[name] = str(error)
+    return found
+
+
+def _regressions() -> dict[str, str]:
+    offered = registry.regressions()
+    return {name: _REGRESSIONS.get(name, "") if isinstance(of, str) else of.description for name, of in offered.items()}
+
+
+def _presets(kind: TaskType[ProtocolData]) -> dict[str, str]:
+    """The size of each preset: what it changes of a protocol's own values."""
+    found = {}
+    for name, changes in kind.presets.items():
+        sizes: dict[str, Any] = {
+            **{field.name: field.default for field in dataclasses.fields(kind.protocol)},
+            **changes,
+        }
+        words = [f"seeds: {len(sizes['seeds'])}"]
+        if "budgets" in sizes:
+            words.append(f"tests: {sizes['evaluation_episodes']:,} after each of {sizes['budgets']} real episodes")
+        if "networks" in sizes:
+            words.append(f"networks a seed: {sizes['networks']}")
+        found[name] = "; ".join(words)
+    return found
 
 
 def _page(title: str, description: str, rows: dict[str, str]) -> str:

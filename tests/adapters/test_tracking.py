@@ -7,10 +7,12 @@ import struct
 import sys
 
 import pytest
+from small_runs import small
 
-from imagine_bench.adapters.tracking import track
+from imagine_bench.adapters.tracking import Tracked, track
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.protocols.data import Failure, Job, Progress, RunSpec
 
 ROWS = (
     "episodes,test_episodes,successes,solved,mean_return,diagnostics/loss/bellman\n2,20,1,0{n},-2.5,\n4,20,5,1{n},3,0.5"
@@ -47,6 +49,57 @@ def test_tensorboard_reads_the_scalars_back(bench, capsys):
     assert "solved" not in events.Tags()["tensors"]
 
 
+class Told:
+    """A launcher that says how two runs go in turn, tests one of them after two episodes, and fails the other."""
+
+    def __init__(self, look):
+        self.look = look
+
+    def launch(self, jobs, on_progress):
+        for episode in (1, 2, 3):
+            for job in jobs:
+                spec = job.spec
+                job.folder.mkdir(parents=True, exist_ok=True)
+                if episode == 3 and spec.seed == 0:
+                    (job.folder / "metrics.csv").write_text("episodes,test_episodes,successes,solved\n2,20,5,1\n")
+                told = {"agent": spec.agent, "seed": spec.seed, "bench": spec.protocol.hash, "done": episode, "work": 9}
+                on_progress(Progress(**told, phase="training", episode=episode, success=episode / 10))
+                self.look(job, episode)
+        on_progress(Failure(job=jobs[1], reason="it broke").progress)
+        return (Failure(job=jobs[1], reason="it broke"),)
+
+
+def tracked(folder, tool, look=lambda job, episode: None):
+    protocol = small(seeds=(0, 1))
+    specs = [RunSpec(protocol=protocol, agent="table", seed=seed) for seed in protocol.seeds]
+    jobs = [Job(spec=spec, folder=folder / f"bench/table/seed_{spec.seed}") for spec in specs]
+    return Tracked(Told(look), tool, "arrow_puzzle").launch(jobs, lambda progress: None)
+
+
+def test_tensorboard_sees_training_and_tests_while_the_runs_go_on(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    seen = []
+
+    def look(job, episode):
+        events = EventAccumulator(str(tmp_path / f"bench/tensorboard/table/seed_{job.spec.seed}"))
+        events.Reload()
+        values = {tag: [each.step for each in events.Tensors(tag)] for tag in events.Tags()["tensors"]}
+        seen.append((job.spec.seed, values))
+
+    (failure,) = tracked(tmp_path, "tensorboard", look)
+    assert failure.reason == "it broke"
+    training = "training/recent_success"
+    assert [values[training] for _, values in seen] == [[1], [1], [1, 2], [1, 2], [1, 2, 3], [1, 2, 3]]
+    assert [values.get("success_rate") for _, values in seen] == [None, None, None, None, [2], None]
+
+
+def test_a_tool_that_fails_costs_no_run(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboard.summary", None)
+    assert len(tracked(tmp_path, "tensorboard")) == 1
+    assert capsys.readouterr().out.count("Note: tensorboard failed and is left alone") == 1
+
+
 def _records(path):
     """The messages in a file: records of a LevelDB log, after a header of seven bytes, in blocks of 32 KiB."""
     content, at, part = path.read_bytes(), 7, b""
@@ -62,10 +115,10 @@ def _records(path):
             part = b""
 
 
-def test_weights_and_biases_files_are_whole(bench):
+def histories(out):
+    """What was logged of each run, whose file is whole."""
     from wandb.proto.wandb_internal_pb2 import Record
 
-    out = track(bench, "wandb")
     found = {}
     for path in out.glob("wandb/offline-run-*/*.wandb"):
         records = [Record.FromString(content) for content in _records(path)]
@@ -76,9 +129,23 @@ def test_weights_and_biases_files_are_whole(bench):
             for each in records
             if each.HasField("history")
         ]
+    return found
+
+
+def test_weights_and_biases_files_are_whole(bench):
+    found = histories(track(bench, "wandb"))
     assert sorted(found) == ["dqn/seed_0", "random/seed_3"]
     rows = [(row["_step"], row["success_rate"], row["mean_return"]) for row in found["random/seed_3"]]
     assert rows == [(2, 0.05, -2.5), (4, 0.25, 3.0)]
+
+
+def test_weights_and_biases_gets_two_runs_at_once(tmp_path):
+    tracked(tmp_path, "wandb")
+    found = histories(tmp_path / "bench/wandb")
+    assert sorted(found) == ["table/seed_0", "table/seed_1"]
+    training = [(row["_step"], row["training/recent_success"]) for row in found["table/seed_1"]]
+    assert training == [(1, 0.1), (2, 0.2), (3, 0.3)]
+    assert [row["success_rate"] for row in found["table/seed_0"] if "success_rate" in row] == [0.25]
 
 
 def test_what_cannot_be_is_one_clear_error(tmp_path, bench, monkeypatch, capsys):

@@ -21,6 +21,7 @@ import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.interfaces import EXECUTIONS, SceneReader
+from imagine_bench.rules import evaluate, tabulate
 from imagine_bench.testing.contract import checks, report
 
 TASKS = tuple(name for name in registry.TASKS if name != "arrows")  # which is arrow_puzzle once more
@@ -92,6 +93,9 @@ def test_an_episode_keeps_the_contract(env):
     spec, physics = registry.task(task), env.spec.kwargs["execution"] == "physics"
     assert env.observation_space == gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
     assert env.action_space == gymnasium.spaces.Discrete(spec.n_actions)
+    names = env.unwrapped.action_names
+    assert names == spec.action_names and len(set(names)) == spec.n_actions
+    assert type(names) is tuple and all(type(name) is str for name in names)
     frame, info = env.reset(seed=3)
     check_info(info, spec, after_step=False)
     assert tuple(info["macrostate"].tolist()) in spec.rules.start_states
@@ -112,6 +116,25 @@ def test_an_episode_keeps_the_contract(env):
         assert new_info is not info
         assert new_info["macrostate"] is not info["macrostate"]
         frame, info = new_frame, new_info
+
+
+@pytest.mark.parametrize("task", registry.TASKS)
+def test_the_threshold_of_reward_follows_from_the_exact_optimum(task):
+    """The share that the TaskSpec asks for, rounded down to a tenth; between blind choice and the optimum."""
+    entry, spec = registry.TASKS[task], registry.task(task)
+    optimal = spec.facts().optimal_return
+    tables = tabulate(spec.rules)
+    policy = np.full(tables.reward.shape, 1.0 / spec.n_actions)
+    blind = evaluate(tables, policy, spec.horizon)
+    for env_id in (entry.env_id, registry.vector_id(entry.env_id)):
+        threshold = gymnasium.spec(env_id).reward_threshold
+        assert threshold == pytest.approx(np.floor(10 * spec.success_threshold * optimal) / 10)
+        assert blind.returns[tables.starts].mean() < threshold < optimal
+
+
+def test_a_world_with_options_has_no_threshold_of_another():
+    assert registry.task_entry("arrows:cubes=2").reward_threshold is None
+    assert registry.task_entry("arrow_puzzle").reward_threshold == 45.8
 
 
 @pytest.mark.parametrize("task", WORLDS)

@@ -89,6 +89,7 @@ def test_lanes_of_any_world_step_as_sync_in_every_mode(name, execution, mode, st
     n_actions = int(sync.single_action_space.n)
     ended = walk_both(sync, vector, steps, n_actions, mask=mode == AutoresetMode.DISABLED)
     assert (ended > 0).all() if world == {"max_episode_steps": 2} else ended.sum() > 0
+    assert vector.action_names == sync.envs[0].unwrapped.action_names
     for one, other in zip(sync.envs, vector.envs, strict=True):
         for field in ("qpos", "qvel", "mocap_pos"):
             assert np.array_equal(getattr(one.unwrapped.data, field), getattr(other.data, field))

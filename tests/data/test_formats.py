@@ -44,6 +44,24 @@ def test_every_format_gives_back_every_bit(tmp_path: Path, format: str) -> None:
     assert not list(tmp_path.glob(".*")), "nothing half-written is left"
 
 
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_card_for_readers_says_what_is_there(tmp_path: Path, format: str) -> None:
+    """Its head is YAML as the hub reads it, and names LeRobot's files; each fact is that of the episodes."""
+    yaml = pytest.importorskip("yaml")
+    episodes = written(tmp_path / "set", format).episodes
+    empty, head, text = (tmp_path / "set/README.md").read_text().split("---\n", 2)
+    card = yaml.safe_load(head)
+    assert empty == "" and "robotics" in card["task_categories"] and card["license"] == "apache-2.0"
+    assert ("LeRobot" in card["tags"]) == (format == "lerobot")
+    patterns = [config["data_files"] for config in card.get("configs", [])]
+    found = [path for pattern in patterns for path in (tmp_path / "set").glob(pattern)]
+    assert found == sorted((tmp_path / "set").glob("data/**/*.parquet"))
+    facts = dict(line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| "))
+    assert facts["task"] == "arrow_puzzle" and facts["policy"] == "mixed"
+    counted = (len(episodes), len(episodes.actions), int(episodes.success.sum()))
+    assert tuple(int(facts[name]) for name in ("episodes", "transitions", "successes")) == counted
+
+
 def test_nothing_a_learner_reads_holds_macrostates(tmp_path: Path) -> None:
     """Four columns of small integers would be found in a file of one of the formats, had they been written there."""
     states = collected()[1]["privileged"]["macrostates"]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import json
 import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import matplotlib
@@ -21,6 +22,7 @@ from doc_tables import PAGES
 from matplotlib import pyplot
 from small_runs import do
 
+import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import ELSEWHERE, Bench, parsed
 from imagine_bench.registry import REGRESSIONS, has_task
@@ -29,7 +31,8 @@ WRITTEN = [*PAGES, ROOT / "CHANGELOG.md"]
 COMMAND = re.compile(r"(?:^|`)imagine-bench ([a-z]+ [^`\n#]+)", re.MULTILINE)
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 BLOCKS = [(page, code) for page in PAGES for code in PYTHON.findall(page.read_text())]
-SCRIPTS = [(page, code) for page, code in BLOCKS if "__main__" in code]
+SCRIPTS = [(page, code) for page, code in BLOCKS if "class MyAgent" in code]
+SHORT = 'preset="smoke", execution="kinematic", budgets=[2], evaluation_episodes=3, seeds=[1]'
 
 
 def name(value: object) -> str:
@@ -89,6 +92,9 @@ def test_commands_could_be_carried_out() -> None:
 @pytest.mark.parametrize(("page", "code"), [block for block in BLOCKS if block not in SCRIPTS], ids=name)
 def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
+    if "import lerobot" in code or "from lerobot" in code:
+        pytest.importorskip("lerobot", reason="LeRobot is large, and no dependency of the tests")
     variables: dict[str, object] = {}
     exec(compile(code, str(page), "exec"), variables)
     if "env" in variables:
@@ -96,44 +102,65 @@ def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch
         assert isinstance(variables["env"], gymnasium.Env | gymnasium.vector.VectorEnv)
 
 
-@pytest.fixture
-def twelve_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The script of the front page, of which another page has a copy, in a folder of its own."""
+def script() -> str:
+    """That of the front page, of which another page has a copy."""
     (page, code), (_, again) = SCRIPTS
     assert page.name == "README.md" and again == code
-    monkeypatch.syspath_prepend(tmp_path)
+    lines = [line for line in code.splitlines() if line and not line.startswith("#")]
+    assert len(lines) <= 10
+    return code
+
+
+def test_the_ten_lines_define_an_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
-    script = tmp_path / "my_agent.py"
-    script.write_text(code)
-    return script
-
-
-def test_the_twelve_lines_define_an_agent(twelve_lines: Path) -> None:
-    importlib.import_module(twelve_lines.stem)
-    assert do(twelve_lines.parent / "seed_0", "my_agent", agents=("my_agent",)).checkpoints
+    variables: dict[str, Any] = {}
+    exec(script().partition("result =")[0], variables)
+    imagine_bench.register_agent("mine", variables["MyAgent"])
+    assert do(tmp_path / "seed_0", "mine", agents=("mine",)).checkpoints
 
 
 @pytest.mark.slow
-def test_the_twelve_lines_bench_an_agent(twelve_lines: Path) -> None:
-    short = "--preset smoke --execution kinematic --budgets 2 --evaluation-episodes 3 --seeds 1"
-    twelve_lines.write_text(twelve_lines.read_text().replace("--preset smoke", short))
-    folder = twelve_lines.parent
-    done = subprocess.run([sys.executable, twelve_lines], cwd=folder, capture_output=True, text=True, check=False)
+@pytest.mark.parametrize("words", [["my_agent.py"], ["-"]])
+def test_the_ten_lines_bench_an_agent(words: list[str], tmp_path: Path) -> None:
+    code = script().replace('preset="smoke"', SHORT)
+    (tmp_path / "my_agent.py").write_text(code)
+    command = [sys.executable, *words]
+    done = subprocess.run(command, cwd=tmp_path, input=code, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "my_agent" in done.stdout and "dqn" in done.stdout
-    assert list(folder.glob("runs/arrow_puzzle/*/my_agent/seed_1/DONE"))
+    assert "MyAgent" in done.stdout and "dqn" in done.stdout
+    assert list(tmp_path.glob("runs/arrow_puzzle/*/MyAgent/seed_1/DONE"))
+
+
+def notebook() -> list[str]:
+    """The code of its cells."""
+    cells = json.loads((ROOT / "docs/tutorial/notebook.ipynb").read_text())["cells"]
+    return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
 
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
     matplotlib.use("agg")
-    cells = json.loads((ROOT / "docs/tutorial/notebook.ipynb").read_text())["cells"]
-    code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    short = "--agents random --execution kinematic --budgets 1 --evaluation-episodes 1"
+    _, *cells = notebook()
+    short = 'agents=["random", MyAgent], launcher="this_process", ' + SHORT
+    code = "\n".join(cells).replace('agents=["random", "dqn", MyAgent], preset="smoke"', short)
+    assert SHORT in code
     variables: dict[str, object] = {}
-    exec(code.replace("--agents random dqn factored:given", short), variables)
+    exec(code, variables)
     pyplot.close("all")
-    assert len(list(tmp_path.glob("runs/arrow_puzzle/*/random/seed_0/DONE"))) == 1
+    assert len(list(tmp_path.glob("runs/arrow_puzzle/*/MyAgent/seed_1/DONE"))) == 1
+
+
+def test_the_first_cell_of_the_notebook_installs_this_checkout() -> None:
+    """As IPython carries it out, where the package is not installed yet; the notebook's folder is the current one."""
+    (line,) = (line.strip() for line in notebook()[0].splitlines() if line.strip().startswith("%pip"))
+    magic, install, quiet, target = shlex.split(line)
+    path, _, extras = target.partition("[")
+    assert (magic, install, quiet) == ("%pip", "install", "-q")
+    project = tomllib.loads((ROOT / "docs/tutorial" / path / "pyproject.toml").read_text())["project"]
+    assert project["name"] == "imagine-bench"
+    assert set(extras.rstrip("]").split(",")) <= set(project["optional-dependencies"])
+    assert 'find_spec("imagine_bench") is None' in notebook()[0]
 
 
 def test_the_elements_of_the_thesis_are_where_they_are_said_to_be() -> None:

@@ -27,6 +27,7 @@ from guest_packages import Guests
 from recordings import contents, times
 from small_runs import Inline, small
 
+import imagine_bench
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays
 from imagine_bench.cli import exit_code as main
@@ -211,6 +212,13 @@ def test_a_model_finds_no_truth_and_changes_nothing_for_the_next(said: Said) -> 
             assert scores[one, 60][name] == scores[other, 60][name], (one, name)
     learned = judgement.data_of(_of(*_MODELS), said.folder, 1000).episodes
     assert learned.frames.any(axis=(1, 2, 3)).all(), "the data that this process holds are as they were"
+
+
+def test_a_judgement_is_loaded_from_its_folder(said: Said) -> None:
+    found = imagine_bench.load(said.folder)
+    assert found.tables["scores"] == (said.folder / "report/scores.csv").read_text()
+    assert len(found.frame()["model"]) == len(list(csv.DictReader(io.StringIO(found.tables["scores"]))))
+    assert found.verdict() and found.verdict() in (said.folder / "report/index.html").read_text() + repr(found)
 
 
 def test_privileged_models_are_marked_wherever_they_stand(said: Said) -> None:

@@ -41,6 +41,7 @@ LAUNCHERS = {
     "local": f"{__name__}:LocalPool",
     "ray": "imagine_bench.running.launchers.ray:RayCluster",
     "slurm": "imagine_bench.running.launchers.slurm:SlurmCluster",
+    "this_process": f"{__name__}:ThisProcess",
 }
 """Where runs can be carried out, by name."""
 
@@ -85,6 +86,11 @@ def carry_out(job: Job, on_progress: OnProgress, run: Callable[[Job, OnProgress]
     """
     with suppress(SetupError):  # where the log cannot be written, the run will say so
         _redirect_output(job)
+    return _attempt(job, on_progress, run)
+
+
+def _attempt(job: Job, on_progress: OnProgress, run: Callable[[Job, OnProgress], None]) -> str:
+    """Carry out a job; returns why it failed, or an empty string."""
     try:
         _log(job, f"{job.spec.agent} seed {job.spec.seed} begins or goes on")
         run(job, on_progress)
@@ -115,6 +121,23 @@ def _log(job: Job, text: str) -> None:
         print(time.strftime("%Y-%m-%d %H:%M:%S"), text, file=log)
 
 
+class ThisProcess:
+    """One run after another in this process, for a debugger: breakpoints stop, and what an agent prints is seen."""
+
+    def __init__(self, workers: int) -> None:
+        del workers
+
+    def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
+        """Carry out every job, in order; see :class:`Launcher`."""
+        failures = []
+        for job in jobs:
+            reason = _attempt(job, on_progress, run_job)
+            if reason:
+                failures.append(Failure(job=job, reason=reason))
+                on_progress(failures[-1].progress)
+        return tuple(failures)
+
+
 class LocalPool:
     """``workers`` processes of this machine at a time, at least 1; none outlives this process."""
 
@@ -140,7 +163,7 @@ def _foreign(job: Job) -> bool:
     Loading torch, MuJoCo and the like once a worker instead of once a run saves four CPU seconds a run.
     """
     task = job.spec.protocol.task
-    return not registry.is_own(task) or not registry.agent_entry(job.spec.agent).make.startswith("imagine_bench.")
+    return not registry.is_own(task) or not str(registry.agent_entry(job.spec.agent).make).startswith("imagine_bench.")
 
 
 def _never(item: object) -> bool:

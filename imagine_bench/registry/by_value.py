@@ -1,0 +1,198 @@
+"""A class or function of a script or a notebook as bytes, for processes that cannot import it, and its digest.
+
+Code of ``__main__``, of a function's inside and of a module that a new process would not find travels by value, with
+the constants and helper functions that it names. Code of any other module is imported there by its name.
+"""
+
+from __future__ import annotations
+
+import builtins
+import dis
+import functools
+import hashlib
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.machinery import PathFinder
+from pathlib import Path
+from types import CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
+from typing import Any
+
+import cloudpickle
+import numpy as np
+
+from imagine_bench.errors import InvalidValueError, SetupError, brief, plain
+
+_INSTALLED = ("site-packages", "dist-packages")
+_NO_CODE = frozenset(
+    (
+        *("__module__", "__dict__", "__weakref__", "__doc__", "__slotnames__", "_abc_impl", "__annotations__"),
+        *("__firstlineno__", "__static_attributes__", "__annotate_func__", "__annotations_cache__"),  # since 3.13
+    )
+)
+"""Attributes of a class that Python itself adds, or that change nothing that it does."""
+_ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
+    CodeType: ("co_code", "co_consts", "co_names", "co_varnames", "co_freevars"),
+    MethodType: ("__func__", "__self__"),
+    ModuleType: ("__name__",),
+    classmethod: ("__func__",),
+    functools.partial: ("func", "args", "keywords"),
+    property: ("fget", "fset", "fdel"),
+    staticmethod: ("__func__",),
+}
+"""What decides about an object of one of Python's own types, by its attributes."""
+
+
+@dataclass(frozen=True, repr=False)
+class CodeByValue:
+    """A class or function that any process can load."""
+
+    name: str  #: its qualified name
+    pickled: bytes = field(compare=False)  #: what :mod:`cloudpickle` made of it, each time otherwise
+    digest: str  #: twelve hex digits, see :func:`code_digest`
+
+    @classmethod
+    def of(cls, target: Callable[..., Any]) -> CodeByValue:
+        """Take up a class or function as it is now.
+
+        Raises:
+            InvalidValueError: It cannot be called, or what it names cannot be sent to another process.
+        """
+        if not callable(target):
+            raise InvalidValueError(f"An agent is made by a class or a function; {brief(target)} is neither.")
+        name = getattr(target, "__qualname__", type(target).__qualname__)
+        try:
+            with _unfindable_by_value():
+                pickled = cloudpickle.dumps(target)
+        except Exception as error:  # whatever the pickling of somebody's object raises
+            why = plain(error).partition("\n")[0]
+            raise InvalidValueError(
+                f"{name} cannot be sent to worker processes ({type(error).__name__}: {why}). Let it make such objects "
+                "itself, in its constructor, and keep them out of variables around it."
+            ) from error
+        return cls(name, pickled, code_digest(target))
+
+    def __str__(self) -> str:
+        return f"the code of {self.name}"
+
+    def load(self) -> Any:
+        """The class or function.
+
+        Raises:
+            SetupError: Its module has been changed since it was taken up.
+        """
+        target = cloudpickle.loads(self.pickled)
+        module = sys.modules.get(target.__module__)
+        is_imported = module is not None and module.__name__ != "__main__" and hasattr(module, self.name)
+        if is_imported and code_digest(target) != self.digest:
+            raise SetupError(
+                f"The code of {self.name} in {target.__module__} was changed after this session had imported it. Start "
+                "Python anew, or restart the notebook's kernel."
+            )
+        return target
+
+
+def code_digest(target: object) -> str:
+    """Twelve hex digits of what a class or function does: its bytecode, constants, bases and helpers.
+
+    Comments, blank lines and docstrings of classes do not count, nor does the code of installed packages. Another
+    minor version of Python has another bytecode.
+    """
+    return hashlib.sha256("\n".join(_described(target, {})).encode()).hexdigest()[:12]
+
+
+@contextmanager
+def _unfindable_by_value() -> Iterator[None]:
+    """Let cloudpickle send by value the code of modules that a new process would not find."""
+    theirs = {"__main__", *cloudpickle.list_registry_pickle_by_value()}
+    modules = [
+        module
+        for name, module in list(sys.modules.items())
+        if getattr(module, "__name__", "") == name and name not in theirs and not _is_installed(name)
+        if PathFinder.find_spec(name.partition(".")[0]) is None
+    ]
+    for module in modules:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        yield
+    finally:
+        for module in modules:
+            cloudpickle.unregister_pickle_by_value(module)
+
+
+def _described(value: object, seen: dict[int, int]) -> Iterator[str]:
+    """A value as lines of text that are the same in every process; ``seen`` are the objects so far."""
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes):
+        yield repr(value)
+        return
+    if isinstance(value, np.ndarray):
+        yield f"array {value.dtype} {value.shape} {hashlib.sha256(value.tobytes()).hexdigest()}"
+        return
+    if isinstance(value, set | frozenset):
+        yield from sorted("\n".join(_described(item, dict(seen))) for item in value)
+        return
+    if id(value) in seen:
+        yield f"object {seen[id(value)]}"
+        return
+    seen[id(value)] = len(seen)
+    yield type(value).__qualname__
+    for part in _parts(value):
+        yield from _described(part, seen)
+    if isinstance(value, tuple | list | Mapping):  # equal ones may be one object in one process and two in another
+        del seen[id(value)]
+
+
+def _parts(value: object) -> Iterator[object]:
+    """What an object consists of, in an order that does not depend on the process."""
+    attributes = next((names for kind, names in _ATTRIBUTES.items() if isinstance(value, kind)), ())
+    if attributes:
+        yield from (getattr(value, name) for name in attributes)
+    elif isinstance(value, tuple | list):
+        yield from value
+    elif isinstance(value, Mapping):
+        yield from (part for item in value.items() for part in item)
+    elif isinstance(value, FunctionType | type):
+        if _is_known(value):
+            yield f"{value.__module__}:{value.__qualname__}"
+        else:
+            yield from _parts_of_class(value) if isinstance(value, type) else _parts_of_function(value)
+    elif isinstance(value, SimpleNamespace) or not _is_known(type(value)):
+        yield type(value)
+        yield dict(sorted(getattr(value, "__dict__", {}).items()))
+
+
+def _parts_of_class(value: type) -> Iterator[object]:
+    yield value.__qualname__
+    yield value.__bases__
+    yield {name: part for name, part in sorted(vars(value).items()) if name not in _NO_CODE}
+
+
+def _parts_of_function(value: FunctionType) -> Iterator[object]:
+    yield from (value.__code__, value.__defaults__, value.__kwdefaults__)
+    yield from (cell.cell_contents for cell in value.__closure__ or ())
+    yield {name: value.__globals__[name] for name in sorted(_globals(value.__code__)) if name in value.__globals__}
+
+
+def _globals(code: CodeType) -> set[str]:
+    """The names of variables outside that code reads, in its inner functions too."""
+    names = {str(step.argval) for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL"}
+    return names.union(*(_globals(inner) for inner in code.co_consts if isinstance(inner, CodeType)))
+
+
+def _is_installed(module: str | None) -> bool:
+    """Whether a module is Python's own, of this package or of another installed one, and not the user's."""
+    if module is None or module == "__main__":
+        return False
+    top = module.partition(".")[0]
+    if top == "imagine_bench" or top in sys.stdlib_module_names:
+        return True
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return file is not None and any(folder in Path(file).parts for folder in _INSTALLED)
+
+
+def _is_known(value: type | FunctionType) -> bool:
+    """Whether a class or function is of an installed module; code without a module is said to be in ``builtins``."""
+    if value.__module__ == "builtins":
+        return hasattr(builtins, value.__qualname__)
+    return _is_installed(value.__module__)

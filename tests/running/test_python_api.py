@@ -1,0 +1,354 @@
+"""The Python API: agents by value, results as tables, and the same results from folders."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import functools
+import io
+import itertools
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pytest
+from doc_cells import ROOT
+from imagine_bench.agents.baselines import RandomAgent
+
+import imagine_bench
+from imagine_bench import api, cli, registry
+from imagine_bench.errors import (
+    ArtefactError,
+    ImagineBenchError,
+    InvalidValueError,
+    RunFailedError,
+    UnknownKeywordError,
+    UnknownNameError,
+)
+from imagine_bench.interfaces import AgentContext
+from imagine_bench.registry.by_value import CodeByValue, code_digest
+from imagine_bench.running.trained import load_trained
+
+_FEW: dict[str, Any] = {
+    "preset": "smoke",
+    "seeds": 1,
+    "budgets": [1, 2],
+    "evaluation_episodes": 2,
+    "execution": "kinematic",
+    "launcher": "this_process",
+}
+_LOCK = threading.Lock()
+_TIMES = ("train_cpu_s", "eval_cpu_s")
+_SOURCE = """
+import functools
+from imagine_bench.agents.baselines import RandomAgent
+
+FIRST = 1
+TABLE = {"left": [0, 2], "right": (1, 3)}
+
+def shifted(number, by=FIRST):
+    return number + by
+
+class Base(RandomAgent):
+    names = {"one", "two", "three", "four"}
+
+class MyAgent(Base):
+    '''Acts by the sum of pixels.'''
+
+    def __init__(self, context):
+        super().__init__(context.n_actions, context.seeds.child("act").generator())
+
+    @property
+    def table(self):
+        return TABLE
+
+    @staticmethod
+    def wrapped(number):
+        return (lambda: shifted(number) % 6)()
+
+    def act(self, observation, *, explore):
+        return self.wrapped(int(observation.frame.sum()))
+
+def make(context):
+    return MyAgent(context)
+
+partial = functools.partial(MyAgent)
+"""
+
+
+@pytest.fixture(autouse=True)
+def agents() -> Iterator[None]:
+    """The agents as they are, whatever a test registers."""
+    before = dict(registry.AGENTS)
+    yield
+    registry.AGENTS.clear()
+    registry.AGENTS.update(before)
+
+
+class Shifting(RandomAgent):
+    """Acts by the sum of pixels."""
+
+    shift = 0
+
+    def __init__(self, context: AgentContext) -> None:
+        super().__init__(context.n_actions, context.seeds.child("act").generator())
+
+    def act(self, observation: Any, *, explore: bool) -> int:
+        return int(observation.frame.sum() + self.shift) % 6
+
+
+def code(source: str = _SOURCE) -> dict[str, Any]:
+    """What a script's or a cell's source defines."""
+    variables: dict[str, Any] = {"__name__": "__main__"}
+    exec(source, variables)
+    return variables
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "changes"),
+    [
+        ("% 6", "% 5", True),
+        ("FIRST = 1", "FIRST = 2", True),
+        ("number + by", "number - by", True),
+        ('"left": [0, 2]', '"left": [0, 4]', True),
+        ('"three", "four"', '"three"', True),
+        ("class MyAgent(Base)", "class MyAgent(RandomAgent)", True),
+        ("@staticmethod", "@functools.cache\n    @staticmethod", True),
+        ("FIRST = 1", "SECOND = 7\n\n# A comment.\nFIRST = 1", False),
+        ("Acts by the sum of pixels.", "Acts.", False),
+    ],
+)
+def test_a_digest_changes_with_all_that_the_code_does_and_with_nothing_else(was: str, now: str, changes: bool) -> None:
+    before, after = code(), code(_SOURCE.replace(was, now))
+    assert _SOURCE.count(was) == 1
+    for name in ("MyAgent", "make", "partial"):
+        assert (code_digest(before[name]) != code_digest(after[name])) == changes, name
+
+
+def test_code_is_the_same_in_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a script, and of a module that is in no file; whatever order the hashes of texts give its sets there."""
+    unwritten = ModuleType("unwritten")
+    exec(_SOURCE, vars(unwritten))
+    monkeypatch.setitem(sys.modules, "unwritten", unwritten)
+    makers = [variables[name] for variables in (code(), vars(unwritten)) for name in ("MyAgent", "make", "partial")]
+    found = [CodeByValue.of(make) for make in makers]
+    probe = (
+        "import sys, pickle, cloudpickle\n"
+        "from imagine_bench.registry.by_value import code_digest\n"
+        "print([code_digest(cloudpickle.loads(each.pickled)) for each in pickle.load(sys.stdin.buffer)])"
+    )
+    words = [sys.executable, "-c", probe]
+    done = subprocess.run(words, input=cloudpickle.dumps(found), capture_output=True, check=True)
+    assert done.stdout.decode().strip() == str([each.digest for each in found])
+
+
+def numbers(results: api.Comparison, table: str = "") -> dict[str, list[Any]]:
+    """A table without its times; NaN as text, so that it equals itself."""
+    frame = results.frame(table)
+    return {name: list(map(repr, np.asarray(frame[name]).tolist())) for name in frame if name not in _TIMES}
+
+
+@pytest.mark.slow
+def test_a_worker_process_gives_the_bits_of_this_process(tmp_path: Path) -> None:
+    given = {**_FEW, "agents": ["dqn", code()["MyAgent"]], "execution": "physics"}
+    here, there = (
+        imagine_bench.bench("arrow_puzzle", **{**given, "launcher": launcher}, out=tmp_path / launcher)
+        for launcher in ("this_process", "local")
+    )
+    assert here.folder.name == there.folder.name
+    assert numbers(here) == numbers(there) and numbers(here)["agent"].count("'MyAgent'") == 2
+    assert here.verdict() == there.verdict()
+    runs = [each.folder / "MyAgent/seed_0/checkpoints" for each in (here, there)]
+    states = [next(run.glob("*/runner.safetensors")).read_bytes() for run in runs]
+    assert states[0] == states[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("from_stdin", [True, False])
+def test_a_script_needs_no_guard(from_stdin: bool, tmp_path: Path) -> None:
+    call = {**_FEW, "launcher": "local", "workers": 1, "agents": ["MyAgent"]}
+    text = _SOURCE + (
+        "import imagine_bench\n"
+        "imagine_bench.register_agent('MyAgent', MyAgent)\n"
+        f"print(imagine_bench.bench('arrow_puzzle', **{call!r}).frame()['agent'])\n"
+    )
+    (tmp_path / "script.py").write_text(text)
+    words = [sys.executable, "-" if from_stdin else "script.py"]
+    done = subprocess.run(words, cwd=tmp_path, input=text, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "MyAgent" in done.stdout, done.stderr
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> api.Comparison:
+    """A small bench of a class."""
+    return imagine_bench.bench("arrow_puzzle", agents=["random", Shifting], out=tmp_path, **_FEW)
+
+
+def test_a_changed_class_resumes_no_run(
+    results: api.Comparison, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = results.folder / "Shifting/seed_0"
+    content = {path: path.read_bytes() for path in results.folder.rglob("*") if path.is_file()}
+    again = {**_FEW, "agents": ["random", Shifting], "out": results.folder.parents[1]}
+    assert imagine_bench.bench("arrow_puzzle", **again).folder == results.folder
+    assert "All runs lie in" in capsys.readouterr().out
+    monkeypatch.setattr(Shifting, "shift", 1)
+    with pytest.raises(ArtefactError, match=r"code of agent Shifting is not that of this bench"):
+        imagine_bench.register_agent("Shifting", Shifting)
+        load_trained(run)
+    other = imagine_bench.bench("arrow_puzzle", **again)
+    assert other.folder != results.folder
+    assert f"the code of an agent was changed since {results.folder}" in capsys.readouterr().out
+    kept = {path: path.read_bytes() for path in content}
+    assert kept == content, "the former bench stays as it is"
+    monkeypatch.setattr(Shifting, "shift", 0)
+    imagine_bench.register_agent("Shifting", Shifting)
+    assert load_trained(run).episodes == 2, "the former class, again"
+
+
+def test_a_frame_is_the_table_of_the_report(results: api.Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = results.report()
+    assert {path.stem for path in page.parent.glob("*.csv")} == set(results.tables)
+    for name, text in results.tables.items():
+        assert (page.parent / f"{name}.csv").read_text() == text
+        rows = list(csv.DictReader(io.StringIO(text)))
+        frame = results.frame(name)
+        assert list(frame) == list(rows[0])
+        for row, column in itertools.product(range(len(rows)), frame):
+            value, cell = frame[column][row], rows[row][column]
+            assert column != "solved" or value == cell, "digits that are a text"
+            if cell in ("", "nan"):
+                assert value == "" or np.isnan(value), (name, column)
+            else:
+                assert type(value)(cell) == value, (name, column)
+    pandas = ModuleType("pandas")
+    vars(pandas)["DataFrame"] = lambda columns: ("pandas", columns)
+    monkeypatch.setitem(sys.modules, "pandas", pandas)
+    kind, columns = results.frame()
+    assert kind == "pandas" and list(columns)[:3] == ["agent", "seed", "episodes"]
+
+
+def test_a_folder_gives_the_same_results_again(results: api.Comparison) -> None:
+    results.report()
+    for folder in (results.folder, results.folder / "report"):
+        again = imagine_bench.load(folder)
+        assert dict(again.tables) == dict(results.tables) and again.verdict() == results.verdict()
+        assert repr(again) == repr(results)
+    assert results.plot().get_axes()[0].get_ylabel() == "test episodes solved (%)"
+    with pytest.raises(UnknownNameError, match="success"):
+        results.plot("sucess")
+    with pytest.raises(ArtefactError, match=r"no recording 'dqn'; it has Shifting/seed_0/recording.rrd, random/seed"):
+        results.show_recording("dqn")
+    with pytest.raises(ArtefactError, match="the folder of one run"):
+        imagine_bench.load(results.folder / "random/seed_0")
+
+
+@pytest.mark.parametrize(
+    "kept", ["arrow_puzzle-quick", "arrow_puzzle-study", "suite", "arrow_puzzle-judge", "robot_ik-quick"]
+)
+def test_kept_results_are_loaded_as_they_were_written(kept: str) -> None:
+    folder = ROOT / "docs/results" / kept
+    results = imagine_bench.load(folder)
+    name = next(iter(results.tables))
+    with (folder / f"{name}.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    frame = results.frame()
+    assert set(frame) == set(rows[0]) and len(rows) == len(frame[next(iter(frame))]) > 5
+    for column in set(frame) - {"agent"}:  # labels that were renamed are today's
+        for value, row in zip(frame[column], rows, strict=True):
+            text = row[column]
+            assert str(value) == text or float(text or "nan") == value or not text, (column, value, text)
+    if kept == "arrow_puzzle-quick":
+        assert "DQN" in results.verdict() and results.plot()
+    else:
+        for method in (results.verdict, results.plot, results.report):
+            with pytest.raises(InvalidValueError, match="holds tables alone"):
+                method()
+
+
+def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(ArtefactError, match="holds no results; give the folder of a bench"):
+            imagine_bench.load(folder)
+
+
+def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
+    """With the same protocol; a mapping stands for its words."""
+    pairs: list[tuple[str, Mapping[str, Any]]] = [
+        ("--physics pad_friction=0.5", {"physics": {"pad_friction": 0.5}}),
+        ("--set controller.discount=0.9", {"set": {"controller.discount": 0.9}}),
+        ("--set controller.discount=0.9", {"set": ["controller.discount=0.9"]}),
+        ("--seeds 0 1 2", {"seeds": 3}),
+        ("--seeds 4 7", {"seeds": np.array([4, 7])}),
+        ("--budgets 1 2 3", {"budgets": range(1, 4)}),
+        ("--appearance mild --demonstrations 2", {"appearance": "mild", "demonstrations": 2}),
+    ]
+    for words, options in pairs:
+        command = cli.parsed(["bench", "arrow_puzzle", "--agents", "dqn", *words.split()])
+        assert isinstance(command, cli.Bench)
+        given = api.protocol_changes({"agents": ["dqn"], **options})
+        wanted, _ = api.benches.plan("arrow_puzzle", "quick", **given)
+        assert wanted == command.planned()[0], words
+    with pytest.raises(UnknownKeywordError, match=r"'episodes'.*evaluation_episodes"):
+        imagine_bench.bench("arrow_puzzle", episodes=3)
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"seeds": -1}, "seeds"),
+        ({"budgets": 3}, "budgets was given 3"),
+        ({"set": "controller.discount=0.9"}, "give a mapping of names to values"),
+        ({"physics": 3}, "give a mapping of names to values"),
+        ({"agents": "dqnn"}, "No agent 'dqnn'"),
+        ({"most_seeds": 3}, "--most-seeds goes with --until-decided"),
+    ]
+    for options, sentence in wrong:
+        with pytest.raises(ImagineBenchError, match=sentence):
+            imagine_bench.bench("arrow_puzzle", out=tmp_path, **options)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "options", "sentence"),
+    [
+        ("dqn", Shifting, {}, "There is an agent 'dqn' already"),
+        ("sb3_dqn", Shifting, {}, "There is an agent 'sb3_dqn' already"),
+        ("my agent", Shifting, {}, "cannot be called 'my agent'"),
+        ("mine", 3, {}, "made by a class or a function; 3 is neither"),
+        ("mine", functools.partial(Shifting, _LOCK), {}, "cannot be sent to worker processes"),
+        ("mine", Shifting, {"learn": False}, "'learn'. Did you mean 'learns'?"),
+    ],
+)
+def test_what_cannot_be_registered_is_one_sentence(
+    name: str, make: Callable[..., Any], options: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises((InvalidValueError, UnknownKeywordError)) as found:
+        imagine_bench.register_agent(name, make, **options)
+    assert sentence in str(found.value)
+
+
+def test_a_class_that_is_changed_keeps_its_name_and_fields(monkeypatch: pytest.MonkeyPatch) -> None:
+    imagine_bench.register_agent("mine", Shifting, title="my own", observes=("frame", "state"))
+    imagine_bench.register_agent("made", code()["make"])
+    first = registry.AGENTS["mine"]
+    assert first.description == "Acts by the sum of pixels." and not first.needs_encoder
+    monkeypatch.setattr(Shifting, "shift", 1)
+    with pytest.raises(UnknownNameError, match="preset"):
+        imagine_bench.bench("arrow_puzzle", [Shifting, code()["make"], code()["MyAgent"]], preset="smke")
+    now = registry.AGENTS["mine"]
+    assert "Shifting" not in registry.AGENTS and "make" not in registry.AGENTS and "MyAgent" in registry.AGENTS
+    assert now.make != first.make and dataclasses.replace(now, make=first.make) == first
+
+
+def test_a_class_that_fails_is_named_and_its_log(tmp_path: Path) -> None:
+    class Failing(Shifting):
+        def act(self, observation: Any, *, explore: bool) -> int:
+            raise RuntimeError("boom")
+
+    with pytest.raises(RunFailedError, match=r"Failing seed 0 in arrow_puzzle: RuntimeError: boom Log: .*log.txt"):
+        imagine_bench.bench("arrow_puzzle", agents=[Failing], out=tmp_path, **_FEW)
+    with pytest.raises(InvalidValueError, match="cannot be called '<lambda>'"):
+        imagine_bench.bench("arrow_puzzle", agents=[lambda context: Shifting(context).act], out=tmp_path, **_FEW)
