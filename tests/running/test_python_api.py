@@ -265,7 +265,7 @@ def test_kept_results_are_loaded_as_they_were_written(kept: str) -> None:
             text = row[column]
             assert str(value) == text or float(text or "nan") == value or not text, (column, value, text)
     if kept == "arrow_puzzle-quick":
-        assert "DQN" in results.verdict() and results.plot()
+        assert "dqn" in results.verdict() and results.plot()
     else:
         for method in (results.verdict, results.plot, results.report):
             with pytest.raises(InvalidValueError, match="holds tables alone"):
