@@ -162,6 +162,12 @@ class CheckFailedError(ImagineBenchError):
     exit_code = 1
 
 
+class IncompleteCheckError(ImagineBenchError):
+    """A command that checks has found nothing wrong, and could not compare everything; the message says what."""
+
+    exit_code = 3
+
+
 EXTRAS = {
     "torch": "agents",
     "matplotlib": "report",
@@ -206,6 +212,12 @@ def require_known(kind: str, given: str, known: Iterable[str]) -> str:
     if not isinstance(given, str) or given not in names:
         raise UnknownNameError(kind, given, names)
     return given
+
+
+def require(holds: bool, complaint: str) -> None:
+    """Raise ArtefactError with the complaint unless a claim of a file holds."""
+    if not holds:
+        raise ArtefactError(complaint)
 
 
 def require_integer(name: str, given: SupportsIndex, low: int) -> int:

@@ -73,7 +73,22 @@ def test_wrong_words_get_one_line_and_exit_code_2(
         ("report a --merge", "--merge has no value; give at least one behind it, or leave it out."),
         ("plan HERE --max-epistemic=-1", "more epistemic uncertainty than -1.0: give at least 0."),
         ("sweep toy_regression", "toy_regression is a regression task, in which no agent acts"),
-        ("sweep arrow_puzzle --name suite", "ladder takes no --task; leave it out."),
+        ("sweep arrow_puzzle --name suite", "suite takes no --task; leave it out."),
+        ("sweep --variants x", "suite takes no --variants; leave it out."),
+        ("sweep arrow_puzzle --name HERE/gone.toml", "There is no file HERE/gone.toml; give one of a study or suite"),
+        ("sweep arrow_puzzle --workers x", "--workers was given 'x'; it takes whole numbers."),
+        ("bench arrow_puzzle --budgets 10 y --seeds 0", "--budgets was given '10 y'; it takes whole numbers."),
+        ("plan --max-epistemic little", "--max-epistemic was given 'little'; it takes numbers."),
+        ("check toy_regression", "toy_regression is a regression task, in which no agent acts"),
+        ("play toy_regression", "toy_regression is a regression task, in which no agent acts"),
+        ("check arrow_puzzle --turns 5", "--turns goes with --physics; leave it out"),
+        ("check arrow_puzzle --physics --agent random", "Physics is measured of a task; give one, and no --agent"),
+        ("play arrow_puzzle --out x.gif", "--out goes with --film; leave it out"),
+        ("play arrow_puzzle --film --execution kinematic", "A film is of the oracle in a task, in contact physics"),
+        ("play arrow_puzzle --encoder x", "--encoder goes with --model"),
+        ("play arrow_puzzle --execution no", "No execution 'no'"),
+        ("play arrow_puzzle --seed -1", "seed is -1; give an integer from 0 on."),
+        ("verify --nonce x", "--nonce goes with --train; leave it out"),
         ("sweep --name smoke", "smoke is a study of one task; give a task as the first word."),
         ("report a --task arrow_puzzle", "Both a and --task arrow_puzzle were given; leave one of them"),
         ("report robot_ik --out HERE", "There is no bench of robot_ik below"),
@@ -84,7 +99,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
         ("view HERE", "There is no recording below"),
         ("play arrow_puzzle --film --out HERE/film.mp4", "does not end in .gif"),
         ("play --film", "A film is of the oracle in a task"),
-        ("check --physics", "Physics is measured of a task; give one."),
+        ("check --physics", "Physics is measured of a task; give one, and no"),
         ("encoder --task arrow_puzzle --out /dev/null/x", "Cannot write /dev/null/x: a part of that path"),
     ],
 )
@@ -93,7 +108,7 @@ def test_wrong_words_of_other_commands(
 ) -> None:
     assert main([word.replace("HERE", str(tmp_path)) for word in words.split()]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("imagine-bench: ") and sentence in line
+    assert line.startswith("imagine-bench: ") and sentence.replace("HERE", str(tmp_path)) in line
 
 
 @pytest.mark.parametrize(

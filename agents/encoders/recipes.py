@@ -10,6 +10,10 @@ ARCHITECTURES = ("ha_schmidhuber", "strips", "image", "factors", "offered")
 """Of networks; ``"factors"`` gives codes, ``"offered"`` is another package's."""
 
 
+_MOST = 100_000
+"""Latents and images a gradient step, more of which no memory holds."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
     """Settings of one way to make an encoder; the defaults are those of the thesis' chapter 5 (section 5.2.2)."""
@@ -40,11 +44,13 @@ class Recipe:
     def __post_init__(self) -> None:
         require_known("encoder architecture", self.architecture, ARCHITECTURES)
         least = min(self.latents, self.frames, self.held_out_frames, self.steps, self.batch, self.probe_steps)
+        most = max(self.latents, self.batch)
         positive = min(self.pixel_std, self.learning_rate)
-        if not (least >= 1 and positive > 0 and self.beta >= 0 and 0 <= self.kl_warmup < 1):
+        if not (least >= 1 and most <= _MOST and positive > 0 and self.beta >= 0 and 0 <= self.kl_warmup < 1):
             raise InvalidValueError(
                 f"Encoder recipe {self.name!r} needs latents, frames, held_out_frames, steps, batch and probe_steps of "
-                "at least 1, beta >= 0, pixel_std > 0, learning_rate > 0 and kl_warmup in [0, 1)."
+                f"at least 1, latents and batch of at most {_MOST:,}, beta >= 0, pixel_std > 0, learning_rate > 0 and "
+                "kl_warmup in [0, 1)."
             )
 
 

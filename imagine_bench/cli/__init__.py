@@ -71,6 +71,8 @@ ELSEWHERE = {
     "speed": "make speed",
 }
 """Former commands that are measurements of a checkout now, and the line to type there."""
+_OF_VALUES = re.compile(r"Error parsing (--[a-z-]+)(.*)", re.DOTALL)
+"""The parser's complaint about a value, behind which it speaks of types."""
 _TASK_FIRST = {"bench", "judge", "sweep", "dataset", "encoder", "play", "check", "describe"}
 """Commands whose first word is a task; of others it may be a path."""
 
@@ -80,13 +82,23 @@ def parsed(words: Sequence[str]) -> Command:
 
     Raises:
         SystemExit: The words are no command, or ask for help, which is then printed.
-        InvalidValueError: As :func:`understood`.
+        InvalidValueError: As :func:`understood`, or an option was given a value that is no number.
         SetupError: A shell's completion is asked for that needs a package which is not installed.
     """
+    given = understood(words)
+    said = io.StringIO()
     try:
-        command = _parsed(understood(words))
+        with redirect_stderr(said):
+            command = _parsed(given)
     except ImportError as error:  # the completion of some shells needs another package
         raise SetupError(f"{plain(error)}.") from error
+    except SystemExit:
+        wrong = _OF_VALUES.search(said.getvalue())
+        if wrong is not None:
+            kind = "numbers" if "float" in wrong[2] else "whole numbers"
+            raise InvalidValueError(f"{wrong[1]} was given {_values(given, wrong[1])!r}; it takes {kind}.") from None
+        print(said.getvalue(), end="", file=sys.stderr)
+        raise
     require_values(command)
     return command
 
@@ -101,6 +113,12 @@ def _parsed(words: Sequence[str]) -> Command:
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     return command
+
+
+def _values(words: Sequence[str], option: str) -> str:
+    """The words behind an option, as they were given."""
+    text = " ".join(words).replace(f"{option}=", f"{option} ")
+    return text.partition(f"{option} ")[2].partition(" --")[0].strip()
 
 
 def understood(words: Sequence[str]) -> list[str]:

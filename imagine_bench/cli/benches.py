@@ -32,12 +32,13 @@ from imagine_bench.cli.options import (
     Words,
     added_up,
     one_of,
+    require_with,
     shown,
 )
-from imagine_bench.errors import CheckFailedError, InvalidValueError, RunFailedError
+from imagine_bench.errors import InvalidValueError, RunFailedError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.judge.judgement import Judgement, judge, kept
-from imagine_bench.judge.verify import Verdict, cost
+from imagine_bench.judge.verify import cost
 from imagine_bench.protocols.control import PRESETS, Protocol
 from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
@@ -274,12 +275,13 @@ class Sweep:
 
     def __call__(self) -> None:
         """Run, compare or score, write."""
-        grid = grid_named(self.name or ("factors" if self.task else SUITE))
+        name = self.name or ("factors" if self.task else SUITE)
+        grid = grid_named(name)
         of_suite = {"experiment": self.experiment, "agents": self.agents, "seeds": self.seeds}
         foreign = of_suite if isinstance(grid, Study) else {"variants": self.variants, "task": self.task}
         for option, value in foreign.items():
             if value:
-                raise InvalidValueError(f"{grid.name} takes no --{option}; leave it out.")
+                raise InvalidValueError(f"{name} takes no --{option}; leave it out.")
         if isinstance(grid, Study):
             self._study(grid.only(added_up(self.variants)))
         else:
@@ -437,24 +439,19 @@ class Verify(OfBench):
                 dataset=self.dataset,
             )
         begun_s = time.process_time()
-        verdicts = audits.verify(folder, again)
-        if again is not None and not any(verdict.of_training for verdict in verdicts):
-            verdicts.append(Verdict(what="training again", holds="no run was, as not all of the above holds"))
-            again = None
-        print(*verdicts, audits.what_is_shown(folder, again), sep="\n")
-        print(cost(verdicts, time.process_time() - begun_s))
-        complaints = sum(bool(verdict.complaint) for verdict in verdicts)
-        if complaints:
-            raise CheckFailedError(f"{complaints} of {len(verdicts)} verdicts are complaints.")
+        found = audits.verify(folder, again)
+        error = audits.conclusion(found)
+        print(error or "Holds.", *found, audits.what_is_shown(folder, found, again), sep="\n")
+        print(cost(found, time.process_time() - begun_s))
+        if error is not None:
+            raise error
 
     def _require_fitting(self) -> None:
         """Raise InvalidValueError for options that do not go together."""
-        needs_train = {name: getattr(self, name) for name in ("nonce", "workers", "dataset")}
-        for name, value in needs_train.items():
-            if value is not None and self.train is None:
-                raise InvalidValueError(f"--{name} goes with --train; leave it out, or give --train 1.")
-        if self.encoder is not None and self.train is None and not self.causes:
-            raise InvalidValueError("--encoder goes with --causes or --train; replaying episodes needs none.")
+        if self.train is None:
+            require_with("--train", self, "nonce", "workers", "dataset")
+            if not self.causes:
+                require_with("--causes or --train", self, "encoder")
         if self.train is not None and (self.causes or self.train < 1):
             raise InvalidValueError(f"--train {self.train} needs at least 1, and goes without --causes.")
 

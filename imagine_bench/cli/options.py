@@ -113,6 +113,14 @@ def require_values(command: object) -> None:
                 raise InvalidValueError(f"--{name} has no value; give at least one behind it, or leave it out.")
 
 
+def require_with(with_option: str, command: object, *names: str) -> None:
+    """Raise InvalidValueError for options of a command that were given without the option that they go with."""
+    for name in names:
+        if getattr(command, name) != getattr(type(command), name):
+            option = name.replace("_", "-")
+            raise InvalidValueError(f"--{option} goes with {with_option}; leave it out, or give {with_option} too.")
+
+
 def added_up(each: Iterable[Iterable[T]]) -> tuple[T, ...]:
     """All values of an option that may be given several times."""
     return tuple(chain.from_iterable(each))

@@ -20,6 +20,7 @@ from imagine_bench.cli.options import (
     TaskWord,
     Word,
     one_of,
+    require_with,
 )
 from imagine_bench.data.folder import FORMATS, read_dataset, require_format, require_new, write_dataset
 from imagine_bench.errors import CheckFailedError, InvalidValueError
@@ -179,11 +180,15 @@ class Play:
         from imagine_bench.tools import play  # noqa: PLC0415 - pillow loads slowly
 
         if not self.film:
+            require_with("--film", self, "out")
             options = {"execution": self.execution, "appearance": self.appearance, "encoder": self.encoder}
             print(play.play(self.task, model=self.model, seed=self.seed, **options))
             return
-        if self.task is None or self.model is not None:
-            raise InvalidValueError("A film is of the oracle in a task; give a task and no --model.")
+        if self.task is None or self.model or self.execution or self.encoder:
+            raise InvalidValueError(
+                "A film is of the oracle in a task, in contact physics; give a task, and no --model, --execution or "
+                "--encoder."
+            )
         print(play.film(self.task, self.out, seed=self.seed, appearance=self.appearance or APPEARANCES[0]))
 
 
@@ -214,9 +219,10 @@ class CheckCommand:
         from imagine_bench.testing import contract, physics  # noqa: PLC0415 - nothing else needs them
 
         if not self.physics:
+            require_with("--physics", self, "turns", "trials", "appearances", "out")
             failed = contract.report(contract.checks(self.task, self.agent, self.model)) > 0
-        elif self.task is None:
-            raise InvalidValueError("Physics is measured of a task; give one.")
+        elif self.task is None or self.agent or self.model:
+            raise InvalidValueError("Physics is measured of a task; give one, and no --agent or --model.")
         else:
             failed = not physics.check_physics(
                 self.task, self.out, turns=self.turns, trials=self.trials, appearances=self.appearances

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -37,7 +38,11 @@ class ExactWorld:
         """That of a task at an appearance; None where frames hide something, so that no frame is a state."""
         if spec.sight is not None:
             return None
-        return cls(rules=spec.rules, render=lambda states, rng: spec.render_macrostates(states, appearance, rng))
+        return cls(rules=spec.rules, render=partial(_rendered, spec, appearance))
+
+
+def _rendered(spec: TaskSpec, appearance: str, states: Ints, rng: np.random.Generator) -> Frame:
+    return spec.render_macrostates(states, appearance, rng)
 
 
 @dataclass(frozen=True, kw_only=True)

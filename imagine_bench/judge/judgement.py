@@ -7,7 +7,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +39,7 @@ from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import (
     make_folder,
+    make_plain,
     read_arrays,
     read_sealed,
     sealed,
@@ -231,9 +231,7 @@ def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict
         with opened(source, judgement.task, folder=folder, log=log) as judged:
             return _judged(judgement, folder, cell, world, judged, seeds)
     finally:
-        with suppress(OSError):  # there is none, another judgement removed it, or the disk refuses: it stays, empty
-            if not log.stat().st_size:
-                log.unlink()
+        make_plain(log)
 
 
 def _judged(

@@ -29,7 +29,7 @@ from imagine_bench.running.isolation import Isolated
 from imagine_bench.running.trained import KeptAgent, agent_of, imaginer_of, read_agent
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
-from imagine_bench.store.files import read_json, read_sealed
+from imagine_bench.store.files import read_sealed
 from imagine_bench.store.run_folder import load_run
 
 __path__: list[str] = []  # the old path imagine_bench.judge.models.outcomes is looked for below this module
@@ -131,12 +131,17 @@ class ModelSource:
         return registry.made(f"World model {self.name}", self.make, *self.given or ())
 
     @property
-    def cost(self) -> dict[str, str | int]:
-        """What was spent beforehand: the encoder's name, and the frames that it was trained on."""
+    def cost(self) -> dict[str, str | float]:
+        """What was spent beforehand: the encoder's name, and the frames that it was trained on.
+
+        If few new frames are read right from the encoder, that share is here too.
+        """
         if self.encoder is None:
             return {"encoder": "", "encoder_frames": 0}
-        card = read_json(self.encoder.with_suffix(".json"), "an encoder's card")
-        return {"encoder": self.encoder.stem, "encoder_frames": card.get("recipe", {}).get("frames", 0)}
+        frames = encoders.card_of(self.encoder).get("recipe", {}).get("frames", 0)
+        share = encoders.low_share(self.encoder)
+        low = {} if share is None else {"encoder_reads": share}
+        return {"encoder": self.encoder.stem, "encoder_frames": frames, **low}
 
 
 def serve(source: ModelSource) -> ServedModel:
@@ -189,7 +194,7 @@ class JudgedModel:
     """A world model, ready to be fitted and asked."""
 
     model: WorldModel
-    cost: dict[str, str | int]  # spent beforehand: the encoder's name and frames
+    cost: dict[str, str | float]  # spent beforehand: the encoder's name and frames, and how well it is read if badly
     visited: set[tuple[State, int]] | None  # tried in an agent's training; None for a model that learns here
     cpu_s: Callable[[], float]  # CPU seconds so far of the process that it is in
 

@@ -368,6 +368,14 @@ def _require_takes(agent: str, wanted: Protocol) -> None:
         )
 
 
+_OF_WORLDS = {
+    "encoder": "their frames show different scenes",
+    "preprocessing": "their frames are prepared differently",
+    "action_names": "they have different macro-actions",
+}
+"""Facts in which tasks of one world agree, and what is said where two tasks do not."""
+
+
 def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
     """Raise InvalidValueError for an earlier task that is not of the world of task ``name``, or UnknownNameError.
 
@@ -375,14 +383,11 @@ def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
     """
     for other in earlier:
         task_entry(other)
-        for fact in ("encoder", "preprocessing", "action_names"):
-            here = getattr(task(name), fact)
-            there = getattr(task(other), fact)
-            if here != there:
+        for fact, words in _OF_WORLDS.items():
+            if getattr(task(name), fact) != getattr(task(other), fact):
                 raise InvalidValueError(
-                    f"{name} cannot come after {other}: what is known of one world is of no use in another ({fact} is "
-                    f"{there!r} there and {here!r} here). Give tasks of one family, such as arrow_puzzle and "
-                    "arrow_puzzle_hard."
+                    f"{name} cannot come after {other}: {words}, so what is learned of one is of no use in the other. "
+                    "Give tasks of one world to --after, such as arrow_puzzle before arrow_puzzle_hard."
                 )
 
 

@@ -265,6 +265,10 @@ def recording_file(
     partial.replace(path)
 
 
+_MAGIC = b"RRF"
+"""The beginning of each recording."""
+
+
 def show_in_notebook(path: Path) -> None:
     """Show a recording in the viewer below the cell of a notebook that calls this.
 
@@ -287,6 +291,9 @@ def open_in_viewer(path: Path) -> None:
     """
     if not path.is_file():
         raise ArtefactError(f"No recording {path}; a bench leaves them in its run folders as recording.rrd.")
+    with path.open("rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise ArtefactError(f"{path} is no recording of Rerun; a bench leaves them as recording.rrd.")
     viewer = [sys.executable, "-P", "-m", "rerun", str(path)]  # -P: no rerun.py of the current folder
     if subprocess.run(viewer, capture_output=True, check=False).returncode:
         raise SetupError(

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -175,12 +176,22 @@ def _misread(data: ReportData) -> list[str]:
     """A line an agent whose encoder reads few frames right."""
     lines = []
     for agent in data.result.protocol.agents:
-        entry = known_agent(agent)
-        used = data.result.protocol.encoder_of(entry.encoder_kind) if entry.make and entry.needs_encoder else None
-        words = encoders.doubt(None if used is None else encoders.find(used))
+        words = encoders.doubt(_encoder(data, agent))
         if words:
             lines.append(f"“{agent}” sees through {words}.")
     return lines
+
+
+def _marked(data: ReportData, agent: str) -> str:
+    """An agent's name, with the share that is read right from its encoder if that is low."""
+    return agent + encoders.mark(encoders.low_share(_encoder(data, agent)))
+
+
+def _encoder(data: ReportData, agent: str) -> Path | None:
+    """The encoder that an agent sees through, where it is here."""
+    entry = known_agent(agent)
+    used = data.result.protocol.encoder_of(entry.encoder_kind) if entry.make and entry.needs_encoder else None
+    return None if used is None else encoders.find(used)
 
 
 def _unfinished(result: BenchResult) -> list[str]:
@@ -242,7 +253,7 @@ def _scores(data: ReportData, budgets: Sequence[int], *, short: bool = False) ->
     cell = _in_short if short else _solved
     rows: list[tuple[str, Mapping[int, str]]] = []
     for agent in data.result.protocol.agents:
-        rows.append((agent, {each["episodes"]: cell(data, each) for each in data.of(agent)}))
+        rows.append((_marked(data, agent), {each["episodes"]: cell(data, each) for each in data.of(agent)}))
         if not short and not data.thesis[agent].keys().isdisjoint(budgets):
             cells = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
             rows.append((f"{agent}, thesis", cells))

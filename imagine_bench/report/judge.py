@@ -32,6 +32,7 @@ from imagine_bench.report.page import (
     p_value,
 )
 from imagine_bench.statistics import can_show, difference, holm, iqm
+from imagine_bench.store import encoders
 from imagine_bench.store.files import read_json, table_text
 
 QUESTIONS = {
@@ -201,7 +202,8 @@ def _scores(found: Judged, table: str, names: Collection[str]) -> Table:
     for (model, size), cells in found.cells.items():
         transitions = DASH if runs_of(model) else f"{size:,}"  # those of a trained agent are its bench's to say
         scores = (over_seeds([score(cell, name) for cell in cells], _number, share=name in _SHARES) for name in names)
-        rows.append([_title(model), transitions, *scores])
+        marks = {encoders.mark(cell.get("encoder_reads")) for cell in cells}
+        rows.append([_title(model) + max(marks), transitions, *scores])
     header = ["world model", "transitions", *map(COLUMNS.__getitem__, names)]
     caption = "Interquartile means over seeds or runs, with 95 % intervals. 0 is best in every error; value loss and "
     return Table(table, header, rows, f"{caption}regret are in units of reward.", _WHY_DASH)

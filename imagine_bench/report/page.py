@@ -237,6 +237,9 @@ def write_page(folder: Path, page: Page) -> Path:
     files |= {f"{image.name}.png": image.png for section in page.sections for image in section.images}
     for name, content in files.items():
         write_bytes(folder / name, content)
+    others = sorted(path.name for path in folder.iterdir() if path.name not in files)
+    if others:
+        print(f"Note: {folder} also holds {', '.join(others)}, of an earlier report or of somebody else.")
     return folder / "index.html"
 
 

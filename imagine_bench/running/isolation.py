@@ -24,7 +24,7 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.abc import MetaPathFinder
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -36,7 +36,7 @@ from safetensors.numpy import load, save
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays
-from imagine_bench.cores import ONE_THREAD
+from imagine_bench.cores import ONE_THREAD, usable_memory
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, plain, writing
 from imagine_bench.registry.loading import fault
 
@@ -58,7 +58,7 @@ class Limits:
     """Limits of a guest."""
 
     call_s: float = 3_600.0  #: Wall seconds of a call
-    memory: int = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 3 // 4  #: Bytes of its data (on Linux)
+    memory: int = field(default_factory=lambda: usable_memory() * 3 // 4)  #: Bytes of its data (on Linux)
 
 
 class GuestError(InvalidValueError):

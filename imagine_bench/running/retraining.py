@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from math import comb
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, plain, require
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import Job, Launcher, RunSpec
 from imagine_bench.registry.machine import describe_environment
@@ -23,13 +23,17 @@ from imagine_bench.running.trained import encoder_of_run
 from imagine_bench.store import run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_control
 from imagine_bench.store.files import reading
-from imagine_bench.store.results import RunResult
+from imagine_bench.store.results import KeptEpisodes, RunResult
 from imagine_bench.values import pack
 
+SAME_COST = (4.0, 1.0)
+"""Factor and CPU seconds by which the cost of training and of tests may differ on the same processor."""
+SAME_EPISODES = 5
+"""First training episodes in which another processor, whose roundings differ, takes the same macro-actions."""
+SAME_TESTS = 0.2
+"""Share of tests that may go otherwise on another processor, where training took the same macro-actions."""
 SAME_SUCCESS = 0.25
-"""Difference of success at a budget that is let pass where another processor or version trains again."""
-SAME_COST = (4.0, 3.0)
-"""Factor and CPU seconds by which the cost of training may differ, where the same processor trains again."""
+"""Difference of success at a budget that is let pass on another processor, where training took others."""
 _OF_MACHINES = {"cpu", "gl_renderer", "device"}
 """Facts on which bits depend, and which whoever trains again may not be able to choose."""
 _OF_OBSERVERS = ("open_loop", "beliefs", "imagined")
@@ -47,13 +51,38 @@ class Retraining:
     dataset: Path | None = None  #: The folder of the protocol's dataset, if it has one
 
 
-class Repeat(NamedTuple):
-    """The comparison of one run with the same run trained again."""
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What was found of a run, of the bench's protocol or of its report."""
 
-    agent: str
-    seed: int
-    complaint: str  #: Empty where it repeats
-    remark: str  #: The parts that repeat, or why bits were not compared
+    what: str
+    complaint: str = ""  #: Empty where all holds
+    episodes: int = 0  #: Played again
+    unshown: tuple[str, ...] = ()  #: Claims that were not compared
+    holds: str = "holds"  #: The words where there is no complaint
+    of_training: bool = False  #: Whether it is on a run that was trained again
+
+    def __str__(self) -> str:
+        if self.complaint:
+            return f"{self.what}: {self.complaint}"
+        played = f"; {self.episodes:,} episodes played again" if self.episodes else ""
+        return f"{self.what}: {self.holds}{played}{''.join(f'; not shown: {each}' for each in self.unshown)}"
+
+
+def judged(what: str, check: Callable[[], Verdict]) -> Verdict:
+    """The verdict of a check, which raises an error for the first claim that does not hold."""
+    try:
+        return check()
+    except ArtefactError as error:
+        return Verdict(what=what, complaint=brief_lines(error))
+    except Exception as error:  # whoever forges a file can write anything
+        reason = f"{type(error).__name__}: {brief_lines(error)}"
+        return Verdict(what=what, complaint=f"its parts do not fit together ({reason}).")
+
+
+def brief_lines(error: object) -> str:
+    """The message of an error, on one line."""
+    return " ".join(plain(error).split())
 
 
 def drawn(protocol: Protocol, count: int, nonce: str) -> list[tuple[str, int]]:
@@ -77,7 +106,7 @@ def chance_to_find(runs: int, forged: int, count: int) -> float:
     return 1.0 - comb(runs - forged, count) / comb(runs, count)
 
 
-def train_again(folder: Path, retraining: Retraining) -> list[Repeat]:
+def train_again(folder: Path, retraining: Retraining) -> list[Verdict]:
     """Train runs of the bench in ``folder`` again, in a folder that is then removed, and compare.
 
     Raises:
@@ -104,12 +133,13 @@ def train_again(folder: Path, retraining: Retraining) -> list[Repeat]:
             for failure in retraining.launcher.launch(jobs, show):
                 why[failure.job.spec.agent, failure.job.spec.seed] = failure.reason
         for run in wanted:
-            complaint = f"it cannot be trained again: {why[run]}" if run in why else ""
-            remark = ""
-            if not complaint:
-                one, other = (run_folder.load_run(store.run_folder(*run)) for store in (kept, again))
-                complaint, remark = _compared(one, other, differing)
-            found.append(Repeat(*run, complaint, remark))
+            what = f"{run[0]} seed {run[1]}, trained again"
+            if run in why:
+                found.append(Verdict(what=what, complaint=f"it cannot be: {brief_lines(why[run])}"))
+                continue
+            one, other = (run_folder.load_run(store.run_folder(*run)) for store in (kept, again))
+            verdict = judged(what, partial(_compared, what, one, other, differing))
+            found.append(replace(verdict, of_training=True))
     return found
 
 
@@ -131,30 +161,59 @@ def _differing(store: BenchStore) -> list[str]:
         return sorted(names if store.protocol.device == "cpu" else names | {"device"})
 
 
-def _compared(kept: RunResult, again: RunResult, differing: Sequence[str]) -> tuple[str, str]:
-    """A complaint, empty if the run repeats, and a remark on the comparison."""
+def _compared(what: str, kept: RunResult, again: RunResult, differing: Sequence[str]) -> Verdict:
+    """The comparison of a run with the same run trained again, where these facts differ."""
     before = _digests(kept)
     now = _digests(again)
     is_older = run_folder.read_config(kept.folder)["format"] == run_folder.WITHOUT_TRAINING
     lacking = [name for name in now if name not in before and not name.startswith(_OF_OBSERVERS)]
-    if lacking and not is_older:
-        return f"{lacking[0]} is not kept, and training again gives it.", ""
+    require(is_older or not lacking, f"{' '.join(lacking[:1])} is not kept, and training again gives it.")
     wrong = [name for name, digest in before.items() if now.get(name, digest) != digest]
-    pairs = list(zip(kept.checkpoints, again.checkpoints, strict=True))
-    apart = max(abs(one.success_rate - other.success_rate) for one, other in pairs)
-    success = f"success differs by at most {100 * apart:.0f} points at a budget"
-    if wrong and not _OF_MACHINES & {*differing}:
-        remedy = f" Its {' and '.join(differing)} differ here; train it again with the same." if differing else ""
-        return f"{wrong[0]} does not repeat; {success}.{remedy}", ""
-    if wrong and apart > SAME_SUCCESS:
-        return f"{success}, and {100 * SAME_SUCCESS:.0f} are let pass where {', '.join(differing)} differs.", ""
-    if wrong:
-        return "", f"{success}; bits were not compared, for {', '.join(differing)} is said to have been another"
-    factor, cpu_s = SAME_COST
-    was_s, is_s = (rows[-1].train_cpu_s for rows in (kept.checkpoints, again.checkpoints))
-    if not differing and max(was_s, is_s) > factor * min(was_s, is_s) + cpu_s:
-        return f"{was_s:,.1f} CPU s of training were kept, and it took {is_s:,.1f}.", ""
-    return "", f"repeats to the bit in {len(before)} parts"
+    facts = " and ".join(differing)
+    remedy = f" Here it is trained with another {facts}; train it again with the same." if differing else ""
+    if wrong and _OF_MACHINES & {*differing}:
+        alike = _beyond_rounding(kept, again, remedy)
+        unshown = (f"bits, for its {facts} is said to have been another",)
+        return Verdict(what=what, holds=f"its first {alike:,} training episodes repeat", unshown=unshown)
+    require(not wrong, f"{' '.join(wrong[:1])} does not repeat.{remedy}")
+    costs = [(run.checkpoints[-1].train_cpu_s, sum(row.eval_cpu_s for row in run.checkpoints)) for run in (kept, again)]
+    for name, was_s, is_s in zip(("training", "tests"), *costs, strict=True):
+        factor, cpu_s = SAME_COST
+        is_near = bool(differing) or max(was_s, is_s) <= factor * min(was_s, is_s) + cpu_s
+        require(is_near, f"{was_s:,.1f} CPU s of {name} were kept, and it took {is_s:,.1f}.")
+    return Verdict(what=what, holds=f"repeats to the bit in {len(before)} parts")
+
+
+def _beyond_rounding(kept: RunResult, again: RunResult, remedy: str) -> int:
+    """Refuse differences that the roundings of another processor do not explain.
+
+    The same learner takes the same macro-actions until a rounding decides one. Until then its tests are the same too.
+    Returns the number of training episodes until then.
+    """
+    episodes = [_episodes(run, alike=kept.training) for run in (kept, again)]
+    apart = [number for number, (one, other) in enumerate(zip(*episodes, strict=False)) if one != other]
+    played = apart[0] if apart else len(episodes[1])
+    alike = len(again.training_length) - len(episodes[1]) + played  # with those of a dataset
+    early = f"training episode {alike} took other macro-actions, before roundings of another processor matter.{remedy}"
+    require(not apart or played >= SAME_EPISODES, early)
+    for one, other in zip(kept.checkpoints, again.checkpoints, strict=True):
+        where = f"after {one.episodes:,} episodes"
+        points = abs(one.success_rate - other.success_rate)
+        far = f"{where} success differs by {points:.0%}, and {SAME_SUCCESS:.0%} of the tests are let pass.{remedy}"
+        require(points <= SAME_SUCCESS, far)
+        if one.kept is not None and other.kept is not None and other.episodes <= alike:
+            tests = range(other.test_episodes)
+            others = sum(one.kept.actions_of(test) != other.kept.actions_of(test) for test in tests)
+            same = f"{where} {others} of {len(tests)} tests went otherwise, though training was the same.{remedy}"
+            require(others <= SAME_TESTS * len(tests), same)
+    return alike
+
+
+def _episodes(run: RunResult, alike: KeptEpisodes | None) -> list[object]:
+    """What is compared of each training episode: its macro-actions, or of an older run, success and length."""
+    if alike is None or run.training is None:
+        return [*zip(run.training_success.tolist(), run.training_length.tolist(), strict=True)]
+    return [run.training.actions_of(episode) for episode in range(len(run.training.lengths))]
 
 
 def _digests(run: RunResult) -> dict[str, str]:
@@ -164,7 +223,6 @@ def _digests(run: RunResult) -> dict[str, str]:
         "settings": run.settings,
         "success in training": run.training_success,
         "lengths in training": run.training_length,
-        "starts of training": run.training_starts,
         "training episodes": run.training,
         "tried macro-actions": None if run.tried is None else sorted(run.tried.tolist()),
     }

@@ -36,6 +36,17 @@ _SESSIONS = "sessions.json"
 _EARLIER = ("environment", "certificate")
 """Facts that lie in files of their own where a bench began before 2026-11-28."""
 _DECISIVE = ("commit", "versions", "gl_renderer")
+_NO_BENCHES = {
+    "judgement.json": "is a judgement of world models; 'imagine-bench judge' with the same options shows it again",
+    f"report/{KEPT}": "is a report of merged benches, which has no runs; give the folder of one of these benches, or "
+    "the folder 'report' below this one to see its table again",
+    "config.json": "is one run; give the folder of its bench, which is two folders above",
+    "study.json": "is a study, which has no runs of its own; give the folder of one of its benches",
+    "suite.json": "is a suite, which has no runs of its own; give the folder of one of its benches",
+    "report/suite.json": "is a suite, which has no runs of its own; give the folder of one of its benches",
+    "card.json": "is a dataset; 'imagine-bench dataset --describe' shows it",
+}
+"""Folders of other kinds by a file that they have, and what is said where a bench's is wanted."""
 _NAME = re.compile("-([0-9a-f]{12})$")
 """The hash in a folder's name; whoever moves a bench elsewhere may leave it out."""
 
@@ -213,6 +224,9 @@ def read_protocol_values(folder: Path) -> dict[str, Any]:
     """Return the values of a bench folder's protocol. Raises ArtefactError: they are missing or damaged."""
     kept = is_archive(folder)
     path = folder / (KEPT if kept else _PROTOCOL)
+    for file, words in _NO_BENCHES.items():
+        if (folder / file).is_file() and not (path.exists() or (folder / _SESSIONS).exists()):
+            raise ArtefactError(f"{folder} {words}.")
     values = read_json(path, "a bench's protocol")
     name = _NAME.search(folder.resolve().name)
     if name is not None and not kept and digest(values) != name[1]:

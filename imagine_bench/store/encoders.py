@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 from collections.abc import Callable
 from importlib import resources
@@ -158,7 +157,7 @@ def _once(path: Path, what: str, make: Callable[[], object]) -> None:
 
 def kind(path: Path) -> str:
     """Whether an encoder gives ``"latents"`` or ``"codes"``, by its card. Raises ArtefactError: the file is damaged."""
-    return "codes" if _card(path).get("code_sizes") else "latents"
+    return "codes" if card_of(path).get("code_sizes") else "latents"
 
 
 def identity(path: Path) -> str:
@@ -169,13 +168,27 @@ def identity(path: Path) -> str:
 def card(used: str | None) -> dict[str, Any] | None:
     """The card of an encoder that :func:`find` finds; None where it finds none. Raises ArtefactError: damaged."""
     path = None if used is None else find(used)
-    return None if path is None else _card(path)
+    return None if path is None else card_of(path)
+
+
+def low_share(path: Path | None) -> float | None:
+    """Share of new frames whose whole macrostate a probe reads right from an encoder, where it is low.
+
+    None where at least READS_AT_LEAST are read right, where the encoder's card does not say it, and without an encoder.
+    """
+    share: float = 1.0 if path is None else card_of(path).get("probe", {}).get("mlp", 1.0)
+    return share if share < READS_AT_LEAST else None
+
+
+def mark(share: float | None) -> str:
+    """The words behind the name of an agent or model in tables, by its encoder's :func:`low_share`."""
+    return "" if share is None else f" (encoder reads {share:.1%})"
 
 
 def doubt(path: Path | None) -> str:
     """A warning about an encoder from which few frames are read right; empty where its card does not say so."""
-    share = 1.0 if path is None else _share_read(path)
-    if path is None or not share < READS_AT_LEAST:
+    share = low_share(path)
+    if path is None or share is None:
         return ""
     return (
         f"the encoder {path.stem}, from which a probe reads only {share:.1%} of new frames right (less than "
@@ -183,13 +196,7 @@ def doubt(path: Path | None) -> str:
     )
 
 
-def _share_read(path: Path) -> float:
-    """Share of held-out frames whose whole macrostate an encoder's probe reads right; NaN where its card says none."""
-    found: float = _card(path).get("probe", {}).get("mlp", math.nan)
-    return found
-
-
-def _card(path: Path) -> dict[str, Any]:
+def card_of(path: Path) -> dict[str, Any]:
     """The card that an artefact holds; the ``.json`` beside it is for people and may be gone."""
     with reading(path, "an encoder with a card"), safe_open(path, framework="numpy") as file:
         return dict(json.loads(file.metadata()["card"]))

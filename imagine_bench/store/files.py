@@ -20,7 +20,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from imagine_bench.arrays import Array, Arrays
-from imagine_bench.errors import ArtefactError, BusyError, InvalidValueError, SetupError, brief, why, writing
+from imagine_bench.errors import ArtefactError, BusyError, InvalidValueError, SetupError, brief, plain, why, writing
 from imagine_bench.values import Json
 
 
@@ -79,6 +79,16 @@ def write_bytes(path: Path, content: bytes) -> None:
         finally:
             with suppress(OSError):
                 temporary.unlink()
+
+
+def make_plain(log: Path) -> None:
+    """Write the control characters in a log as escapes, for whoever prints it; an empty log is removed."""
+    with suppress(OSError):  # there is none, another removed it, or the disk refuses: it stays as it is
+        text = plain(log.read_text(errors="replace"))
+        if text:
+            log.write_text(text)
+        else:
+            log.unlink()
 
 
 def with_null(value: Any) -> Any:

@@ -148,8 +148,6 @@ class RunResult(OneRun):
     training_success: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     #: Macro-actions of each training episode. Shape (episodes,), or (0,) likewise.
     training_length: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    #: Where the training episodes began that were played. Shape (played, M). None in results of before 2026-11-24.
-    training_starts: NDArray[np.int16] | None = None
     #: The training episodes that were played: all but a dataset's, those of a resumed run from when this version took
     #: it up. None in results of before 2026-11-28.
     training: KeptEpisodes | None = None

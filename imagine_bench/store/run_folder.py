@@ -399,12 +399,6 @@ def _result(folder: Path) -> RunResult | None:
     with reading(folder / CHECKPOINTS, "a run's checkpoint"):
         values = snapshot.values
         rows = unpack(tuple[Checkpoint, ...], values["rows"], grouped(snapshot.arrays).get("rows", {}))
-        training = training_of(snapshot)
-        starts = values.get("starts")  # those that an earlier version began
-        if starts is not None and training is None:
-            starts = starts[: snapshot.episode]  # a library began one more at its end
-        elif training is not None:
-            starts = [*(starts or []), *training.starts.tolist()]
         tried = values.get("tried")
         pairs = None if tried is None else tried_pairs(tried)
         return RunResult(
@@ -414,8 +408,7 @@ def _result(folder: Path) -> RunResult | None:
             settings=config["settings"],
             training_success=np.array(values["success"], dtype=np.bool_),
             training_length=np.array(values["length"], dtype=np.int64),
-            training_starts=None if starts is None else np.array(starts, dtype=np.int16),
-            training=training,
+            training=training_of(snapshot),
             tried=None if pairs is None else np.array(pairs, dtype=np.int32),
             folder=folder,
         )

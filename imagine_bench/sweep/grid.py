@@ -166,6 +166,10 @@ def read_grid(path: Path) -> Study | Suite:
     Raises:
         InvalidValueError: It cannot be read, or a field is missing, unknown or of another type.
     """
+    if not path.is_file():
+        raise InvalidValueError(
+            f"There is no file {path}; give one of a study or suite, or a name: {', '.join(GRIDS)}."
+        )
     try:
         text = path.read_text()
         data = {"name": path.stem, **(json.loads(text) if path.suffix == ".json" else tomllib.loads(text))}

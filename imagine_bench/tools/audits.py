@@ -11,11 +11,18 @@ import numpy as np
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.arrays import Pixels
-from imagine_bench.errors import ArtefactError, InvalidValueError, brief, writing
+from imagine_bench.errors import (
+    ArtefactError,
+    CheckFailedError,
+    IncompleteCheckError,
+    InvalidValueError,
+    brief,
+    writing,
+)
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.causes import causes_of
 from imagine_bench.judge.plans import PlanResult, make_plans, require_threshold
-from imagine_bench.judge.verify import UNSHOWN, Verdict, does_not_fit, verify_runs
+from imagine_bench.judge.verify import UNSHOWN, verify_runs
 from imagine_bench.recording.filmstrips import filmstrip, png
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.report.bench import bench_page
@@ -23,7 +30,7 @@ from imagine_bench.report.data import known_agent
 from imagine_bench.report.page import DASH, Table, percent, texts, write_page
 from imagine_bench.report.sections import HEAD, causes_table
 from imagine_bench.running.bench import counted, load_bench, task_type
-from imagine_bench.running.retraining import Retraining, chance_to_find, train_again
+from imagine_bench.running.retraining import Retraining, Verdict, chance_to_find, judged, train_again
 from imagine_bench.running.trained import (
     best_run,
     learners,
@@ -243,32 +250,48 @@ def verify(folder: Path, retraining: Retraining | None = None) -> list[Verdict]:
         if retraining is not None:
             raise ArtefactError(f"{folder} keeps results and no runs; give a bench's folder, runs/<task>/<preset>-...")
         load_so_far(folder)
-        return [Verdict(what=str(folder), holds="its table can be read, but no episode is kept: nothing can be shown")]
+        return [Verdict(what=str(folder), holds="its table can be read", unshown=("its figures: no episode is kept",))]
     found = with_report(folder, verify_runs(folder))
     if retraining is None or any(each.complaint for each in found):
         return found
-    return [*found, *map(Verdict.of, train_again(folder, retraining))]
+    return [*found, *train_again(folder, retraining)]
 
 
-def what_is_shown(folder: Path, retraining: Retraining | None = None) -> str:
-    """The claims that a verdict does not show, and the chance that training again finds a forged run, as text."""
+def conclusion(found: Sequence[Verdict]) -> CheckFailedError | IncompleteCheckError | None:
+    """The error that says what does not hold, or what could not be compared; None where neither is the case."""
+    complaints = [each for each in found if each.complaint]
+    if complaints:
+        return CheckFailedError(f"Does not hold. {len(complaints)} of {len(found)} verdicts are complaints.")
+    unshown = dict.fromkeys(claim for each in found for claim in each.unshown)
+    if unshown:
+        return IncompleteCheckError(f"Holds as far as it was compared. Not compared: {'; '.join(unshown)}.")
+    return None
+
+
+def what_is_shown(folder: Path, found: Sequence[Verdict], retraining: Retraining | None = None) -> str:
+    """The claims that no verdict shows, and the chance that training again finds a forged run, as text."""
     protocol = read_control(folder)
     environment = bench_facts(folder)["environment"]
     benches = [each for each in (environment, *environment.values()) if isinstance(each, Mapping) and "commit" in each]
     commits = ", ".join(sorted({str(each["commit"]) for each in benches}))
     lines = [*(f"Not shown: {each}." for each in UNSHOWN), f"Made at commit {commits}, as it says."]
-    if is_archive(folder):
-        return "\n".join(lines)
-    if retraining is None:
-        return "\n".join([*lines, "Training again, verify --train 1, shows whether a run of each agent repeats."])
-    count = len(protocol.seeds)
-    trained = min(retraining.runs, count)
-    chances = (
-        f"{forged} of {count} forged: {percent(chance_to_find(count, forged, trained))} %" for forged in _few(count)
-    )
-    lines[0] = f"{lines[0][:-1]}, but in the runs that were trained again."
-    how = f"Trained again: {trained} of each agent's {count} runs, drawn by --nonce {retraining.nonce}."
-    return "\n".join([*lines, how, f"Chance that a draw finds a forged run of an agent: {'; '.join(chances)}."])
+    trained = sum(each.of_training for each in found)
+    if trained and retraining is not None:
+        count = len(protocol.seeds)
+        each = min(retraining.runs, count)
+        chances = (
+            f"{forged} of {count} forged: {percent(chance_to_find(count, forged, each))} %" for forged in _few(count)
+        )
+        lines[0] = f"{lines[0][:-1]}, but in the runs that were trained again."
+        lines.append(
+            f"Trained again: {trained} runs, {each} of an agent's {count}, drawn by --nonce {retraining.nonce}."
+        )
+        lines.append(f"Chance that a draw finds a forged run of an agent: {'; '.join(chances)}.")
+    elif retraining is not None:
+        lines.append("Training again: no run was.")
+    elif not is_archive(folder):
+        lines.append("Training again, verify --train 1, shows whether a run of each agent repeats.")
+    return "\n".join(lines)
 
 
 def _few(count: int) -> list[int]:
@@ -284,22 +307,16 @@ def with_report(folder: Path, runs: list[Verdict]) -> list[Verdict]:
     if elsewhere:  # a script's, or of a package that is not installed here
         unshown = f"what it says, for no package here offers {', '.join(elsewhere)}"
         return [*runs, Verdict(what="report", holds="not compared", unshown=(unshown,))]
-    try:
-        complaint = _report_complaint(folder)
-    except ArtefactError as error:
-        complaint = str(error)
-    except Exception as error:  # as of a run
-        complaint = does_not_fit(error)
-    return [*runs, Verdict(what="report", complaint=complaint)]
+    return [*runs, judged("report", lambda: _verify_report(folder))]
 
 
-def _report_complaint(folder: Path) -> str:
-    """The first line of the report that does not follow from the runs; empty if all do."""
+def _verify_report(folder: Path) -> Verdict:
+    """Raise ArtefactError for the first line of the report that does not follow from the runs."""
     for name, text in texts(bench_page(load_so_far(folder)), images=False).items():
         path = folder / "report" / name
         there = path.read_text() if path.is_file() else ""
         both = zip_longest(_IMAGE.sub("base64,", there).splitlines(), text.splitlines(), fillvalue="nothing")
         for has, wanted in both:
             if has != wanted:
-                return f"{name} has {brief(has)} where the runs give {brief(wanted)}."
-    return ""
+                raise ArtefactError(f"{name} has {brief(has)} where the runs give {brief(wanted)}.")
+    return Verdict(what="report")

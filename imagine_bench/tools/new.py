@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
+import shlex
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
@@ -64,4 +65,5 @@ def new_package(kind: str, name: str, out: Path) -> str:
     source = make_folder(folder / "src")  # beside pyproject.toml the folder would hide the module
     write_bytes(source / f"{name}.py", code.encode())
     write_bytes(folder / "pyproject.toml", _PYPROJECT.format(kind=kind, name=name, group=group).encode())
-    return f"Wrote {folder}.\nNext: pip install -e {folder} && imagine-bench check --{kind} {name} (or pytest {folder})"
+    typed = shlex.quote(str(folder))
+    return f"Wrote {folder}.\nNext: pip install -e {typed} && imagine-bench check --{kind} {name} (or pytest {typed})"

@@ -19,8 +19,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from imagine_bench import registry
+from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Action, Frame, Info, State
-from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.errors import InvalidValueError, SetupError, require_integer
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.running.trained import load_trained
@@ -204,8 +205,14 @@ def play(
         chosen = {**trained.spec.protocol.world, "appearance": trained.spec.protocol.appearance}
     if task is None:
         raise InvalidValueError("There is nothing to play; give a task or --model.")
+    if encoder is not None and model is None:
+        raise InvalidValueError("--encoder goes with --model; a person needs none.")
     spec = registry.task(task)
-    chosen |= {name: value for name, value in (("execution", execution), ("appearance", appearance)) if value}
+    if execution is not None:
+        chosen["execution"] = spec.execution(execution)
+    if appearance is not None:
+        chosen["appearance"] = appearance_name(appearance)
+    require_integer("seed", seed, 0)
     registry.load("imagine_bench.tasks.rendering.window:open_display")(seen=True)
     with warnings.catch_warnings(), mock.patch("matplotlib.use"):  # it would let matplotlib open windows, too
         warnings.simplefilter("ignore")

@@ -30,7 +30,9 @@ def open_display(*, seen: bool) -> ModuleType:
         raise SetupError("Windows need pygame: pip install 'imagine-bench[play]'.") from error
     chosen = os.environ.get("SDL_VIDEODRIVER")
     linux = sys.platform == "linux"
-    for driver in () if chosen or not linux else ("x11", "wayland", "dummy"):
+    needs = {"x11": "DISPLAY", "wayland": "XDG_RUNTIME_DIR"}  # where they are not set, SDL itself complains
+    drivers = [*(driver for driver, variable in needs.items() if variable in os.environ), "dummy"]
+    for driver in () if chosen or not linux else drivers:
         os.environ["SDL_VIDEODRIVER"] = driver
         with contextlib.suppress(pygame.error):
             pygame.display.init()

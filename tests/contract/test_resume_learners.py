@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import run_state
 from imagine_bench.store import encoders
 from imagine_bench.store.results import RunResult
+from imagine_bench.testing.checks import checked_agent
 
 LEARNERS = [
     name
@@ -45,9 +48,21 @@ _DO_LESS = (
 """Agents that do as much as another of the same class or less, which the fast tests kill."""
 
 
-@pytest.mark.parametrize(
-    "agent", [pytest.param(agent, marks=[pytest.mark.slow] * (agent in _DO_LESS)) for agent in LEARNERS]
-)
+EACH = [pytest.param(agent, marks=[pytest.mark.slow] * (agent in _DO_LESS)) for agent in LEARNERS]
+
+
+@pytest.mark.parametrize("agent", EACH)
+def test_copies_and_pickles_of_a_learner_learn_on_by_themselves(agent: str) -> None:
+    one = checked_agent(agent, "arrow_puzzle")
+    original = one.make()
+    one.train(original, range(2))
+    twins = [copy.deepcopy(original), pickle.loads(pickle.dumps(original))]
+    ends = [(one.train(each, range(2, 4)), each.state()) for each in (*twins, original)]
+    for actions, state in ends[:2]:
+        assert actions == ends[2][0] and same(state, ends[2][1])
+
+
+@pytest.mark.parametrize("agent", EACH)
 def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str) -> None:
     whole = do(tmp_path / "whole", agent, 1e9)
     real, saves = run_state.save_snapshot, []

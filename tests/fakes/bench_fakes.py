@@ -104,6 +104,7 @@ class FailingAgent(TableAgent):
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         if self.seeds.root == 1 and episode == 2:
+            print("\x1b[31mred")
             raise RuntimeError("this agent breaks on purpose")
         super().observe(transition, episode=episode)
 

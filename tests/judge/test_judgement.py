@@ -84,7 +84,7 @@ class Spy(Nearest):
 
 class Exits(Nearest):
     def fit(self, dataset, rng):
-        print("its last words")
+        print("its last words\\x1b[31m")
         sys.exit(0)
 
 class Dies(Nearest):
@@ -200,7 +200,7 @@ def test_what_models_do_wrong_is_a_sentence_each(said: Said) -> None:
     assert "World model dies: imagine() failed: its process ended itself with exit code 0." in said.err
     assert "Traceback" not in said.err
     assert not list(said.folder.glob("raises-*.json"))
-    assert [path.read_text() for path in sorted(said.folder.glob("*.log"))] == ["its last words\n"] * 2
+    assert [path.read_text() for path in sorted(said.folder.glob("*.log"))] == ["its last words\\x1b[31m\n"] * 2
 
 
 def test_a_model_finds_no_truth_and_changes_nothing_for_the_next(said: Said) -> None:
@@ -456,6 +456,21 @@ def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> No
     costs = [source_of(name, spec, index, "clean", SeedTree(0), judged.encoder).cost for name in judged.models]
     assert [cost["encoder"] for cost in costs] == ["pick_place-mild", "pick_place-clean-codes"]
     assert judged.folder_name != dataclasses.replace(judged, encoder=None).folder_name
+    assert "encoder_reads" not in costs[0]
+
+
+def test_a_judged_model_whose_encoder_reads_few_frames_is_marked_in_its_row(said: Said, tmp_path: Path) -> None:
+    folder = tmp_path / said.folder.name
+    shutil.copytree(said.folder, folder)
+    for path in folder.glob("nearest-*.json"):
+        cell = read_sealed(path, "a cell")
+        write_json(path, sealed({**cell, "encoder_reads": 0.115}))
+    assert "(encoder reads 11.5%)" in judgement_page(judged(folder, _of("nearest", "copy"))).summary
+    spec = registry.task("arrow_puzzle")
+    index = RenderedFrameIndex(spec, "strong")
+    assert source_of("structured", spec, index, "strong", SeedTree(1000)).cost["encoder_reads"] == pytest.approx(
+        0.115, abs=1e-3
+    )
 
 
 def test_judges_at_once_train_one_reader_of_a_world_and_see_it_whole(

@@ -196,11 +196,27 @@ def test_viewing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(ArtefactError, match=r"No recording .*none\.rrd"):
         open_in_viewer(tmp_path / "none.rrd")
     there = tmp_path / "there.rrd"
-    there.write_bytes(b"")
+    there.write_bytes(b"no recording")
+    with pytest.raises(ArtefactError, match=r"there\.rrd is no recording of Rerun"):
+        open_in_viewer(there)
+    there.write_bytes(b"RRF2")
     failed = subprocess.CompletedProcess[bytes]([], returncode=1)
     monkeypatch.setattr(stream.subprocess, "run", lambda *_, **__: failed)
     with pytest.raises(SetupError, match=r"No display .* the viewer failed; .* run 'rerun there.rrd' .* --serve-web"):
         open_in_viewer(there)
+
+
+def test_a_module_in_the_current_folder_is_no_viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in on Python's path is run, and one in the current folder is not."""
+    for folder in ("path", "here"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "rerun.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').write({folder!r})")
+    (tmp_path / "here" / "a.rrd").write_bytes(b"RRF2")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "path"))
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    monkeypatch.chdir(tmp_path / "here")
+    open_in_viewer(Path("a.rrd"))
+    assert (tmp_path / "ran").read_text() == "path"
 
 
 def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:

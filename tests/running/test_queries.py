@@ -192,7 +192,7 @@ def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monke
             "Agent 'dqn' has no model of the world to carry over; leave --after out, or that agent.",
         ),
         (["--queries", "2"], "Agent 'dqn' cannot query an oracle; leave --queries out"),
-        (["--after", "pick_place"], "arrow_puzzle cannot come after pick_place: what is known of one world is of no"),
+        (["--after", "pick_place"], "arrow_puzzle cannot come after pick_place: their frames show different scenes"),
     ],
 )
 def test_wrong_words_get_one_line_and_exit_code_2(

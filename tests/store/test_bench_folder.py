@@ -9,10 +9,12 @@ from pathlib import Path
 import pytest
 from small_runs import small
 
+from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, BusyError
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.launchers.jobs import launcher
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, newest_bench, newest_recording
+from imagine_bench.store.files import make_folder
 
 _ENVIRONMENT = {"command": "imagine-bench bench", "commit": "abc", "versions": {"torch": "1"}, "gl_renderer": "x"}
 
@@ -55,6 +57,30 @@ def test_a_foreign_protocol_is_named_and_untouched(tmp_path: Path) -> None:
             with pytest.raises(ArtefactError, match=r"protocol\.json is damaged: .* stands for another protocol"):
                 read()
         assert path.read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("judgement.json", "is a judgement of world models; 'imagine-bench judge'"),
+        ("report/bench.json", "is a report of merged benches, which has no runs"),
+        ("config.json", "is one run; give the folder of its bench"),
+        ("study.json", "is a study, which has no runs"),
+        ("report/suite.json", "is a suite, which has no runs"),
+        ("card.json", "is a dataset; 'imagine-bench dataset --describe'"),
+        ("other.json", "There is no "),
+    ],
+)
+def test_a_folder_of_another_kind_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], file: str, words: str
+) -> None:
+    folder = tmp_path / "given"
+    make_folder((folder / file).parent)
+    (folder / file).write_text("{}")
+    for command in ("report", "verify"):
+        assert main([command, str(folder)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert words in line and str(folder) in line
 
 
 def test_a_session_elsewhere_is_noticed(tmp_path: Path) -> None:

@@ -66,6 +66,7 @@ def test_an_encoder_that_reads_few_frames_right_is_named(tmp_path, share, doubte
     save_file({"a": np.zeros(1)}, path, {"card": json.dumps({"probe": {"mlp": share}})})
     words = encoders.doubt(path)
     assert bool(words) == doubted
+    assert encoders.mark(encoders.low_share(path)) == (f" (encoder reads {share:.1%})" if doubted else "")
     assert not doubted or (f"reads only {share:.1%} of new frames right" in words and "theirs" in words)
 
 
@@ -76,7 +77,9 @@ def test_a_bench_and_its_report_name_an_encoder_that_misreads(tmp_path, capsys):
     wanted, paths = plan("arrow_puzzle", "smoke", agents=agents, appearance="strong", execution="kinematic", **few)
     result = bench(wanted, paths, root=tmp_path, launcher=Inline())
     assert "reads only 11.5% of new frames right" in capsys.readouterr().out
-    assert any("reads only 11.5% of new frames right" in line for line in bench_page(result).answers)
+    page = bench_page(result)
+    assert any("reads only 11.5% of new frames right" in line for line in page.answers)
+    assert "(encoder reads 11.5%)" in page.summary.partition("chance level")[0]
 
 
 @pytest.mark.parametrize("kind", ["latents", "codes"])

@@ -47,7 +47,7 @@ STUDY = Study(
 )
 
 
-def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
+def test_every_variant_is_run_once_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     launcher = Inline()
     lines = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
     assert [(line.variant.name, line.success.shape) for line in lines] == [
@@ -63,6 +63,10 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path) -> None:
     assert len(launcher.jobs) == 6, "what is done is not run again"
     assert all(np.array_equal(one.success, other.success) for one, other in zip(lines, again, strict=True))
     write_page(tmp_path / "out", study_page(STUDY, lines))
+    assert "also holds" not in capsys.readouterr().out
+    (tmp_path / "out" / "former.png").touch()
+    write_page(tmp_path / "out", study_page(STUDY, lines))
+    assert "out also holds former.png, of an earlier report" in capsys.readouterr().out
     rows = list(csv.DictReader((tmp_path / "out" / "seeds.csv").read_text().splitlines()))
     assert len(rows) == 3 * 2 * 2 and {row["seed"] for row in rows} == {"1000", "1001"}
     right = dataclasses.replace(lines[1], imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]))

@@ -21,9 +21,10 @@ from imagine_bench.running.bench import bench, plan
 def test_a_new_package_keeps_the_contract(
     guests: Guests, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
 ) -> None:
-    assert main(["new", kind, "my_own", "--out", str(tmp_path)]) == 0
-    assert f"imagine-bench check --{kind} my_own" in capsys.readouterr().out
-    guests.add(tmp_path / "my_own")
+    folder = tmp_path / "a folder" / "my_own"
+    assert main(["new", kind, "my_own", "--out", str(folder.parent)]) == 0
+    assert f"pip install -e '{folder}' && imagine-bench check --{kind} my_own" in capsys.readouterr().out
+    guests.add(folder)
     assert main(["check", f"--{kind}", "my_own"]) == 0, capsys.readouterr().out
 
 

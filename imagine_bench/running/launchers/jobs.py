@@ -26,7 +26,7 @@ from imagine_bench.errors import ImagineBenchError, InvalidValueError, SetupErro
 from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress
 from imagine_bench.registry.loading import Registered, register, registered, script_left_out
 from imagine_bench.running.bench import task_type
-from imagine_bench.store.files import make_folder
+from imagine_bench.store.files import make_folder, make_plain
 
 _POLL_S = 0.5
 _PATIENCE_S = 5.0
@@ -98,6 +98,7 @@ def _attempt(job: Job, on_progress: OnProgress, run: Callable[[Job, OnProgress],
     except (Exception, SystemExit) as error:
         with suppress(SetupError):
             _log(job, traceback.format_exc())
+        make_plain(job.log)
         return str(error) if isinstance(error, ImagineBenchError) else f"{type(error).__name__}: {error}"
     return ""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,21 @@ def mend(run: Path) -> None:
     names += [path.relative_to(run).as_posix() for path in run.glob("checkpoints/*/state.json")]
     done["sha256"] = {name: sha256(run / name) for name in names}
     (run / "DONE").write_text(json.dumps(sealed(done)))
+
+
+def forged(honest: Path, root: Path, forge: Callable[[Path], object]) -> Path:
+    """A copy of a bench that somebody has forged."""
+    folder = root / honest.name
+    shutil.copytree(honest, folder)
+    forge(folder)
+    return folder
+
+
+def share_weights(folder: Path) -> None:
+    one, other = (load_newest(folder / "table" / seed / "checkpoints") for seed in ("seed_0", "seed_1"))
+    assert one is not None and other is not None
+    save_snapshot(folder / "table" / "seed_1" / "checkpoints", dataclasses.replace(other, agent=one.agent))
+    mend(folder / "table" / "seed_1")
 
 
 def one_run(bench: Path, rng: np.random.Generator) -> Path:
@@ -207,7 +223,7 @@ def rewrite_protocol(bench: Path, **values: Any) -> Path:
         config |= {"protocol": protocol, "protocol_hash": digest(protocol)}
         (run / "config.json").write_text(json.dumps(sealed(config)))
         mend(run)
-    return bench.rename(bench.with_name(f"smoke-{digest(protocol)}"))
+    return bench.rename(bench.with_name(f"{protocol['preset']}-{digest(protocol)}"))
 
 
 def seed(bench: Path, rng: np.random.Generator) -> None:

@@ -15,8 +15,9 @@ import pytest
 from bench_fakes import FakeRunSpec
 from small_runs import small
 
-from imagine_bench.cores import usable_cores
+from imagine_bench.cores import usable_cores, usable_memory
 from imagine_bench.protocols.data import Job, Progress
+from imagine_bench.running.isolation import Limits
 from imagine_bench.running.launchers.jobs import LocalPool, at_a_time, work_through
 from imagine_bench.store import run_folder
 
@@ -36,6 +37,7 @@ def test_a_failed_run_is_named_and_stops_no_other(tmp_path: Path) -> None:
     assert failure.reason == "RuntimeError: this agent breaks on purpose"
     log = failure.job.log.read_text()
     assert "failing seed 1 begins or goes on" in log and "Traceback" in log and "breaks on purpose" in log
+    assert r"\x1b[31mred" in log and "\x1b" not in log
     assert not run_folder.is_done(jobs[0].folder) and run_folder.is_done(jobs[1].folder)
     assert [progress.seed for progress in told if progress.phase == "done"] == [0]
     assert [(progress.seed, progress.detail) for progress in told if progress.phase == "failed"] == [
@@ -159,11 +161,32 @@ def test_a_worker_that_dies_costs_one_item_and_others_go_on_in_one_process() -> 
 def test_a_quota_bounds_the_cores_counted(
     tmp_path: Path, groups: str, files: dict[str, str], cores: int | None
 ) -> None:
+    write_groups(tmp_path, groups, files)
+    unbounded = usable_cores(tmp_path / "none")
+    assert usable_cores(tmp_path) == min(unbounded, cores or unbounded)
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "limit"),
+    [
+        ("0::/a/b", {"a/memory.max": "1048576", "a/b/memory.max": "max"}, 1048576),
+        ("0::/", {"memory.max": "max", "cpu.max": "1 1"}, None),
+        ("2:memory:/x", {"memory/x/memory.limit_in_bytes": "4096"}, 4096),
+        ("2:memory:/x", {"memory/x/memory.limit_in_bytes": "9223372036854771712"}, None),
+    ],
+)
+def test_a_containers_limit_bounds_the_memory_of_a_judged_model(
+    tmp_path: Path, groups: str, files: dict[str, str], limit: int | None
+) -> None:
+    write_groups(tmp_path, groups, files)
+    assert usable_memory(tmp_path) == (limit or usable_memory(tmp_path / "none"))
+    assert Limits().memory == usable_memory() * 3 // 4
+
+
+def write_groups(tmp_path: Path, groups: str, files: dict[str, str]) -> None:
     for name, text in {"proc/self/cgroup": groups, **{f"sys/fs/cgroup/{n}": t for n, t in files.items()}}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(f"{text}\n")
-    unbounded = usable_cores(tmp_path / "none")
-    assert usable_cores(tmp_path) == min(unbounded, cores or unbounded)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system knows no affinity")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 import torch
@@ -69,7 +69,8 @@ class ExactImaginationAgent(DQN):
     ) -> None:  # fmt: skip
         super().__init__(perception, n_actions, settings, seeds, device)
         node = seeds.child("imagination")
-        self._outcomes = cache(world.rules.outcomes)
+        self._rules = world.rules
+        self._known: dict[tuple[State, int], Sequence[Outcome]] = {}
         self._gallery = Gallery(world, perception, node.child("gallery"))
         self._draws = torch.Generator(device).manual_seed(node.child("rollouts").integer())
         self.visited: deque[State] = deque(maxlen=settings.memory.real)
@@ -94,6 +95,12 @@ class ExactImaginationAgent(DQN):
                 self.imagine_rollouts()
             self.learn_values(self.imagined, settings.updates_per_step)
         self.meters.count("time/imagination_s")
+
+    def _outcomes(self, state: State, action: int) -> Sequence[Outcome]:
+        """What the rules say, asked once each."""
+        if (state, action) not in self._known:
+            self._known[state, action] = self._rules.outcomes(state, action)
+        return self._known[state, action]
 
     def imagine_rollouts(self) -> None:
         """I_B rollouts of the rules, I_D steps deep, into the imagined memory."""

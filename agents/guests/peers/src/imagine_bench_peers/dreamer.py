@@ -67,11 +67,7 @@ class Dreamer:
             shown = spaces.Dict({name: spaces.Box(-np.inf, np.inf, array.shape) for name, array in self._blank.items()})
             *learners, self._player = build_agent(self._fabric, (n_actions,), False, self._config, shown)
         self._world, self._actor, self._critic, self._target = learners
-        rates = settings.model_learning_rate, settings.actor_learning_rate, settings.critic_learning_rate
-        self._optimisers = [
-            self._fabric.setup_optimizers(torch.optim.Adam(module.parameters(), lr=rate, eps=eps, fused=True))
-            for module, rate, eps in zip(learners, rates, (1e-8, 1e-5, 1e-5), strict=False)
-        ]
+        self._optimisers = self._new_optimisers()
         moments = self._config.algo.actor.moments
         self._moments = Moments(moments.decay, moments.max, moments.percentile.low, moments.percentile.high)
         self._memory = Sequences(settings.buffer_size)
@@ -80,6 +76,28 @@ class Dreamer:
         self._arrived = (0.0, False, False)  # reward and ends of the transition before, of this episode
         self._owed = 0.0  # updates
         self.begin_episode()
+
+    def _new_optimisers(self) -> list[Any]:
+        settings = self.settings
+        modules = self._world, self._actor, self._critic
+        rates = settings.model_learning_rate, settings.actor_learning_rate, settings.critic_learning_rate
+        return [
+            self._fabric.setup_optimizers(torch.optim.Adam(module.parameters(), lr=rate, eps=eps, fused=True))
+            for module, rate, eps in zip(modules, rates, (1e-8, 1e-5, 1e-5), strict=True)
+        ]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes of a copy or a pickle, with the optimisers' states in place of what the library makes of them.
+
+        The library wraps each optimiser in a class of its own, which no pickle finds.
+        """
+        return {**vars(self), "_optimisers": [optimiser.state_dict() for optimiser in self._optimisers]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._optimisers = self._new_optimisers()
+        for optimiser, kept in zip(self._optimisers, state["_optimisers"], strict=True):
+            optimiser.load_state_dict(kept)
 
     def begin_episode(self) -> None:
         """Forget what was seen: the next frame is an episode's first."""

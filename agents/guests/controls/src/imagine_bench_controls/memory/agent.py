@@ -44,7 +44,7 @@ class RememberingAgent(DQN, ABC):
     def __init__(
         self, perception: Perception, n_actions: int, settings: Any, seeds: SeedTree, device: torch.device, **more: Any
     ) -> None:
-        remembering = Remembering(perception, settings.recurrence.units, lambda: self.recurrence)
+        remembering = Remembering(perception, settings.recurrence.units, self.recurrence_now)
         super().__init__(remembering, n_actions, settings, seeds, device, **more)
         self._read_out: tuple[int, ReadOut] | None = None  # of how many real steps
         self.begin_episode()
@@ -64,13 +64,17 @@ class RememberingAgent(DQN, ABC):
             device,
             units=settings.units,
             burn_in=settings.burn_in,
-            recurrence=lambda: self.recurrence,
+            recurrence=self.recurrence_now,
         )
 
     @property
     @abstractmethod
     def recurrence(self) -> Recurrence:
         """What remembers."""
+
+    def recurrence_now(self) -> Recurrence:
+        """What remembers, for parts that ask anew each time; as a method it is that of a copy in a copy."""
+        return self.recurrence
 
     def perceive(self, frame: Frame) -> Tensor:
         """The mean latents of a frame and what is remembered after it. Shape (Z + H,).

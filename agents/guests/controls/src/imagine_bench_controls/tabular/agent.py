@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
@@ -31,7 +32,11 @@ ReadState = Callable[[Observation], int]
 
 def read_codes(perception: CodePerception) -> ReadState:
     """Reads the frame's whole code, one number, from a perception that is not factored."""
-    return lambda observation: perception.code(observation.frame)[0]
+    return functools.partial(_whole_code, perception)
+
+
+def _whole_code(perception: CodePerception, observation: Observation) -> int:
+    return perception.code(observation.frame)[0]
 
 
 def read_macrostate(observation: Observation) -> int:
