@@ -24,7 +24,7 @@ def result(tmp_path_factory):
 def test_training_and_tests_start_where_the_split_says(result):
     split = split_of(registry.task("arrow_puzzle").rules, "plan_length=2")
     (run,) = result.runs
-    trained = {tuple(start) for start in run.training_starts.tolist()}
+    trained = {tuple(start) for start in run.training.starts.tolist()}
     tested = {tuple(start) for row in run.checkpoints for start in row.kept.starts.tolist()}
     assert trained and trained <= set(split.train)
     assert tested and tested <= set(split.test)

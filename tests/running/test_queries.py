@@ -46,8 +46,8 @@ def test_demonstrations_are_optimal_and_seen_as_frames(tmp_path: Path) -> None:
     plain, shown = do(tmp_path / "plain"), do(tmp_path / "shown", demonstrations=4)
     alone, taught = Pupil.made
     assert shown.training_success[:4].all() and not plain.training_success.all()
-    assert shown.training_starts is not None
-    fewest = [fewest_actions(registry.task("arrow_puzzle").rules, tuple(s)) for s in shown.training_starts[:4].tolist()]
+    assert shown.training is not None
+    fewest = [fewest_actions(registry.task("arrow_puzzle").rules, tuple(s)) for s in shown.training.starts[:4].tolist()]
     assert shown.training_length[:4].tolist() == fewest, "shortest plans"
 
     def starts(pupil: Pupil) -> list[bytes]:
