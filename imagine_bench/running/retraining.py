@@ -28,7 +28,7 @@ from imagine_bench.values import pack
 
 SAME_COST = (4.0, 1.0)
 """Factor and CPU seconds by which the cost of training and of tests may differ on the same processor."""
-SAME_EPISODES = 5
+SAME_EPISODES = 10
 """First training episodes in which another processor, whose roundings differ, takes the same macro-actions."""
 SAME_TESTS = 0.2
 """Share of tests that may go otherwise on another processor, where training took the same macro-actions."""
