@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fake_results import bench_result, rewritten
+from small_runs import Inline, small
 
 from imagine_bench import statistics
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.running.bench import bench
 from imagine_bench.running.headlines import decided, headlines, stages, until_decided
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
@@ -82,6 +85,31 @@ def test_stages_end_once_decided_or_at_the_most(staged: Any, tmp_path: Path, gap
     again: list[Protocol] = []
     assert until_decided(staged(gap, again), FIRST, most=13, root=tmp_path)[1].protocol == whole.protocol
     assert again == asked, "the same call asks for the same benches, which are then only read"
+
+
+def test_an_interrupted_search_ends_in_the_same_results(tmp_path: Path) -> None:
+    """Real runs, six seeds and then up to eight, killed after each run: every run is made once."""
+    wanted = {"agents": ("table", "random"), "seeds": (0, 1, 2, 3, 4, 5), "budgets": (4,)}
+    first = small(**wanted, headlines=(("table", "random"),))
+
+    def search(root: Path, launcher: Inline) -> BenchResult:
+        def plan(**changes: Any) -> BenchResult:
+            asked = small(**{**wanted, "headlines": first.headlines, **changes})
+            return bench(asked, {}, root=root, launcher=launcher)
+
+        return until_decided(plan, first, most=8, root=root)[1]
+
+    whole = search(tmp_path / "whole", Inline())
+    assert whole.protocol.seeds == tuple(range(8)) and whole.protocol.most_looks == 2
+    order: list[tuple[str, int]] = []
+    for _ in range(20):
+        launcher = Inline(patience=1)
+        with suppress(KeyboardInterrupt):
+            again = search(tmp_path / "killed", launcher)
+        order += launcher.order
+    assert len(order) == 16 and len(set(order)) == 16
+    assert again.protocol == whole.protocol
+    assert [row.solved for _, row in again.rows] == [row.solved for _, row in whole.rows]
 
 
 def test_without_headlines_or_with_too_few_seeds_nothing_is_run(tmp_path: Path) -> None:
