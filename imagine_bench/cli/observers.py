@@ -79,7 +79,8 @@ class BenchObserver(RunObserver):
             found["imagined"] = examples(run.agent, run.task, seeds=seeds.child("examples"), **_in_tests(run))
             seeds = seeds.child("sampled_rollouts")
             found["sampled_rollouts"] = imagine_sampled_rollouts(run.agent, run.task, seeds=seeds, **_in_tests(run))
-        if run.protocol.recorded_episodes > 0:
+        recorded = run.protocol.seeds[: run.protocol.recorded_seeds or None]
+        if run.protocol.recorded_episodes > 0 and run.spec.seed in recorded:
             from imagine_bench.recording.episodes import record_run  # noqa: PLC0415 - loading Rerun costs a second
 
             run.tell("recording", at_once=True)

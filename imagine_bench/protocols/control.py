@@ -51,6 +51,7 @@ _AT_LEAST = {
     "open_loop_starts": 0,
     "sampled_futures": 0,
     "recorded_episodes": 0,
+    "recorded_seeds": 0,
 }
 
 
@@ -187,6 +188,8 @@ class EvaluationSection:
     #: Futures that benches of before 2026-11-25 sampled; nothing reads it now.
     sampled_futures: int = 0
     recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
+    #: Of how many seeds runs are recorded, the first ones; 0 for all
+    recorded_seeds: int = field(default=0, metadata=LATER)
     #: Comparisons declared beforehand: an agent, and the agent that it should beat at the last budget. Their p-values
     #: are corrected for one another alone.
     headlines: tuple[tuple[str, str], ...] = field(default=(), metadata=LATER)
@@ -267,7 +270,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {
         "agents": ("random", "dqn", "dqn_more_updates", *_THESIS_AGENTS[1:], "factored:given", "oracle"),
-        "seeds": tuple(range(6)), "budgets": (100, 250, 400), "few_seeds": {"imagination_uncertainty": 3},
+        "seeds": tuple(range(6)), "few_seeds": {"imagination_uncertainty": 3}, "budgets": (100, 250, 400),
+        "recorded_seeds": 1,
         "headlines": (("imagination", "dqn"), ("imagination", "dqn_more_updates")),
     },
     "thesis": {

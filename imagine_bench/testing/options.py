@@ -105,6 +105,7 @@ WITHOUT_ROW: Mapping[str, str] = {
     "open_loop_starts": "what observers ask, which changes no agent",
     "sampled_futures": "read in older files only",
     "recorded_episodes": "what a recording shows",
+    "recorded_seeds": "which runs are recorded",
     "headlines": "what the report decides, which changes no agent",
     "most_looks": "how strictly it decides",
     "few_seeds": "how many runs an agent has",

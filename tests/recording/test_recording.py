@@ -16,6 +16,7 @@ from fake_agents import FakeAgent, FakeImaginer
 from numpy.typing import NDArray
 from recordings import contents, rerun, times, view_names
 from rerun.chunk import RrdReader
+from small_runs import Inline, small
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
@@ -25,6 +26,7 @@ from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording import episodes, stream
 from imagine_bench.recording.episodes import q_table, record_run
 from imagine_bench.recording.stream import entity_name, log_motion, log_shapes, open_in_viewer, recording_file
+from imagine_bench.running.bench import bench
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
@@ -319,3 +321,10 @@ def test_a_recording_shows_what_the_agent_sees_and_says_what_is_true(tmp_path: P
         for name, now, late in zip(spec.macrostate_names, truth, seen, strict=True):
             assert f"- {name}: {now}{'' if now == late else f' (frame: {late})'}\n" in text
     assert "(frame: " in "".join(texts) and "(frame: " not in texts[0]
+
+
+def test_of_so_many_seeds_alone_runs_are_recorded(tmp_path: Path) -> None:
+    wanted = small(agents=("random",), seeds=(4, 5), budgets=(1,), recorded_episodes=1, recorded_seeds=1)
+    result = bench(wanted, {}, root=tmp_path, launcher=Inline())
+    assert [run.recording is not None for run in result.runs] == [True, False]
+    assert bench(wanted, {}, root=tmp_path, launcher=Inline(patience=0)).missing == (), "no run lacks anything"
