@@ -47,7 +47,7 @@ def test_any_change_changes_the_hash():
         "after": ("arrow_puzzle",), "demonstrations": 1, "queries": 1, "feedback": 1.0, "split": "plan_length=2",
         "dataset": "random-3@0123456789ab", "settings_digest": "0123456789ab", "test_appearance": "strong",
         "physics": (("pad_friction", 0.5),), "observation": "state", "observation_size": 128,
-        "headlines": (("imagination", "dqn"),), "most_looks": 2, "recorded_seeds": 1, "few_seeds": (("dqn", 0),),
+        "headlines": (("imagination", "dqn"),), "most_looks": 2, "recorded_seeds": 2, "few_seeds": (("dqn", 0),),
         "code": (("my_agent", "0123456789ab"),),
     }  # fmt: skip
     others = {"after_episodes", "feedback_error", "agent_names"}  # the last one says how names are written
