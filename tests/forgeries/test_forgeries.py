@@ -96,7 +96,7 @@ def test_at_most_three_kinds_pass(
             found[court.verdict(folder, f"{kind} {variant}")] += 1
             shutil.rmtree(folder.parents[1])
         lines.append(f"{kind:36}  {'/'.join(f'{found[way]:2}' for way in WAYS)}")
-        if found["passed"]:
+        if found["passed"] > 1:  # one forgery may be the same to the bit in the run that is drawn
             passing.add(kind)
     with capsys.disabled():
         print(f"\n{'every run of an agent' if every else 'one run'}, {cpu}: {' / '.join(WAYS)}", *lines, sep="\n")
