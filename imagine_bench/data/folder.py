@@ -99,15 +99,23 @@ def _readme(card: Mapping[str, Json]) -> str:
     }
     if format == "lerobot":
         head["configs"] = [{"config_name": "default", "data_files": "data/*/*.parquet"}]
-    rows = [f"| {name.replace('_', ' ')} | {card[name]} |" for name in _SHOWN if name in card]
-    lines = [
-        *("---", *(f"{name}: {json.dumps(value)}" for name, value in head.items()), "---", ""),
-        *(f"# Episodes of {card.get('task', 'a task')}", "", str(card.get("description", "")), ""),
-        *("| fact | value |", "|---|---|", *rows, ""),
-        f"Made with imagine_bench: `{card.get('command', '')}`. `{_CARD}` has all facts and the episodes' digest.",
-        "`imagine_bench.data.folder.read_dataset(folder)` reads and checks them.",
-    ]
-    return "\n".join([*lines, ""])
+    yaml = "\n".join(f"{name}: {json.dumps(value)}" for name, value in head.items())
+    facts = "\n".join(f"| {name.replace('_', ' ')} | {card[name]} |" for name in _SHOWN if name in card)
+    return f"""---
+{yaml}
+---
+
+# Episodes of {card.get("task", "a task")}
+
+{card.get("description", "")}
+
+| fact | value |
+|---|---|
+{facts}
+
+Made with imagine_bench: `{card.get("command", "")}`. `{_CARD}` has all facts and the digest of the episodes.
+`imagine_bench.data.folder.read_dataset(folder)` reads and checks them.
+"""
 
 
 def require_format(format: str) -> None:
