@@ -337,11 +337,12 @@ def test_the_functions_of_the_package_outlive_the_import_of_all_of_its_modules()
     rooms = ("imagine_bench.agents", "imagine_bench.tasks", "imagine_bench.__main__")
     modules = [name for name in _MODULES if not name.startswith(rooms)]
     probe = f"""
-import importlib
+import contextlib, importlib
 import imagine_bench
 for _ in range(2):
     for name in {modules}:
-        importlib.import_module(name)
+        with contextlib.suppress(imagine_bench.errors.SetupError):  # of a library that is not installed
+            importlib.import_module(name)
     for call in (imagine_bench.bench, imagine_bench.load):
         try:
             call("nowhere")
