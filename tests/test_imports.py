@@ -341,7 +341,7 @@ import contextlib, importlib
 import imagine_bench
 for _ in range(2):
     for name in {modules}:
-        with contextlib.suppress(imagine_bench.errors.SetupError):  # of a library that is not installed
+        with contextlib.suppress(ModuleNotFoundError):  # of a library that is not installed
             importlib.import_module(name)
     for call in (imagine_bench.bench, imagine_bench.load):
         try:
