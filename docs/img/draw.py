@@ -4,20 +4,22 @@ import csv
 import json
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import matplotlib as mpl
 import numpy as np
+from PIL import Image
 
 from imagine_bench import appearance, reference, registry, statistics
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.judge.causes import CAUSES
+from imagine_bench.recording.filmstrips import Tile, sheet
 from imagine_bench.registry.entries import label_today
 from imagine_bench.report import figures
-from imagine_bench.report.data import agent_title, collect, frames_before
+from imagine_bench.report.data import ReportData, agent_title, collect, frames_before
 from imagine_bench.store.loading import load_so_far
 
 mpl.use("agg")
@@ -25,15 +27,6 @@ from matplotlib import pyplot as plt
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "results"
-COLORS = {
-    "factored:given": "#882255",
-    "imagination_uncertainty": "#009e73",
-    "imagination": "#d55e00",
-    "dqn": "#0072b2",
-    "imagination_only": "#cc79a7",
-    "sb3_dqn": "#b07d00",
-    "sb3_dqn_latents": "#332288",
-}
 
 
 def rates(folder: str, agent: str) -> dict[int, np.ndarray]:
@@ -57,8 +50,9 @@ def curve(axes: plt.Axes, folder: str, agent: str, label: str | None = None) -> 
     if np.isnan(intervals).any():
         intervals = [(values.min(), values.max()) for values in table.values()]
     ends = 100 * np.array(intervals)
-    axes.plot(budgets, means, "o-", color=COLORS[agent], label=label or agent, markersize=4, linewidth=2)
-    axes.fill_between(budgets, *zip(*ends, strict=True), color=COLORS[agent], alpha=0.15, linewidth=0)
+    style = figures.line_style(agent)
+    axes.plot(budgets, means, label=label or agent, markersize=5, linewidth=2, **style)
+    axes.fill_between(budgets, *zip(*ends, strict=True), color=style["color"], alpha=0.15, linewidth=0)
 
 
 def finish(axes: plt.Axes, budgets: list[int]) -> None:
@@ -83,45 +77,84 @@ SETTINGS = {"replay_ratio": " tuned", "discount": " defaults"}
 """What stands behind a name that has settings, by one that only those have."""
 
 
-def peers() -> None:
-    """Area under the success curve to 500 episodes of our agents and of libraries', and its price."""
-    rows = []
+FAMILIES = {
+    "imagination": ("trains on imagined episodes", "#d55e00", "D"),
+    "dqn": ("DQN without a world model", "#0072b2", "o"),
+    "count_table": ("counts or rules over discrete codes", "#202020", "s"),
+    "sb3": ("another library", "#9a9a9a", "^"),
+}
+"""Kinds of agents, by the first word of a name: in words, a color and a marker."""
+SAME_FAMILY = {"factored": "count_table", "posterior": "count_table", "dreamer": "sb3", "lewm": "sb3"}
+
+
+def family(agent: str) -> tuple[str, str, str]:
+    """The kind of an agent in words, its color and its marker."""
+    for word, same in {**SAME_FAMILY, **dict(zip(FAMILIES, FAMILIES, strict=True))}.items():
+        if agent.startswith(word):
+            return FAMILIES[same]
+    raise KeyError(f"{agent} belongs to no family of agents; name one in FAMILIES.")
+
+
+def name_of_row(agent: str) -> str:
+    """The name beside a row: as it is typed, with short words for settings."""
+    settings = "".join(said for name, said in SETTINGS.items() if name in agent)
+    rewards = " unscaled" if agent in UNSCALED else ""
+    label = agent if agent in registry.agents() else agent.partition(":")[0]
+    return label + settings + rewards
+
+
+def kept_rows() -> list[tuple[ReportData, dict[str, Any]]]:
+    """Each agent of PEERS once, by its area under the curve to 500 episodes, ascending."""
+    rows: list[tuple[ReportData, dict[str, Any]]] = []
     for kept in PEERS:
         data = collect(load_so_far(RESULTS / kept))
         known = {record["agent"] for _, record in rows}
         last = [record for record in data.records if record["episodes"] == 500 and "area" in record]
         rows += [(data, record) for record in last if record["agent"] not in known]
-    rows.sort(key=lambda row: row[1]["area"])
-    figure, axes = plt.subplots(figsize=(9, 0.9 + 0.28 * len(rows)), layout="constrained")
-    columns = {1.14: "frames\nbefore", 1.28: "updates", 1.40: "CPU s"}
+    return sorted(rows, key=lambda row: row[1]["area"])
+
+
+def draw_row(axes: plt.Axes, height: int, data: ReportData, record: dict[str, Any]) -> None:
+    """An agent's interquartile mean (bar) and its seeds (markers)."""
+    agent = record["agent"]
+    _, color, marker = family(agent)
+    protocol = data.result.protocol
+    rates_by_seed = data.result.success_rates(agent)
+    shares = statistics.running_means(protocol.budgets, rates_by_seed, data.facts.chance_level)
+    seeds = 100 * shares[:, protocol.budgets.index(500)]
+    axes.plot(seeds, [height] * len(seeds), marker, color=color, markersize=4)
+    axes.plot([100 * record["area"]], [height], "|", color=color, markersize=13, markeredgewidth=2.5)
+
+
+def peers() -> None:
+    """Area under the success curve to 500 episodes of our agents and of libraries', and its price."""
+    rows = kept_rows()
+    executions = " and ".join(sorted({data.result.protocol.execution for data, _ in rows}))
+    figure, axes = plt.subplots(figsize=(9.4, 1.7 + 0.28 * len(rows)), layout="constrained")
+    columns = {1.14: "frames seen\nbefore", 1.27: "gradient\nupdates", 1.40: "training\nCPU s"}
     for height, (data, record) in enumerate(rows):
-        agent = record["agent"]
-        color = figures.color(agent)
-        shares = statistics.running_means(data.result.protocol.budgets, data.result.success_rates(agent),
-                                          data.facts.chance_level)  # fmt: skip
-        seeds = 100 * shares[:, data.result.protocol.budgets.index(500)]
-        axes.plot([100 * record["area_low_95"], 100 * record["area_high_95"]], [height] * 2, color=color, linewidth=6,
-                  alpha=0.3)  # fmt: skip
-        axes.plot(seeds, [height] * len(seeds), "o", color=color, markersize=3.5)
-        axes.plot([100 * record["area"]], [height], "|", color=color, markersize=13, markeredgewidth=2.5)
-        prices = (frames_before(data, agent), record["gradient_updates"], record["train_cpu_s"])
+        draw_row(axes, height, data, record)
+        prices = (frames_before(data, record["agent"]), record["gradient_updates"], record["train_cpu_s"])
         for place, value in zip(columns, prices, strict=True):
             said = "?" if np.isnan(value) else f"{value:,.0f}"
             axes.text(place, height, said, transform=axes.get_yaxis_transform(), ha="right", va="center")
     for place, name in columns.items():
         axes.text(place, 1.0, name, transform=axes.transAxes, ha="right", va="bottom")
     axes.axvline(100 * rows[0][0].facts.chance_level, color="#777777", linestyle=":", linewidth=1)
-    names = []
-    for _, record in rows:
-        settings = "".join(said for name, said in SETTINGS.items() if name in record["agent"])
-        rewards = " unscaled" if record["agent"] in UNSCALED else ""
-        label = record["agent"] if record["agent"] in COLORS else record["agent"].partition(":")[0]
-        names.append(label + settings + rewards)
-    axes.set_yticks(range(len(rows)), names)
+    axes.set_yticks(range(len(rows)), [name_of_row(record["agent"]) for _, record in rows])
     axes.set(xlim=(0, 100), ylim=(-0.6, len(rows) - 0.4))
-    axes.set_xlabel("mean success over the first 500 real episodes (%); dotted: chance")
+    axes.set_xlabel(
+        "test episodes solved (%), averaged over training episodes 0 to 500 (area under\n"
+        "the learning curve divided by 500); a marker a seed, bar: their interquartile mean, dotted: chance"
+    )
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title(
+        f"arrow puzzle, execution: {executions}\n(the outcome is set; the arm does not move)", fontsize=10, loc="left"
+    )
+    for said, color, marker in FAMILIES.values():
+        axes.plot([], [], marker, color=color, label=said)
+    axes.legend(loc="lower right", frameon=False)
     figure.savefig(HERE / "peers.png", dpi=120, facecolor="white", bbox_inches="tight")
 
 
@@ -151,22 +184,27 @@ def ladder() -> None:
     order = sorted(found, key=lambda agent: (np.median(found[agent]), np.mean(found[agent])))
     figure, axes = plt.subplots(figsize=(9, 1.2 + 0.34 * len(order)), layout="constrained")
     for place, agent in enumerate(order):
-        color = figures.color(agent)
-        axes.plot([min(found[order[0]]), np.median(found[agent])], [place] * 2, color=color, linewidth=2, alpha=0.4)
-        axes.plot([np.median(found[agent])], [place], "|", color=color, markersize=13, markeredgewidth=2.5)
+        _, color, marker = family(agent)
+        middle = np.median(found[agent])
+        axes.plot([min(found[order[0]]), middle], [place] * 2, color=color, linewidth=2, alpha=0.4)
+        axes.plot([middle], [place], "|", color=color, markersize=15, markeredgewidth=2.5)
         for point, shift in zip(found[agent], np.linspace(-0.12, 0.12, len(found[agent])), strict=True):
-            axes.plot([point], [place + shift], ">" if point == beyond else "o", color=color, markersize=4.5)
+            axes.plot([point], [place + shift], ">" if point == beyond else marker, color=color, markersize=4.5)
     if floor:
         axes.axvline(floor.episodes, **figures.REFERENCE)
-        axes.set_title(f"dashed: cost of a cautious learner, {floor.episodes:.0f} episodes", fontsize=9, loc="left")
-    axes.set_yticks(range(len(order)), [agent_title(agent) for agent in order])
+        said = f"a marker a seed, bar: median; dashed: cost of a cautious learner, {floor.episodes:.0f} episodes"
+        axes.set_title(said, fontsize=9, loc="left")
+    axes.set_yticks(range(len(order)), order)
     axes.set_xscale("log")
     ticks = [50, 100, 200, 500]
-    axes.set_xticks([*ticks, beyond], [*(f"{tick:,}" for tick in ticks), "never"], rotation=45)
+    axes.set_xticks([*ticks, beyond], [*(f"{tick:,}" for tick in ticks), "not by 500"])
     axes.minorticks_off()
-    axes.set_xlabel("real training episodes (logarithmic)")
+    axes.set_xlabel("real training episodes until 95 % of the tests are solved (logarithmic)")
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
+    for said, color, marker in list(FAMILIES.values())[:3]:
+        axes.plot([], [], marker, color=color, label=said)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
     figure.savefig(HERE / "ladder.png", dpi=110)
 
 
@@ -178,7 +216,8 @@ def thesis_settings() -> None:
             curve(axes, f"{task}-thesis", agent)
             points = reference.success(task, agent)
             means = [100 * mean for mean, _ in points.values()]
-            axes.plot(list(points), means, "D:", color=COLORS[agent], label=f"{agent}, thesis", fillstyle="none")
+            axes.plot(list(points), means, "*:", markersize=8, color=figures.color(agent), label=f"{agent}, thesis",
+                      fillstyle="none")  # fmt: skip
         axes.set_title(task)
         finish(axes, [250, 500, 1000, 2000, 6000])
     both[0].set_ylabel("test episodes solved (%)")
@@ -194,7 +233,7 @@ def rungs() -> None:
     figure, axes = plt.subplots(figsize=(8, 0.8 + 0.32 * len(names)), layout="constrained")
     for place, name in enumerate(names):
         own = [row for row in rows if row["variant"] == name]
-        color = COLORS["dqn" if own[0]["agent"] == "dqn" else "imagination"]
+        color = figures.color("dqn" if own[0]["agent"] == "dqn" else "imagination")
         solved = [100 * float(row["success"]) for row in own]
         right = [100 * float(row["imagined_right"]) for row in own if row["imagined_right"]]
         axes.plot(solved, [place] * len(own), "o", color=color, alpha=0.6, markersize=5)
@@ -250,7 +289,7 @@ def margins() -> None:
     figure.savefig(HERE / "margins.png", dpi=110)
 
 
-CAUSE_COLORS = ("#0072b2", "#56b4e9", "#e69f00", "#cc79a7", "#882255", "#8c8c8c", "#2b2b2f")
+CAUSE_COLORS = ("#0072b2", "#7cc8f2", "#f0b400", "#d55e00", "#7a1f6b", "#9a9a9a", "#202020")
 
 
 def why() -> None:
@@ -282,66 +321,79 @@ def why() -> None:
     figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
 
 
-def radar() -> None:
-    """Scores of the kept suites, of two seeds: too few for an interval."""
+def suite() -> None:
+    """Scores of the kept suites as a heat map; they are of two seeds, too few for an interval."""
     scores: dict[str, dict[str, float]] = {}
     for kept in ("suite", "suite-own"):
         with (RESULTS / kept / "scores.csv").open() as file:
             for row in csv.DictReader(file):
                 scores.setdefault(label_today(row["agent"]), {})[row["experiment"]] = float(row["score"] or "nan")
-    spokes = list(dict.fromkeys(name for found in scores.values() for name in found))
-    figure = plt.figure(figsize=(8.4, 6.8), layout="constrained")
-    axes = figure.add_subplot(projection="polar", theta_offset=np.pi / 2.0, theta_direction=-1)
-    angles = np.linspace(0.0, 2.0 * np.pi, len(spokes) + 1)
-    for agent, found in scores.items():
-        middle = np.clip([found[name] for name in (*spokes, spokes[0])], 0.0, 1.0)
-        axes.plot(angles, middle, "o-", color=figures.color(agent), label=agent_title(agent))
-    axes.set(ylim=(0.0, 1.0), yticks=(0.25, 0.5, 0.75, 1.0))
-    axes.set_xticks(angles[:-1], [spoke.replace("_", " ") for spoke in spokes])
-    axes.tick_params(axis="x", pad=20)
-    figure.legend(loc="outside upper center", ncols=4)
-    figure.savefig(HERE / "radar.png", dpi=90, facecolor="white")
+    experiments = list(dict.fromkeys(name for found in scores.values() for name in found))
+    cells = np.array([[found.get(name, np.nan) for found in scores.values()] for name in experiments])
+    figure, axes = plt.subplots(figsize=(9.0, 5.4), layout="constrained")
+    shown = axes.imshow(np.clip(cells, 0.0, 1.0), cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    for (row, column), score in np.ndenumerate(cells):
+        said = "not run" if np.isnan(score) else f"{score:.2f}"
+        axes.text(column, row, said, ha="center", va="center", color="white" if score > 0.55 else figures.INK)
+    axes.set_xticks(range(len(scores)), list(scores))
+    axes.set_yticks(range(len(experiments)), [name.replace("_", " ") for name in experiments])
+    axes.tick_params(length=0, top=True, labeltop=True, bottom=False, labelbottom=False)
+    axes.spines[:].set_visible(False)
+    axes.set_xlabel("score: 0 as good as chance, 1 as good as an optimal player; means of two seeds", fontsize=9)
+    figure.colorbar(shown, ax=axes, shrink=0.6)
+    figure.savefig(HERE / "suite.png", dpi=110, facecolor="white")
 
 
-DIALS = ({}, {"slip": 0.5}, {"fickle": 0.7}, {"gesture": "first"}, {"lag": 1}, {"distractors": 4})
+PARAMETERS = ({}, {"slip": 0.5}, {"goal_change": 0.7}, {"gesture": "first"}, {"lag": 1}, {"distractors": 4})
 FACTORS = ("", *(f"{name}=1" for name in appearance.FACTORS))
-TURNS = {"start": None, "left turned": 0, "middle turned": 2, "right turned": 4}
-"""Frames of a row of dials, and the macro-action before each."""
+START = (2, 1, 0, 1)
+TURNS = {"left turned": 0, "middle turned": 2, "right turned": 4}
+"""A start and macro-actions by whose rules no two arrows are ever equal and no episode ends."""
 
 
 def walk(options: Mapping[str, Any]) -> list[np.ndarray]:
-    """Frames of the same episode in a world of these dials."""
-    with gymnasium.make("imagine_bench/Arrows-v0", execution="kinematic", forbid="none", **options) as env:
-        frames = [env.reset(seed=2, options={"macrostate": (3, 2, 2, 1)})[0]]
-        return frames + [env.step(action)[0] for action in TURNS.values() if action is not None]
+    """Frames of the same episode in a world of these parameters."""
+    with gymnasium.make("imagine_bench/Arrows-v0", execution="kinematic", **options) as env:
+        frame, info = env.reset(seed=18, options={"macrostate": START})
+        frames = [frame]
+        for action in TURNS.values():
+            frame, _, over, _, info = env.step(action)
+            if over or not info["legal"]:
+                raise ValueError(f"With {options} the episode ends at {info['macrostate']}; choose another start.")
+            frames.append(frame)
+    return frames
 
 
-def looks(factor: str) -> list[np.ndarray]:
+def vary(factor: str) -> list[np.ndarray]:
     """Frames of one macrostate where one factor of appearance varies."""
     world, rng = registry.task("arrow_puzzle"), np.random.default_rng(1)
-    return list(world.render_macrostates(np.array([(0, 1, 2, 1)] * len(TURNS)), factor or "clean", rng))
+    return list(world.render_macrostates(np.array([(0, 1, 2, 1)] * 4), factor or "clean", rng))
 
 
-def dials() -> None:
-    """Each dial as frames of one episode, and each factor of appearance as frames of one macrostate."""
-    figure = plt.figure(figsize=(11, 7.6), layout="constrained")
-    left, right = figure.subfigures(1, 2, wspace=0.03)
-    rows = {
-        left: [(walk(each), "".join(f"{n}={v}" for n, v in each.items()) or "no dial") for each in DIALS],
-        right: [(looks(each), each or "clean") for each in FACTORS],
-    }
-    for part, strips in rows.items():
-        for (frames, said), cells in zip(strips, part.subplots(len(strips), len(TURNS)), strict=True):
-            for frame, axes in zip(frames, cells, strict=True):
-                axes.imshow(frame, interpolation="nearest")
-                axes.set(xticks=[], yticks=[])
-            cells[0].set_ylabel(said, fontsize=8)
-        for axes, title in zip(part.axes, TURNS if part is left else ("one macrostate", "", "", ""), strict=False):
-            axes.set_title(title, fontsize=8)
-    figure.savefig(HERE / "dials.png", dpi=110)
+def strips(rows: Mapping[str, list[np.ndarray]], titles: Sequence[str]) -> np.ndarray:
+    """Named rows of frames below one another, with titles above the first row."""
+    drawn = []
+    for label, frames in rows.items():
+        above = [""] * len(frames) if drawn else titles
+        drawn.append((label, [Tile(frame, title) for frame, title in zip(frames, above, strict=True)]))
+    return sheet(drawn)
 
 
-PICTURES = {each.__name__: each for each in (peers, ladder, thesis_settings, rungs, mild, margins, why, radar, dials)}
+def parameters() -> None:
+    """Each parameter as frames of one episode, and each factor of appearance as frames of one macrostate.
+
+    A pixel of a frame is two pixels of the image in each direction, so that none is interpolated.
+    """
+    worlds = {" ".join(f"{name} = {value}" for name, value in each.items()): walk(each) for each in PARAMETERS}
+    worlds = {name or "no parameter": frames for name, frames in worlds.items()}
+    factors = {each or "clean": vary(each) for each in FACTORS}
+    halves = (strips(worlds, ["start", *TURNS]), strips(factors, ["one macrostate", "", "", ""]))
+    Image.fromarray(np.concatenate(halves, axis=1)).save(HERE / "parameters.png", optimize=True)
+
+
+PICTURES = {
+    each.__name__: each for each in (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, parameters)
+}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or PICTURES:

@@ -255,7 +255,7 @@ def _layout(recording: Recording) -> rrb.Vertical:
     top = rrb.Horizontal(scene_view(recording), side, column_shares=[1.1, 1.0])
     seen = "What it has learned to see: a color a factor, and beside it a look of each of its values"
     plan = "The agent's own plan from here: what would really happen (above), what it imagines (below)"
-    uncertainty = "Uncertainty by depth: epistemic pink, aleatoric blue, modal green"
+    uncertainty = "Uncertainty by depth: epistemic pink, aleatoric blue, modal yellow"
     strip = sheet_view("/imagined/filmstrip", plan)
     now = rrb.Horizontal(
         strip,

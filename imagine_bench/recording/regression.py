@@ -17,6 +17,8 @@ from imagine_bench.recording.stream import KINDS, ROOT, Recording, log_motion, l
 _BLUE = (0, 114, 178)
 _GRAY = (150, 150, 150)
 _RED = (200, 30, 60)
+_INK = (28, 30, 34)
+_ORANGE = (213, 94, 0)
 _TICKS = 100
 """Steps of the timeline per unit of x: a timeline counts whole numbers."""
 _TIMELINE = "x_hundredths"
@@ -87,7 +89,7 @@ def record_robot(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, nam
             chosen = int(scores.argmin())
             words = (
                 f"### Choice {choice + 1}\n\nA network ({name}) learned from {variant} random movements which joint "
-                "angles lead to a place. Green places it is surest of, orange ones least (epistemic uncertainty); it "
+                "angles lead to a place. Blue places it is surest of, orange ones least (epistemic uncertainty); it "
                 f"reaches for the one in the ring, where its uncertainty is {scores[chosen]:.3g} rad²."
             )
             missed = (
@@ -116,9 +118,9 @@ def _lifted(points: Floats) -> Floats:
 
 def _show_candidates(recording: Recording, points: Floats, scores: Floats) -> None:
     ranks = scores.argsort().argsort()[:, None] / (len(scores) - 1)  # 0 the surest
-    colors = (1 - ranks) * KINDS["modal"] + ranks * np.array([213, 94, 0])
+    colors = (1 - ranks) * _BLUE + ranks * _ORANGE
     recording.log("/choice/candidates", rr.Points3D(_lifted(points), colors=colors.astype(np.uint8), radii=0.022))
     angle = np.linspace(0, 2 * np.pi, 33)
     ring = points[scores.argmin()] + 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    recording.log("/choice/chosen", rr.LineStrips3D([_lifted(ring)], colors=_BLUE, radii=0.007))
+    recording.log("/choice/chosen", rr.LineStrips3D([_lifted(ring)], colors=_INK, radii=0.007))
     recording.clear("/choice/error_line")

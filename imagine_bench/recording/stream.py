@@ -26,8 +26,8 @@ from imagine_bench.recording.filmstrips import png, rgb
 from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
 
-KINDS = {"epistemic": (204, 121, 167), "aleatoric": (86, 180, 233), "modal": (0, 158, 115)}
-"""The color of each kind of uncertainty."""
+KINDS = {"epistemic": (204, 121, 167), "aleatoric": (86, 180, 233), "modal": (240, 180, 0)}
+"""The color of each kind of uncertainty: pink, blue and yellow, which color-blind readers tell apart."""
 ROOT = "/scene"
 _MOTION_HZ = 20.0
 _STILL_M = 1e-6  # bodies whose poses (metres; quaternions) change by less in a macro-action get no new transforms

@@ -72,6 +72,13 @@ AGENTS: dict[str, AgentEntry] = {
         title="DQN",
         description="Learns the value of each macro-action from real experience only (deep Q-learning): the baseline.",
     ),
+    "dqn_more_updates": AgentEntry(
+        make="imagine_bench.agents.dqn:make_more_updates",
+        relative_cost=2.0,
+        settings="imagine_bench.agents.dqn_settings:MORE_UPDATES",
+        title="DQN, more updates",
+        description="A control: the DQN with as many updates a real step as imagination makes of its controller.",
+    ),
     "imagination": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make",
         relative_cost=5.0,
@@ -115,13 +122,6 @@ AGENTS: dict[str, AgentEntry] = {
         settings=_IMAGINATION_SETTINGS,
         title="imagination only + uncertainty",
         description="Like imagination only, but an imagined episode ends where the model is uncertain.",
-    ),
-    "dqn_more_updates": AgentEntry(
-        make="imagine_bench.agents.dqn:make_more_updates",
-        relative_cost=2.0,
-        settings="imagine_bench.agents.dqn_settings:MORE_UPDATES",
-        title="DQN, more updates",
-        description="A control: the DQN with as many updates a real step as imagination makes of its controller.",
     ),
 }
 

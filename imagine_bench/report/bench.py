@@ -388,7 +388,7 @@ def success_figure(data: ReportData) -> Figure:
     for agent in agents:
         rows = data.of(agent)
         curves[agent] = {row["episodes"]: _band(data, row) for row in rows}
-    figure = figures.lines({"": curves}, figures.colors(agents), "real training episodes (logarithmic)")
+    figure = figures.lines({"": curves}, figures.line_styles(agents), "real training episodes (logarithmic)")
     (axes,) = figure.axes
     for agent in agents:
         seeds = 100.0 * data.result.success_rates(agent).T  # [budgets, seeds]

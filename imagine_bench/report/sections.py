@@ -115,7 +115,7 @@ def open_loop_figure(loops: Mapping[str, Arrays]) -> Figure:
         scale = 100.0 if "%" in title else 1.0
         known = {agent: loop[name] for agent, loop in loops.items() if name not in _KINDS or loop[name].any()}
         panels[title] = {agent: dict(enumerate(scale * by_depth, 1)) for agent, by_depth in known.items()}
-    return figures.lines(panels, figures.colors(loops), "imagined depth (macro-actions)")
+    return figures.lines(panels, figures.line_styles(loops), "imagined depth (macro-actions)")
 
 
 def rollouts(data: ReportData) -> Section | None:

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
+from itertools import combinations
 
 import numpy as np
 import pytest
 from fake_results import WIDE, bench_result
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 
+from imagine_bench import registry
+from imagine_bench.interfaces import Floats
+from imagine_bench.protocols.control import protocol
+from imagine_bench.recording.filmstrips import CUT, RIGHT, WRONG
+from imagine_bench.recording.stream import KINDS
 from imagine_bench.report import figures
 from imagine_bench.report.bench import success_figure
 from imagine_bench.report.data import ReportData, collect, open_loop_means
@@ -47,7 +55,7 @@ def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(data: ReportDat
 
 def test_lines_along_an_axis_are_not_clipped() -> None:
     panels = {"zeros": {"a": {1: 0.0, 2: 0.0}}, "ones": {"a": {1: 1.0, 2: 1.0}, "b": {1: 0.5, 2: 1.0}}}
-    figure = figures.lines(panels, {"a": "#000000", "b": "#0072b2"}, "depth")
+    figure = figures.lines(panels, {name: figures.line_style(name) for name in "ab"}, "depth")
     assert [axes.get_title() for axes in figure.axes] == list(panels)
     for axes in figure.axes:
         low, high = axes.get_ylim()
@@ -55,8 +63,49 @@ def test_lines_along_an_axis_are_not_clipped() -> None:
         assert low < values.min() and values.max() < high
 
 
-def test_no_two_registered_agents_share_a_color() -> None:
-    own = ("random", "oracle", "dqn", "imagination", "imagination_uncertainty", "imagination_only", "factored")
-    assert len({figures.color(agent) for agent in own}) == len(own)
+_VISION = {
+    "common": np.eye(3),
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]],
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+}
+"""Linear RGB as people with a color deficiency see it, severity 1.0 (Machado, Oliveira and Fernandes, 2009)."""
+_XYZ = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)
+"""Linear sRGB to CIE XYZ (IEC 61966-2-1), white D65."""
+
+
+def lab(color: str | tuple[int, ...], vision: str) -> Floats:
+    """CIELAB (CIE 1976) of a color as somebody sees it."""
+    srgb = np.array(to_rgb(color)) if isinstance(color, str) else np.array(color) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(np.array(_VISION[vision]) @ linear, 0.0, 1.0)
+    xyz = _XYZ @ seen / _XYZ.sum(axis=1)
+    x, y, z = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def least_difference(colors: Iterable[str | tuple[int, ...]], vision: str) -> float:
+    labs = [lab(color, vision) for color in colors]
+    return min(float(np.linalg.norm(one - other)) for one, other in combinations(labs, 2))
+
+
+@pytest.mark.parametrize("vision", _VISION)
+@pytest.mark.parametrize(
+    "palette", [figures.COLORS, KINDS.values(), (RIGHT, WRONG, CUT)], ids=["lines", "kinds", "marks"]
+)
+def test_color_blind_readers_tell_every_palette_apart(palette: Iterable[str], vision: str) -> None:
+    assert least_difference(palette, vision) > 19
+
+
+def test_a_palette_that_is_known_to_fail_fails() -> None:
+    assert least_difference(("#b8860b", "#d55e00"), "deuteranopia") < 4, "oracle and imagination of 0.1"
+
+
+def test_no_two_agents_have_the_same_line() -> None:
+    every = [tuple(figures.line_style(agent).values()) for agent in registry.agents()]
+    assert len(set(every)) == len(every)
+    compared = protocol("arrow_puzzle", "quick").agents
+    assert len({figures.color(agent) for agent in compared}) == len(set(compared))
     assert figures.color("an agent that nobody registered").startswith("#")
-    assert figures.colors(own)["dqn"] == figures.color("dqn")
+    assert figures.line_styles(["dqn"])["dqn"] == figures.line_style("dqn")
