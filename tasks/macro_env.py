@@ -26,7 +26,7 @@ from .rendering.window import HAS_PYGAME, Window
 from .scene_reader import FilmedScene
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
-from .scenes.constants import AGENT_CAMERA, HUMAN_CAMERA
+from .scenes.constants import AGENT_CAMERA, FAR_CAMERA, HUMAN_CAMERA
 from .world import World, WorldState
 
 Step = tuple[float, bool, bool, Info]
@@ -91,7 +91,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             motion as long as it took.
         width: Pixels of :meth:`render`.
         height: Pixels of :meth:`render`.
-        camera: Camera of :meth:`render`, by name.
+        camera: Camera of :meth:`render`: ``"human"`` looks at the table from nearby, ``"far"`` at the whole arm, and
+            ``"wrist"`` is the agent's.
         physics: What decides whether a grasp holds: settings, or a mapping of some of their names to values.
         motion_hz: :attr:`capture_motion_hz`.
         observation: What is observed, of one moment: ``"frame"``, or others and several, as :class:`.Observer` says.
@@ -161,8 +162,9 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         self._n_actions = spec.n_actions
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self.camera)
         self.observation_space = self._observer.space
-        require_known("camera", camera, (HUMAN_CAMERA, AGENT_CAMERA))
-        self._rendered = self.camera(human_camera_view(camera, width, height))
+        require_known("camera", camera, (HUMAN_CAMERA, FAR_CAMERA, AGENT_CAMERA))
+        human_camera_view(camera, width, height)  # refuses a size out of range now, not at the first image
+        self._image_of = (camera, width, height)
         self._macrostate = self._starts[0]
         self._observed: tuple[State, ...] = ()
         self._reuses = False
@@ -273,7 +275,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
 
     def rendered(self, envs: Sequence[MacroEnv]) -> list[Frame]:
         """What :meth:`render` returns of environments like this, drawn by its camera."""
-        return self._rendered.frames([(env.model, env.data) for env in envs])
+        return self.renderer_for_people(*self._image_of).frames([(env.model, env.data) for env in envs])
 
     def close(self) -> None:
         """Free the OpenGL contexts and close the window; may be called again."""
@@ -319,8 +321,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         if self._window is None:
             return
         for _ in self.replay():
-            self._window.show(self._rendered.frame(self.data), self.capture_motion_hz or _WINDOW_HZ)
-        self._window.show(self._rendered.frame(self.data), _WINDOW_HZ)
+            self._window.show(self.rendered([self])[0], self.capture_motion_hz or _WINDOW_HZ)
+        self._window.show(self.rendered([self])[0], _WINDOW_HZ)
 
     def _vary(self, *, move_objects: bool = True) -> None:
         """Draw how this moment looks, and where that is hidden by chance, whether the gesture is seen."""

@@ -93,6 +93,7 @@ class FilmedScene:
         self._cameras: list[Renderer] = []
         self.latest: MacroResult | None = None
         self._people = self._mocap()
+        self._replaying = False
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -169,11 +170,18 @@ class FilmedScene:
         return self.world.composite(self.camera(agent_camera_view()).frame(self.data))
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
-        """An image of the whole scene with the arm. Shape (height, width, 3)."""
-        return self.camera(human_camera_view(HUMAN_CAMERA, width, height)).frame(self.data)
+        """An image for people of what happens on the table, with the arm. Shape (height, width, 3)."""
+        return self.renderer_for_people(HUMAN_CAMERA, width, height).frame(self.data)
+
+    def renderer_for_people(self, camera: str, width: int, height: int) -> Renderer:
+        """The renderer of images for people from a camera, by name.
+
+        While a motion is replayed it draws coarser shadows and edges, so that a window on a processor does not stall.
+        """
+        return self.camera(human_camera_view(camera, width, height, quick=self._replaying))
 
     def film(self, width: int = 640, height: int = 480) -> Frame:
-        """Images of the whole scene during the latest macro-action, as captured. Shape (K, height, width, 3)."""
+        """Images for people of the latest macro-action, as captured. Shape (K, height, width, 3)."""
         return np.stack([self.human_view(width, height) for _ in self.replay()])
 
     def agent_film(self) -> Frame:
@@ -195,11 +203,13 @@ class FilmedScene:
         people = self._mocap()
         try:
             data.mocap_pos[:], data.mocap_quat[:] = self._people
+            self._replaying = True
             for time_s, qpos in zip(captured.time_s.tolist(), captured.qpos, strict=True):
                 data.qpos[:] = qpos
                 self.world.update()
                 yield time_s
         finally:
+            self._replaying = False
             data.qpos[:] = standing
             data.mocap_pos[:], data.mocap_quat[:] = people
             self.world.update()

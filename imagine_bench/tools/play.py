@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import string
+import textwrap
 import warnings
 from collections.abc import Iterator
 from contextlib import closing
@@ -42,7 +43,10 @@ _HEIGHT = 480
 _PANEL = 284
 _FRAME = 192
 _TOP = 36
-"""Pixels: the scene, the width of a panel beside it, the edge of a frame in that, and where it begins."""
+_BAND = 88
+_LETTERS = 128
+"""Pixels: the scene, the width of a panel beside it, the edge of a frame in that, and where it begins; the height of
+the band below the scene, and how many letters fit into a line of it."""
 _Step = tuple[Frame, SupportsFloat, bool, bool, Info]
 
 
@@ -77,6 +81,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         self._reset_seed = None
         self._start = self._frame
         self._actions: list[int] = []
+        self._moves = 0
         self._rollout: ImaginedRollout | None = None
         self._due: _Step | None = None
         self._said = "press a key"
@@ -119,6 +124,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
     def act(self, action: int) -> tuple[_Step, Iterator[Frame]]:
         """Carry out a macro-action: what came of it, and images of it, each drawn when it is due."""
         self._said = self._task.action_names[action]
+        self._moves += 1
         if self._imaginer is not None:  # the same draws each time, so that what was imagined before stays as it was
             self._actions.append(action)
             actions = np.array(self._actions)
@@ -143,25 +149,33 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         yield from [self._window()] * (_HOLD if end else 1)
 
     def _window(self) -> Frame:
-        """The scene, the agent's frame, what is imagined of it, and words."""
+        """The scene with the goal below it, the agent's frame, what is imagined of it, and words."""
         keys = "\n".join(f"{key}  {name}" for key, name in zip(KEYS, self._task.action_names, strict=False))
-        said = f"{self._said}\n\nsolved {self.solved} of {self.episodes}\n\n{keys}"
-        panels = [("what the agent sees", self._frame, said)]
+        panels = [("what the agent sees", self._frame, f"{self._said}\n\n{keys}\n\nEsc  end the game")]
         if self._imaginer is not None:
             panels.append(("what the model imagines", *self._imagination()))
-        canvas = Image.new("RGB", (_WIDTH + len(panels) * _PANEL, _HEIGHT), "white")
+        canvas = Image.new("RGB", (_WIDTH + len(panels) * _PANEL, _HEIGHT + _BAND), "white")
         if hasattr(self._scene, "human_view"):
             canvas.paste(Image.fromarray(self._scene.human_view(_WIDTH, _HEIGHT)))
         else:  # others' tasks may show the agent's frame alone
             canvas.paste(Image.fromarray(self._frame).resize((_HEIGHT, _HEIGHT)))
         draw = ImageDraw.Draw(canvas)
         font = ImageFont.load_default(14)
+        draw.multiline_text((8, _HEIGHT + 4), self._goal(), "black", font, spacing=2)
         for column, (title, image, words) in enumerate(panels):
             left = _WIDTH + 8 + column * _PANEL
             draw.text((left, _TOP // 3), title, "black", font)
             canvas.paste(Image.fromarray(image).resize((_FRAME, _FRAME), Image.Resampling.NEAREST), (left, _TOP))
             draw.multiline_text((left, _TOP + _FRAME + 8), words, "black", font)
         return np.array(canvas)
+
+    def _goal(self) -> str:
+        """The goal, the directions in the agent's frame, and how many macro-actions are left."""
+        task = self._task
+        goal = textwrap.wrap(f"Goal: {task.description}", _LETTERS)
+        directions = "In the frame, up is toward the human and down toward the robot. "
+        left = "" if task.horizon is None else f"Moves left: {task.horizon - self._moves} of {task.horizon}. "
+        return "\n".join([*goal, directions + left + f"Solved: {self.solved} of {self.episodes}."])
 
     def _imagination(self) -> tuple[Frame, str]:
         """The latest imagined image, gray or RGB, and in words what the model predicts and how sure it is."""

@@ -53,7 +53,7 @@ class View:
     shadow_px: int = 0  # edge of the shadow map; 0 draws no shadows
     samples: int = 0  # multisampling; 0 draws hard edges
     slices: int = 12  # corners of a drawn cylinder
-    sky: bool = False  # whether to draw the skybox
+    for_people: bool = False  # whether to draw the sky, by all lights of the model
 
 
 def _is_egl() -> bool:
@@ -131,7 +131,7 @@ def _drawing(model: mujoco.MjModel, view: View) -> tuple[mujoco.MjvOption, mujoc
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + _EXTRA_GEOMS)
     flags = mujoco.mjtRndFlag
     scene.flags[flags.mjRND_SHADOW.value] = view.shadow_px > 0
-    scene.flags[flags.mjRND_SKYBOX.value] = view.sky
+    scene.flags[flags.mjRND_SKYBOX.value] = view.for_people
     scene.flags[flags.mjRND_REFLECTION.value] = False
     scene.flags[flags.mjRND_HAZE.value] = False
     return option, camera, scene
@@ -327,11 +327,19 @@ class Renderer:
             self._canvas = canvas
             canvas.make_current()
             for scene in scenes:
-                mujoco.mjv_updateScene(*scene, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
+                self._fill(*scene)
                 drawn.append(canvas.draw(self._scene)[::-1].copy())
             if canvas.thread is None or theirs is not None:
                 _release(theirs)
         return drawn
+
+    def _fill(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Put into the scene what the view shows, lit by all lights if it is for people."""
+        lights = model.light_active
+        as_compiled = lights.copy()
+        lights[:] = lights | self.view.for_people
+        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
+        lights[:] = as_compiled
 
     def close(self) -> None:
         """Leave the OpenGL context to the next renderer. Safe to call again; a later frame finds or makes one."""

@@ -29,14 +29,16 @@ HOME_QPOS_RAD = (0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161)
 """Published Sawyer home configuration (gripper straight down), the posture that IK prefers."""
 
 SCENE_GROUP = 0
+AGENT_GROUP = 1
 ARM_GROUP = 2
 SETTING_GROUP = 3
 COLLISION_GROUP = 5
-"""Geom groups: table top, loose objects and hands; the arm, so that a view can leave it out; what only the human's view
-shows (floor, legs, person); what only contact sees."""
+"""Geom groups: loose objects; the plain table top and hands that only agents' frames show; the arm, so that a view can
+leave it out; what only views for people show (floor, legs, person, wood, smooth hands); what only contact sees."""
 
 AGENT_CAMERA = "wrist"
 HUMAN_CAMERA = "human"
+FAR_CAMERA = "far"
 
 FINGERTIP_IN_SLOT_M = (0.048, 0.0, 0.040)
 """Nominal tip of the pointing index finger relative to the centre of the cube it points at."""

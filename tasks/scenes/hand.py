@@ -11,7 +11,7 @@ from __future__ import annotations
 import mujoco
 
 from . import constants as c
-from .meshes import Mesh, ellipsoid, limb, merge
+from .meshes import Mesh, ellipsoid, limb, merge, rounded
 
 Joint = tuple[float, float, float, float]
 Limb = tuple[Joint, ...]
@@ -62,11 +62,22 @@ _RIM_RADIUS_M = 0.007
 
 
 def hand_meshes() -> dict[str, Mesh]:
-    """Index, curled fingers, thumb and palm, which the agent's frame shows; the bare wrist; the sleeve."""
-    curled = [limb(finger, sides=5) for finger in _CURLED]
-    palm = ellipsoid(_PALM_CENTER_M, _PALM_RADII_M, sides=9, rings=4)
-    hand = merge([limb(_INDEX, sides=7), limb(_THUMB, sides=5), *curled, palm])
-    return {"hand": hand, "wrist": limb(_FOREARM, sides=10), "sleeve": limb(_SLEEVE, sides=12)}
+    """Index, curled fingers, thumb and palm, as agents' frames show them and smooth; the bare wrist; the sleeve."""
+    fingers = (_INDEX, _THUMB, *_CURLED)
+    coarse = [limb(finger, sides=7 if finger is _INDEX else 5) for finger in fingers]
+    coarse.append(ellipsoid(_PALM_CENTER_M, _PALM_RADII_M, sides=9, rings=4))
+    palm = ellipsoid(_PALM_CENTER_M, _PALM_RADII_M, sides=28, rings=14)
+    return {
+        "hand": merge(coarse),
+        "hand_smooth": merge([*map(_smooth, fingers), palm]),
+        "wrist": _smooth(_FOREARM),
+        "sleeve": _smooth(_SLEEVE),
+    }
+
+
+def _smooth(joints: Limb) -> Mesh:
+    """A limb for people, who look closely."""
+    return limb(rounded(joints), sides=20)
 
 
 def fingertip_m(slot_xy_m: tuple[float, float]) -> c.Point:
@@ -83,23 +94,30 @@ def add_pointing_hand(spec: mujoco.MjSpec, tip_m: c.Point) -> None:
 
 
 def add_limb(spec: mujoco.MjSpec, name: str, pos_m: c.Point, meshes: dict[str, Mesh]) -> mujoco.MjsBody:
-    """Add a mocap body drawn by three meshes, which touch nothing: hand, bare wrist and sleeve, in this order.
+    """Add a mocap body drawn by four meshes, which touch nothing: hand, smooth hand, bare wrist, sleeve, in this order.
 
-    The agent's frame shows the hand alone.
+    The agent's frame shows the first alone, and views for people the others.
     """
     body = spec.worldbody.add_body(name=name, mocap=True, pos=pos_m)
-    materials = (("skin", c.SCENE_GROUP), ("skin", c.SETTING_GROUP), ("cloth", c.SETTING_GROUP))
+    seen = c.SETTING_GROUP
+    materials = (("skin", c.AGENT_GROUP), ("skin", seen), ("skin", seen), ("cloth", seen))
     for (part, mesh), (material, group) in zip(meshes.items(), materials, strict=True):
         add_drawn_mesh(spec, body, part, mesh, material=material, group=group, suffix="_skin")
     return body
 
 
 def open_hand_meshes() -> dict[str, Mesh]:
-    """Palm, four fingers bent up a little and the thumb, which the agent's frame shows; the bare wrist; the sleeve."""
+    """Palm, four fingers bent up a little, thumb and heel, as agents' frames show them and smooth; wrist; sleeve."""
     fingers = [limb(finger, sides=5) for finger in _OPEN_FINGERS]
     palm = ellipsoid(_OPEN_PALM_CENTER_M, _OPEN_PALM_RADII_M, sides=11, rings=4)
-    hand = merge([palm, limb(_OPEN_THUMB, sides=5), *fingers, limb(_HEEL, sides=7)])
-    return {"palm": hand, "palm_wrist": limb(_OPEN_FOREARM, sides=10), "palm_sleeve": limb(_OPEN_SLEEVE, sides=12)}
+    coarse = merge([palm, limb(_OPEN_THUMB, sides=5), *fingers, limb(_HEEL, sides=7)])
+    palm = ellipsoid(_OPEN_PALM_CENTER_M, _OPEN_PALM_RADII_M, sides=28, rings=14)
+    return {
+        "palm": coarse,
+        "palm_smooth": merge([palm, *map(_smooth, (_OPEN_THUMB, *_OPEN_FINGERS, _HEEL))]),
+        "palm_wrist": _smooth(_OPEN_FOREARM),
+        "palm_sleeve": _smooth(_OPEN_SLEEVE),
+    }
 
 
 def add_open_hand(spec: mujoco.MjSpec, palm_m: c.Point) -> None:
@@ -137,6 +155,7 @@ def add_drawn_mesh(
     """
     spec.add_mesh(
         name=name,
+        smoothnormal=group == c.SETTING_GROUP,
         uservert=mesh.vertices.ravel(),
         userface=mesh.faces.ravel(),
         inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,

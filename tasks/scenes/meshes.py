@@ -62,7 +62,7 @@ def _frames_along(axes: Floats) -> Floats:
     return np.stack([u, np.cross(axes, u)], axis=1)
 
 
-def limb(joints: Sequence[tuple[float, float, float, float]], *, sides: int) -> Mesh:
+def limb(joints: ArrayLike, *, sides: int) -> Mesh:
     """A bent, tapered tube through joints, rounded at its last one, such as a finger.
 
     Args:
@@ -83,6 +83,17 @@ def limb(joints: Sequence[tuple[float, float, float, float]], *, sides: int) -> 
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ across  # [R, N, 3]
     rings = centers[:, None] + scales[:, None] * circle
     return _rings_to_mesh(rings, points[0] - 0.5 * radii[0] * bones[0], points[-1] + radii[-1] * tip)
+
+
+def rounded(joints: ArrayLike, *, times: int = 3) -> Floats:
+    """A path of joints whose corners are cut ``times`` times (Chaikin, 1974); its ends stay. Shape (N, 4)."""
+    path = np.asarray(joints, dtype=np.float64)
+    for _ in range(times):
+        near = 0.75 * path[:-1] + 0.25 * path[1:]
+        far = 0.25 * path[:-1] + 0.75 * path[1:]
+        inner = np.stack([near, far], axis=1).reshape(-1, path.shape[1])
+        path = np.concatenate([path[:1], inner, path[-1:]])
+    return path
 
 
 def ellipsoid(center: Point, radii: Point, *, sides: int, rings: int) -> Mesh:

@@ -1,4 +1,4 @@
-"""The room: physics options, visual quality, lights, table, the person's place and the human's camera."""
+"""The room: physics options, visual quality, lights, table, the person's place and the cameras for people."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ _TABLE_X_M = 0.72
 _FLOOR_Z_M = -0.92
 _LEG_INSET_M = 0.05
 
-_HUMAN_CAMERA_M = (1.44, 1.14, 0.70)
-_HUMAN_TARGET_M = (0.46, 0.03, 0.215)
-_HUMAN_FOVY_DEG = 41.0
+_CAMERAS: dict[str, tuple[c.Point, c.Point, float]] = {
+    c.HUMAN_CAMERA: ((1.22, 0.62, 0.66), (0.55, -0.01, 0.13), 36.0),
+    c.FAR_CAMERA: ((1.44, 1.14, 0.70), (0.46, 0.03, 0.215), 41.0),
+}
+"""Of each camera for people its place and the point that it looks at, in metres, and its field of view in degrees."""
+_WOOD_PX = 256
 _DRAWN_ONLY = {"contype": 0, "conaffinity": 0, "group": c.SETTING_GROUP}
 """Of geoms that only the human's view shows."""
 
@@ -41,8 +44,30 @@ def _set_visual(spec: mujoco.MjSpec) -> None:
     headlight.specular = (0.0,) * 3
 
 
+def _add_wood(spec: mujoco.MjSpec) -> None:
+    """The material ``wood``: planks along y whose grain is drawn once, from a fixed seed."""
+    rng = np.random.default_rng(0)
+    across, along = np.mgrid[0:_WOOD_PX, 0:_WOOD_PX] / _WOOD_PX
+    bend = 0.02 * np.sin(2 * np.pi * along) + 0.01 * np.sin(6 * np.pi * along)
+    grain = np.interp((across + bend) % 1.0, np.linspace(0.0, 1.0, 97), rng.normal(0.0, 0.04, 97), period=1.0)
+    planks = np.repeat(rng.normal(0.0, 0.035, 4), _WOOD_PX // 4)[:, None]
+    seams = np.where(across * 4 % 1.0 < 0.02, -0.15, 0.0)
+    shade = 1.0 + grain + planks + seams
+    pixels = np.clip(235 * shade[..., None], 0, 255).repeat(3, axis=2).astype(np.uint8)
+    spec.add_texture(
+        name="wood",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=_WOOD_PX,
+        height=_WOOD_PX,
+        nchannel=3,
+        data=pixels.ravel().tolist(),
+    )
+    wood = spec.add_material(name="wood", rgba=(0.60, 0.47, 0.34, 1.0), specular=0.15, shininess=0.3)
+    wood.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "wood"
+
+
 def _add_table(spec: mujoco.MjSpec, timestep_s: float) -> None:
-    """The table top, which carries the objects, and its legs, which only the human's view shows."""
+    """The table top, which carries the objects; its wood and legs, which only views for people show."""
     spec.add_material(name="table_top", rgba=(0.50, 0.44, 0.38, 1.0), specular=0.1, shininess=0.1)
     spec.add_material(name="table_leg", rgba=(0.30, 0.27, 0.25, 1.0), specular=0.1)
     table = spec.worldbody.add_body(name="table", pos=(_TABLE_X_M, 0.0, c.TABLE_HEIGHT_M - _TABLE_HALF_M[2]))
@@ -51,9 +76,12 @@ def _add_table(spec: mujoco.MjSpec, timestep_s: float) -> None:
         type=mujoco.mjtGeom.mjGEOM_BOX,
         size=_TABLE_HALF_M,
         material="table_top",
-        group=c.SCENE_GROUP,
+        group=c.AGENT_GROUP,
         friction=(0.8, 0.005, 0.0001),
         solref=(2 * timestep_s, 1.0),
+    )
+    table.add_geom(
+        name="table_wood", type=mujoco.mjtGeom.mjGEOM_BOX, size=_TABLE_HALF_M, material="wood", **_DRAWN_ONLY
     )
     leg_half_m = (c.TABLE_HEIGHT_M - 2 * _TABLE_HALF_M[2] - _FLOOR_Z_M) / 2
     x_m, y_m = (half_m - _LEG_INSET_M for half_m in _TABLE_HALF_M[:2])
@@ -117,15 +145,15 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         )
 
 
-def _add_human_camera(spec: mujoco.MjSpec) -> None:
-    """The view a person wants: arm, cubes and pointing hand from the far left."""
-    camera = np.array(_HUMAN_CAMERA_M)
-    target = np.array(_HUMAN_TARGET_M)
-    backward = (camera - target) / np.linalg.norm(camera - target)
-    right = np.cross((0.0, 0.0, 1.0), backward)
-    right /= np.linalg.norm(right)
-    up = np.cross(backward, right)
-    spec.worldbody.add_camera(name=c.HUMAN_CAMERA, pos=camera, fovy=_HUMAN_FOVY_DEG, xyaxes=(*right, *up))
+def _add_cameras(spec: mujoco.MjSpec) -> None:
+    """The views for people, from the human's left: of what happens on the table, and of everything."""
+    for name, (place, target, fovy_deg) in _CAMERAS.items():
+        backward = np.subtract(place, target)
+        backward /= np.linalg.norm(backward)
+        right = np.cross((0.0, 0.0, 1.0), backward)
+        right /= np.linalg.norm(right)
+        up = np.cross(backward, right)
+        spec.worldbody.add_camera(name=name, pos=place, fovy=fovy_deg, xyaxes=(*right, *up))
 
 
 def add_tabletop(spec: mujoco.MjSpec, timestep_s: float = c.TIMESTEP_S) -> None:
@@ -144,6 +172,7 @@ def add_tabletop(spec: mujoco.MjSpec, timestep_s: float = c.TIMESTEP_S) -> None:
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP.value  # resting cubes cost nothing: halves a macro-action
     _set_visual(spec)
+    _add_wood(spec)
     spec.worldbody.add_light(  # over the human's left shoulder; shadows fall only where a renderer draws them
         name="key",
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
@@ -153,6 +182,16 @@ def add_tabletop(spec: mujoco.MjSpec, timestep_s: float = c.TIMESTEP_S) -> None:
         diffuse=(0.5, 0.49, 0.47),
         specular=(0.06, 0.06, 0.06),
     )
+    spec.worldbody.add_light(  # from the right, for people: a renderer that draws for them switches it on
+        name="fill",
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        active=False,
+        castshadow=False,
+        pos=(1.0, -1.2, 1.2),
+        dir=(-0.5, 0.8, -0.75),
+        diffuse=(0.17, 0.18, 0.20),
+        specular=(0.45, 0.45, 0.45),
+    )
     _add_table(spec, timestep_s)
     _add_floor(spec)
-    _add_human_camera(spec)
+    _add_cameras(spec)

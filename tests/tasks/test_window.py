@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 
@@ -89,3 +90,47 @@ def test_without_pygame_the_extra_is_named(monkeypatch):
     with pytest.raises(SetupError, match=r"pip install 'imagine-bench\[play\]'"):
         env.reset(seed=0)
     env.close()
+
+
+_PRESS_ESCAPE = """
+import threading, time, pygame
+def press():
+    while True:
+        time.sleep(0.3)
+        if pygame.display.get_init() and pygame.display.get_surface():
+            assert pygame.display.get_driver() == "x11", pygame.display.get_driver()
+            pygame.event.post(pygame.event.Event(pygame.KEYDOWN, {"key": pygame.K_ESCAPE}))
+threading.Thread(target=press, daemon=True).start()
+"""
+_WINDOWS = {
+    "play": _PRESS_ESCAPE + "from imagine_bench.tools.play import play; print(play('arrow_puzzle', seed=0))",
+    "human": "import gymnasium, pygame, imagine_bench\n"
+    "env = gymnasium.make('imagine_bench/ArrowPuzzle-v0', render_mode='human', execution='kinematic')\n"
+    "env.reset(seed=0); env.step(0); print(pygame.display.get_driver()); env.close()",
+}
+
+
+@pytest.fixture(scope="module")
+def desktop():
+    """The name of an X11 display of its own."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("Xvfb, a desktop without a screen, is not installed")
+    ready, told = os.pipe()
+    with subprocess.Popen(["Xvfb", "-displayfd", str(told)], pass_fds=[told], stderr=subprocess.DEVNULL) as server:
+        yield f":{os.read(ready, 16).decode().strip()}"
+        server.terminate()
+    os.close(ready)
+    os.close(told)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("code", _WINDOWS.values(), ids=_WINDOWS)
+def test_windows_open_on_x11_where_mesa_draws_and_escape_ends_a_game(desktop, code):
+    """X11 ends a process that draws by GLX where EGL draws, too: the window must not be drawn by OpenGL."""
+    words = ("WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "SDL_FRAMEBUFFER_ACCELERATION")
+    there = {name: value for name, value in os.environ.items() if name not in words} | {"DISPLAY": desktop}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=there, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert "x11" in done.stdout or "No episode was finished" in done.stdout

@@ -192,7 +192,7 @@ def test_a_film_reaches_the_goal_and_is_never_overwritten(tmp_path):
     out = film("arrow_puzzle", tmp_path / "new" / "turn.gif", seed=0)
     with Image.open(out) as gif:
         pictures = np.stack([np.float32(picture.convert("L")) for picture in ImageSequence.Iterator(gif)])
-    assert len(pictures) > 20 and pictures.shape[1:] == (480, 924)
+    assert len(pictures) > 20 and pictures.shape[1:] == (568, 924)
     assert np.abs(np.diff(pictures[:, :, :640], axis=0)).max() > 50, "the arm is seen moving"
     frames = pictures[:, 36 : 36 + 192, 648 : 648 + 192]
     assert np.abs(frames[-1] - frames[0]).max() > 50, "what the agent sees at the end is not what it saw at first"
