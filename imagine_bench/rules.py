@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -315,6 +315,15 @@ def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
         returns = reward + alive @ returns
         length = 1.0 + alive @ length
     return PolicyValues(success=successes, failure=failures, returns=returns, length=length)
+
+
+def ending(info: Mapping[str, Any], *, terminated: bool) -> str:
+    """How an episode ended, in words; ``info`` and ``terminated`` are of its last step."""
+    if info["is_success"]:
+        return "solved"
+    if terminated:
+        return "lost, because the rules forbid what the last macro-action led to"
+    return f"lost, because {info['fault_reason'] or 'no macro-actions are left'}"
 
 
 def is_random(rules: Rules) -> bool:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import runpy
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -391,9 +392,13 @@ def parameters() -> None:
     Image.fromarray(np.concatenate(halves, axis=1)).save(HERE / "parameters.png", optimize=True)
 
 
-PICTURES = {
-    each.__name__: each for each in (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, parameters)
-}
+def tasks() -> None:
+    """An image of every task."""
+    runpy.run_path(str(HERE / "draw_tasks.py"))["tasks"]()
+
+
+FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, parameters, tasks)
+PICTURES = {each.__name__: each for each in FIGURES}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or PICTURES:

@@ -28,9 +28,9 @@ from imagine_bench.interfaces.capabilities import (
     begin_episode,
 )
 from imagine_bench.judge.open_loop import Moment
-from imagine_bench.recording.filmstrips import filmstrip, sampled_filmstrips
+from imagine_bench.recording.filmstrips import DARK, filmstrip, sampled_filmstrips
 from imagine_bench.recording.stream import KINDS, Recording, recording_file, scene_view, sheet_view
-from imagine_bench.rules import is_random
+from imagine_bench.rules import ending, is_random
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.results import ComparedRollout
 
@@ -70,18 +70,21 @@ def record_run(
 
 
 def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> str:
-    """Q-values (A,) as Markdown: a monospaced row each with a bar from the lowest value to the highest.
+    """Q-values (A,) as Markdown: a monospaced row each with a bar from zero, to the left where it is negative.
 
     The one of index ``chosen``, which is carried out, is marked by an arrow head.
     """
-    low = float(values.min())
-    high = float(values.max())
+    low = min(float(values.min()), 0.0)
+    high = max(float(values.max()), 0.0)
+    cells_per_unit = _BAR_CELLS / (high - low or 1.0)
+    room = round(-low * cells_per_unit)
     width = max(len(name) for name in names)
     rows = []
     for index, (name, value) in enumerate(zip(names, values, strict=True)):
-        cells = round(1 + (_BAR_CELLS - 1) * (float(value) - low) / (high - low or 1.0))
-        rows.append(f"{'>' if index == chosen else ' '} {name:<{width}} {value:+7.2f} {'█' * cells}")
-    return "\n".join(["```", *rows, "```", "\\> is the one it carries out."])
+        bar = "█" * round(abs(float(value)) * cells_per_unit)
+        below, above = (bar, "") if value < 0 else ("", bar)
+        rows.append(f"{'>' if index == chosen else ' '} {name:<{width}} {value:+7.2f} {below:>{room}}│{above}")
+    return "\n".join(["```", *rows, "```", "\\> is the one it carries out; bars begin at zero."])
 
 
 @dataclass
@@ -125,7 +128,7 @@ class _EpisodeRecorder:
             fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
             outcome = f"Done: {names[action]}. Reward {float(reward):+.0f}.{fault}"
             heading = f"### Episode {episode}, after macro-action {step}\n\n{outcome}"
-        self._describe(heading, info, "Solved." if info["is_success"] else "Not solved.", observation.frame)
+        self._describe(heading, info, f"{ending(info, terminated=terminated).capitalize()}.", observation.frame)
         recording.clear("/real/q_table")  # nothing more is carried out
         recording.clear("/imagined")
         recording.clock_s += _STILL_S
@@ -207,7 +210,9 @@ class _EpisodeRecorder:
             before=self.states,
         )
         compared = moment.beside(rollout, rng)
-        self.recording.sheet("/imagined/filmstrip", filmstrip(compared, spec.action_names, columns=IMAGINED_DEPTH))
+        self.recording.sheet(
+            "/imagined/filmstrip", filmstrip(compared, spec.action_names, columns=IMAGINED_DEPTH, colors=DARK)
+        )
         for index, (kind, color) in enumerate(KINDS.items()):  # three bars, side by side, at each depth
             values = np.zeros(IMAGINED_DEPTH)  # none after the rollout's end, so that the axis stays the same
             imagined = getattr(rollout, kind)
@@ -217,7 +222,7 @@ class _EpisodeRecorder:
             self.recording.log(f"/imagined/uncertainty/{kind}", bars)
         if is_random(spec.rules):  # several rollouts, since what happens next is partly chance
             branch = seeds.child("sampled_rollouts", episode, step)
-            sampled = sampled_filmstrips(moment.sampled(self.agent, branch), spec)
+            sampled = sampled_filmstrips(moment.sampled(self.agent, branch), spec, DARK)
             self.recording.sheet("/imagined/sampled_rollouts", sampled)
         if step == 0:
             _log_by_depth(self.recording, compared, f"/imagined/episode_{episode}")
@@ -251,6 +256,7 @@ def _layout(recording: Recording) -> rrb.Vertical:
             rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64"),
         ),
         *shown(table),
+        row_shares=[1.2, 1.0],
     )
     top = rrb.Horizontal(scene_view(recording), side, column_shares=[1.1, 1.0])
     seen = "What it has learned to see: a color a factor, and beside it a look of each of its values"
@@ -260,7 +266,7 @@ def _layout(recording: Recording) -> rrb.Vertical:
     now = rrb.Horizontal(
         strip,
         rrb.BarChartView(origin="/imagined/uncertainty", name=uncertainty, plot_legend=rrb.PlotLegend(visible=False)),
-        column_shares=[1.9, 1.0],
+        column_shares=[1.5, 1.0],
         name="Imagination from the current frame",
     )
     over_time = shown(
@@ -285,4 +291,4 @@ def _layout(recording: Recording) -> rrb.Vertical:
         rrb.Horizontal(*over_time, name="Rewards and values over time"),
         *[by_depth] * imagines,
     ]
-    return rrb.Vertical(top, rrb.Tabs(*pages, active_tab=0), row_shares=[1.45, 1.0])
+    return rrb.Vertical(top, rrb.Tabs(*pages, active_tab=0), row_shares=[1.35, 1.0])

@@ -25,12 +25,28 @@ TITLE_PX = 52  # three lines above a row's images
 _LINE_PX = 17
 _BORDER_PX = 3
 _LETTERS = 18  # of a line
-_BLANK_PX = 24
+_BLANK_PX = 14
 INK = (28, 30, 34)
 PAPER = (255, 255, 255)
 RIGHT = (0, 114, 178)  # Okabe-Ito blue and vermilion: color-blind safe
 WRONG = (213, 94, 0)
 CUT = (204, 30, 90)
+_Rgb = tuple[int, int, int]
+
+
+class SheetColors(NamedTuple):
+    """Colors of a sheet: its paper, its words, what is right, what is wrong, and where the filter cuts."""
+
+    paper: _Rgb = PAPER
+    ink: _Rgb = INK
+    right: _Rgb = RIGHT
+    wrong: _Rgb = WRONG
+    cut: _Rgb = CUT
+
+
+LIGHT = SheetColors()
+DARK = SheetColors((13, 16, 17), (222, 224, 228), (86, 180, 233), (255, 140, 60), (255, 80, 150))
+"""For a report's white page, and for a viewer's dark one."""
 TileRow = tuple[str, Sequence[Pixels] | Pixels, Sequence[bool] | None]
 """The name of a row of images, the images, and whether each is right; None where that is no question."""
 
@@ -46,42 +62,46 @@ class Tile(NamedTuple):
     cut: bool = False  # the uncertainty filter cuts before it, which a line marks
 
 
-def sheet(rows: Sequence[tuple[str, Sequence[Tile]]], columns: int | None = None) -> Pixels:
+def sheet(
+    rows: Sequence[tuple[str, Sequence[Tile]]], columns: int | None = None, colors: SheetColors = LIGHT
+) -> Pixels:
     """Draw named rows of images below one another, with room for so many ``columns``, None for all.
 
     The image has shape (height, width, 3), uint8.
     """
     room = columns or max(len(tiles) for _, tiles in rows)
-    return np.concatenate([_row(name, tiles[:room], LABELS_PX + room * STEP_PX) for name, tiles in rows])
+    return np.concatenate([_row(name, tiles[:room], LABELS_PX + room * STEP_PX, colors) for name, tiles in rows])
 
 
-def _row(name: str, tiles: Sequence[Tile], width: int) -> Pixels:
+def _row(name: str, tiles: Sequence[Tile], width: int, colors: SheetColors) -> Pixels:
     top = TITLE_PX if any(tile.above for tile in tiles) else _BORDER_PX
     bottom = top + CELL_PX
-    lines = max(1 + tile.below.count("\n") for tile in tiles)
-    canvas = Image.new("RGB", (width, bottom + _LINE_PX * lines + _BLANK_PX), PAPER)
+    lines = max(tile.below.count("\n") + bool(tile.below) for tile in tiles)
+    canvas = Image.new("RGB", (width, bottom + _LINE_PX * lines + _BLANK_PX), colors.paper)
     draw = ImageDraw.Draw(canvas)
-    draw.multiline_text((4, top + 40), textwrap.fill(name, 13), INK, font(bold=True))
+    draw.multiline_text((4, top + 40), textwrap.fill(name, 13), colors.ink, font(bold=True))
     for column, tile in enumerate(tiles):
         left = LABELS_PX + column * STEP_PX
         title = "\n".join(textwrap.wrap(tile.above, _LETTERS)[:3])
-        draw.multiline_text((left, 4), title, INK, font(bold=True), spacing=2)
-        color = INK
+        draw.multiline_text((left, 4), title, colors.ink, font(bold=True), spacing=2)
+        color = colors.ink
         if tile.right is not None:
-            color = RIGHT if tile.right else WRONG
+            color = colors.right if tile.right else colors.wrong
             edge = (left - _BORDER_PX, top - _BORDER_PX, left + CELL_PX + 2, bottom + 2)
             draw.rectangle(edge, outline=color, width=_BORDER_PX)
         if tile.frame is not None:
             image = Image.fromarray(tile.frame).convert("RGB").resize((CELL_PX, CELL_PX), Image.Resampling.NEAREST)
-            paper = Image.new("RGB", image.size, PAPER)
+            paper = Image.new("RGB", image.size, colors.paper)
             canvas.paste(Image.blend(image, paper, 0.65 * tile.pale), (left, top))
         if tile.cut:
-            draw.line([(left - 9, 0), (left - 9, canvas.height)], CUT, 3)
+            draw.line([(left - 9, 0), (left - 9, canvas.height)], colors.cut, 3)
         draw.multiline_text((left, bottom + 4), tile.below, color, font(), spacing=3)
     return np.asarray(canvas)
 
 
-def filmstrip(compared: ComparedRollout, action_names: tuple[str, ...], *, columns: int | None = None) -> Pixels:
+def filmstrip(
+    compared: ComparedRollout, action_names: tuple[str, ...], *, columns: int | None = None, colors: SheetColors = LIGHT
+) -> Pixels:
     """Draw one imagined rollout below reality, one column a macro-action.
 
     Each column names the macro-action and shows the real frame, the decoded imagined one, and the predicted reward,
@@ -94,7 +114,7 @@ def filmstrip(compared: ComparedRollout, action_names: tuple[str, ...], *, colum
     rollout = compared.rollout
     done = len(compared.real_frames)
     real = [Tile(compared.start_frame, "start")]
-    imagined = [Tile(rgb(rollout.start_frame), below="\npredicted\n(true)\n\n")]
+    imagined = [Tile(rgb(rollout.start_frame), below="\npredicted\n(true)")]
     for index, action in enumerate(rollout.actions.tolist()):
         over = 0 < index <= done and bool(compared.real_terminated[index - 1])
         kept = bool(rollout.accepted[index])
@@ -115,10 +135,12 @@ def filmstrip(compared: ComparedRollout, action_names: tuple[str, ...], *, colum
         )
         real.append(Tile(frame, f"{index + 1}. {action_names[action]}", pale=over, cut=cut))
         imagined.append(Tile(rgb(rollout.frames[index]), "", "\n".join(lines), right, not kept, cut))
-    return sheet([("real", real), ("imagined", imagined)], None if columns is None else 1 + columns)
+    return sheet([("real", real), ("imagined", imagined)], None if columns is None else 1 + columns, colors)
 
 
-def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: TaskSpec) -> Pixels:
+def sampled_filmstrips(
+    sampled_rollouts: tuple[ComparedRollout, ...], spec: TaskSpec, colors: SheetColors = LIGHT
+) -> Pixels:
     """Draw imagined rollouts of one start below one another, a column a macro-action; only the start is real.
 
     Below each imagined frame stands what a probe says has changed: in blue where the rules make it possible, in
@@ -138,7 +160,7 @@ def sampled_filmstrips(sampled_rollouts: tuple[ComparedRollout, ...], spec: Task
             tiles.append(Tile(rgb(rollout.frames[step]), spec.action_names[action], words, right))
             before = now
         rows.append(("the same start, imagined again" if rows else "the real start", tiles))
-    return sheet(rows)
+    return sheet(rows, colors=colors)
 
 
 def transition_sheet(titles: Sequence[str], rows: Sequence[TileRow]) -> Pixels:

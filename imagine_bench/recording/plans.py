@@ -14,7 +14,7 @@ from pathlib import Path
 import rerun.blueprint as rrb
 
 from imagine_bench.judge.plans import PlanResult, carry_out, make_env
-from imagine_bench.recording.filmstrips import filmstrip
+from imagine_bench.recording.filmstrips import DARK, filmstrip
 from imagine_bench.recording.stream import Recording, recording_file, scene_view, sheet_view
 from imagine_bench.running.trained import Trained
 
@@ -60,7 +60,7 @@ def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic:
                 compared = dataclasses.replace(plan.compared, **so_far)
                 recording.frames(compared, done, real="/real/frame", imagined="/imagined/frame")
                 # room for the longest plan: the viewer takes no images of different sizes
-                strip = filmstrip(compared, task.action_names, columns=task.horizon)
+                strip = filmstrip(compared, task.action_names, columns=task.horizon, colors=DARK)
                 recording.sheet("/imagined/filmstrip", strip)
                 recording.text("/real/text", _words(plan, done, count, task.action_names))
             recording.clock_s += _LOOK_S

@@ -48,15 +48,15 @@ def record_toy(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, name:
             root = f"/{variant}"
             x = data["x"]
             order = data["training_x"].argsort()
-            dots = rr.SeriesPoints(colors=_GRAY, marker_sizes=1.5)
+            dots = rr.SeriesPoints(colors=_GRAY, marker_sizes=1.5, names="training")
             _curve(recording, f"{root}/y/training", dots, data["training_x"][order], data["training_y"][order])
-            dots = rr.SeriesPoints(colors=_BLUE, marker_sizes=1.5)
+            dots = rr.SeriesPoints(colors=_BLUE, marker_sizes=1.5, names="prediction")
             _curve(recording, f"{root}/y/prediction", dots, x, data["prediction"][0])
             for kind, color in KINDS.items():
                 true = np.atleast_2d(data[f"true_{kind}"])[0]
-                estimated = rr.SeriesLines(colors=color)
+                estimated = rr.SeriesLines(colors=color, names="estimated")
                 _curve(recording, f"{root}/{kind}/estimated", estimated, x, np.sqrt(data[kind][0]))
-                _curve(recording, f"{root}/{kind}/true", rr.SeriesLines(colors=_GRAY), x, np.sqrt(true))
+                _curve(recording, f"{root}/{kind}/true", rr.SeriesLines(colors=_GRAY, names="true"), x, np.sqrt(true))
     return path
 
 

@@ -22,12 +22,23 @@ from imagine_bench.arrays import Floats, Frame, Pixels
 from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, require_modules
 from imagine_bench.interfaces import Motion, SceneReader, Shape3D
-from imagine_bench.recording.filmstrips import png, rgb
+from imagine_bench.recording.filmstrips import DARK, png, rgb
 from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout
 
 KINDS = {"epistemic": (204, 121, 167), "aleatoric": (86, 180, 233), "modal": (240, 180, 0)}
 """The color of each kind of uncertainty: pink, blue and yellow, which color-blind readers tell apart."""
+SERIES = (
+    (86, 180, 233),
+    (224, 102, 16),
+    (252, 233, 139),
+    (65, 93, 221),
+    (241, 42, 174),
+    (45, 255, 39),
+    (255, 100, 126),
+    (185, 214, 205),
+)
+"""The colors of other curves of one plot, in their order, on the viewer's dark ground."""
 ROOT = "/scene"
 _MOTION_HZ = 20.0
 _STILL_M = 1e-6  # bodies whose poses (metres; quaternions) change by less in a macro-action get no new transforms
@@ -107,9 +118,13 @@ class Recording:
         self.stream.disable_timeline(timeline)
 
     def curves(self, path: str, values: Mapping[str, float]) -> None:
-        """Log one value of a curve for each name."""
-        for name, value in values.items():
-            self.log(f"{path}/{entity_name(name)}", rr.Scalars(float(value)))
+        """Log one value of a curve for each name, which the plot shows; kinds of uncertainty have their colors."""
+        for index, (name, value) in enumerate(values.items()):
+            entity = f"{path}/{entity_name(name)}"
+            if entity not in self._paths:
+                color = KINDS.get(name, SERIES[index % len(SERIES)])
+                self.log(entity, rr.SeriesLines(names=name, colors=color), static=True)
+            self.log(entity, rr.Scalars(float(value)))
 
     def text(self, path: str, markdown: str) -> None:
         """Log a text."""
@@ -223,8 +238,8 @@ def _xyzw(quaternions: Floats) -> Floats:
 
 
 def sheet_view(origin: str, name: str) -> rrb.Spatial2DView:
-    """A large image on white."""
-    return rrb.Spatial2DView(origin=origin, name=name, background=[255, 255, 255])
+    """A large image on paper as dark as the viewer."""
+    return rrb.Spatial2DView(origin=origin, name=name, background=list(DARK.paper))
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from imagine_bench.arrays import Action, Frame, Info, State
 from imagine_bench.errors import InvalidValueError, SetupError, require_integer
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
+from imagine_bench.rules import ending
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import episode_seed
 from imagine_bench.statistics import wilson
@@ -144,8 +145,8 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
             self.imagined += 1
             shown = self._task.as_observed(self._info.get("shown", self._info["macrostate"]))
             self.foreseen += tuple(self._rollout.macrostates[-1].tolist()) == shown
-        end = "solved" if solved else "an illegal end" if terminated else "out of time" if truncated else ""
-        self._said += f"\nreward {float(reward):+g}" + f", {end}" * bool(end) + ", a fault" * bool(self._info["fault"])
+        end = textwrap.fill(ending(self._info, terminated=terminated), _PANEL // 8) if terminated or truncated else ""
+        self._said += f"\nreward {float(reward):+g}" + f"\n{end}" * bool(end) + ", a fault" * bool(self._info["fault"])
         yield from [self._window()] * (_HOLD if end else 1)
 
     def _window(self) -> Frame:

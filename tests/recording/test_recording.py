@@ -26,6 +26,7 @@ from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording import episodes, stream
 from imagine_bench.recording.episodes import q_table, record_run
 from imagine_bench.recording.stream import entity_name, log_motion, log_shapes, open_in_viewer, recording_file
+from imagine_bench.rules import ending
 from imagine_bench.running.bench import bench
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
@@ -224,8 +225,34 @@ def test_a_module_in_the_current_folder_is_no_viewer(tmp_path: Path, monkeypatch
 def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
     _, left, right, *_ = q_table(("left", "right turn"), np.array([-1.0, 2.5], dtype=np.float32), 1).splitlines()
     assert left.startswith("  left") and right.startswith("> right turn   +2.50 ")
-    assert (left.count("█"), right.count("█")) == (1, 16)
+    assert (left.count("█"), right.count("█")) == (5, 11), "as long as their values are large: 1 to 2.5"
+    assert left.index("│") == right.index("│"), "all bars begin at one zero"
+    assert left.rindex("█") < left.index("│") < right.index("█")
     assert "nan" not in q_table(("a", "b"), np.zeros(2, dtype=np.float32), 0)
+
+
+def test_every_series_has_its_name(imagined: Path) -> None:
+    names = registry.task("arrow_puzzle").action_names
+    found = logged(imagined)
+    for name in names:
+        assert str([name]) in found["/real/q_values/" + entity_name(name), "SeriesLines:names"]
+
+
+@pytest.mark.parametrize(
+    ("info", "terminated", "words"),
+    [
+        ({"is_success": True}, True, "solved"),
+        ({"is_success": False}, True, "lost, because the rules forbid what the last macro-action led to"),
+        ({"is_success": False, "fault_reason": ""}, False, "lost, because no macro-actions are left"),
+        (
+            {"is_success": False, "fault_reason": "the simulation blew up"},
+            False,
+            "lost, because the simulation blew up",
+        ),
+    ],
+)
+def test_an_episode_that_is_lost_says_why(info: dict[str, object], terminated: bool, words: str) -> None:
+    assert ending(info, terminated=terminated) == words
 
 
 def test_entity_names_are_lower_snake() -> None:

@@ -15,8 +15,8 @@ from matplotlib.colors import to_rgb
 from imagine_bench import registry
 from imagine_bench.interfaces import Floats
 from imagine_bench.protocols.control import protocol
-from imagine_bench.recording.filmstrips import CUT, RIGHT, WRONG
-from imagine_bench.recording.stream import KINDS
+from imagine_bench.recording.filmstrips import DARK, LIGHT
+from imagine_bench.recording.stream import KINDS, SERIES
 from imagine_bench.report import figures
 from imagine_bench.report.bench import success_figure
 from imagine_bench.report.data import ReportData, collect, open_loop_means
@@ -91,9 +91,7 @@ def least_difference(colors: Iterable[str | tuple[int, ...]], vision: str) -> fl
 
 
 @pytest.mark.parametrize("vision", _VISION)
-@pytest.mark.parametrize(
-    "palette", [figures.COLORS, KINDS.values(), (RIGHT, WRONG, CUT)], ids=["lines", "kinds", "marks"]
-)
+@pytest.mark.parametrize("palette", [figures.COLORS, KINDS.values(), SERIES, LIGHT, DARK])
 def test_color_blind_readers_tell_every_palette_apart(palette: Iterable[str], vision: str) -> None:
     assert least_difference(palette, vision) > 19
 

@@ -1,0 +1,88 @@
+"""Draws an image of every task: ``python docs/img/draw.py tasks``."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from imagine_bench.tasks import robot_ik, toy_regression
+from matplotlib import pyplot as plt
+from PIL import Image, ImageDraw
+
+from imagine_bench.recording.filmstrips import font
+from imagine_bench.report import figures
+
+HERE = Path(__file__).parent
+CELL_PX = (320, 240)
+SCENES = {
+    "arrow_puzzle": ("ArrowPuzzle", {}, (2, 1, 0, 1), 3),
+    "arrow_puzzle_hard": ("ArrowPuzzleHard", {}, (1, 3, 0, 2), 5),
+    "arrows:cubes=5,distractors=4": ("Arrows", {"cubes": 5, "distractors": 4}, (1, 0, 3, 2, 0, 3), 6),
+    "pick_place": ("PickPlace", {}, (0, 0, 0, 1), 1),
+}
+"""Of each task with episodes: environment, keywords, first macrostate, and the macro-action that is shown."""
+
+
+def scene(env_id: str, options: Mapping[str, Any], macrostate: tuple[int, ...], action: int) -> Image.Image:
+    """A macro-action at its middle as people see it, and in the corner the agent's frame, two pixels a pixel."""
+    with gymnasium.make(f"imagine_bench/{env_id}-v0", render_mode="rgb_array", **options) as env:
+        env.unwrapped.capture_motion_hz = 10
+        frame, _ = env.reset(seed=0, options={"macrostate": macrostate})
+        env.step(action)
+        film = env.unwrapped.film(2 * CELL_PX[0], 2 * CELL_PX[1])
+    image = Image.fromarray(film[len(film) // 2]).resize(CELL_PX, Image.Resampling.LANCZOS)
+    inset = Image.fromarray(np.pad(frame, ((1, 1), (1, 1), (0, 0)), constant_values=255))
+    image.paste(inset, (CELL_PX[0] - 66, CELL_PX[1] - 66))
+    return image
+
+
+def toy_function() -> Image.Image:
+    """Training points of the toy regression: three functions at once, and more noise in the middle."""
+    data = toy_regression.training("high_noise", np.random.default_rng(0))
+    figure, axes = plt.subplots(figsize=(3.2, 2.4), layout="constrained")
+    axes.scatter(data.inputs[:, 0], data.targets[:, 0], s=4, color=figures.COLORS[2])
+    axes.set(xlabel="x", ylabel="y")
+    axes.spines[["top", "right"]].set_visible(False)
+    return as_image(figure)
+
+
+def joints_in_plane(angles: np.ndarray) -> np.ndarray:
+    """Where base, elbow, wrist and tip of the planar arm are, in metres. Angles (..., 3), result (..., 4, 2)."""
+    heading = np.cumsum(angles, axis=-1)
+    links = np.stack([np.cos(heading), np.sin(heading)], axis=-1) * np.array(robot_ik.LINKS_M)[:, None]
+    return np.concatenate([np.zeros_like(links[..., :1, :]), np.cumsum(links, axis=-2)], axis=-2)
+
+
+def planar_arm() -> Image.Image:
+    """The planar arm in four configurations whose tips are all at one place, which a star marks."""
+    angles = np.random.default_rng(0).uniform(robot_ik.LOW_RAD, robot_ik.HIGH_RAD, (20_000, 3))
+    target = np.array([0.35, 0.45])
+    misses = np.linalg.norm(joints_in_plane(angles)[:, -1] - target, axis=1)
+    figure, axes = plt.subplots(figsize=(3.2, 2.4), layout="constrained")
+    for which, color in zip(misses.argsort()[[0, 3, 9, 12]], (2, 4, 5, 7), strict=True):
+        axes.plot(*joints_in_plane(angles[which]).T, "o-", color=figures.COLORS[color], linewidth=3, markersize=5)
+    axes.plot(*target, "*", color=figures.INK, markersize=14, zorder=5)
+    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    axes.spines[["top", "right"]].set_visible(False)
+    return as_image(figure)
+
+
+def as_image(figure: plt.Figure) -> Image.Image:
+    """A figure as an image of a cell's size."""
+    figure.set_dpi(100)
+    figure.canvas.draw()
+    return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+
+
+def tasks() -> None:
+    """An image of every task, two rows of three, each below its name."""
+    cells = {name: scene(*facts) for name, facts in SCENES.items()}
+    cells |= {"toy_regression": toy_function(), "robot_ik": planar_arm()}
+    width, height = CELL_PX
+    canvas = Image.new("RGB", (3 * (width + 8) - 8, 2 * (height + 28)), "white")
+    for place, (name, image) in enumerate(cells.items()):
+        left, top = (width + 8) * (place % 3), (height + 28) * (place // 3)
+        ImageDraw.Draw(canvas).text((left + 2, top + 7), name, figures.INK, font(bold=True))
+        canvas.paste(image.quantize(160).convert("RGB"), (left, top + 26))
+    canvas.save(HERE / "tasks.png", optimize=True)
