@@ -70,7 +70,7 @@ class WorldOptions:
     execution: ExecutionWord = None
     """How macro-actions happen: physics (the default), or kinematic (their outcome is set)."""
     appearance: Word = None
-    """How much frames vary: clean (the default), mild, strong, photo (a finite pool), or factors such as
+    """How much frames vary: clean (the default), mild, strong, patched (from a finite pool), or factors such as
     light=0.5,camera=0.2."""
     physics: ManyWords = ()
     """What decides whether a grasp holds, as name=value, such as pad_friction=0.5."""

@@ -54,7 +54,7 @@ class DatasetCommand:
     execution: ExecutionWord = None
     """How macro-actions happen: physics, or kinematic (their outcome is set)."""
     appearance: str = APPEARANCES[0]
-    """How much frames vary: clean, mild, strong, photo, or factors such as light=0.5,camera=0.2."""
+    """How much frames vary: clean, mild, strong, patched, or factors such as light=0.5,camera=0.2."""
     motion_hz: float = 0.0
     """Samples a second of the arm's motion and commands, kept in a file apart; 0 keeps none."""
     encoder: EncoderWord = None

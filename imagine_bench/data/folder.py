@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
+from imagine_bench.appearance import appearance_typed
 from imagine_bench.arrays import Array, Arrays, content_hash
 from imagine_bench.errors import ArtefactError, InvalidValueError, require_known, writing
 from imagine_bench.interfaces import TaskSpec
@@ -174,5 +175,6 @@ def require_fits(dataset: Dataset, spec: TaskSpec, appearance: str) -> None:
         raise InvalidValueError(f"{dataset.folder} is of {task or 'a task'} with {given}; give one of {wanted}.")
     looks = appearance if dataset.card is None else dataset.card.get("appearance")
     if looks != appearance:
-        how = f"--appearance {looks}, and --test-appearance for tests at another"
-        raise InvalidValueError(f"{dataset.folder} has frames of appearance {looks}, not {appearance}; give {how}.")
+        has, asked = (appearance_typed(str(each)) for each in (looks, appearance))
+        how = f"--appearance {has}, and --test-appearance for tests at another"
+        raise InvalidValueError(f"{dataset.folder} has frames of appearance {has}, not {asked}; give {how}.")

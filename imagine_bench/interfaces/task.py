@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from imagine_bench.appearance import STORED_AS
 from imagine_bench.arrays import Frame, Ints, Macrostate, State
 from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
 from imagine_bench.rules import RuleFacts, Rules
@@ -160,4 +161,5 @@ class TaskSpec:
 
 def bundled_name(encoder: str, appearance: str, kind: str) -> str:
     """Name of a bundled encoder: ``"arrow_puzzle-clean"`` gives latents, ``"arrow_puzzle-clean-codes"`` codes."""
-    return f"{encoder}-{appearance}" if kind == "latents" else f"{encoder}-{appearance}-{kind}"
+    name = f"{encoder}-{STORED_AS.get(appearance, appearance)}"
+    return name if kind == "latents" else f"{name}-{kind}"

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from imagine_bench.appearance import appearance_name
+from imagine_bench.appearance import appearance_name, appearance_typed
 from imagine_bench.errors import ArtefactError, InvalidValueError, brief, require_known
 from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.exact.splits import StartingFrom, split_of
@@ -246,7 +246,9 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
     def looks(self) -> str:
         """The appearance in words: ``clean``, or ``clean, tested at strong``; and what agents see beside frames."""
         other = self.test_appearance not in (None, self.appearance)
-        words = [self.appearance, *([f"tested at {self.test_appearance}"] if other else [])]
+        words = [appearance_typed(self.appearance)]
+        if other and self.test_appearance is not None:
+            words.append(f"tested at {appearance_typed(self.test_appearance)}")
         if not self.shows_frames_alone:
             privileged = " (privileged)" if "state" in self.observation else ""
             words.append(f"agents see {self.observation} at {self.observation_size} pixels{privileged}")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import registry
+from imagine_bench.appearance import appearance_typed
 from imagine_bench.arrays import Arrays, Pixels
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.change import FALSE_ALARMS, LENGTH, SLIP
@@ -151,9 +152,10 @@ def judgement_page(found: Judged) -> Page:
     judgement = found.judgement
     data = f"Data: {judgement.policy} policy, kinematic" if judgement.learning else "Trained agents"
     sections = [section for make in SECTIONS if (section := make(found)) is not None]
+    looks = appearance_typed(judgement.appearance)
     return Page(
         title=f"{found.spec.title}: world models against the exact truth",
-        subtitle=f"{data} · appearance “{judgement.appearance}” · {judgement.samples} futures a question",
+        subtitle=f"{data} · appearance “{looks}” · {judgement.samples} futures a question",
         question="Which model imagines what really happens, how sure is it, and what do its mistakes cost?",
         table=sections[0].tables[0],
         sections=sections,

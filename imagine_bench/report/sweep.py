@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 
+from imagine_bench.appearance import appearance_typed
 from imagine_bench.report.page import (
     DASH,
     Page,
@@ -43,9 +44,10 @@ def study_page(study: Study, lines: Sequence[Line]) -> Page:
     table = Table.of("variants", rows, caption, "not compared, or no model to ask")
     made = {**lines[0].environment, "study": dataclasses.asdict(study)}
     seeds = ", ".join(map(str, study.seeds))
+    looks = appearance_typed(study.appearance)
     return Page(
         title=study.question,
-        subtitle=f"{study.execution} · {study.appearance} · tuning seeds {seeds} · {study.evaluation_episodes} tests",
+        subtitle=f"{study.execution} · {looks} · tuning seeds {seeds} · {study.evaluation_episodes} tests",
         question="Interquartile means, differences with 95 % intervals over seeds, each alone: of many, some exclude "
         "zero by chance. Fewer than five seeds have none.",
         table=table,

@@ -15,6 +15,7 @@ import platformdirs
 from safetensors import safe_open
 
 from imagine_bench import registry
+from imagine_bench.appearance import appearance_typed
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, Frame, TaskSpec, bundled_name
 from imagine_bench.registry.entries import file_name
@@ -130,14 +131,14 @@ def own(spec: TaskSpec, appearance: str, kind: str = "latents") -> Path:
     if name in bundled():
         return bundled()[name]
     has_others = any(other.startswith(f"{spec.encoder}-") for other in bundled())
-    if has_others and registry.is_own(spec.id) and appearance in APPEARANCES:
+    if has_others and registry.is_own(spec.id) and appearance_typed(appearance) in APPEARANCES:
         raise ArtefactError(
             f"No encoder {name!r} is bundled; train one with 'imagine-bench encoder --task {spec.id} --appearance "
-            f"{appearance}' (for codes with --recipe codes) and give it with --encoder."
+            f"{appearance_typed(appearance)}' (for codes with --recipe codes) and give it with --encoder."
         )
     path = cached(spec, appearance, kind)
     recipe = "codes" if kind == "codes" else "default"
-    what = f"{spec.id} has no encoder for {kind} at {appearance}; one is trained"
+    what = f"{spec.id} has no encoder for {kind} at {appearance_typed(appearance)}; one is trained"
     settings = {"recipe": recipe, "appearance": appearance, "seed": 0, "out": path.parent}
     _once(path, what, lambda: registry.load(_TRAIN)(spec, **settings))
     return path

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from imagine_bench import reference, registry, statistics
+from imagine_bench.appearance import appearance_typed
 from imagine_bench.arrays import Pixels
 from imagine_bench.errors import (
     ArtefactError,
@@ -231,7 +232,8 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
         write_bytes(where / "causes.csv", csv_text([HEAD, *rows]).encode())
         write_json(where / "summary.json", made)
     write_page(bench / "report", bench_page(load_so_far(bench)))
-    return f"{spec.title}, {appearance}\n\n{table.text}\n\n{table.remark}\n\nAll rows:   {where / 'causes.csv'}"
+    title = f"{spec.title}, {appearance_typed(appearance)}"
+    return f"{title}\n\n{table.text}\n\n{table.remark}\n\nAll rows:   {where / 'causes.csv'}"
 
 
 # Verification ------------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ def make(task="Arrows", **options):
     [
         ("mild", "mild"),
         ("photo", "photo"),
+        ("patched", "photo"),
         ({}, "clean"),
         ({"light": 0, "hand": 0.0}, "clean"),
         ("light=0.5,pose=0.50,hand=5e-1", "mild"),
@@ -46,7 +47,7 @@ def test_one_appearance_has_one_name(given, name):
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [
-        ("strng", "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, photo, "),
+        ("strng", "No appearance 'strng'. Did you mean 'strong'? Known: clean, mild, strong, patched, "),
         ("light=2", "Appearance has light='2'; give a number from 0 to 1."),
         ({"light": -0.1}, "Appearance has light=-0.1; give a number from 0 to 1."),
         ({"light": True}, "Appearance has light=True; give a number from 0 to 1."),
