@@ -18,9 +18,9 @@ import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.graphics import choose_platform
 from imagine_bench.tasks.pick_place.world import PickWorld
-from imagine_bench.tasks.rendering import Renderer
+from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.rendering import renderer as rendering
-from imagine_bench.tasks.rendering.cameras import agent_camera_view
+from imagine_bench.tasks.rendering.cameras import DRAWN_GROUPS, agent_camera_view
 from imagine_bench.tasks.scenes.appearance import appearance
 
 from imagine_bench.errors import SetupError
@@ -244,7 +244,7 @@ def test_scenes_of_several_threads_end_in_silence():
         from concurrent.futures import ThreadPoolExecutor
         import numpy as np
         from imagine_bench.tasks.arrows.spec import spec_of
-        from imagine_bench.tasks.rendering import Renderer
+        from imagine_bench.tasks.rendering import Renderer, View
         from imagine_bench.tasks.rendering.cameras import agent_camera_view
         from imagine_bench.tasks.arrows.world import ArrowWorld
         from imagine_bench.tasks.scenes.appearance import appearance
@@ -276,4 +276,19 @@ def test_any_thread_draws_one_at_a_time(world, made):
         assert len(made) == 2, "one of the main thread, one of all others"
         second.submit(camera.close).result()
     assert np.array_equal(camera.frame(world.data), before)
+    camera.close()
+
+
+def test_a_view_for_people_has_one_more_light_and_leaves_agents_frames_as_they_were(world):
+    camera = own_camera(world.model)
+    before = camera.frame(world.data)
+    lights = world.model.light_active.tolist()
+    dim, lit = (
+        Renderer(world.model, View(camera="human", groups=DRAWN_GROUPS, for_people=for_people)).frame(world.data)
+        for for_people in (False, True)
+    )
+    table = (slice(48, 62), slice(4, 60))
+    assert lit[table].mean() > dim[table].mean() + 5
+    assert world.model.light_active.tolist() == lights
+    np.testing.assert_array_equal(camera.frame(world.data), before)
     camera.close()

@@ -37,6 +37,28 @@ def test_macrostates_are_read_back_at_every_level(name, level):
         assert (reading.macrostate, reading.problem) == (state, None)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_people_see_all_that_is_acted_on_and_larger_than_from_afar(name):
+    """Objects, fingers, and what points or is held out lie within an image of four to three."""
+    world, rules = world_of(name, FIXED), registry.task(name).rules
+    model, data = world.model, world.data
+    parts = [model.body(index).name for index in range(model.nbody)]
+    acted_on = [part for part in parts if part.startswith(("cube", "ball", "car", "cup", "finger"))]
+    for state in rules.states[:: len(rules.states) // 20 + 1]:
+        world.place(state, np.random.default_rng(0))
+        near_hands = [part for part in ("hand", "palm") if part in parts and data.body(part).xpos[0] < 0.8]
+        widths = {}
+        for name_of_camera in ("human", "far"):
+            camera = data.cam(name_of_camera)
+            places = [data.body(part).xpos - camera.xpos for part in (*acted_on, *near_hands)]
+            x, y, z = (np.array(places) @ camera.xmat.reshape(3, 3)).T
+            half_height = -z * np.tan(np.radians(model.cam(name_of_camera).fovy / 2))
+            across, upward = x / half_height, y / half_height
+            assert np.abs(across).max() < 4 / 3 and np.abs(upward).max() < 1
+            widths[name_of_camera] = np.ptp(across[: len(acted_on)])
+        assert widths["human"] > widths["far"]
+
+
 @pytest.mark.parametrize(
     ("name", "state", "action"),
     [
