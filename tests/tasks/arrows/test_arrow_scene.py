@@ -75,9 +75,9 @@ def test_the_arm_is_out_of_the_agent_s_view(world, camera):
         with closing(Renderer(world.model, View(camera=camera, groups=groups))) as renderer:
             return renderer.frame(world.data)
 
-    both = c.SCENE_GROUP, c.ARM_GROUP
-    assert np.array_equal(camera.frame(world.data), frame(c.AGENT_CAMERA, *both))
-    assert not np.array_equal(frame(c.HUMAN_CAMERA, c.SCENE_GROUP), frame(c.HUMAN_CAMERA, *both))
+    seen = c.SCENE_GROUP, c.AGENT_GROUP
+    assert np.array_equal(camera.frame(world.data), frame(c.AGENT_CAMERA, *seen, c.ARM_GROUP))
+    assert not np.array_equal(frame(c.HUMAN_CAMERA, *seen), frame(c.HUMAN_CAMERA, *seen, c.ARM_GROUP))
 
 
 def _strip_of_column(column):
