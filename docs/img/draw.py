@@ -20,7 +20,7 @@ from imagine_bench.judge.causes import CAUSES
 from imagine_bench.recording.filmstrips import Tile, sheet
 from imagine_bench.registry.entries import label_today
 from imagine_bench.report import figures
-from imagine_bench.report.data import ReportData, agent_title, collect, frames_before
+from imagine_bench.report.data import ReportData, collect, frames_before
 from imagine_bench.store.loading import load_so_far
 
 mpl.use("agg")
@@ -313,7 +313,7 @@ def why() -> None:
             if any(counts[cause] for each in shown for counts in found[each].values()):
                 axes.bar(list(found[agent]), shares, bottom=bottom, color=color, label=cause)
             bottom += shares
-        axes.set_title(agent_title(agent), fontsize=9.5)
+        axes.set_title(agent, fontsize=9.5)
         axes.set_ylim(0, 100)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_xlabel("real training episodes")
