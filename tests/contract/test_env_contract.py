@@ -383,7 +383,7 @@ def test_shapes_and_motion_describe_the_scene():
     env.reset(seed=0, options={"macrostate": (0, 1, 2, 1)})
     shapes, still = env.shapes(), env.motion()
     names = {shape.name for shape in shapes}
-    assert len(names) == len(shapes) and {"cube_0_box", "hand_skin", "floor"} <= names
+    assert len(names) == len(shapes) and {"cube_0_box", "hand_smooth_skin", "floor"} <= names
     assert {"right_l3"} <= {shape.body for shape in shapes} <= set(still.body_names)
     for shape in shapes:
         assert (shape.vertices is None) == (shape.faces is None) == (shape.kind != "mesh")
