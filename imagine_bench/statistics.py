@@ -4,8 +4,8 @@ The score of an agent is the interquartile mean over seeds (Agarwal et al., "Dee
 precipice", 2021): the middle half, so that one seed that is stuck does not decide. Of three seeds that is their mean.
 Seeds often fall into two groups, those that learn and those that are stuck. A trimmed mean then hides a group, and its
 spread with it. So whatever is said holds of the trimmed mean (Tukey and McLaughlin 1963; Yuen 1974) and of the mean of
-all (Student; Welch 1947) alike, and of too few seeds nothing is said. ``tests/measure/coverage.py`` measures on kept
-scores and on seven laws how often that is right.
+all (Student; Welch 1947) alike, and of too few seeds nothing is said. ``tests/measure/interval_coverage.py`` measures
+on kept scores and on eight laws how often that is right.
 """
 
 from __future__ import annotations

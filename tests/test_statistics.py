@@ -44,12 +44,13 @@ def student(values: list[float], trim: float) -> tuple[float, float]:
     return middle - half, middle + half
 
 
-def test_an_interval_holds_what_the_trimmed_and_the_plain_mean_allow() -> None:
-    """And the median's exact interval: of eight, from the least to the greatest."""
-    found = statistics.interval(OTHERS, share=False)
-    ends = [student(OTHERS, 0.0), student(OTHERS, 0.25), (min(OTHERS), max(OTHERS))]
+@pytest.mark.parametrize("scores", [OTHERS, [0.1, 0.12, 0.15, 0.2, 0.8, 0.85, 0.9, 0.95]])
+def test_an_interval_holds_what_the_trimmed_and_the_plain_mean_allow(scores: list[float]) -> None:
+    """And the median's exact interval: of eight, from the least to the greatest. Of two groups, the trimmed decides."""
+    found = statistics.interval(scores, share=False)
+    ends = [student(scores, 0.0), student(scores, 0.25), (min(scores), max(scores))]
     assert found == pytest.approx((min(low for low, _ in ends), max(high for _, high in ends)), abs=1e-12)
-    assert statistics.bounds([OTHERS, OTHERS], share=False).T.tolist() == [list(found), list(found)], "many at once"
+    assert statistics.bounds([scores, scores], share=False).T.tolist() == [list(found), list(found)], "many at once"
 
 
 def test_a_trimmed_mean_hides_a_stuck_run_and_its_interval_does_not() -> None:

@@ -67,7 +67,7 @@ FORMER = {
 ALSO = {"list": "describe"}
 """Second names of commands."""
 ELSEWHERE = {
-    "coverage": "python tests/measure/coverage.py",
+    "coverage": "python tests/measure/interval_coverage.py",
     "speed": "make speed",
 }
 """Former commands that are measurements of a checkout now, and the line to type there."""

@@ -177,17 +177,19 @@ def test_what_a_protocol_says_follows_from_its_runs(
 
 
 def test_failures_are_a_seeds_own_unless_it_knows_nothing_or_chance_decides() -> None:
-    def kept(task: Protocol, actions: list[int]) -> KeptEpisodes:
-        starts = np.array([task.spec(testing=True).rules.start_states[0]] * 2)
-        none = np.zeros(2, dtype=np.int64)
+    def kept(task: Protocol, *failed: list[int]) -> KeptEpisodes:
+        played = [[0], *failed]
+        starts = np.array([task.spec(testing=True).rules.start_states[0]] * len(played))
+        none = np.zeros(len(played), dtype=np.int64)
         return KeptEpisodes(
-            starts=starts, lengths=np.array([1, len(actions)]), actions=np.array([0, *actions]), returns=none * 1.0,
-            success=np.array([True, False]), faults=none, fingerprints=none,
+            starts=starts, lengths=np.array([*map(len, played)]), actions=np.concatenate(played), returns=none * 1.0,
+            success=none == np.arange(len(played)), faults=none, fingerprints=none,
         )  # fmt: skip
 
     certain = small()
     slips = protocol("arrows:slip=0.3", "smoke", agents=("random",))
     assert has_own_failures(kept(certain, [0, 1, 2]), certain)
+    assert has_own_failures(kept(certain, [0, 1], [2]), certain), "together"
     assert not has_own_failures(kept(certain, [0, 1, 0]), certain)
     assert not has_own_failures(kept(slips, [0, 1, 2]), slips)
 

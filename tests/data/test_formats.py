@@ -233,6 +233,20 @@ def test_what_lerobots_tools_made_is_read_with_the_last_frames_copied(
     assert [told(found, episode) for episode in range(len(found))] == wanted and wanted
 
 
+def test_episodes_alike_up_to_their_last_frames_keep_these_in_their_order(tmp_path: Path) -> None:
+    written(tmp_path / "set", "lerobot")
+    edited(tmp_path / "out", *((tmp_path / "set", range(6)),) * 2)
+    ends = pq.read_table(tmp_path / "set/final_frames.parquet")
+    column = ends.column_names.index("observation.image")
+    others = ends.set_column(column, ends.field(column), ends[column].take([5, 4, 3, 2, 1, 0]))
+    for number, table in enumerate((ends, others)):
+        pq.write_table(table, tmp_path / f"out/final_frames_{number}.parquet")
+    found, honest = read_dataset(tmp_path / "out").episodes, collected()[0]
+    last = [found.frames[found.steps(index)[1]][-1] for index in range(12)]
+    wanted = [honest.frames[honest.steps(index)[1]][-1] for index in (*range(6), *range(5, -1, -1))]
+    np.testing.assert_array_equal(last, wanted)
+
+
 def test_last_frames_of_before_they_had_digests_are_read_in_their_order(tmp_path: Path) -> None:
     written(tmp_path / "set", "lerobot")
     path = tmp_path / "set/final_frames.parquet"

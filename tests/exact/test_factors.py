@@ -59,6 +59,22 @@ class _Coupled(Wheels):
         return tuple(found)
 
 
+class _Reordered(Wheels):
+    """The same outcomes, which half of the macrostates name in another order."""
+
+    def outcomes(self, state, action):
+        return super().outcomes(state, action)[:: 1 if sum(state) % 2 else -1]
+
+
+def test_no_fact_depends_on_the_order_of_outcomes():
+    dials = {"slip": 0.1, "fickle": 0.2}
+    graph, again = (factor_graph(machine(kind(**dials))) for kind in (Wheels, _Reordered))
+    assert again.facts == graph.facts
+    assert [(f.action, f.children, f.parents) for f in again.factors] == [
+        (f.action, f.children, f.parents) for f in graph.factors
+    ]
+
+
 def test_what_is_drawn_together_is_one_factor():
     graph = factor_graph(machine(_Coupled(slip=0.3, forbid=False)))
     assert {(f.action, f.children, f.parents) for f in graph.factors if f.action < 2} == {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 from machines import Wheels
 
@@ -25,6 +27,8 @@ def test_a_split_is_known_by_its_content():
     assert sorted(split.train + split.test) == sorted(RULES.start_states)
     again = Split(name="another", train=split.train[::-1], test=split.test)
     assert split.hash == again.hash != split_of(RULES, "values=3:1").hash
+    fewer = (dataclasses.replace(split, train=split.train[1:]), dataclasses.replace(split, test=split.test[1:]))
+    assert len({split.hash, *(each.hash for each in fewer)}) == 3
     with pytest.raises(InvalidValueError, match="leaves no start for test"):
         split_of(RULES, "values=3:9")
 

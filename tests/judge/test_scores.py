@@ -315,6 +315,29 @@ def test_rewards_are_judged_as_outcomes() -> None:
     assert scores["reward_brier"] == pytest.approx(2.0 * np.mean(wrong))
 
 
+def test_rewards_of_a_later_step_are_judged_from_where_it_began() -> None:
+    """Of a model that imagines one possible future: the rules' rewards for its macrostates are its own."""
+    world = judged_world("pick_place")
+    rules = world.spec.rules
+
+    class OneFuture(Exact):
+        def imagine(self, frames: Frame, actions: NDArray[np.int64], *given: Any) -> Imagined:
+            shape = (len(frames), 1, actions.shape[1])
+            images, rewards = np.zeros((*shape, *frames.shape[2:]), dtype=np.uint8), np.zeros(shape)
+            for row, step in np.ndindex(actions.shape):
+                if step == 0:
+                    state, goes_on = self.renderer.shows(frames[row, -1]), 1.0
+                outcome = rules.outcomes(state, int(actions[row, step]))[-1]
+                images[row, 0, step] = self.renderer.frame(outcome.macrostate)
+                rewards[row, 0, step] = goes_on * outcome.reward
+                state, goes_on = outcome.macrostate, goes_on * (not outcome.terminated)
+            return Imagined(pictures=images, probabilities=np.ones(shape), rewards=rewards)
+
+    predictions = world.predictions(OneFuture(world.spec, world.index), world.ranked)
+    found = ranking_scores(world.spec, world.ranked, predictions)
+    assert found["regret"] == found["regret_ruled"] > 0.0
+
+
 def test_noise_is_told_apart_where_most_of_the_world_is_certain() -> None:
     """By an uncertainty that is 1 where several macrostates may follow, and 0 elsewhere."""
     world = judged_world("pick_place")

@@ -6,8 +6,8 @@ import dataclasses
 import json
 from pathlib import Path
 
-import coverage
 import decisions
+import interval_coverage
 import numpy as np
 import pytest
 import scipy
@@ -27,12 +27,12 @@ CHANCE = 3.0 * (0.05 * 0.95 / DRAWS) ** 0.5  # three standard errors of a rate o
 
 @pytest.fixture(scope="module")
 def scores() -> list[Floats]:
-    return coverage.populations(coverage.RESULTS)[:40]
+    return interval_coverage.populations(interval_coverage.RESULTS)[:40]
 
 
 def test_intervals_hold_and_tables_do_not_err_under_any_law(scores: list[Floats]) -> None:
-    found = list(coverage.measure(scores, DRAWS, np.random.default_rng(0), seeds=(3, 5, 7)))
-    assert len(found) == 3 * (len(coverage.LAWS) + 2)
+    found = list(interval_coverage.measure(scores, DRAWS, np.random.default_rng(0), seeds=(3, 5, 7)))
+    assert len(found) == 3 * (len(interval_coverage.LAWS) + 2)
     for row in found:
         few = [np.isnan(row[name]) for name in ("difference", "false_table")]
         assert few == [row["seeds"] == 3] * 2 and (row["seeds"] == 7 or np.isnan(row["coverage"]))
@@ -41,7 +41,7 @@ def test_intervals_hold_and_tables_do_not_err_under_any_law(scores: list[Floats]
 
 
 def test_a_true_gap_of_40_points_is_shown() -> None:
-    five, ten, *_ = coverage.power(DRAWS, np.random.default_rng(0), seeds=(5, 10))
+    five, ten, *_ = interval_coverage.power(DRAWS, np.random.default_rng(0), seeds=(5, 10))
     assert five["alone"] > 0.8 and ten["alone"] > 0.95 and ten["table"] > 0.95
 
 
@@ -49,7 +49,7 @@ def test_looking_again_and_again_claims_no_more() -> None:
     """Headlines of agents of one law, at four looks; without the allowance two modes would claim too many."""
     for name, runs in decisions.drawn(300, np.random.default_rng(0)).items():
         assert decisions.false_claims(runs) <= 0.05 + CHANCE, name
-    modes = coverage.LAWS[coverage.WORST](np.random.default_rng(0), (1000, 3, 40))
+    modes = interval_coverage.LAWS[interval_coverage.WORST](np.random.default_rng(0), (1000, 3, 40))
     looks = range(6, 41, 4)
     assert decisions.false_claims(modes, looks) < 0.05
     careless = [statistics.differences(*modes[:, :2, :count].swapaxes(0, 1))[3] < 0.05 for count in looks]
@@ -76,7 +76,7 @@ def test_repetitions_are_groups_of_six_seeds(tmp_path: Path) -> None:
 def test_a_mistake_of_these_tests_would_be_seen() -> None:
     """Of two groups Yuen's test alone claims a false difference in every third table of six."""
     rng = np.random.default_rng(0)
-    a, b = coverage.LAWS[coverage.WORST](rng, (2, 1000, 5))
+    a, b = interval_coverage.LAWS[interval_coverage.WORST](rng, (2, 1000, 5))
     yuen = scipy.stats.ttest_ind(a, b, axis=1, equal_var=False, trim=0.25).pvalue
     assert np.mean(yuen < 0.05 / 6) > 0.04
     assert np.mean(statistics.differences(a, b)[3] < 0.05 / 6) < 0.01
@@ -99,12 +99,12 @@ def test_exact_tests_of_two_modes_cannot_find_four_in_five() -> None:
 
 @pytest.mark.slow
 def test_rates_are_kept_and_nothing_to_draw_from_is_said(tmp_path: Path) -> None:
-    coverage.main(2, out=tmp_path / "new" / "coverage.json")
+    interval_coverage.main(2, out=tmp_path / "new" / "coverage.json")
     kept = json.loads((tmp_path / "new" / "coverage.json").read_text())
-    assert len(kept["rows"]) == len(coverage.SEEDS) * (len(coverage.LAWS) + 2) and kept["draws"] == 2
-    assert len(kept["power"]) == len(coverage.SEEDS) * len(coverage.PAIRS)
+    assert len(kept["rows"]) == len(interval_coverage.SEEDS) * (len(interval_coverage.LAWS) + 2) and kept["draws"] == 2
+    assert len(kept["power"]) == len(interval_coverage.SEEDS) * len(interval_coverage.PAIRS)
     with pytest.raises(InvalidValueError, match="no learner has five seeds; give a folder of kept results"):
-        coverage.populations(tmp_path)
+        interval_coverage.populations(tmp_path)
 
 
 def test_a_frame_costs_little_more_than_mujocos_drawing_alone() -> None:

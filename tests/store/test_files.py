@@ -26,6 +26,8 @@ from imagine_bench.store.files import (
     make_folder,
     read_sealed,
     sealed,
+    table_rows,
+    table_text,
     write_bytes,
     write_json,
 )
@@ -92,6 +94,11 @@ def test_a_sealed_file_that_lost_its_seal_or_has_another_value_is_refused(tmp_pa
 )
 def test_what_either_side_lacks_is_a_difference(then: Json, now: Json, found: tuple[str, Json, Json] | None) -> None:
     assert first_difference(then, now) == found
+
+
+def test_a_table_has_the_columns_of_all_its_rows() -> None:
+    rows = [{"episodes": 1, "loss": 0.5}, {"episodes": 2, "agent": "dqn"}, {"late": 1e-9}]
+    assert table_rows(table_text(rows), texts=("agent",)) == rows
 
 
 def test_a_file_in_the_way_of_a_folder(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 
@@ -52,6 +53,9 @@ def test_what_looks_otherwise_is_trained_for_itself(trained):
     ]
     places = {encoders.own(registry.task(name), appearance, kind) for name, appearance, kind in wanted}
     assert len(places) == len(wanted) == len(trained)
+    spec = registry.task("arrows:cubes=2")
+    for settings in ({"config_group": "chapter_3"}, {"preprocessing": "small_rgb"}):  # and what is trained otherwise
+        assert encoders.cached(dataclasses.replace(spec, **settings), "clean", "codes") not in places
 
 
 @pytest.mark.parametrize("name", ["arrows", "arrows:slip=0.2", "arrows:goal=012,forbid=none"])

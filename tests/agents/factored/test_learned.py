@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from agent_states import same
@@ -9,9 +11,11 @@ from fake_codes import drawn, starts
 from fake_pictures import Code, agent, picture, played, shape
 from imagine_bench.agents.factored import appearance
 from imagine_bench.agents.factored.learned import LearnedPerceptionAgent
+from imagine_bench.agents.factored.perception import LearnedPerception
+from imagine_bench.agents.factored.settings import LearnedPerceptionSettings
 from numpy.typing import NDArray
 
-from imagine_bench.interfaces import Frame, Observation
+from imagine_bench.interfaces import AgentState, Frame, Observation
 
 
 def walk(steps: int, rng: np.random.Generator) -> tuple[list[Code], Frame]:
@@ -182,6 +186,23 @@ def test_a_look_that_was_never_seen_is_unknown() -> None:
     _, known = appearance.read(found, frames)
     wheel = int(np.argmin(known[~without].mean(axis=0)))
     assert known[~without][:, wheel].mean() < 0.1 and known[without].all(axis=1).mean() > 0.95
+
+
+def test_a_resumed_perception_looks_again_as_soon_as_one_that_was_not_interrupted() -> None:
+    """Sooner once something had no known value."""
+    _, frames = walk(40, np.random.default_rng(0))
+    eyes = LearnedPerception(LearnedPerceptionSettings(), factored=True)
+    for begins, (before, after) in enumerate(pairwise(frames)):
+        eyes.remember(before, 0, after, begins=not begins)
+    eyes.look(len(eyes.frames))
+    for unknown, frame in ((False, frames[0]), (True, gray(1)[0])):
+        eyes.remember(eyes.frames[-1], 1, frame)
+        state = AgentState(
+            arrays={**eyes.arrays(), "replay/action": np.array(eyes.actions)}, values=dict(eyes.values())
+        )
+        resumed = LearnedPerception(LearnedPerceptionSettings(), factored=True)
+        resumed.load(state)
+        assert resumed.values() == eyes.values() and eyes.unknown == unknown
 
 
 @pytest.mark.parametrize(("shift", "gain"), [((5, -5), 0.5), ((-3, 4), 2.0)])

@@ -1,4 +1,4 @@
-"""``python tests/measure/coverage.py [DRAWS]``: do intervals cover, do tables err, and is a true difference found?
+"""Do intervals cover, do tables err, is a true difference found? ``python tests/measure/interval_coverage.py [DRAWS]``.
 
 A law says how often a trained agent solves its tests. From each law benches are drawn, and judged by
 :mod:`imagine_bench.statistics` as every report is. Kept scores are drawn as they are. Runs of the other laws are tested
