@@ -136,7 +136,7 @@ def test_benches_of_every_kind_hold(task: str, changes: dict[str, Any], tmp_path
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bench of two seeds of a learner, without a report."""
-    wanted = small(seeds=(0, 1), evaluation_episodes=8)
+    wanted = small(seeds=(0, 1), budgets=(3, 8), evaluation_episodes=8)
     return bench(wanted, {}, root=tmp_path_factory.mktemp("pair"), launcher=Inline()).folder
 
 
@@ -146,7 +146,19 @@ def share_cpu_seconds(folder: Path) -> None:
     rewrite(other.folder, [dataclasses.replace(row, train_cpu_s=known.train_cpu_s) for row, known in pairs])
 
 
-@pytest.mark.parametrize(("what", "forge"), [("weights", share_weights), ("CPU seconds", share_cpu_seconds)])
+def share_first_tests(folder: Path) -> None:
+    one, other = (load_run(folder / "table" / seed) for seed in ("seed_0", "seed_1"))
+    first, *rows = other.checkpoints
+    theirs = one.checkpoints[0]
+    assert rows and theirs.kept is not None and has_own_failures(theirs.kept, small())
+    theirs = dataclasses.replace(theirs, env_steps=first.env_steps, train_cpu_s=first.train_cpu_s)
+    rewrite(other.folder, [theirs, *rows])
+
+
+@pytest.mark.parametrize(
+    ("what", "forge"),
+    [("weights", share_weights), ("CPU seconds", share_cpu_seconds), ("tests", share_first_tests)],
+)
 def test_two_seeds_of_a_learner_share_nothing(
     pair: Path, tmp_path: Path, what: str, forge: Callable[[Path], None]
 ) -> None:
@@ -239,6 +251,13 @@ def test_a_report_on_agents_that_are_not_installed_here_is_not_blamed(
     assert str(last) == "report: not compared; not shown: what it says, for no package here offers table"
 
 
+def test_a_report_that_cannot_be_made_is_a_complaint(finished: Path, tmp_path: Path) -> None:
+    folder = forged(finished, tmp_path, lambda folder: None)
+    (folder / "why").mkdir()
+    (folder / "why" / "causes.csv").write_text("agent,seed\ntable,zero\n")
+    assert "causes.csv" in with_report(folder, [])[0].complaint
+
+
 def test_a_page_is_compared_in_time_that_grows_with_its_length(pair: Path, tmp_path: Path) -> None:
     def write(folder: Path) -> None:
         (folder / "report").mkdir()
@@ -326,6 +345,9 @@ def test_an_episode_cut_off_before_its_end_is_found(finished: Path) -> None:
             counts.add(
                 replays.test(episode_seed("evaluation", 0, test), actions[: len(actions) - (test == cut_off)])[0]
             )
+        whole = row.kept.actions_of(cut_off)
+        beyond = [replays.test(episode_seed("evaluation", 0, cut_off), [*whole, more])[1] for more in range(6)]
+        assert not any(beyond), "nothing ends an episode that is over"
         cut = dataclasses.replace(row, kept=counts.kept(), **counts.figures())
         with pytest.raises(ArtefactError, match=f"test {cut_off}: its actions do not end an episode"):
             verify_tests(cut, small(evaluation_episodes=8), "evaluation", replays, env_steps=row.env_steps)

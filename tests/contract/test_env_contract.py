@@ -389,6 +389,10 @@ def test_shapes_and_motion_describe_the_scene():
         assert (shape.vertices is None) == (shape.faces is None) == (shape.kind != "mesh")
         assert shape.faces is None or shape.faces.max() < len(shape.vertices)
         assert (*shape.rgba.shape, *shape.pose_in_body.shape) == (4, 7)
+        geom = env.model.geom(shape.name)
+        is_plane = geom.type[0] == mujoco.mjtGeom.mjGEOM_PLANE
+        below_m = np.array([0.0, 0.0, shape.size[2] if is_plane else 0.0])  # a plane is the top of a thin box
+        np.testing.assert_array_equal(shape.pose_in_body, [*(geom.pos - below_m), *geom.quat])
     assert still.poses_in_world.shape == (1, len(still.body_names), 7)
     for name, pose in zip(still.body_names, still.poses_in_world[0], strict=True):
         matrix = np.empty(9)

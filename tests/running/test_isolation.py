@@ -56,6 +56,9 @@ def test_a_guest_finds_nothing_of_its_caller(start: Start, tmp_path: Path, close
         with pytest.raises(GuestError, match="tasks is closed to code that is judged"):
             guest.call("imported", module)
     guest.call("imported", "imagine_bench.agents")
+    spent_s = guest.cpu_s
+    guest.call("listed", str(tmp_path))
+    assert guest.cpu_s >= spent_s > 0.0, "of all calls together"
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         if not closed:

@@ -49,6 +49,8 @@ def test_velocities_and_poses_belong_to_the_angles():
         mujoco.mju_quat2Mat(matrix, pose[3:])
         np.testing.assert_allclose(matrix.reshape(3, 3), turn, atol=1e-9)
     assert motion.gripper_m.min() < 0.03 < motion.gripper_m.max()  # closed on a cube of 55 mm, and open
+    assert (motion.gripper_command_m.min(axis=0) < motion.gripper_m.min(axis=0) - 5e-4).all(), "told to squeeze"
+    assert np.abs(motion.joint_command_rad - motion.joint_rad).max() > 0.01, "told ahead of the motion"
 
 
 def test_rates_above_the_simulation_s_are_interpolated():

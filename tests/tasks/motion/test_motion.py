@@ -2,7 +2,6 @@
 
 import math
 import os
-import re
 import tempfile
 
 import mujoco
@@ -165,13 +164,15 @@ def test_only_contact_turns_the_cube(turner):
     assert fault == "the fingers closed past cube 1"
 
 
-def test_an_arm_that_does_not_come_back_is_a_fault(turner):
+def test_an_arm_of_which_one_joint_does_not_come_back_is_a_fault(turner):
+    """The wrist's 9 Nm hold a spring of 10 Nm/rad, whose rest is a radian away, 0.1 rad off."""
+
     def pulled_wrist(model):
         joint = model.joint("right_j6")
-        model.jnt_stiffness[joint.id], model.qpos_spring[joint.qposadr[0]] = 16.0, OBSERVATION_QPOS_RAD[6] + 1.0
+        model.jnt_stiffness[joint.id], model.qpos_spring[joint.qposadr[0]] = 10.0, OBSERVATION_QPOS_RAD[6] + 1.0
 
     fault = turned_deg(turner, compile_arrow_scene(), pulled_wrist)[1]
-    assert re.fullmatch(r"the arm ended 0\.\d{3} rad off its observation pose", fault)
+    assert fault == "the arm ended 0.100 rad off its observation pose"
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,22 @@ def test_plans_keep_speed_limits_and_use_them(arm):
     assert max(shares) > 0.95
 
 
+def test_what_is_told_there_and_back_differs_by_the_damping_alone(arm):
+    """For the inertia, of the whole motion that halfway, is told alike both ways."""
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        start, end = rng.uniform(*arm.model.jnt_range.T, (2, 7))
+        there, back = (
+            plan(arm, start_qpos_rad=a, start_opening_m=0.02, waypoints=[Waypoint("", b, 0.02)], timestep_s=TIMESTEP_S)
+            for a, b in ((start, end), (end, start))
+        )
+        steps = len(there.opening_m)
+        speed_rad_s = minimum_jerk(steps)[:-1, 1:2] * (end - start) / (steps * TIMESTEP_S)
+        damped_rad = arm.damping_nms_rad * speed_rad_s / arm.stiffness_nm_rad
+        apart_rad = there.arm_command_rad[:-1] - back.arm_command_rad[-2::-1]
+        np.testing.assert_allclose(apart_rad, 2 * damped_rad, atol=1e-9)
+
+
 def test_blended_motions_add_up(arm):
     """A blend shortens the plan by its length, and every joint still stops at the last waypoint within its limits."""
     start, via = np.array(HOME_QPOS_RAD), np.array(HOME_QPOS_RAD) + 0.3

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.motion.ik import ArmModel
 from imagine_bench.tasks.pick_place.rules import HAND_OVER, OPEN_PALM, WITHDRAWN
-from imagine_bench.tasks.pick_place.scene import TIMESTEP_S
+from imagine_bench.tasks.pick_place.scene import PALM_M, TIMESTEP_S
 from imagine_bench.tasks.pick_place.spec import SPEC
 from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import appearance
-from imagine_bench.tasks.scenes.objects import OBJECTS
+from imagine_bench.tasks.scenes.objects import OBJECTS, standing_m
 
 FIXED = appearance("clean").__class__(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
 RULES = SPEC.rules
@@ -118,6 +118,15 @@ def test_a_ball_is_picked_alike_however_it_has_rolled(world):
     np.testing.assert_array_equal(*commands)
 
 
+def test_an_object_held_off_the_grips_middle_comes_down_on_its_place(world):
+    """4 mm aside in the fingers, which turn it by 0.3 rad."""
+    world.place((0, 1, 0, 2), rng())
+    row = world.object_qpos[1]
+    world.data.qpos[row[0]] += 0.004
+    assert world.executor.place(index=1, noise=(0.0, 0.0, 0.3)).fault is None
+    assert np.linalg.norm(world.data.qpos[row[:2]] - standing_m(1)[:2]) < 1e-3
+
+
 def slippery_tips(model):
     tips = [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
     model.geom_friction[tips] = (0.02, 0.001, 0.0001)
@@ -143,6 +152,18 @@ def test_only_friction_holds_and_what_slips_is_a_fault_and_ends_the_episode(macr
     assert not reason or info["macrostate"][action] == 0
     assert (reward, terminated, info["success"]) == (-5.0, True, False)
     assert info["macrostate"][3] == WITHDRAWN
+
+
+def test_what_was_reached_against_the_draw_is_judged_from_where_the_action_began(monkeypatch):
+    """The handover should have slipped, and the car came into the palm all the same: a fault, and what was asked."""
+    env = gymnasium.make("imagine_bench/PickPlace-v0", slip=0.99).unwrapped
+    env.reset(seed=0, options={"macrostate": (0, 1, 0, OPEN_PALM)})
+    executor = env.world.executor
+    monkeypatch.setattr(executor, "visit", lambda **_: executor.hand_over(index=1, palm_m=np.array(PALM_M)))
+    _, reward, terminated, _, info = env.step(HAND_OVER)
+    env.close()
+    assert info["macrostate"].tolist() == [0, 2, 0, OPEN_PALM] and info["fault"]
+    assert (reward, terminated, info["success"]) == (5.0, True, True)
 
 
 def test_held_objects_go_with_the_arm_to_the_canonical_start(world):
