@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import coverage
+import interval_coverage
 import numpy as np
 
 from imagine_bench import statistics
@@ -20,7 +20,7 @@ from imagine_bench.protocols.control import PRESETS
 from imagine_bench.running.headlines import stages
 from imagine_bench.store.loading import load_so_far
 
-KEPT = coverage.RESULTS / "arrow_puzzle-quick-20_seeds"
+KEPT = interval_coverage.RESULTS / "arrow_puzzle-quick-20_seeds"
 PAIRS: Sequence[tuple[str, str]] = PRESETS["quick"]["headlines"]
 SEEDS = len(PRESETS["quick"]["seeds"])
 LOOKS = stages(SEEDS, 15)
@@ -61,10 +61,10 @@ def false_claims(runs: Floats, looks: Sequence[int] = tuple(LOOKS), trials: int 
 
 
 def drawn(draws: int, rng: np.random.Generator) -> dict[str, Floats]:
-    """Scores (draws, 3, seeds) of three agents of one law: every law of :mod:`coverage`, and kept scores."""
+    """Scores (draws, 3, seeds) of three agents of one law: every law of :mod:`interval_coverage`, and kept scores."""
     shape = (draws, 3, LOOKS[-1])
-    found = {name: law(rng, shape) for name, law in coverage.LAWS.items()}
-    many = coverage.populations(coverage.RESULTS)
+    found = {name: law(rng, shape) for name, law in interval_coverage.LAWS.items()}
+    many = interval_coverage.populations(interval_coverage.RESULTS)
     kept = [rng.choice(many[which], shape[1:]) for which in rng.integers(len(many), size=draws)]
     return {**found, "kept scores": np.array(kept)}
 
