@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from fake_reader import BlindReader
 from imagine_bench.agents.world_models.limits import Exact
 from judged import STILL, JudgedWorld, judged_world
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Frame, Rules, State
 from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge import questions
+from imagine_bench.judge.predictions import evaluate
 from imagine_bench.judge.questions import FRAMES
 from imagine_bench.judge.scores import (
     after_the_end_scores,
@@ -313,6 +316,15 @@ def test_rewards_are_judged_as_outcomes() -> None:
     wrong = [not any(reward == 5.0 for _, reward in steps[0].values()) for steps in world.one_step.truth]
     assert scores["reward_ece"] == pytest.approx(np.mean(wrong))
     assert scores["reward_brier"] == pytest.approx(2.0 * np.mean(wrong))
+
+
+def test_the_cost_of_imagining_is_that_of_all_batches() -> None:
+    """By a clock that ticks once whenever it is read."""
+    world, ticks = judged_world(ARROWS), itertools.count()
+    reader = BlindReader(len(world.spec.macrostate_names))
+    how = {"samples": 2, "reader": reader, "index": world.index, "rng": np.random.default_rng(0)}
+    found = evaluate(STILL, "it", world.one_step, **how, cpu_clock=lambda: float(next(ticks)))
+    assert found.cpu_s == next(ticks) / 2 > 1.0
 
 
 def test_rewards_of_a_later_step_are_judged_from_where_it_began() -> None:
