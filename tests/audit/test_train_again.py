@@ -95,7 +95,8 @@ def play_as_oracle(folder: Path, tests: int = 8) -> None:
 def invent_prices(folder: Path, name: str) -> None:
     for seed in (0, 1):
         run = load_run(folder / "table" / f"seed_{seed}")
-        rewrite(run.folder, [dataclasses.replace(row, **{name: 99.0 + seed}) for row in run.checkpoints])
+        *rows, last = run.checkpoints
+        rewrite(run.folder, [*rows, dataclasses.replace(last, **{name: 99.0 + seed})])
 
 
 @pytest.mark.parametrize(
@@ -124,8 +125,14 @@ def elsewhere(folder: Path) -> None:
     change_sessions(folder, lambda found: found["environment"]["machine"].update(cpu="another"))
 
 
+def elsewhere_in_between(folder: Path) -> None:
+    """Begun here, resumed on another processor, and ended here."""
+    session = {"changed": {"cpu": ["this", "another"]}, "wall_s": 0.0}
+    change_sessions(folder, lambda found: found["sessions"].insert(0, {**found["sessions"][0], **session}))
+
+
 def lose_weights(folder: Path) -> None:
-    elsewhere(folder)
+    elsewhere_in_between(folder)
     for seed in (0, 1):
         run = folder / "table" / f"seed_{seed}"
         snapshot = load_newest(run / "checkpoints")
