@@ -68,12 +68,10 @@ def finish(axes: plt.Axes, budgets: list[int]) -> None:
 
 
 PEERS = (
-    "arrow_puzzle-controls-networks", "arrow_puzzle-peers-sb3_latents", "arrow_puzzle-peers",
-    "arrow_puzzle-dreamer_latents",
+    "arrow_puzzle-controls-networks", "arrow_puzzle-peers-sb3_latents", "arrow_puzzle-peers-sb3_pixels",
+    "arrow_puzzle-peers", "arrow_puzzle-dreamer_latents",
 )  # fmt: skip
 """Kept benches with the same tests after 100, 250 and 500 episodes; an agent of two is that of the first."""
-UNSCALED = ("sb3_dqn", "sb3_qrdqn")
-"""Agents that were last run with rewards as they are, for which their library is not made."""
 SETTINGS = {"replay_ratio": " tuned", "discount": " defaults"}
 """What stands behind a name that has settings, by one that only those have."""
 
@@ -99,9 +97,8 @@ def family(agent: str) -> tuple[str, str, str]:
 def name_of_row(agent: str) -> str:
     """The name beside a row: as it is typed, with short words for settings."""
     settings = "".join(said for name, said in SETTINGS.items() if name in agent)
-    rewards = " unscaled" if agent in UNSCALED else ""
     label = agent if agent in registry.agents() else agent.partition(":")[0]
-    return label + settings + rewards
+    return label + settings
 
 
 def kept_rows() -> list[tuple[ReportData, dict[str, Any]]]:
