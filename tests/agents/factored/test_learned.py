@@ -190,7 +190,7 @@ def test_a_look_that_was_never_seen_is_unknown() -> None:
 
 def test_a_resumed_perception_looks_again_as_soon_as_one_that_was_not_interrupted() -> None:
     """Sooner once something had no known value."""
-    _, frames = walk(40, np.random.default_rng(0))
+    _, frames = walk(16, np.random.default_rng(0))
     eyes = LearnedPerception(LearnedPerceptionSettings(), factored=True)
     for begins, (before, after) in enumerate(pairwise(frames)):
         eyes.remember(before, 0, after, begins=not begins)
