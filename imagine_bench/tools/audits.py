@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -313,6 +315,30 @@ def with_report(folder: Path, runs: list[Verdict]) -> list[Verdict]:
 
 
 def _verify_report(folder: Path) -> Verdict:
+    """Compare the report with the runs, line by line; another version's reports have other words.
+
+    Raises:
+        ArtefactError: The bench was made by this version, and a line of its report does not follow from its runs.
+    """
+    made_by, here = (_version(facts) for facts in (bench_facts(folder)["environment"], describe_environment()))
+    try:
+        _require_lines(folder)
+    except ArtefactError as error:
+        if made_by == here:
+            raise
+        again = f"'imagine-bench report {shlex.quote(str(folder))}' writes it as this version does"
+        unshown = f"its report, which another version may have written ({made_by}, as it says); {again}"
+        return Verdict(what="report", holds=f"not compared: {error}", unshown=(unshown,))
+    return Verdict(what="report")
+
+
+def _version(environment: Mapping[str, Any]) -> str:
+    """The commit and version that an environment's description names."""
+    versions = environment.get("versions", {})
+    return f"commit {environment.get('commit')}, version {versions.get('imagine-bench')}"
+
+
+def _require_lines(folder: Path) -> None:
     """Raise ArtefactError for the first line of the report that does not follow from the runs."""
     for name, text in texts(bench_page(load_so_far(folder)), images=False).items():
         path = folder / "report" / name
@@ -321,4 +347,3 @@ def _verify_report(folder: Path) -> Verdict:
         for has, wanted in both:
             if has != wanted:
                 raise ArtefactError(f"{name} has {brief(has)} where the runs give {brief(wanted)}.")
-    return Verdict(what="report")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shutil
 import time
 from collections.abc import Callable
@@ -29,6 +30,7 @@ from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode
 from imagine_bench.running.retraining import Retraining
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import episode_seed
+from imagine_bench.store.files import read_sealed, sealed
 from imagine_bench.store.results import KeptEpisodes
 from imagine_bench.store.run_folder import load_newest, load_run, save_snapshot
 from imagine_bench.tools.audits import verify, what_is_shown, with_report
@@ -241,6 +243,21 @@ def test_a_sentence_of_the_report_follows_from_the_runs(finished: Path, tmp_path
 
     *runs, report = verify(forged(finished, tmp_path, edit))
     assert not any(each.complaint for each in runs) and "It is compared" in report.complaint
+
+
+def test_a_report_of_another_version_is_not_compared(finished: Path, tmp_path: Path) -> None:
+    """Its words may have been others; the runs are compared all the same, and the way to a new report is said."""
+
+    def edit(folder: Path) -> None:
+        page, sessions = folder / "report" / "index.html", folder / "sessions.json"
+        page.write_text(page.read_text().replace("<li>Nothing is compared", "<li>Nothing was compared"))
+        facts = read_sealed(sessions, "sessions")
+        facts["environment"]["commit"] = "0123456789ab"
+        sessions.write_text(json.dumps(sealed(facts)))
+
+    *runs, report = verify(forged(finished, tmp_path, edit))
+    assert not any(each.complaint for each in [*runs, report])
+    assert "commit 0123456789ab" in report.unshown[0] and "imagine-bench report" in report.unshown[0]
 
 
 def test_a_report_on_agents_that_are_not_installed_here_is_not_blamed(
