@@ -196,7 +196,8 @@ def _sentence(progress: Progress, spec: RunSpec[ProtocolData]) -> str:
     solved = "" if progress.success is None else f"{100 * progress.success:.0f} %"
     if progress.phase == "training":
         return f"{who}: {doing}" + (f", last {RECENT} solved {solved}" if solved else "")
-    return f"{who}: {progress.phase} at {doing}" + (f", solved {solved}" if solved else "")
+    at = f" at {doing}" if progress.episode and progress.phase != "done" else ""
+    return f"{who}: {progress.phase}{at}" + (f", solved {solved}" if solved and at else "")
 
 
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"

@@ -26,7 +26,10 @@ from imagine_bench.running.bench import plan, read_protocol
 from imagine_bench.running.control import resolved_settings
 
 COMMANDS = {row["folder"]: row for row in table("commands.csv")}
-NOT_OPTIONS = ("encoder", "codes", "sampled_futures", "settings_digest", "agent_names", "dataset")
+NOT_OPTIONS = (
+    *("encoder", "codes", "sampled_futures", "settings_digest", "agent_names", "dataset"),
+    *("headlines", "open_loop_starts", "recorded_episodes"),
+)
 """Fields of a protocol that no option sets: what they were is compared, and a difference is named in the file."""
 
 

@@ -20,7 +20,7 @@ from imagine_bench.protocols.control import PRESETS
 from imagine_bench.running.headlines import stages
 from imagine_bench.store.loading import load_so_far
 
-KEPT = interval_coverage.RESULTS / "arrow_puzzle-quick-20_seeds"
+KEPT = interval_coverage.RESULTS / "arrow_puzzle-quick-fresh_seeds"
 PAIRS: Sequence[tuple[str, str]] = PRESETS["quick"]["headlines"]
 SEEDS = len(PRESETS["quick"]["seeds"])
 LOOKS = stages(SEEDS, 15)
