@@ -11,11 +11,12 @@ import io
 import re
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -34,8 +35,9 @@ from imagine_bench.registry.entries import AgentEntry, parse_settings
 from imagine_bench.registry.machine import CALL
 from imagine_bench.running import bench as benches
 from imagine_bench.running.launchers.jobs import launcher as launcher_named
+from imagine_bench.seeding import SEEDS
 from imagine_bench.store.bench_folder import is_archive, read_protocol_values
-from imagine_bench.store.files import read_json, reading
+from imagine_bench.store.files import expanded, read_json, reading
 from imagine_bench.values import Setting, unpack
 
 if TYPE_CHECKING:
@@ -49,6 +51,12 @@ MakeAgent = Callable[[AgentContext], Agent]
 _MAIN_TABLES = ("results", "scores")
 _NOTEBOOK = "ipykernel"
 """The module that carries out the cells of a notebook."""
+_KINDS = {int: "a whole number", float: "a number", str: "a text", bool: "True or False"}
+"""The values that options take, in words."""
+_SETTINGS = ("set", "physics")
+"""Options that are mappings."""
+_OWN = ("preset", "workers", "launcher", "track", "out")
+"""Keywords of :func:`bench` that are no part of a protocol."""
 _TEXT = ("solved",)
 """Columns whose digits are a text."""
 
@@ -204,9 +212,15 @@ def bench(
         ImagineBenchError: As :func:`imagine_bench.running.bench.plan` and :func:`imagine_bench.running.bench.bench`.
     """
     registry.refuse_while_loading()
-    several = [agents] if isinstance(agents, str) or callable(agents) else agents
-    given = {"agents": several and [_name(agent) for agent in several], "seeds": seeds, **options}
-    given = {name: value for name, value in given.items() if value is not None}
+    task = _fitting("task", _plain(task), str)
+    root = expanded(Path(_fitting("out", _plain(out), str)))
+    processes = None if workers is None else _fitting("workers", _plain(workers), int)
+    several: list[Any] = list(agents) if isinstance(agents, list | tuple | np.ndarray | Iterator) else [agents]
+    if agents is not None and not all(isinstance(agent, str) or callable(agent) for agent in several):
+        raise InvalidValueError(f"agents is {brief(agents)}; give a name, a class or a function, or a list of them.")
+    named = None if agents is None else [_name(agent) for agent in several]
+    given = {"agents": named, "seeds": seeds, **options}
+    given = {name: _plain(value) for name, value in given.items() if value is not None}
     words = [f"{name}={value!r}" for name, value in {"preset": preset, **given}.items()]
     python = f"import imagine_bench; imagine_bench.bench({', '.join([repr(task), *words])})"
     call = CALL.set(shlex.join(["python", "-c", python]))
@@ -214,10 +228,10 @@ def bench(
         with torch_as_it_was():
             changes = protocol_changes(given)
             until, most = changes.pop("until_decided", False), changes.pop("most_seeds", None)
-            launch: Launcher = Observed(launcher_named(launcher, workers))
+            launch: Launcher = Observed(launcher_named(launcher, processes))
             if track is not None:
                 launch = Tracked(launch, track, task)
-            *_, whole = carry_out(task, preset, changes, root=Path(out), launcher=launch, until=until, most=most)
+            *_, whole = carry_out(task, preset, changes, root=root, launcher=launch, until=until, most=most)
             return _of_bench(whole)
     finally:
         CALL.reset(call)
@@ -225,15 +239,16 @@ def bench(
 
 def protocol_changes(given: Mapping[str, Any]) -> dict[str, Any]:
     """The options of a bench as fields of its protocol."""
-    known = [field.name for part in (WorldOptions, Learner, Budget, Tests) for field in dataclasses.fields(part)]
+    known: dict[str, Any] = {}
+    for part in (WorldOptions, Learner, Budget, Tests):
+        known |= get_type_hints(part)
     changes: dict[str, Any] = {}
     for name, value in given.items():
         if name not in known:
-            raise UnknownKeywordError.of(name, known)
-        plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-        changes[name] = tuple(plain) if isinstance(plain, list | range) else plain
-    if isinstance(changes.get("seeds"), int):
-        changes["seeds"] = tuple(range(changes["seeds"]))
+            raise UnknownKeywordError.of(name, [*known, *_OWN])
+        changes[name] = value if name in _SETTINGS else _fitting(name, _plain(value), known[name])
+    if isinstance(_plain(given.get("seeds")), int):
+        changes["seeds"] = _first_seeds(*changes["seeds"])
     if "set" in changes:
         changes["overrides"] = _pairs("set", changes.pop("set"))
     if "physics" in changes:
@@ -241,11 +256,43 @@ def protocol_changes(given: Mapping[str, Any]) -> dict[str, Any]:
     return changes
 
 
+def _fitting(name: str, value: Any, kind: Any) -> Any:
+    """The value as an option of a kind takes it: a list, or one value where a list is taken, as a tuple.
+
+    Raises InvalidValueError: it is of another kind.
+    """
+    one = next((part for part in get_args(kind) if types.NoneType in get_args(kind)), kind)
+    several = get_origin(one) is tuple
+    element = get_args(one)[0] if several else one
+    is_list = several and isinstance(value, list | tuple | range)
+    plain = tuple(_plain(each) for each in (value if is_list else (value,)))
+    element = str if element not in _KINDS else element  # a path, or the repeated words of a command
+    if not all(type(each) is element or (element is float and type(each) is int) for each in plain):
+        raise InvalidValueError(f"{name} is {brief(value)}; give {_KINDS[element]}{' or a list of them' * several}.")
+    return plain if several else plain[0]
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of numpy as Python's, what a generator gives as a list, and a path as text."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Iterator):
+        return list(value)
+    return str(value) if isinstance(value, PurePath) else value
+
+
+def _first_seeds(number: int) -> tuple[int, ...]:
+    """So many seeds, from 0 on. Raises InvalidValueError: so many there are not."""
+    if not 1 <= number <= SEEDS:
+        raise InvalidValueError(f"seeds is {number}; give their number, 1 to {SEEDS}, or a list of seeds.")
+    return tuple(range(number))
+
+
 def _pairs(name: str, given: Mapping[str, Setting] | Sequence[str]) -> tuple[tuple[str, Setting], ...]:
     """Settings, given as a mapping or as the words of the command."""
     if isinstance(given, Mapping):
-        return tuple(sorted(given.items()))
-    if isinstance(given, list | tuple):
+        return tuple(sorted((str(key), _plain(value)) for key, value in given.items()))
+    if isinstance(given, list | tuple) and all(isinstance(each, str) for each in given):
         return parse_settings(given, name)
     raise InvalidValueError(f"{name} is {brief(given)}; give a mapping of names to values.")
 
@@ -263,15 +310,21 @@ def register_agent(name: str, make: MakeAgent | str, **options: Any) -> None:
             agent needs no encoder by default; its description is the first line of the docstring.
 
     Raises:
-        InvalidValueError: The name is no name or taken, or the class cannot be sent to another process.
+        InvalidValueError: The name is no name or taken, the class cannot be sent to another process, or an
+            option has a value of another kind.
         UnknownKeywordError: An option that agents do not have.
     """
-    known = [field.name for field in dataclasses.fields(AgentEntry) if field.name != "make"]
-    for option in options:
+    known = get_type_hints(AgentEntry)
+    del known["make"]
+    for option, value in options.items():
         if option not in known:
-            raise UnknownKeywordError.of(option, known)
+            raise UnknownKeywordError.of(option, list(known))
+        options[option] = _fitting(option, _plain(value), known[option])
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name):
-        raise InvalidValueError(f"An agent cannot be called {brief(name)}; give letters, digits and underscores.")
+        raise InvalidValueError(
+            f"An agent cannot be called {brief(name)}; give a name of letters, digits and underscores that begins with "
+            "one of a to z or A to Z. register_agent gives a class another name than its own."
+        )
     taken = registry.AGENTS.get(name)
     is_ours = taken is not None and str(taken.make).startswith("imagine_bench.")
     if is_ours or name in registry.usable(registry.AGENT_GROUP):
@@ -311,7 +364,7 @@ def load(path: Path | str) -> Comparison:
     Raises:
         ArtefactError: There are no results in the folder, or a file is damaged.
     """
-    folder = Path(path)
+    folder = expanded(Path(_fitting("path", _plain(path), str)))
     places = [place for place in (folder, folder / "report") if place.is_dir()]
     for place in places:
         if (place / "protocol.json").exists() or (is_archive(place) and "variants" not in read_protocol_values(place)):

@@ -222,7 +222,7 @@ def carry_out(
         stage, paths = plan(task, preset, **{**options, **changes})
         return cast("BenchResult", bench(stage, paths, root=root, launcher=launcher))
 
-    begun, whole = until_decided(staged, wanted, most=most or _MOST_SEEDS, root=root)
+    begun, whole = until_decided(staged, wanted, most=_MOST_SEEDS if most is None else most, root=root)
     return [begun] if whole is begun else [begun, whole]
 
 

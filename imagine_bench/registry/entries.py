@@ -127,7 +127,7 @@ def entrant(text: str) -> Entrant:
     words = _BETWEEN.split(rest) if colon else []
     if words and words[0].isidentifier():
         agent = f"{agent}:{words.pop(0)}"
-    return Entrant(agent, dict(parse_settings(words, f"entrant {text!r}:")))
+    return Entrant(agent, dict(parse_settings(words, f"Agent {text!r}:")))
 
 
 def parse_settings(pairs: Sequence[str], where: str = "--set") -> tuple[tuple[str, Setting], ...]:

@@ -78,12 +78,14 @@ def bench_page(result: BenchResult) -> Page:
     split = f" · tests start where training never does, {protocol.split}" if protocol.split else ""
     fewer = [f"{agent} {len(protocol.seeds_of(agent))}" for agent, _ in protocol.few_seeds]
     few = f" ({', '.join(fewer)})" if fewer else ""
+    trials = protocol.evaluation_episodes
     interval = seeds_note(len(protocol.seeds))
     if len(protocol.seeds) == 1:
         interval = "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
     subtitle = (
         f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.looks}” · "
-        f"{len(protocol.seeds)} seed(s){few}, {protocol.evaluation_episodes} test episodes{dataset}{split} · "
+        f"{len(protocol.seeds)} seed{'s' * (len(protocol.seeds) != 1)}{few}, "
+        f"{trials} test episode{'s' * (trials != 1)}{dataset}{split} · "
         f"{interval} · protocol {result.protocol_hash}"
     )
     return Page(

@@ -95,7 +95,8 @@ def suite_page(result: SuiteResult) -> Page:
     questions = [f"{each.name}: {each.question}" for each in suite.experiments]
     return Page(
         title="The benchmark suite: what can each agent do?",
-        subtitle=f"Suite {suite.name} {suite.hash} · {suite.execution} execution · {len(suite.seeds)} seed(s) · "
+        subtitle=f"Suite {suite.name} {suite.hash} · {suite.execution} execution · {len(suite.seeds)} "
+        f"seed{'s' * (len(suite.seeds) != 1)} · "
         f"{suite.evaluation_episodes} tests a level",
         question="Each experiment changes one parameter of a world of arrows. Where is an agent between blind choice "
         "(0) and perfect play (1), which are exact?",

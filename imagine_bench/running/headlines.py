@@ -69,9 +69,7 @@ def stages(first: int, most: int) -> list[int]:
     Raises InvalidValueError: fewer than the first.
     """
     if most < first:
-        raise InvalidValueError(
-            f"--most-seeds {most} is less than the {first} seeds that come first; give at least that."
-        )
+        raise InvalidValueError(f"--most-seeds {most} is fewer than the bench begins with; give at least {first}.")
     return [*range(first, most, STAGE), most]
 
 
@@ -98,7 +96,7 @@ def until_decided(
     if not first.headlines:
         raise InvalidValueError(
             "This bench has no headlines, so there is nothing to decide; leave --until-decided out. The preset quick "
-            "has two, unless --agents names others."
+            "has two if --agents is left out."
         )
     counts = stages(len(first.seeds), most)
     begun = plan(most_looks=len(counts))

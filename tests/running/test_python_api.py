@@ -288,6 +288,11 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         ("--seeds 0 1 2", {"seeds": 3}),
         ("--seeds 4 7", {"seeds": np.array([4, 7])}),
         ("--budgets 1 2 3", {"budgets": range(1, 4)}),
+        ("--budgets 4", {"budgets": 4}),
+        ("--seeds 0 1", {"seeds": (seed for seed in range(2))}),
+        ("--seeds 0 1", {"seeds": np.array(2)}),
+        ("--seeds 3", {"seeds": (np.int64(3),), "appearance": Path("clean")}),
+        ("--set controller.discount=0.5", {"set": {"controller.discount": np.float32(0.5)}}),
         ("--appearance mild --demonstrations 2", {"appearance": "mild", "demonstrations": 2}),
     ]
     for words, options in pairs:
@@ -298,17 +303,32 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         assert wanted == command.planned()[0], words
     with pytest.raises(UnknownKeywordError, match=r"'episodes'.*evaluation_episodes"):
         imagine_bench.bench("arrow_puzzle", episodes=3)
+    with pytest.raises(UnknownKeywordError, match=r"'worker'. Did you mean 'workers'"):
+        imagine_bench.bench("arrow_puzzle", worker=2)
     wrong: list[tuple[dict[str, Any], str]] = [
-        ({"seeds": -1}, "seeds"),
-        ({"budgets": 3}, "budgets was given 3"),
+        ({"seeds": -1}, "seeds is -1; give their number"),
+        ({"seeds": 1 << 70}, "give their number, 1 to 16777216"),
+        ({"seeds": {0, 1}}, "give a whole number or a list of them"),
+        ({"budgets": [True]}, "give a whole number or a list of them"),
+        ({"evaluation_episodes": True}, "give a whole number"),
+        ({"workers": "2"}, "workers is '2'; give a whole number"),
+        ({"until_decided": "false"}, "give True or False"),
+        ({"split": {"plan_length": 2}}, "give a text"),
+        ({"out": None}, "out is None"),
+        ({"set": [("controller.discount", 0.9)]}, "give a mapping of names to values"),
+        ({"agents": {"dqn", "random"}}, "give a name, a class or a function, or a list of them"),
+        ({"agents": 3}, "agents is 3; give a name"),
         ({"set": "controller.discount=0.9"}, "give a mapping of names to values"),
         ({"physics": 3}, "give a mapping of names to values"),
         ({"agents": "dqnn"}, "No agent 'dqnn'"),
+        ({"until_decided": True, "most_seeds": 0}, "give at least 6"),
         ({"most_seeds": 3}, "--most-seeds goes with --until-decided"),
     ]
     for options, sentence in wrong:
         with pytest.raises(ImagineBenchError, match=sentence):
-            imagine_bench.bench("arrow_puzzle", out=tmp_path, **options)
+            imagine_bench.bench("arrow_puzzle", **{"out": tmp_path, **options})
+    with pytest.raises(InvalidValueError, match="task is None"):
+        imagine_bench.bench(None)
     assert not list(tmp_path.iterdir())
 
 
@@ -320,6 +340,9 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         ("my agent", Shifting, {}, "cannot be called 'my agent'"),
         ("mine", 3, {}, "made by a class or a function; 3 is neither"),
         ("mine", functools.partial(Shifting, _LOCK), {}, "cannot be sent to worker processes"),
+        ("_mine", Shifting, {}, "begins with one of a to z"),
+        ("mine", Shifting, {"needs_encoder": "no"}, "needs_encoder is 'no'; give True or False"),
+        ("mine", Shifting, {"observes": 3}, "observes is 3; give a text"),
         ("mine", Shifting, {"learn": False}, "'learn'. Did you mean 'learns'?"),
     ],
 )

@@ -178,7 +178,7 @@ def test_an_agent_of_fewer_seeds_is_whole_with_these(tmp_path: Path) -> None:
     protocol = dataclasses.replace(small(agents=("table", "random")), seeds=(0, 1, 2), few_seeds=few)
     made = bench(protocol, {}, root=tmp_path / "runs", launcher=Inline())
     assert [(run.agent, run.seed) for run in made.runs if run.agent == "random"] == [("random", 0), ("random", 1)]
-    assert "3 seed(s) (random 2)" in summary_table(made)
+    assert "3 seeds (random 2)" in summary_table(made)
     kept = kept_from(made.folder, tmp_path / "kept")
     assert load_so_far(kept).missing == () and load_so_far(kept).protocol == protocol
     rows = (kept / "results.csv").read_text().splitlines()
