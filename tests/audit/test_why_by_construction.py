@@ -145,7 +145,7 @@ def test_unlucky_is_what_an_optimal_policy_fails_with_the_same_draws(task: str, 
 
     Among equals it does what the agent does, as 'unlucky' says.
     """
-    row, found = asked(tmp_path, "bad", task, evaluation_episodes=120, budgets=(1,))
+    row, found = asked(tmp_path, "bad", task, evaluation_episodes=70, budgets=(1,))
     assert row.kept is not None and row.beliefs is not None
     spec = registry.task(task)
     sets, usual = best_sets(spec.rules, spec.horizon), dict(zip(states_of(spec.rules), row.beliefs.action, strict=True))

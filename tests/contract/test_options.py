@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import imagine_bench.agents.dqn  # noqa: F401 - loads torch, which no test's time holds
 import pytest
 
@@ -30,6 +32,12 @@ AGENTS = [
     ),
 ]
 """All of the suite and of its guests; fakes of other tests are registered, too."""
+NAMES = [str(each.values[0]) for each in AGENTS]
+_SHOWN_TO = ("random", "oracle", "dqn", "factored", "factored:given", "imagination_memory", "count_table")
+"""One of each kind: without perception, with macrostates, with latents, with frames, with codes, with memory, a guest.
+
+Options of the world act in environments, before any agent sees a frame.
+"""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -42,14 +50,27 @@ def test_every_field_of_a_protocol_has_a_row_or_a_reason() -> None:
     require_every_field()
 
 
-@pytest.mark.parametrize("agent", AGENTS)
-def test_every_option_has_an_effect_or_is_refused(agent: str) -> None:
-    options, refused = CheckedOptions(agent, TASK), set()
-    for option in OPTION_ROWS:
+def refusals(agent: str, options: Iterable[str]) -> set[str]:
+    """The options that are refused; InvalidValueError for one that is not, and changes nothing."""
+    checked, refused = CheckedOptions(agent, TASK), set[str]()
+    for option in options:
         try:
-            options.check(option)
+            checked.check(option)
         except NotOffered:
             refused.add(option)
+    return refused
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_every_option_of_training_has_an_effect_or_is_refused(agent: str) -> None:
+    refusals(agent, [name for name, row in OPTION_ROWS.items() if not row.shown])
+
+
+@pytest.mark.parametrize(
+    "agent", [pytest.param(each, marks=[pytest.mark.slow] * (each not in _SHOWN_TO)) for each in NAMES]
+)
+def test_every_option_of_the_world_has_an_effect_or_is_refused(agent: str) -> None:
+    refused = refusals(agent, [name for name, row in OPTION_ROWS.items() if row.shown])
     if registry.agent_entry(agent).privileged:  # one that renders its world needs an encoder of that very world
         refused -= {"gesture", "lag"}
     assert not refused & {"split", "physics", "appearance", "gesture", "lag"}, "what the world is like is for all"

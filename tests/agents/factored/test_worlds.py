@@ -18,7 +18,7 @@ from imagine_bench.agents.factored import appearance
 def test_every_cube_and_the_hand_are_factors_and_nothing_else(world: dict[str, int], sizes: list[int]) -> None:
     rng, frames, begins, actions = np.random.default_rng(2), [], [], []
     with gymnasium.make("imagine_bench/Arrows-v0", execution="kinematic", **world) as env:
-        for episode in range(40):
+        for episode in range(28):
             frames.append(env.reset(seed=2000 + episode)[0])
             begins.append(True)
             ended = False
