@@ -117,7 +117,7 @@ def _blind(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         (folder / "reader.json").write_text(json.dumps(dict.fromkeys(names, 0.0)))
         return BlindReader(len(spec.macrostate_names))
 
-    monkeypatch.setattr(judgement, "_reader", read_nothing)
+    monkeypatch.setattr(judgement, "reader_in", read_nothing)
     yield
     judgement.prepare.cache_clear()
     judgement.data_of.cache_clear()

@@ -84,10 +84,11 @@ def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_l
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["describe"]) == 0
-    marked = [line for line in capsys.readouterr().out.splitlines() if line.startswith("not installed")]
-    for folder, line in zip(FOLDERS, marked, strict=True):
-        names = [name for group in project(folder)["entry-points"].values() for name in group]
-        assert line == f"{'not installed':22}{', '.join(names)} (pip install -e {folder})"
+    marked = capsys.readouterr().out.partition("\nNot installed\n")[2].partition("\n\n")[0].splitlines()
+    names = {name: folder for folder in FOLDERS for each in project(folder)["entry-points"].values() for name in each}
+    assert {line.split()[0]: line.split(maxsplit=1)[1] for line in marked} == {
+        name: f"pip install -e {folder}" for name, folder in names.items()
+    }
     assert main(["bench", "--task", "arrow_puzzle", "--agents", "dqn", "dreamer_v3:replay_ratio=2"]) == 2
     said = capsys.readouterr().err
     where = f"Install it with: pip install -e {ROOT / 'agents' / 'guests' / 'peers'}"

@@ -76,7 +76,7 @@ def test_a_packages_agent_is_compared_like_one_of_ours(
     folder = newest_bench(tmp_path / "runs")
     noted = json.loads((folder / "sessions.json").read_text())["environment"]["versions"]["their_package"]
     assert re.fullmatch(r"1\.2\+[0-9a-f]{8}", noted) and versions()["their_package"] == noted
-    assert "Theirs" in (folder / "report" / "index.html").read_text()
+    assert "their_agent" in (folder / "report" / "index.html").read_text()
     metrics = (folder / "their_agent/seed_0/metrics.csv").read_text().splitlines()
     row = dict(zip(metrics[0].split(","), metrics[-1].split(","), strict=True))
     assert float(row["diagnostics/real_transitions"]) == float(row["env_steps"]) > 0
@@ -84,7 +84,7 @@ def test_a_packages_agent_is_compared_like_one_of_ours(
     assert main(["report", str(folder)]) == 0, "what was measured can be read without the package"
     said = capsys.readouterr().out
     assert "Not installed here: agent their_agent. What follows from their code is not shown." in said
-    assert re.search(r"^their agent +\d", said, re.MULTILINE)
+    assert re.search(r"^their_agent +\d", said, re.MULTILINE)
     assert main([*words, *size, "--out", str(tmp_path / "runs")]) == 2
     assert "No agent 'their_agent'" in capsys.readouterr().err
 
