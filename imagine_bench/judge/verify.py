@@ -195,7 +195,7 @@ class _RunCheck:
             f"the training episodes that are those of the dataset {protocol.dataset}": protocol.dataset
             and self.trained,
             f"its training on {', '.join(protocol.after)} before": protocol.after and self.trained,
-            "whether it learns, for no package here offers it": self.entry is None,
+            f"whether {self.agent} learns, for no package here offers it": self.entry is None,
         }
         return tuple(claim for claim, is_unshown in claims.items() if is_unshown)
 

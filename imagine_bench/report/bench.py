@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from imagine_bench import reference
 from imagine_bench.arrays import Floats
+from imagine_bench.protocols.control import PRESETS
 from imagine_bench.registry.entries import FIRST
 from imagine_bench.report import figures, sections
 from imagine_bench.report.data import (
@@ -166,7 +167,12 @@ def _undecided(data: ReportData, agent: str, more: int) -> str:
     if not command.startswith("imagine-bench bench ") or ";" in command:
         return words
     alone = f" --agents {BASE_AGENT} {agent}" if agent in dict(protocol.few_seeds) else ""
-    return f"{words}: {_SEEDS_OPTION.sub('', command)}{alone} --seeds {every}"
+    command = _SEEDS_OPTION.sub("", command) + alone
+    for name, now in PRESETS.get(protocol.preset, {}).items():  # an earlier version's preset may have been another
+        was = getattr(protocol, name)
+        if name in ("agents", "budgets") and f" --{name} " not in command and set(was) != set(now):
+            command += f" --{name} {' '.join(map(str, was))}"
+    return f"{words}: {command} --seeds {every}"
 
 
 def shown(record: Record) -> int:

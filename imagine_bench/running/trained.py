@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol, context_of
@@ -139,7 +139,10 @@ def learners(bench: Path) -> tuple[Path, ...]:
     store = BenchStore(bench, protocol)
     found = []
     for agent, seed in protocol.runs:
-        entry = registry.agent_entry(agent)
+        try:
+            entry = registry.agent_entry(agent)
+        except UnknownNameError:  # of a script, or of a package that is not installed here
+            continue
         if entry.learns and not entry.external_training_loop:
             folder = store.run_folder(agent, seed)
             snapshot = load_newest(folder / run_folder.CHECKPOINTS, agent=False)
@@ -147,8 +150,9 @@ def learners(bench: Path) -> tuple[Path, ...]:
                 found.append(folder)
     if not found:
         raise ArtefactError(
-            f"No run below {bench} has a checkpoint of an agent that learns and can be taken up again (a library's "
-            "cannot); give the folder of a bench with one, such as of dqn."
+            f"No run below {bench} has a checkpoint of an agent that learns and can be taken up again. (One of a "
+            "library, of a script, or of a package that is not installed here cannot.) Give the folder of a bench with "
+            "one, such as of dqn."
         )
     return tuple(found)
 

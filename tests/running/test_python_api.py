@@ -33,7 +33,7 @@ from imagine_bench.errors import (
 )
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.registry.by_value import CodeByValue, code_digest
-from imagine_bench.running.trained import load_trained
+from imagine_bench.running.trained import learners, load_trained
 
 _FEW: dict[str, Any] = {
     "preset": "smoke",
@@ -211,6 +211,10 @@ def test_a_changed_class_resumes_no_run(
     monkeypatch.setattr(Shifting, "shift", 0)
     imagine_bench.register_agent("Shifting", Shifting)
     assert load_trained(run).episodes == 2, "the former class, again"
+    assert learners(results.folder) == (run,)
+    del registry.AGENTS["Shifting"]
+    with pytest.raises(ArtefactError, match="of a script"):
+        learners(results.folder)
 
 
 def test_a_frame_is_the_table_of_the_report(results: api.Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,6 +271,7 @@ def test_kept_results_are_loaded_as_they_were_written(kept: str) -> None:
             assert str(value) == text or float(text or "nan") == value or not text, (column, value, text)
     if kept == "arrow_puzzle-quick":
         assert "dqn" in results.verdict() and results.plot()
+        assert "--budgets 100 250 500 --seeds" in results.verdict(), "the bench that is kept, not today's preset"
     else:
         for method in (results.verdict, results.plot, results.report):
             with pytest.raises(InvalidValueError, match="holds tables alone"):
