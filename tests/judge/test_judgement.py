@@ -24,7 +24,7 @@ import pytest
 from doc_cells import ROOT
 from fake_reader import BlindReader
 from guest_packages import Guests
-from recordings import contents, times
+from recordings import contents, times, view_names
 from small_runs import Inline, small
 
 import imagine_bench
@@ -227,7 +227,7 @@ def test_privileged_models_are_marked_wherever_they_stand(said: Said) -> None:
     marked = {row["model"] for row in rows if row["privileged"] == "true"}
     assert marked == {"exact", "cheat"} < {row["model"] for row in rows}
     page = (report / "index.html").read_text()
-    recording = (said.folder / "judgement.rrd").read_bytes().decode("latin1")
+    recording = "\n".join(view_names(said.folder / "judgement.rrd"))
     for text in (said.out, page, recording):
         assert "cheat (privileged)" in text and "exact (privileged)" in text
         assert "frame (privileged)" not in text
