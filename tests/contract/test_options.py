@@ -32,12 +32,6 @@ AGENTS = [
     ),
 ]
 """All of the suite and of its guests; fakes of other tests are registered, too."""
-NAMES = [str(each.values[0]) for each in AGENTS]
-_SHOWN_TO = ("random", "oracle", "dqn", "factored", "factored:given", "imagination_memory", "count_table")
-"""One of each kind: without perception, with macrostates, with latents, with frames, with codes, with memory, a guest.
-
-Options of the world act in environments, before any agent sees a frame.
-"""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -66,9 +60,7 @@ def test_every_option_of_training_has_an_effect_or_is_refused(agent: str) -> Non
     refusals(agent, [name for name, row in OPTION_ROWS.items() if not row.shown])
 
 
-@pytest.mark.parametrize(
-    "agent", [pytest.param(each, marks=[pytest.mark.slow] * (each not in _SHOWN_TO)) for each in NAMES]
-)
+@pytest.mark.parametrize("agent", AGENTS)
 def test_every_option_of_the_world_has_an_effect_or_is_refused(agent: str) -> None:
     refused = refusals(agent, [name for name, row in OPTION_ROWS.items() if row.shown])
     if registry.agent_entry(agent).privileged:  # one that renders its world needs an encoder of that very world
