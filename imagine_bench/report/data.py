@@ -194,7 +194,9 @@ def _against_dqn(data: ReportData, agent: str, place: int) -> Record:
     }
     if data.spec.reference:
         found["thesis_gain"] = reference.gain(data.spec.reference, agent).get(protocol.budgets[place])
-    solved = [[run.checkpoints[place].solved or "" for run in result.of(name)] for name in (agent, BASE_AGENT)]
+    seeds = set(protocol.seeds_of(agent)) & set(protocol.seeds_of(BASE_AGENT))
+    runs = [[run for run in result.of(name) if run.seed in seeds] for name in (agent, BASE_AGENT)]
+    solved = [[run.checkpoints[place].solved or "" for run in each] for each in runs]
     if all(map(all, solved)):  # it is known which tests were solved
         found |= zip(_PAIRED, statistics.mcnemar(*map("".join, solved)), strict=True)
     return found

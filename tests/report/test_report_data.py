@@ -14,7 +14,7 @@ from fake_results import WIDE, bench_result, rewritten
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report.bench import cost, success
+from imagine_bench.report.bench import bench_page, cost, success
 from imagine_bench.report.data import DIFFERENCE, SCORE, collect, frames_before, open_loop_means
 from imagine_bench.report.page import DASH, count, seconds
 from imagine_bench.rules import fewest_actions
@@ -171,6 +171,25 @@ def test_the_same_starts_are_compared(tmp_path: Path) -> None:
         for row in rows:
             beyond += [row.lengths[test] - fewest[tuple(row.starts[test])] for test in np.flatnonzero(row.success)]
         assert record["excess_macro_actions"] == pytest.approx(np.mean(beyond))
+
+
+def test_an_agent_of_fewer_seeds_is_paired_where_both_have_one(result: BenchResult) -> None:
+    """As in the default bench, whose report must be written."""
+    known = kept(result)
+    agent = next(name for name in collect(known).compared if name != "dqn")
+    last = known.protocol.seeds[-2]
+    protocol = dataclasses.replace(known.protocol, few_seeds=((agent, last),))
+    runs = tuple(run for run in known.runs if run.agent != agent or run.seed <= last)
+    fewer = dataclasses.replace(known, protocol=protocol, runs=runs)
+    mine, base = ([run for run in runs if run.agent == name and run.seed <= last] for name in (agent, "dqn"))
+    alone = sum(
+        ours == "1" and theirs == "0"
+        for one, other in zip(mine, base, strict=True)
+        for ours, theirs in zip(one.checkpoints[0].solved, other.checkpoints[0].solved, strict=True)
+    )
+    (record, *_) = [record for record in collect(fewer).records if record["agent"] == agent]
+    assert record["alone"] == alone > 0
+    assert bench_page(fewer).summary
 
 
 def test_an_agent_whose_tests_are_not_known_leaves_nothing_to_pair(result: BenchResult) -> None:
