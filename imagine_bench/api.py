@@ -63,7 +63,7 @@ _TEXT = ("solved",)
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
-    """What a comparison has found: a bench, a merged report, a judgement, or the tables that were kept of one.
+    """The results of a comparison: a bench, a merged report, a judgement, or the tables that were kept of one.
 
     Printed, it shows the table and the verdict of the report.
     """
@@ -273,7 +273,7 @@ def _fitting(name: str, value: Any, kind: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers of numpy as Python's, what a generator gives as a list, and a path as text."""
+    """Numbers of numpy as Python's, the items of a generator as a list, and a path as text."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Iterator):
@@ -387,7 +387,7 @@ def _of_bench(result: Result) -> Comparison:
 
 
 def _page_of_judgement(folder: Path) -> Page:
-    """The report of what was judged in a folder."""
+    """The report of a judgement in a folder."""
     path = folder / "judgement.json"
     with reading(path, "a judgement"):
         judgement = unpack(Judgement, read_json(path, "a judgement"), {})

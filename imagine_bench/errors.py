@@ -163,7 +163,7 @@ class CheckFailedError(ImagineBenchError):
 
 
 class IncompleteCheckError(ImagineBenchError):
-    """A command that checks has found nothing wrong, and could not compare everything; the message says what."""
+    """A command that checks has found nothing wrong, and could not compare everything; the message names the rest."""
 
     exit_code = 3
 

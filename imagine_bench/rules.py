@@ -70,7 +70,7 @@ class Rules(Protocol):
 
 
 Dynamics = Callable[[State, int], Sequence[Outcome]]
-"""What may come of a macro-action in a macrostate, as :meth:`Rules.outcomes` says it."""
+"""The possible outcomes of a macro-action in a macrostate, as :meth:`Rules.outcomes` says it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +177,7 @@ def tabulate(rules: Rules, depth: int | None = None) -> RuleTables:
 def every_outcome(
     states: Iterable[State], n_actions: int, outcomes: Dynamics, *, follow: bool, depth: int | None = None
 ) -> OutcomeTable:
-    """Write out what every macro-action may bring.
+    """Write out the possible outcomes of every macro-action.
 
     Args:
         states: Macrostates to ask about.

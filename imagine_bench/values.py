@@ -59,7 +59,7 @@ def pack(value: Any, path: str = "") -> tuple[Any, Arrays]:
 
 
 def unpack(kind: Any, values: Any, arrays: Mapping[str, Array]) -> Any:
-    """Rebuild an object of type ``kind`` from what :func:`pack` gave; ``values`` is None if only arrays were kept.
+    """Rebuild an object of type ``kind`` from the values of :func:`pack`; ``values`` is None if only arrays were kept.
 
     A field that files do not have takes its default.
 

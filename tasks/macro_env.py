@@ -362,7 +362,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         )
 
     def _execute(self, action: int, intended: State) -> MacroResult:
-        """Carry out a macro-action in physics, or set what became of it before; see :meth:`reuse_outcomes`."""
+        """Carry out a macro-action in physics, or set its earlier outcome again; see :meth:`reuse_outcomes`."""
         if not self._reuses or self.capture_motion_hz > 0.0:
             return self.world.execute(action, intended)
         before = (self._kind, action, intended, *self.world.decisive())

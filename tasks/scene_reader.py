@@ -170,7 +170,7 @@ class FilmedScene:
         return self.world.composite(self.camera(agent_camera_view()).frame(self.data))
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
-        """An image for people of what happens on the table, with the arm. Shape (height, width, 3)."""
+        """An image for people: the table and the objects on it, with the arm. Shape (height, width, 3)."""
         return self.renderer_for_people(HUMAN_CAMERA, width, height).frame(self.data)
 
     def renderer_for_people(self, camera: str, width: int, height: int) -> Renderer:

@@ -121,18 +121,18 @@ class World(abc.ABC):
         self.set_physics_state(state.physics)
 
     def physics(self) -> Floats:
-        """MuJoCo's state of the scene, with what starts its solvers, copied."""
+        """MuJoCo's state of the scene, with the start values of its solvers, copied."""
         physics = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, physics, _STATE)
         return physics
 
     def set_physics_state(self, physics: Floats) -> None:
-        """Put what moves in the scene as :meth:`physics` found it, to the bit."""
+        """Put the moving bodies of the scene as :meth:`physics` found it, to the bit."""
         mujoco.mj_setState(self.model, self.data, physics, _STATE)
         self.update()
 
     def decisive(self) -> tuple[Hashable, ...]:
-        """All that decides, with the model and the arguments, what :meth:`execute` does."""
+        """All values that decide, with the model and the arguments, the result of :meth:`execute`."""
         noise = tuple(each for offset in self._placement_noise for each in offset)
         return self.physics().tobytes(), noise, self.sensing.aside_m, self.sensing.turned_rad
 

@@ -7,8 +7,8 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AutoresetMode
 
-from imagine_bench.environments import Lanes
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces.environments import Lanes
 
 
 def vector_env(env: Lanes | str, **kwargs: Any) -> Lanes:

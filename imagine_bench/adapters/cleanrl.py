@@ -15,7 +15,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from imagine_bench.adapters import vector_env
 from imagine_bench.arrays import Bools, Floats, Info, Ints, Observed
-from imagine_bench.environments import Lanes
+from imagine_bench.interfaces.environments import Lanes
 
 
 def as_cleanrl(env: Lanes | str, **kwargs: Any) -> FinalObservation:

@@ -17,8 +17,8 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.arrays import Action, Floats, Info
-from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.interfaces.environments import Env
 
 try:
     registry.load("imagine_bench.tasks.graphics:choose_platform")()  # dm_control chooses another one while it loads

@@ -20,8 +20,8 @@ import numpy as np
 from gymnasium.wrappers.vector import DictInfoToList
 
 from imagine_bench.adapters import vector_env
-from imagine_bench.environments import Lanes
 from imagine_bench.errors import lacking
+from imagine_bench.interfaces.environments import Lanes
 
 try:
     from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv

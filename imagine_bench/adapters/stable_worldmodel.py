@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imagine_bench.arrays import Action, Info, Observed, State
-from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame
+from imagine_bench.interfaces.environments import Env, Wrapper
 
 
 class SuccessTerminates(Wrapper):

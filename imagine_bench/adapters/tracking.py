@@ -27,7 +27,7 @@ class RunWriter(Protocol):
         """Write scalars after so many real training episodes."""
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the metrics that are left."""
 
 
 def track(folder: Path, tool: str) -> Path:
@@ -114,7 +114,7 @@ class Tracked:
                 self.guarded(run.close)
 
     def writer(self, run: Path) -> RunWriter:
-        """What writes the run of a folder."""
+        """The writer of the run of a folder."""
         bench = run.parents[1]
         return self._make_writer(make_folder(bench / self._tool), run.relative_to(bench))
 
@@ -130,7 +130,7 @@ class Tracked:
 
 
 class _Run:
-    """A run and what of it is written; nothing before its first news."""
+    """A run and the number of its metrics that are written; none before its first news."""
 
     def __init__(self, tracked: Tracked, folder: Path) -> None:
         self._tracked = tracked
@@ -155,7 +155,7 @@ class _Run:
         self._tests = len(rows)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the metrics that are left."""
         if self._writer is not None:
             self._write_tests(self._writer)
             self._writer.close()

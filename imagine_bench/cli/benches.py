@@ -192,7 +192,7 @@ def carry_out(
     until: bool = False,
     most: int | None = None,
 ) -> list[Result]:
-    """Run what is missing of a bench, or with ``until`` of its stages, and read it.
+    """Carry out the missing runs of a bench, or with ``until`` of its stages, and read it.
 
     Args:
         task: The task.

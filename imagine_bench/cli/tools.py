@@ -236,7 +236,7 @@ class New:
     """Write a package of your own with a task, an agent or a world model in it, ready to be changed."""
 
     kind: Annotated[str, tyro.conf.Positional, one_of("task", "agent", "model")]
-    """What the package holds."""
+    """The kind of thing that the package holds."""
     name: Annotated[str, tyro.conf.Positional]
     """Name of the package and of what it offers."""
     out: Path = Path()

@@ -22,7 +22,7 @@ from imagine_bench.arrays import Floats, Ints
 from imagine_bench.rules import Rules, every_outcome
 
 Class = tuple[float, bool, bool]
-"""What a macro-action gave: the reward, whether the episode ended, whether as a success."""
+"""The outcome of a macro-action: the reward, whether the episode ended, whether as a success."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -83,7 +83,7 @@ def _next(rules: Rules, sight: Sight, now: _Seen, action: int, step: int) -> Ite
 
 
 def best_without_memory(rules: Rules, sight: Sight, horizon: int, *, bound: float) -> Memoryless:
-    """Solve the programme, or say after :data:`NODES` of the search what was found and what is proved.
+    """Solve the programme, or say after :data:`NODES` of the search the best policy found and the bound proved.
 
     ``bound`` is the optimum with memory: a policy without it that reaches it is the best, and where the programme is
     too large, no other bound is proved. A value of 0 says that none was looked for.

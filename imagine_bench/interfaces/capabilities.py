@@ -187,7 +187,7 @@ class FrameReader(Protocol):
 class ExpectedOutcomes:
     """What a model expects of every macro-action in N frames; what is missing to probability 1 ends the episode."""
 
-    macrostates: Ints  #: what may follow, B branches, as a probe reads it. Shape (N, A, B, M).
+    macrostates: Ints  #: the possible next ones, B branches, as a probe reads it. Shape (N, A, B, M).
     p_continues: Floats  #: probability that this follows and the episode goes on. Shape (N, A, B).
     reward: Floats  #: expected reward. Shape (N, A).
 

@@ -59,7 +59,7 @@ class WorldModel(Protocol):
 
 
 class Untaught:
-    """What a world model that learns nothing has in common with others."""
+    """The methods that a world model that learns nothing shares with others."""
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Learn nothing."""

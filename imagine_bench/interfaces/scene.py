@@ -44,7 +44,7 @@ class ArmMotion:
     joint_rad: Floats  #: Shape (K, 7).
     joint_rad_s: Floats  #: Shape (K, 7).
     gripper_m: Floats  #: each finger's distance from the grip's middle. Shape (K, 2).
-    joint_command_rad: Floats  #: what the servos are told, feed-forward included. Shape (K, 7).
+    joint_command_rad: Floats  #: commands of the servos, feed-forward included. Shape (K, 7).
     gripper_command_m: Floats  #: the same of the fingers. Shape (K, 2).
     #: the point between the fingers: position (m) and quaternion (w, x, y, z). Shape (K, 7).
     tcp_in_world: Floats

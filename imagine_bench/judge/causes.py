@@ -30,10 +30,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from imagine_bench.arrays import Bools, Frame, Ints, State, read_only
-from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Outcome, Rules, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.judge.truth import Model, action_values, added_up, rows_of, total_variation, true_model
 from imagine_bench.rules import states_of
 from imagine_bench.running.run_state import make_env

@@ -132,7 +132,7 @@ class ModelSource:
 
     @property
     def cost(self) -> dict[str, str | float]:
-        """What was spent beforehand: the encoder's name, and the frames that it was trained on.
+        """The cost beforehand: the encoder's name, and the frames that it was trained on.
 
         If few new frames are read right from the encoder, that share is here too.
         """

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from imagine_bench.arrays import Bools, State
-from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.capabilities import ImaginedRollout, begin_episode
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.judge.open_loop import Real, beside_reality
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running import run_state

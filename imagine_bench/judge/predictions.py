@@ -115,10 +115,11 @@ def evaluate(
 def imagined_by(
     model: WorldModel, name: str, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator
 ) -> Imagined:
-    """What a model imagines, see :class:`.interfaces.model.WorldModel`, if it is what it has to be.
+    """The imagined futures of a model, checked; see :class:`.interfaces.model.WorldModel`.
 
     Raises:
-        InvalidValueError: The model fails, or hands in what it must not; the message names model and method.
+        InvalidValueError: The model fails, or returns a type, shape or value that is not allowed; the message
+            names model and method.
     """
     depth = actions.shape[1] - frames.shape[1] + 1
     found = call(name, "imagine", model.imagine, frames, actions, samples, rng)

@@ -1,4 +1,4 @@
-"""What images show, as macrostates: an image equal to a rendered frame shows its macrostate, a reader reads the rest.
+"""Macrostates read from images: an image equal to a rendered frame shows its macrostate, a reader reads the rest.
 
 A reader is trained once for each world and kept in the user's cache, and a judgement's folder keeps the one it is of.
 """
@@ -40,7 +40,7 @@ _PATIENCE_S = 1_800.0  # seconds that a process waits while another makes the da
 
 
 class ImageReader(Protocol):
-    """What reads images; see :mod:`imagine_bench.agents.world_models.reader`."""
+    """A reader of images; see :mod:`imagine_bench.agents.world_models.reader`."""
 
     def read(self, pictures: Images) -> Ints:
         """Macrostates (N, M) of images (N, H, W) or (N, H, W, 3); -1 where one shows nothing of this world."""
@@ -73,7 +73,7 @@ def reader_errors(reader: ImageReader, spec: TaskSpec, appearance: str) -> dict[
 
 
 class RenderedFrameIndex:
-    """Frames of macrostates that were rendered for one judgement, and what each of them shows, to the pixel."""
+    """Frames that were rendered for one judgement, and the macrostate that each of them shows, to the pixel."""
 
     def __init__(self, spec: TaskSpec, appearance: str) -> None:
         self._spec = spec
@@ -100,7 +100,7 @@ class RenderedFrameIndex:
         return self._shows.get(_key(image))
 
     def read(self, images: Images, reader: ImageReader) -> Ints:
-        """Macrostates (N, S, D, M) of images (N, S, D, ...); a reader reads what was not rendered, equal ones once."""
+        """Macrostates (N, S, D, M) of images (N, S, D, ...); a reader reads those not rendered, equal ones once."""
         flat = images.reshape(-1, *images.shape[3:])
         keys = [_key(image) for image in flat]
         unknown = {key: row for row, key in enumerate(keys) if key not in self._shows}
@@ -116,7 +116,7 @@ def _key(image: Images) -> bytes:
 
 
 def making(folder: Path) -> AbstractContextManager[None]:
-    """Let one process at a time make what all cells of a folder share; the others wait and find it made."""
+    """Let one process at a time make the files that all cells of a folder share; the others wait and find it made."""
     return lock(folder / ".lock", f"The folder {folder}", patience_s=_PATIENCE_S)
 
 

@@ -125,7 +125,7 @@ class Branches(NamedTuple):
 
 
 def branches(states: Sequence[State], n_actions: int, dynamics: Dynamics) -> Branches:
-    """Write out what may come of macro-actions in some macrostates."""
+    """Write out the possible outcomes of macro-actions in some macrostates."""
     found = every_outcome(states, n_actions, dynamics, follow=False)
     pair = found.before * n_actions + found.action
     branch = np.arange(len(pair)) - np.searchsorted(pair, pair)
@@ -136,9 +136,9 @@ def branches(states: Sequence[State], n_actions: int, dynamics: Dynamics) -> Bra
 
 
 class Model(NamedTuple):
-    """What somebody expects in S macrostates; probabilities of less than 1 in sum end the episode."""
+    """Outcomes that a model or the rules expect in S macrostates. A sum of probabilities below 1 is an end."""
 
-    following: Ints  # rows of macrostates, S for what is none of them. Shape (S, A, B).
+    following: Ints  # rows of macrostates, S for a state that is none of them. Shape (S, A, B).
     p_continues: Floats  # shape (S, A, B)
     reward: Floats  # expected reward. Shape (S, A).
 
@@ -152,7 +152,7 @@ def true_model(rules: Rules, states: Sequence[State]) -> Model:
 
 
 def rows_of(macrostates: NDArray[np.integer], states: Sequence[State]) -> Ints:
-    """The row of each macrostate (..., M) among S; S for what is none of them. Shape (...)."""
+    """The row of each macrostate (..., M) among S; S for a state that is none of them. Shape (...)."""
     index = {state: row for row, state in enumerate(states)}
     flat = macrostates.reshape(-1, macrostates.shape[-1]).tolist()
     return np.array([index.get(tuple(each), len(states)) for each in flat], dtype=np.int64).reshape(
@@ -165,7 +165,7 @@ def action_values(model: Model, horizon: int, allowed: Bools | None = None) -> F
 
     ``allowed`` (S, A) leaves macro-actions out, where any other is left.
     """
-    values = np.zeros(len(model.reward) + 1)  # the last is of what is no macrostate
+    values = np.zeros(len(model.reward) + 1)  # the last is that of a state that is no macrostate
     found = []
     for _ in range(horizon):
         of_actions = model.reward + (model.p_continues * values[model.following]).sum(axis=2)

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError, brief, require
 from imagine_bench.exact.certificate import Certificate
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.protocols.control import PRESETS, Protocol
 from imagine_bench.protocols.data import digest
 from imagine_bench.registry.entries import AgentEntry
@@ -109,7 +109,7 @@ class Replays:
 
 
 def _agree(where: str, claimed: Mapping[str, object], found: Sequence[object]) -> None:
-    """Raise ArtefactError for the first claim, by name, that is not what was found in its place."""
+    """Raise ArtefactError for the first claim, by name, that differs from the value found in its place."""
     for (name, claim), value in zip(claimed.items(), found, strict=True):
         require(claim == value, f"{where}{name} is {brief(value)}, and {brief(claim)} was kept.")
 

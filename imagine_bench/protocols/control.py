@@ -311,7 +311,7 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     spec = task(task_name)
     values = {"config_group": spec.config_group, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
     few = values.pop("few_seeds", {})
-    if "agents" in changes:  # what a preset says of agents is about its own
+    if "agents" in changes:  # a preset speaks of its own agents
         few = {}
         values["headlines"] = changes.get("headlines", ())
     values["execution"] = spec.execution(values.get("execution"))
@@ -379,7 +379,7 @@ _OF_WORLDS = {
     "preprocessing": "their frames are prepared differently",
     "action_names": "they have different macro-actions",
 }
-"""Facts in which tasks of one world agree, and what is said where two tasks do not."""
+"""Facts in which tasks of one world agree, and the sentence where two tasks do not."""
 
 
 def require_same_world(name: str, earlier: tuple[str, ...]) -> None:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays, Info, Macrostate, Observed
-from imagine_bench.environments import Env
 from imagine_bench.interfaces import Agent, Frame, Observation, State, TaskSpec
 from imagine_bench.interfaces.capabilities import (
     Imaginer,
@@ -27,6 +26,7 @@ from imagine_bench.interfaces.capabilities import (
     ValueReader,
     begin_episode,
 )
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording.filmstrips import DARK, filmstrip, sampled_filmstrips
 from imagine_bench.recording.stream import KINDS, Recording, recording_file, scene_view, sheet_view

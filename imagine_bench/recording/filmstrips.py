@@ -35,7 +35,7 @@ _Rgb = tuple[int, int, int]
 
 
 class SheetColors(NamedTuple):
-    """Colors of a sheet: its paper, its words, what is right, what is wrong, and where the filter cuts."""
+    """Colors of a sheet: its paper, its words, right and wrong images, and the cut of the filter."""
 
     paper: _Rgb = PAPER
     ink: _Rgb = INK

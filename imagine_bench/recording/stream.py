@@ -19,9 +19,9 @@ import rerun.blueprint as rrb
 import rerun.notebook
 
 from imagine_bench.arrays import Floats, Frame, Pixels
-from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, require_modules
 from imagine_bench.interfaces import Motion, SceneReader, Shape3D
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.recording.filmstrips import DARK, png, rgb
 from imagine_bench.store.files import make_folder
 from imagine_bench.store.results import ComparedRollout

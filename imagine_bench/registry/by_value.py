@@ -41,7 +41,7 @@ _ATTRIBUTES: Mapping[type, tuple[str, ...]] = {
     property: ("fget", "fset", "fdel"),
     staticmethod: ("__func__",),
 }
-"""What decides about an object of one of Python's own types, by its attributes."""
+"""The attributes that decide about an object of one of Python's own types."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,7 +49,7 @@ class CodeByValue:
     """A class or function that any process can load."""
 
     name: str  #: its qualified name
-    pickled: bytes = field(compare=False)  #: what :mod:`cloudpickle` made of it, each time otherwise
+    pickled: bytes = field(compare=False)  #: the bytes of :mod:`cloudpickle`, each time others
     digest: str  #: twelve hex digits, see :func:`code_digest`
 
     @classmethod
@@ -57,7 +57,7 @@ class CodeByValue:
         """Take up a class or function as it is now.
 
         Raises:
-            InvalidValueError: It cannot be called, or what it names cannot be sent to another process.
+            InvalidValueError: It cannot be called, or an object that it names cannot be sent to another process.
         """
         if not callable(target):
             raise InvalidValueError(f"An agent is made by a class or a function; {brief(target)} is neither.")
@@ -94,7 +94,7 @@ class CodeByValue:
 
 
 def code_digest(target: object) -> str:
-    """Twelve hex digits of what a class or function does: its bytecode, constants, bases and helpers.
+    """Twelve hex digits of the behaviour of a class or function: its bytecode, constants, bases and helpers.
 
     Comments, blank lines and docstrings of classes do not count, nor does the code of installed packages. Another
     minor version of Python has another bytecode.
@@ -144,7 +144,7 @@ def _described(value: object, seen: dict[int, int]) -> Iterator[str]:
 
 
 def _parts(value: object) -> Iterator[object]:
-    """What an object consists of, in an order that does not depend on the process."""
+    """The parts of an object, in an order that does not depend on the process."""
     attributes = next((names for kind, names in _ATTRIBUTES.items() if isinstance(value, kind)), ())
     if attributes:
         yield from (getattr(value, name) for name in attributes)

@@ -105,7 +105,7 @@ def bench_page(result: BenchResult) -> Page:
 
 
 def verdict(data: ReportData) -> list[str]:
-    """The verdict: headlines first, a line an agent; then every other learner against DQN; then what is amiss."""
+    """The verdict: headlines first, a line an agent; then every other learner against DQN; then the faults."""
     amiss = [*_unfinished(data.result), *_left_out(data.result), *_not_installed(data), *_misread(data)]
     by_agent: dict[str, list[str]] = {}
     for headline in data.headlines:

@@ -140,7 +140,7 @@ class Judged:
 
 
 def judged(folder: Path, judgement: Judgement) -> Judged:
-    """A judgement with what is kept of it in its folder. Raises ArtefactError: a file is damaged."""
+    """A judgement with the cells that are kept in its folder. Raises ArtefactError: a file is damaged."""
     cells: dict[tuple[str, int], list[Scores]] = {}
     for cell in kept(folder, judgement):
         cells.setdefault((cell["model"], cell["transitions"]), []).append(cell)

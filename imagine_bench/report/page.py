@@ -87,7 +87,7 @@ class Image:
     name: str  # file name without ending
     content: bytes | Callable[[], bytes]  # the PNG, or what draws it
     caption: str  # the text below it
-    draw: Callable[[], Figure] | None = None  # what draws it as a matplotlib figure, if it is one
+    draw: Callable[[], Figure] | None = None  # draws it as a matplotlib figure, if it is one
 
     @cached_property
     def png(self) -> bytes:

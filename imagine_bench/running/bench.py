@@ -96,7 +96,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
             return
         spec = self._specs[run]
         done = self._costs[run] * progress.done / spec.work
-        self._before.setdefault(run, done)  # what an earlier session did took no time now
+        self._before.setdefault(run, done)  # work of an earlier session took no time now
         self._done[run] = done
         if progress.phase == "training" and progress.success is not None:
             self._curves.setdefault(run, {})[progress.episode // RECENT] = progress.success
@@ -131,7 +131,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
 
 
 def expected_cost(spec: RunSpec[ProtocolData]) -> float:
-    """What a run costs in all, in units of its work by an agent of cost 1."""
+    """The whole cost of a run, in units of its work by an agent of cost 1."""
     acts = registry.has_task(spec.protocol.task)
     return spec.work * (registry.agent_entry(spec.agent).relative_cost if acts else 1.0)
 
@@ -188,7 +188,7 @@ def counted(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:
 
 
 def _sentence(progress: Progress, spec: RunSpec[ProtocolData]) -> str:
-    """What a run is doing and how far it is."""
+    """The phase of a run, and how far it is."""
     who = f"{progress.agent} seed {progress.seed}"
     if progress.detail is not None or not isinstance(spec.protocol, Protocol):
         return f"{who}: {progress.detail or progress.phase}, {100 * progress.done / spec.work:.0f} % of its work"
@@ -367,7 +367,7 @@ _Bench = tuple[BenchStore, Encoders]
 
 
 def _jobs(store: BenchStore, paths: Encoders) -> list[Job]:
-    """What is missing of a bench, seed by seed, the costliest runs of each first: all cores are busy to the end.
+    """The missing runs of a bench, seed by seed, the costliest runs of each first: all cores are busy to the end.
 
     Of agents that cost alike, those that are listed last come first.
     """

@@ -17,10 +17,10 @@ from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Arrays, Info, State
 from imagine_bench.data.folder import Apart, Dataset, read_apart
-from imagine_bench.environments import Env
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.interfaces import Agent, AgentContext, ArmMotion, ArmReader, TaskSpec, Transition
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.rules import states_of_play

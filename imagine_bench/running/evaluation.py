@@ -19,10 +19,10 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.arrays import Action, Info, Ints, Observed, State
-from imagine_bench.environments import Env, Wrapper
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Agent, Observation, Rules, Transition
 from imagine_bench.interfaces.capabilities import Label, QueryingAgent, begin_episode
+from imagine_bench.interfaces.environments import Env, Wrapper
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.rules import optimal_actions, tabulate

@@ -53,7 +53,7 @@ class Retraining:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What was found of a run, of the bench's protocol or of its report."""
+    """The findings about a run, the bench's protocol or of its report."""
 
     what: str
     complaint: str = ""  #: Empty where all holds
@@ -210,7 +210,7 @@ def _beyond_rounding(kept: RunResult, again: RunResult, remedy: str) -> int:
 
 
 def _episodes(run: RunResult, alike: KeptEpisodes | None) -> list[object]:
-    """What is compared of each training episode: its macro-actions, or of an older run, success and length."""
+    """The compared parts of each training episode: its macro-actions, or of an older run, success and length."""
     if alike is None or run.training is None:
         return [*zip(run.training_success.tolist(), run.training_length.tolist(), strict=True)]
     return [run.training.actions_of(episode) for episode in range(len(run.training.lengths))]

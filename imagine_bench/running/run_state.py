@@ -15,10 +15,10 @@ import gymnasium
 from imagine_bench import registry
 from imagine_bench.arrays import Action, Info, Observed
 from imagine_bench.data.folder import read_dataset
-from imagine_bench.environments import Env
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import OBSERVATIONS, Agent, AgentState
 from imagine_bench.interfaces.capabilities import ExternalTrainer, QueryingAgent, TransferLearner
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import RECENT, OnProgress, Phase, Progress, RunSpec

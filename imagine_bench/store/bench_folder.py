@@ -46,7 +46,7 @@ _NO_BENCHES = {
     "report/suite.json": "is a suite, which has no runs of its own; give the folder of one of its benches",
     "card.json": "is a dataset; 'imagine-bench dataset --describe' shows it",
 }
-"""Folders of other kinds by a file that they have, and what is said where a bench's is wanted."""
+"""Folders of other kinds by a file that they have, and the sentence where a bench's is wanted."""
 _NAME = re.compile("-([0-9a-f]{12})$")
 """The hash in a folder's name; whoever moves a bench elsewhere may leave it out."""
 

@@ -61,7 +61,7 @@ class ComparedRollout:
     #: What they show: what the rules say, or where the task's frames are late or hide a coordinate, that, with one more
     #: than its last value for what is hidden. Shape (D, M).
     real_macrostates: Ints
-    real_rewards: Floats  #: What the rules say. Shape (D,).
+    real_rewards: Floats  #: Rewards by the rules. Shape (D,).
     real_terminated: Bools  #: Shape (D,)
 
 

@@ -7,7 +7,7 @@ with the digests of the others. Finished runs of before 2026-11-28 have more fil
 A checkpoint is a folder ``checkpoint_000007_episode_120`` (the seventh of its run) of ``agent.safetensors``,
 ``runner.safetensors`` and ``state.json``, which has its own digest and those of the other two. It is complete once it
 has its name, so that a ``kill -9`` at any moment damages none; one of another name is none. The newest is kept; the one
-before it goes when the newer is complete. :func:`.values.pack` turns what a runner knows into JSON-like values and
+before it goes when the newer is complete. :func:`.values.pack` turns the state of a runner into JSON-like values and
 named arrays, and :func:`.values.unpack` reads it back to the bit.
 """
 

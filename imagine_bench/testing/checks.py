@@ -16,11 +16,11 @@ from gymnasium.utils.env_checker import check_env
 
 from imagine_bench import registry
 from imagine_bench.arrays import Frame, Info, Ints, State, content_hash
-from imagine_bench.environments import Env
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, ExactWorld, Observation, TaskSpec
 from imagine_bench.interfaces.capabilities import begin_episode
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge.models import source_of

@@ -23,10 +23,10 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.data.folder import write_dataset
-from imagine_bench.environments import Env
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, Observation, Transition
 from imagine_bench.interfaces.capabilities import ExternalTrainer, begin_episode
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import runner

@@ -262,7 +262,7 @@ def verify(folder: Path, retraining: Retraining | None = None) -> list[Verdict]:
 
 
 def conclusion(found: Sequence[Verdict]) -> CheckFailedError | IncompleteCheckError | None:
-    """The error that says what does not hold, or what could not be compared; None where neither is the case."""
+    """The error that names claims that do not hold, or that could not be compared; None where there are none."""
     complaints = [each for each in found if each.complaint]
     if complaints:
         return CheckFailedError(f"Does not hold. {len(complaints)} of {len(found)} verdicts are complaints.")

@@ -35,14 +35,14 @@ _REGRESSIONS = {
     "toy_regression": "A number x leads to one of three curves, plus noise; is it known where data lack?",
     "robot_ik": "A planar arm learns by moving at random which joint angles lead to a place.",
 }
-"""What the regression tasks of this suite are; loading one loads MuJoCo."""
+"""Descriptions of the regression tasks of this suite; loading one loads MuJoCo."""
 _LAUNCHERS = (
     "Processes of this machine: the default.",
     "The cluster at RAY_ADDRESS, else one that is started here; needs the extra ray.",
     "Jobs of a Slurm cluster; needs the extra slurm.",
     "One run after another in this process, for a debugger.",
 )
-"""What each execution, appearance and launcher is, in their order."""
+"""Descriptions of executions, appearances and launchers, in their order."""
 _MOST = 10
 """Plan lengths that are listed one by one."""
 
@@ -81,7 +81,7 @@ def describe_task(name: str) -> str:
 
 
 def names() -> str:
-    """All tasks, agents, presets and so on, one a line with a description, by kind; then what cannot be used, and why.
+    """All tasks, agents, presets and so on, one a line with a description, by kind; then unusable ones, and why.
 
     The first line of each kind says in which words of a command its names stand.
     """
@@ -121,7 +121,7 @@ def _described(entries: Mapping[str, AgentEntry | EncoderEntry | RegressorEntry 
 
 
 def _tasks() -> dict[str, str]:
-    """What each control task is, or why it cannot be used."""
+    """The description of each control task, or why it cannot be used."""
     found = {}
     for name in registry.tasks():
         try:
@@ -137,7 +137,7 @@ def _regressions() -> dict[str, str]:
 
 
 def _presets(kind: TaskType[ProtocolData]) -> dict[str, str]:
-    """The size of each preset: what it changes of a protocol's own values."""
+    """The size of each preset: the values of a protocol that it changes."""
     found = {}
     for name, changes in kind.presets.items():
         sizes: dict[str, Any] = {

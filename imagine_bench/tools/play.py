@@ -150,7 +150,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         yield from [self._window()] * (_HOLD if end else 1)
 
     def _window(self) -> Frame:
-        """The scene with the goal below it, the agent's frame, what is imagined of it, and words."""
+        """The scene with the goal below it, the agent's frame, the imagined frame, and words."""
         keys = "\n".join(f"{key}  {name}" for key, name in zip(KEYS, self._task.action_names, strict=False))
         panels = [("what the agent sees", self._frame, f"{self._said}\n\n{keys}\n\nEsc  end the game")]
         if self._imaginer is not None:

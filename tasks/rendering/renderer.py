@@ -334,7 +334,7 @@ class Renderer:
         return drawn
 
     def _fill(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Put into the scene what the view shows, lit by all lights if it is for people."""
+        """Put the geoms of the view into the scene, lit by all lights if it is for people."""
         lights = model.light_active
         as_compiled = lights.copy()
         lights[:] = lights | self.view.for_people

@@ -34,7 +34,7 @@ ARM_GROUP = 2
 SETTING_GROUP = 3
 COLLISION_GROUP = 5
 """Geom groups: loose objects; the plain table top and hands that only agents' frames show; the arm, so that a view can
-leave it out; what only views for people show (floor, legs, person, wood, smooth hands); what only contact sees."""
+leave it out; those that only views for people show (floor, legs, person, wood, smooth hands); those of contact."""
 
 AGENT_CAMERA = "wrist"
 HUMAN_CAMERA = "human"

@@ -146,7 +146,7 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
 
 
 def _add_cameras(spec: mujoco.MjSpec) -> None:
-    """The views for people, from the human's left: of what happens on the table, and of everything."""
+    """The views for people, from the human's left: of the objects on the table, and of everything."""
     for name, (place, target, fovy_deg) in _CAMERAS.items():
         backward = np.subtract(place, target)
         backward /= np.linalg.norm(backward)

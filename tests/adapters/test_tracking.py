@@ -116,7 +116,7 @@ def _records(path):
 
 
 def histories(out):
-    """What was logged of each run, whose file is whole."""
+    """The logged values of each run, whose file is whole."""
     from wandb.proto.wandb_internal_pb2 import Record
 
     found = {}

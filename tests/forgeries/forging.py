@@ -18,9 +18,9 @@ import numpy as np
 from small_runs import run_observed
 
 from imagine_bench import registry
-from imagine_bench.environments import Env
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, Observation
+from imagine_bench.interfaces.environments import Env
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import Failure, Job, OnProgress, RunSpec
 from imagine_bench.report import bench_page

@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -35,12 +34,12 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
 from imagine_bench.judge.models import JudgedModel, model_entry, opened, source_of
-from imagine_bench.judge.reading import RenderedFrameIndex, reader_in
+from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.report.judge import COLUMNS, Judged, judged, judgement_page
 from imagine_bench.report.page import DASH
 from imagine_bench.running import bench as benches
 from imagine_bench.seeding import SeedTree
-from imagine_bench.store.files import make_folder, read_arrays, read_sealed, sealed, write_arrays, write_json
+from imagine_bench.store.files import read_arrays, read_sealed, sealed, write_arrays, write_json
 
 _PYPROJECT = """
 [project]
@@ -471,41 +470,3 @@ def test_a_judged_model_whose_encoder_reads_few_frames_is_marked_in_its_row(said
     assert source_of("structured", spec, index, "strong", SeedTree(1000)).cost["encoder_reads"] == pytest.approx(
         0.115, abs=1e-3
     )
-
-
-def test_judges_at_once_train_one_reader_of_a_world_and_see_it_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spec, trained = registry.task("pick_place"), []
-
-    class Slow(BlindReader):
-        def content(self) -> bytes:
-            return b"whole"
-
-    def train(*_: object) -> Slow:
-        trained.append(threading.get_ident())
-        time.sleep(0.2)
-        return Slow(4)
-
-    code = ModuleType("reader")
-    vars(code).update(__file__=__file__, train_reader=train, load_reader=lambda spec, path: path.read_bytes())
-    monkeypatch.setattr(registry, "load", lambda name: code)
-    monkeypatch.setattr("imagine_bench.judge.reading.reader_errors", lambda *_: {"misread": 0.0, "refused": 0.0})
-    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
-    folders = [tmp_path / name for name in ("one", "one", "other")]
-    for folder in folders:
-        folder.mkdir(exist_ok=True)
-    with ThreadPoolExecutor(3) as pool:
-        jobs = [pool.submit(reader_in, spec, "clean", folder) for folder in folders]
-    assert [job.result() for job in jobs] == [b"whole"] * 3
-    assert len(trained) == 1, "the reader of a world serves every folder"
-    (cached,) = (tmp_path / "cache").rglob("reader.safetensors")
-    cached.write_bytes(b"other")
-    with pytest.raises(ArtefactError, match=r"reader\.safetensors is damaged; remove .* trains it anew"):
-        reader_in(spec, "clean", make_folder(tmp_path / "third"))
-
-
-def test_a_half_written_reader_is_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / "reader.safetensors").write_bytes(b"half")
-    with pytest.raises(ArtefactError, match=r"reader\.safetensors is not the judge's reader; remove it, and the same"):
-        reader_in(registry.task("pick_place"), "clean", tmp_path)

@@ -22,12 +22,18 @@ def far(seed: int, done: int, phase: Phase = "training", **more: Any) -> Progres
     return Progress(seed=seed, bench=PROTOCOL.hash, phase=phase, done=done, work=WORK, **known)
 
 
-def test_time_left_counts_neither_what_was_done_before_nor_what_a_failed_run_lacks(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.fixture
+def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The one value is the time that the screen reads, in seconds."""
+    clock = [0.0]
+    monkeypatch.setattr("imagine_bench.running.bench.time.monotonic", lambda: clock[0])
+    return clock
+
+
+def test_time_left_counts_neither_work_done_before_nor_that_of_a_failed_run(
+    now_s: list[float], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of 72 parts, 9 were done before and 10 take ten hours; 34 are left, for a run that failed has 19."""
-    now_s = [0.0]
-    monkeypatch.setattr("imagine_bench.running.bench.time.monotonic", lambda: now_s[0])
     with ProgressBar(SPECS) as show:
         show(far(0, 9))
         show(far(1, 0, "failed", detail="RuntimeError: it broke"))
@@ -38,11 +44,7 @@ def test_time_left_counts_neither_what_was_done_before_nor_what_a_failed_run_lac
     assert line.startswith("1/6 runs · 10:00:00 elapsed, about 34 h left")
 
 
-def test_a_minute_shows_each_run_and_its_curve(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    now_s = [0.0]
-    monkeypatch.setattr("imagine_bench.running.bench.time.monotonic", lambda: now_s[0])
+def test_a_minute_shows_each_run_and_its_curve(now_s: list[float], capsys: pytest.CaptureFixture[str]) -> None:
     with ProgressBar(SPECS) as show:
         for block, success in enumerate((0.0, 0.5)):
             show(far(0, 1, episode=50 * block, success=success))

@@ -104,7 +104,7 @@ class Shifting(RandomAgent):
 
 
 def code(source: str = _SOURCE) -> dict[str, Any]:
-    """What a script's or a cell's source defines."""
+    """The names that the source of a script or a cell defines."""
     variables: dict[str, Any] = {"__name__": "__main__"}
     exec(source, variables)
     return variables

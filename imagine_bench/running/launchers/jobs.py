@@ -106,7 +106,7 @@ def _attempt(job: Job, on_progress: OnProgress, run: Callable[[Job, OnProgress],
 def _redirect_output(job: Job) -> None:
     """Let everything this process prints, native libraries included, end in the job's log."""
     make_folder(job.folder)
-    sys.stdout.flush()  # what an earlier job of this process left
+    sys.stdout.flush()  # lines that an earlier job of this process left
     sys.stderr.flush()
     with writing(job.log):
         log = os.open(job.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -123,7 +123,7 @@ def _log(job: Job, text: str) -> None:
 
 
 class ThisProcess:
-    """One run after another in this process, for a debugger: breakpoints stop, and what an agent prints is seen."""
+    """One run after another in this process, for a debugger: breakpoints stop, and the output of agents is seen."""
 
     def __init__(self, workers: int) -> None:
         del workers

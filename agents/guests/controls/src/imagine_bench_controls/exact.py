@@ -97,7 +97,7 @@ class ExactImaginationAgent(DQN):
         self.meters.count("time/imagination_s")
 
     def _outcomes(self, state: State, action: int) -> Sequence[Outcome]:
-        """What the rules say, asked once each."""
+        """The outcomes that the rules give, asked once for each pair."""
         if (state, action) not in self._known:
             self._known[state, action] = self._rules.outcomes(state, action)
         return self._known[state, action]

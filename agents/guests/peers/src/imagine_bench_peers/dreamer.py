@@ -87,7 +87,7 @@ class Dreamer:
         ]
 
     def __getstate__(self) -> dict[str, Any]:
-        """The attributes of a copy or a pickle, with the optimisers' states in place of what the library makes of them.
+        """The attributes of a copy or a pickle, with the optimisers' states in place of the library's wrappers.
 
         The library wraps each optimiser in a class of its own, which no pickle finds.
         """

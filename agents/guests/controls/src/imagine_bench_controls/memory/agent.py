@@ -73,7 +73,7 @@ class RememberingAgent(DQN, ABC):
         """What remembers."""
 
     def recurrence_now(self) -> Recurrence:
-        """What remembers, for parts that ask anew each time; as a method it is that of a copy in a copy."""
+        """The recurrent network, for parts that ask anew each time. As a method, it is the copy's own in a copy."""
         return self.recurrence
 
     def perceive(self, frame: Frame) -> Tensor:

@@ -1,0 +1,55 @@
+"""The judge's reader of images: trained once for a world, kept whole, and refused in one sentence where it is not."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from fake_reader import BlindReader
+
+from imagine_bench import registry
+from imagine_bench.errors import ArtefactError
+from imagine_bench.judge.reading import reader_in
+from imagine_bench.store.files import make_folder
+
+
+def test_judges_at_once_train_one_reader_of_a_world_and_see_it_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, trained = registry.task("pick_place"), []
+
+    class Slow(BlindReader):
+        def content(self) -> bytes:
+            return b"whole"
+
+    def train(*_: object) -> Slow:
+        trained.append(threading.get_ident())
+        time.sleep(0.2)
+        return Slow(4)
+
+    code = ModuleType("reader")
+    vars(code).update(__file__=__file__, train_reader=train, load_reader=lambda spec, path: path.read_bytes())
+    monkeypatch.setattr(registry, "load", lambda name: code)
+    monkeypatch.setattr("imagine_bench.judge.reading.reader_errors", lambda *_: {"misread": 0.0, "refused": 0.0})
+    monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
+    folders = [tmp_path / name for name in ("one", "one", "other")]
+    for folder in folders:
+        folder.mkdir(exist_ok=True)
+    with ThreadPoolExecutor(3) as pool:
+        jobs = [pool.submit(reader_in, spec, "clean", folder) for folder in folders]
+    assert [job.result() for job in jobs] == [b"whole"] * 3
+    assert len(trained) == 1, "the reader of a world serves every folder"
+    (cached,) = (tmp_path / "cache").rglob("reader.safetensors")
+    cached.write_bytes(b"other")
+    with pytest.raises(ArtefactError, match=r"reader\.safetensors is damaged; remove .* trains it anew"):
+        reader_in(spec, "clean", make_folder(tmp_path / "third"))
+
+
+def test_a_half_written_reader_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "reader.safetensors").write_bytes(b"half")
+    with pytest.raises(ArtefactError, match=r"reader\.safetensors is not the judge's reader; remove it, and the same"):
+        reader_in(registry.task("pick_place"), "clean", tmp_path)
