@@ -62,6 +62,28 @@ def options_of(options: Info | None) -> Info:
     return dict(options or {})
 
 
+def start_of(options: Info, task: TaskSpec, known: Mapping[State, State], rng: np.random.Generator) -> State:
+    """The macrostate of ``known`` that options of a reset name, or one of the task's start states, drawn.
+
+    Raises:
+        UnknownNameError: An unknown option.
+        InvalidValueError: Not a macrostate of the task.
+    """
+    for key in options:
+        require_known("reset option", key, ("macrostate",))
+    starts = task.rules.start_states
+    if "macrostate" not in options:
+        return starts[int(rng.integers(len(starts)))]
+    given = options["macrostate"]
+    start: State | None = None
+    with contextlib.suppress(Exception):  # what holds no numbers can fail in any way
+        start = known.get(tuple(np.asarray(given)))
+    if start is None:
+        listed = f"one of the {len(known)} of imagine_bench.registry.task({task.id!r}).rules.states"
+        raise InvalidValueError(f"No macrostate {brief(given)}; give {listed}, such as {starts[0]}.")
+    return start
+
+
 class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
     """Macro-actions on a real scene, seen by the wrist camera.
 
@@ -140,17 +162,16 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         modes = ("rgb_array", "human")
         self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
         self.execution = require_known("execution", execution, EXECUTIONS)
-        self._id = spec.id
+        self._task = spec
+        self._known = {state: state for state in states_of(spec.rules)}
         self._rules = spec.rules
         self.preprocessing = spec.preprocessing
         self.action_names = spec.action_names
-        self._starts = spec.rules.start_states
         self.horizon = spec.horizon
         self._sight = spec.sight
         self._lag = spec.sight.lag if spec.sight else 0
         self._steps = 0
         self._observations: tuple[Observed, ...] = ()
-        self._known = {state: state for state in states_of(spec.rules)}
         settings = PhysicsSettings.of(physics)
         level = appearance_level(appearance)
         self._window = Window(spec.title) if self.render_mode == "human" else None
@@ -165,7 +186,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         require_known("camera", camera, (HUMAN_CAMERA, FAR_CAMERA, AGENT_CAMERA))
         human_camera_view(camera, width, height)  # refuses a size out of range now, not at the first image
         self._image_of = (camera, width, height)
-        self._macrostate = self._starts[0]
+        self._macrostate = spec.rules.start_states[0]
         self._observed: tuple[State, ...] = ()
         self._reuses = False
 
@@ -189,7 +210,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
     def restart(self, *, seed: int | None = None, options: Info | None = None) -> Info:
         """As :meth:`reset`, without an observation."""
         super().reset(seed=None if seed is None else require_integer("seed", seed, 0))
-        start = self._start(options_of(options))
+        start = start_of(options_of(options), self._task, self._known, self.np_random)
         self.begun = True
         self.latest = None
         self._steps = 0
@@ -334,20 +355,6 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         """Be in a macrostate, once a moment, of which the frame that is due may show less, or another."""
         self._macrostate = macrostate
         self._observed = delivered(self._observed, self.world.observed(macrostate), self._lag)
-
-    def _start(self, options: Info) -> State:
-        for key in options:
-            require_known("reset option", key, ("macrostate",))
-        if "macrostate" not in options:
-            return self._starts[int(self.np_random.integers(len(self._starts)))]
-        given = options["macrostate"]
-        start: State | None = None
-        with contextlib.suppress(Exception):  # what holds no numbers can fail in any way
-            start = self._known.get(tuple(np.asarray(given)))
-        if start is None:
-            listed = f"one of the {len(self._known)} of imagine_bench.registry.task({self._id!r}).rules.states"
-            raise InvalidValueError(f"No macrostate {brief(given)}; give {listed}, such as {self._starts[0]}.")
-        return start
 
     def checked(self, action: np.int64 | int) -> int:
         """A macro-action as a number. Raises InvalidValueError: no such action."""

@@ -21,7 +21,7 @@ from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Rules
 from imagine_bench.rules import require_macrostates, states_of
 
 from .parameters.parameters import HIDDEN
-from .rendering.cameras import FRAME_PX, agent_camera_view, human_camera_view
+from .rendering.cameras import CONTROL_CAMERAS, FRAME_PX, agent_camera_view, control_view, human_camera_view
 from .rendering.renderer import Renderer, View
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
@@ -29,6 +29,8 @@ from .scenes.arm import TCP_SITE, arm_columns, tcp_in_world
 from .scenes.constants import HUMAN_CAMERA
 from .world import World
 
+CONTROL_OBSERVATIONS = (*CONTROL_CAMERAS, "proprio", "objects", "state")
+"""Parts of what an environment of continuous control can show of one moment."""
 Part = NDArray[np.uint8] | NDArray[np.float32]
 """An image, or a vector."""
 _Space = gymnasium.Space[Any]  # of one part, or of several
@@ -43,14 +45,16 @@ class Observer:
     ``frame`` is the agent's camera and ``human`` the whole scene, uint8 (size, size, 3). ``state`` is the macrostate, a
     one-hot vector for each coordinate, zeros where it is hidden, float32. ``proprio`` is float32 (16,): seven joints
     (rad), each finger's distance from the grip's middle (m), and the point between them: position (m) and quaternion
-    (w, x, y, z).
+    (w, x, y, z). In continuous control the images are ``hand``, from the hand past its fingers, and ``front``; and
+    ``objects`` is float32 (N, 7), the position (m) and quaternion (w, x, y, z) of each loose object.
 
     Args:
-        choice: Names in :data:`.interfaces.OBSERVATIONS`.
+        choice: Names in :data:`.interfaces.OBSERVATIONS`, or in :data:`CONTROL_OBSERVATIONS`.
         size: Edge of images in pixels.
         world: What is observed.
         values: Names of the values of each coordinate of a macrostate.
         camera: The renderer of a view.
+        control: Whether this is continuous control.
 
     Raises:
         UnknownNameError: Another part.
@@ -58,15 +62,21 @@ class Observer:
     """
 
     def __init__(
-        self, choice: str, size: int, world: World, values: Sequence[Sequence[str]], camera: Callable[[View], Renderer]
+        self,
+        choice: str,
+        size: int,
+        world: World,
+        values: Sequence[Sequence[str]],
+        camera: Callable[[View], Renderer],
+        *,
+        control: bool = False,
     ) -> None:
+        known = CONTROL_OBSERVATIONS if control else OBSERVATIONS
         names = choice.split(",") if isinstance(choice, str) else [choice]
         for name in names:
-            require_known("observation", name, OBSERVATIONS)
+            require_known("observation", name, known)
         if len(set(names)) < len(names):
-            raise InvalidValueError(
-                f"Observation {choice!r} names a part twice; give each of {', '.join(OBSERVATIONS)} once."
-            )
+            raise InvalidValueError(f"Observation {choice!r} names a part twice; give each of {', '.join(known)} once.")
         low, high = OBSERVATION_SIZES_PX
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not low <= size <= high:
             raise InvalidValueError(f"Observation size {brief(size)} must be an integer from {low} to {high} pixels.")
@@ -74,12 +84,17 @@ class Observer:
         self._arm_qpos = arm_columns(world.model).qpos
         self._tcp = world.model.site(TCP_SITE).id
         self._offsets = np.cumsum([0, *(len(each) for each in values)])  # where each coordinate's values begin
-        views = {"frame": agent_camera_view(int(size)), "human": human_camera_view(HUMAN_CAMERA, size, size)}
+        if control:
+            views = {name: control_view(name, int(size)) for name in CONTROL_CAMERAS}
+        else:
+            views = {"frame": agent_camera_view(int(size)), "human": human_camera_view(HUMAN_CAMERA, size, size)}
         self._cameras = {name: camera(view) for name, view in views.items() if name in names}
         image = gymnasium.spaces.Box(0, 255, (int(size), int(size), 3), np.uint8)
         one_hot = gymnasium.spaces.Box(0.0, 1.0, (int(self._offsets[-1]),), np.float32)
         arm = gymnasium.spaces.Box(_LOW, -_LOW)
-        spaces: dict[str, _Space] = {"frame": image, "human": image, "state": one_hot, "proprio": arm}
+        lowest = np.tile(_LOW[-7:], (len(world.object_names), 1))
+        poses = gymnasium.spaces.Box(lowest, -lowest)
+        spaces: dict[str, _Space] = {"state": one_hot, "proprio": arm, "objects": poses, **dict.fromkeys(views, image)}
         chosen = {name: spaces[name] for name in names}
         self.space: _Space = gymnasium.spaces.Dict(chosen) if len(chosen) > 1 else chosen[names[0]]
         self._names = tuple(names)
@@ -93,6 +108,8 @@ class Observer:
                 columns[name] = [self._one_hot(macrostate) for _, macrostate in moments]
             elif name == "proprio":
                 columns[name] = [observer._proprio() for observer, _ in moments]
+            elif name == "objects":
+                columns[name] = [observer._world.object_poses().astype(np.float32) for observer, _ in moments]
             else:
                 images = self._cameras[name].frames(scenes)
                 worlds = [observer._world for observer, _ in moments]

@@ -16,13 +16,12 @@ from .parameters.parameters import WorldParameters, WorldRules
 
 if TYPE_CHECKING:
     from .macro_env import MacroEnv
-    from .scenes.appearance import Appearance
     from .world import World
 
 
 @functools.cache
-def world_maker(parameters: WorldParameters) -> Callable[[Appearance], World]:
-    """Makes the scene of a world at an appearance; the same one for the same world, so that what draws it is shared."""
+def world_maker(parameters: WorldParameters) -> Callable[..., World]:
+    """Makes the scene of a world, given an appearance; always the same one, so that what draws it is shared."""
     module, name = parameters.SCENE.split(":")
     make: Callable[..., World] = getattr(importlib.import_module(module), name)
     return functools.partial(make, parameters=parameters)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Collection, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from imagine_bench.interfaces import Floats, Frame, PhysicsSettings, State
+from imagine_bench.arrays import Floats, Frame, Ints, State
+from imagine_bench.interfaces import PhysicsSettings
 
 from .motion import orientation
 from .motion.executor import MacroExecutor, MacroResult, at_rest
@@ -26,6 +28,9 @@ MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)
 """An object that is tipped, or turned off where it may stand, by more is a problem."""
 MAX_OTHER_SHIFT_M = 0.005
+SLIP_FRICTION = 0.02
+SLIP_FORCE_N = 1.0
+"""Friction and force (N) of fingertips whose grip slips, in continuous control."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +42,10 @@ class Reading:
 
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
+_ASLEEP = ("body_awake", "body_awake_ind", "dof_awake_ind", "parent_awake_ind", "tree_asleep", "tree_awake")
+_N_AWAKE = ("nbody_awake", "nparent_awake", "ntree_awake", "nv_awake")
+"""Arrays and numbers of ``mjData`` that say what sleeps; they decide what follows, and no state of MuJoCo has them."""
+Sleep = Mapping[str, Ints | int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +56,7 @@ class WorldState:
     looks: tuple[Floats, ...]
     composite: Composite | None  #: where frames are patched, of what the latest is
     sensing: Sensing
+    sleep: Sleep = field(default_factory=dict)  #: what sleeps, by the names in ``mjData``
 
 
 class World(abc.ABC):
@@ -74,15 +84,19 @@ class World(abc.ABC):
         self.model = model
         self.data = mujoco.MjData(model)
         self.sensing = Sensing()
-        self._bodies = [model.body(body).id for body in objects]
+        self.object_bodies = [model.body(body).id for body in objects]
         self.level = level
-        self._names = tuple(objects.values())
+        self.object_names = tuple(objects.values())
         self._varies = level.varies_every_frame
         self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
         self._composite: Composite | None = None
         self._distraction = Distraction(model, distractors) if distractors else None
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
         self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
+        moves = [int(model.joint(f"{body}_joint").dofadr[0]) for body in objects]
+        self.object_qvel = np.array(moves)[:, None] + np.arange(6)  # [N, 6]
+        self._tips = [index for index in range(model.ngeom) if TIP_IN_NAME in model.geom(index).name]
+        self._tip_friction = model.geom_friction[self._tips, :1].copy()
         self._people = [model.material(name).id for name in ("skin", "cloth")]
         self._placement_noise = [[0.0, 0.0, 0.0] for _ in starts]
         self._read_at: tuple[bytes, bytes] | None = None
@@ -96,20 +110,36 @@ class World(abc.ABC):
         self.sensing.settings = settings
         model = self.model
         built = PhysicsSettings()
-        tips = [index for index in range(model.ngeom) if TIP_IN_NAME in model.geom(index).name]
-        model.geom_friction[tips, :2] *= settings.pad_friction / built.pad_friction
-        for name in FINGER_JOINTS:
-            force_range = (-settings.finger_force_n, settings.finger_force_n)
-            model.actuator_forcerange[model.actuator(name.replace("_slide", "_servo")).id] = force_range
+        model.geom_friction[self._tips, :2] *= settings.pad_friction / built.pad_friction
+        self._set_finger_force(settings.finger_force_n)
         if settings.object_mass != built.object_mass:
-            model.body_mass[self._bodies] *= settings.object_mass
-            model.body_inertia[self._bodies] *= settings.object_mass
+            model.body_mass[self.object_bodies] *= settings.object_mass
+            model.body_inertia[self.object_bodies] *= settings.object_mass
             mujoco.mj_setConst(model, mujoco.MjData(model))
+
+    def set_slipping(self, slipping: bool) -> None:
+        """Let the fingers hold what they grip, or let it slip: with next to no friction and force."""
+        settings = self.sensing.settings
+        built = PhysicsSettings()
+        friction = SLIP_FRICTION if slipping else settings.pad_friction / built.pad_friction * self._tip_friction
+        self.model.geom_friction[self._tips, :1] = friction
+        self._set_finger_force(SLIP_FORCE_N if slipping else settings.finger_force_n)
+
+    def _set_finger_force(self, force_n: float) -> None:
+        for name in FINGER_JOINTS:
+            servo = self.model.actuator(name.replace("_slide", "_servo")).id
+            self.model.actuator_forcerange[servo] = (-force_n, force_n)
 
     def get_state(self) -> WorldState:
         """Everything in the scene that may change, copied."""
         looks = tuple(np.array(each) for each in looks_of(self.model))
-        return WorldState(physics=self.physics(), looks=looks, composite=self._composite, sensing=replace(self.sensing))
+        return WorldState(
+            physics=self.physics(),
+            looks=looks,
+            composite=self._composite,
+            sensing=replace(self.sensing),
+            sleep=self._sleep(),
+        )
 
     def set_state(self, state: WorldState) -> None:
         """Put the scene as it was, to the bit."""
@@ -119,6 +149,28 @@ class World(abc.ABC):
         self.sensing.aside_m = state.sensing.aside_m
         self.sensing.turned_rad = state.sensing.turned_rad
         self.set_physics_state(state.physics)
+        self._set_sleep(state.sleep)
+
+    def _sleep(self) -> Sleep:
+        counts = {name: int(getattr(self.data, name)) for name in _N_AWAKE}
+        return {name: getattr(self.data, name).copy() for name in _ASLEEP} | counts
+
+    def _set_sleep(self, sleep: Sleep) -> None:
+        for name, value in sleep.items():
+            if name in _ASLEEP:
+                getattr(self.data, name)[:] = value
+            else:
+                setattr(self.data, name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The attributes of a copy or a pickle, and what sleeps: a pickled ``mjData`` forgets a part of that."""
+        return {**self.__dict__, "sleep": self._sleep()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """See :meth:`__getstate__`."""
+        sleep = state.pop("sleep")
+        self.__dict__.update(state)
+        self._set_sleep(sleep)
 
     def physics(self) -> Floats:
         """MuJoCo's state of the scene, with the start values of its solvers, copied."""
@@ -144,7 +196,7 @@ class World(abc.ABC):
         *objects, gesture = macrostate
         for index, offset in enumerate(rng.uniform(-1.0, 1.0, (len(objects), 3)).tolist()):
             self._put(index, objects[index], offset)
-        self._gesture(gesture)
+        self.set_gesture(gesture)
         if self._distraction is not None:
             self._distraction.place(self.data, rng)
         self.update()
@@ -196,7 +248,8 @@ class World(abc.ABC):
         """Put hands off their places by shares of what the appearance allows in x, y, z and yaw, if they may vary."""
         if self._hands_vary():
             *shift, turn = offset
-            self._gesture(gesture, [self.level.hand_offset_m * each for each in shift], self.level.hand_yaw_rad * turn)
+            offset_m = [self.level.hand_offset_m * each for each in shift]
+            self.set_gesture(gesture, offset_m, self.level.hand_yaw_rad * turn)
 
     def composite(self, frame: Frame) -> Frame:
         """What the agent's camera makes of a rendered frame (H, W, 3): itself but where frames are photographs."""
@@ -221,6 +274,10 @@ class World(abc.ABC):
             DivergedError: The simulation blew up.
         """
 
+    @abc.abstractmethod
+    def rest(self) -> None:
+        """Bring the scene to where macro-actions begin: the arm at its observation pose, with what it holds."""
+
     def read(self) -> Reading:
         """Read the macrostate back from where objects, gripper and hands are."""
         objects, problem = self._objects()
@@ -233,8 +290,15 @@ class World(abc.ABC):
         """Put an object where ``value`` says, off by shares of what the appearance allows in x, y and yaw."""
 
     @abc.abstractmethod
-    def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
+    def read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
         """The value nearest to an object's pose (7), and what is wrong with how it is there."""
+
+    @abc.abstractmethod
+    def value_in_hand(self, index: int, pose: list[float], value: int, *, gripped: bool) -> int:
+        """The value that an object which is touched or moves has come to, from ``value``, by its pose (7).
+
+        ``gripped``: both fingers touch it.
+        """
 
     @abc.abstractmethod
     def _hands_m(self, gesture: int) -> dict[int, Point]:
@@ -254,7 +318,8 @@ class World(abc.ABC):
         x, y, yaw = offset
         return self.level.object_offset_m * x, self.level.object_offset_m * y, self.level.object_yaw_rad * yaw
 
-    def _gesture(self, gesture: int, offset_m: Sequence[float] = (0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> None:
+    def set_gesture(self, gesture: int, offset_m: Sequence[float] = (0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> None:
+        """Put people's hands where they say ``gesture``, off that by an offset (3,) in m and a yaw in rad."""
         x_m, y_m, z_m = offset_m
         turned = orientation.about_vertical(yaw_rad)
         for mocap, place_m in self._hands_m(gesture).items():
@@ -274,7 +339,7 @@ class World(abc.ABC):
         """The value of each object, and what is wrong with the first that is not as it should be."""
         place = self.data.qpos.tobytes(), self.data.mocap_pos.tobytes()
         if place != self._read_at:  # asked several times of one moment
-            read = [self._read_object(index, pose) for index, pose in enumerate(self.object_poses().tolist())]
+            read = [self.read_object(index, pose) for index, pose in enumerate(self.object_poses().tolist())]
             problem = next((problem for _, problem in read if problem), None)
             self._read_at = place
             self._latest_objects = (tuple([value for value, _ in read]), problem)
@@ -284,12 +349,12 @@ class World(abc.ABC):
         tilt_rad = orientation.tilt_rad(*pose[4:6])
         if tilt_rad <= MAX_TILT_RAD:
             return None
-        return f"{self._names[index]} is tipped by {math.degrees(tilt_rad):.0f} degrees"
+        return f"{self.object_names[index]} is tipped by {math.degrees(tilt_rad):.0f} degrees"
 
     def _pushed(self, moving: Collection[int], before: Floats, how: str) -> str | None:
         """Which object but the moving ones is elsewhere than in the poses before (N, 7)."""
         shift_m = np.linalg.norm(self.object_poses()[:, :3] - before[:, :3], axis=1)
-        for index, name in enumerate(self._names):
+        for index, name in enumerate(self.object_names):
             if index not in moving and shift_m[index] > MAX_OTHER_SHIFT_M:
                 return f"{name} was pushed {1e3 * shift_m[index]:.0f} mm {how}"
         return None

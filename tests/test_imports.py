@@ -38,6 +38,7 @@ FOLDERS = (
     "tasks",
     "tasks/arrows",
     "tasks/pick_place",
+    "tasks/continuous",
     "agents/networks",
     "agents/encoders",
     "agents",

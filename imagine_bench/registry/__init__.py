@@ -270,6 +270,20 @@ def register_env(entry: TaskEntry) -> None:
             kwargs={"env": entry.env, **entry.options},
         )
 
+    if entry.motion:
+        gymnasium.register(
+            motion_id(entry.env_id),
+            entry.motion,
+            reward_threshold=entry.reward_threshold,
+            kwargs=dict(entry.options),
+        )
+
+
+def motion_id(env_id: str) -> str:
+    """The id of a task's environment of continuous control, by that of its macro-actions."""
+    name, _, version = env_id.rpartition("-v")
+    return f"{name}Motion-v{version}"
+
 
 def vector_id(env_id: str) -> str:
     """The id of an environment's own vector environment; that of the single one keeps Gymnasium's default, sync."""

@@ -18,6 +18,7 @@ _ARROWS = TaskEntry(
     env_id="imagine_bench/Arrows-v0",
     horizon=None,
     world="imagine_bench.tasks.arrows.rules:Arrows",
+    motion="imagine_bench.tasks.continuous.spec:make_arrows",
 )
 TASKS: dict[str, TaskEntry] = {
     **{
@@ -45,6 +46,7 @@ TASKS: dict[str, TaskEntry] = {
         horizon=50,
         world="imagine_bench.tasks.pick_place.rules:PickPlace",
         reward_threshold=7.8,
+        motion="imagine_bench.tasks.continuous.spec:make_pick_place",
     ),
 }
 

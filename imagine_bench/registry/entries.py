@@ -39,6 +39,9 @@ class TaskEntry:
     #: Mean return at which Gymnasium counts it as solved; None where nobody says. Of this suite's tasks it is the
     #: TaskSpec's ``success_threshold`` times the exact optimal mean return, rounded down to a tenth.
     reward_threshold: float | None = None
+    #: ``"module:attr"`` of the constructor of its environment of continuous control, which takes ``options`` too and
+    #: truncates by itself; empty where it has none.
+    motion: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

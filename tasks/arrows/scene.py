@@ -20,6 +20,7 @@ from imagine_bench.arrays import Floats
 from ..parameters.distractors import add_distractors
 from ..scenes import constants as c
 from ..scenes.arm import arm_spec, let_arm_touch
+from ..scenes.control_views import add_control_views
 from ..scenes.hand import add_pointing_hand, fingertip_m
 from ..scenes.meshes import stack
 from ..scenes.tabletop import add_tabletop
@@ -105,7 +106,7 @@ def add_cubes(spec: mujoco.MjSpec, slots_xy_m: Sequence[tuple[float, float]]) ->
 
 
 @functools.cache
-def _compiled(cubes: int, distractors: int) -> mujoco.MjModel:
+def _compiled(cubes: int, distractors: int, control: bool) -> mujoco.MjModel:
     spec = arm_spec()  # the scene is added to the arm's own specification, so that every name stays without a prefix
     spec.modelname = "arrow_puzzle"
     add_tabletop(spec)
@@ -115,9 +116,14 @@ def _compiled(cubes: int, distractors: int) -> mujoco.MjModel:
     add_distractors(spec, distractors)
     let_arm_touch(spec)
     spec.camera(c.AGENT_CAMERA).fovy = places.fovy_deg
+    if control:
+        add_control_views(spec)
     return spec.compile()
 
 
-def compile_arrow_scene(cubes: int = 3, distractors: int = 0) -> mujoco.MjModel:
-    """A model of the scene of one's own, with 1 to 6 cubes: appearance may write its colors, lights and cameras."""
-    return copy.copy(_compiled(cubes, distractors))
+def compile_arrow_scene(cubes: int = 3, distractors: int = 0, *, control: bool = False) -> mujoco.MjModel:
+    """A model of the scene of one's own, with 1 to 6 cubes: appearance may write its colors, lights and cameras.
+
+    ``control`` adds the cameras of continuous control.
+    """
+    return copy.copy(_compiled(cubes, distractors, control))

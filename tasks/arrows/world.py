@@ -28,14 +28,14 @@ MAX_OFF_SLOT_M = 0.015
 
 
 class ArrowWorld(World):
-    """One scene of the arrow puzzle, its appearance varied as ``level`` says."""
+    """One scene of the arrow puzzle, its appearance varied as ``level`` says; ``control``: for continuous control."""
 
-    def __init__(self, level: Appearance, parameters: Arrows = _THESIS) -> None:
+    def __init__(self, level: Appearance, parameters: Arrows = _THESIS, *, control: bool = False) -> None:
         self._turns = parameters.turns
         self.layout = layout(parameters.cubes)
         objects = {f"cube_{cube}": f"cube {cube}" for cube in range(parameters.cubes)}
         materials = ("table_top", "cube", "arrow", "skin")
-        model = compile_arrow_scene(parameters.cubes, parameters.distractors)
+        model = compile_arrow_scene(parameters.cubes, parameters.distractors, control=control)
         super().__init__(model, level, objects=objects, materials=materials, distractors=parameters.distractors)
         self._hand = int(self.model.body("hand").mocapid[0])
 
@@ -51,7 +51,7 @@ class ArrowWorld(World):
         for turn in self._turns[action]:
             if not self._slipped(turn.cube, intended):
                 self._put(turn.cube, intended[turn.cube], self._placement_noise[turn.cube])
-        self._gesture(intended[-1])
+        self.set_gesture(intended[-1])
         self.update()
 
     def execute(self, action: int, intended: State) -> MacroResult:
@@ -71,13 +71,17 @@ class ArrowWorld(World):
             )
             for turn in turns
         ]
-        self.executor.rest()
-        self._gesture(intended[-1])
+        self.rest()
+        self.set_gesture(intended[-1])
         self.update()
         result = functools.reduce(MacroResult.then, results)
         turned = [turn.cube for turn in turns if turn.cube not in slipping]
         pushed = self._pushed(turned, before, f"while cube {turns[0].cube} was turned")
         return replace(result, fault=result.fault or pushed)
+
+    def rest(self) -> None:
+        """Bring the arm to its observation pose."""
+        self.executor.rest()
 
     def _slipped(self, cube: int, intended: State) -> bool:
         """Whether a cube whose turn is due has slipped: its direction is to be the one that it has."""
@@ -96,7 +100,7 @@ class ArrowWorld(World):
     def _hands_m(self, gesture: int) -> dict[int, c.Point]:
         return {self._hand: self.layout.fingertips_m[gesture]}
 
-    def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
+    def read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
         """The nearest direction of a cube's arrow, and what is wrong with how the cube stands."""
         turned_rad = orientation.yaw_rad(*pose[3:])
         quarters = round(turned_rad / _QUARTER_RAD)
@@ -104,10 +108,18 @@ class ArrowWorld(World):
         off_m = math.dist(pose[:2], self.layout.slots_xy_m[index])
         problem = self._tipped(index, pose)
         if problem is None and off_m > MAX_OFF_SLOT_M:
-            problem = f"{self._names[index]} stands {1e3 * off_m:.0f} mm off its slot"
+            problem = f"{self.object_names[index]} stands {1e3 * off_m:.0f} mm off its slot"
         if problem is None and skew_rad > MAX_SKEW_RAD:
-            problem = f"{self._names[index]} stands {math.degrees(skew_rad):.0f} degrees off a right angle"
+            problem = f"{self.object_names[index]} stands {math.degrees(skew_rad):.0f} degrees off a right angle"
         return -quarters % 4, problem
+
+    def value_in_hand(self, index: int, pose: list[float], value: int, *, gripped: bool) -> int:
+        """The direction that a cube has been turned past by more than 20 degrees: one quarter further, or its own."""
+        del index, gripped
+        turned_rad = math.remainder(-orientation.yaw_rad(*pose[3:]) - value * _QUARTER_RAD, 2 * math.pi)
+        if abs(turned_rad) <= _QUARTER_RAD + MAX_SKEW_RAD:
+            return value
+        return (value + (1 if turned_rad > 0 else -1)) % 4
 
     def _read_gesture(self) -> int:
         """The slot that the fingertip is over."""

@@ -63,6 +63,12 @@ def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
     return qpos, ctrl
 
 
+def blew_up(data: mujoco.MjData) -> bool:
+    """Whether a simulation has seen NaN, infinity or runaway speed since its data were reset."""
+    warned = any(data.warning[int(kind)].number for kind in _BAD_STATE)
+    return warned or not np.abs(data.qvel).max() < _RUNAWAY_RAD_S
+
+
 class Samples(NamedTuple):
     """A motion of a whole scene, for a recording."""
 
@@ -105,6 +111,7 @@ class MacroExecutor:
         self.data = data
         self.arm = ArmModel()
         self.sensing = sensing
+        self.trajectory: Trajectory | None = None  # the latest that was run
         self.capture_motion_hz = 0.0  # samples of a motion a second for a recording; 0 takes none
         columns = arm_columns(model)
         self._arm_qpos, self._finger_qpos = np.split(columns.qpos, [len(ARM_JOINTS)])
@@ -182,6 +189,7 @@ class MacroExecutor:
         Raises:
             DivergedError: NaN, infinity or runaway speed; the message names the saved start.
         """
+        self.trajectory = trajectory
         self.rest(squeeze_m=squeeze_m)
         steps = len(trajectory.opening_m)
         if len(self._control) < steps:
@@ -195,8 +203,7 @@ class MacroExecutor:
         control[:, self._arm_ctrl] = trajectory.arm_command_rad
         control[:, self._finger_ctrl] = trajectory.opening_m[:, None]
         mujoco.rollout.rollout(self.model, self.data, states[0], control, control_spec=_INPUTS, state=states[None, 1:])
-        exploded = any(self.data.warning[int(kind)].number for kind in _BAD_STATE)
-        if exploded or not (np.isfinite(states[-1]).all() and np.abs(self.data.qvel).max() < _RUNAWAY_RAD_S):
+        if blew_up(self.data) or not np.isfinite(states[-1]).all():
             raise self._divergence(states[0], control)
         return states[:, self._qpos_column : self._qpos_column + self.model.nq]
 

@@ -11,6 +11,7 @@ import mujoco
 from ..parameters.distractors import add_distractors
 from ..scenes import constants as c
 from ..scenes.arm import arm_spec, let_arm_touch
+from ..scenes.control_views import add_control_views
 from ..scenes.hand import add_open_hand, add_pointing_hand
 from ..scenes.objects import add_objects
 from ..scenes.tabletop import add_tabletop
@@ -19,6 +20,8 @@ TIMESTEP_S = 0.003
 """Objects are carried here: contacts are as stiff as two steps, and in softer ones what is held creeps as the arm
 accelerates, since the servos' damping is integrated implicitly and contacts are not."""
 
+CONTROL_TIMESTEP_S = 0.0025
+"""Of continuous control: a period of 40 ms has 16 of them."""
 _SOLIMP = (0.988, 0.995)
 """Stiffer than MuJoCo's (0.9, 0.95), where a ball sinks by 2 mm in each carry; beyond 0.995 grips chatter and fail."""
 
@@ -35,24 +38,30 @@ _PITCH_RAD = math.radians(5.5)
 
 
 @functools.cache
-def _compiled(distractors: int) -> mujoco.MjModel:
+def _compiled(distractors: int, control: bool) -> mujoco.MjModel:
     spec = arm_spec()  # the scene is added to the arm's own specification, so that every name stays without a prefix
     spec.modelname = "pick_place"
-    add_tabletop(spec, TIMESTEP_S)
+    timestep_s = CONTROL_TIMESTEP_S if control else TIMESTEP_S
+    add_tabletop(spec, timestep_s)
     add_objects(spec)
     add_pointing_hand(spec, IDLE_FINGERTIP_M)
     add_open_hand(spec, IDLE_PALM_M)
     add_distractors(spec, distractors)
     for geom in spec.geoms:
-        geom.solref = (2 * TIMESTEP_S, 1.0)
+        geom.solref = (2 * timestep_s, 1.0)
         geom.solimp[:2] = _SOLIMP
     let_arm_touch(spec)
     camera = spec.camera(c.AGENT_CAMERA)
     camera.fovy = _FOVY_DEG
     camera.alt.xyaxes = (0.0, 1.0, 0.0, math.cos(_PITCH_RAD), 0.0, math.sin(_PITCH_RAD))
+    if control:
+        add_control_views(spec)
     return spec.compile()
 
 
-def compile_pick_scene(distractors: int = 0) -> mujoco.MjModel:
-    """A model of the scene of one's own: appearance may write its colors, lights and cameras."""
-    return copy.copy(_compiled(distractors))
+def compile_pick_scene(distractors: int = 0, *, control: bool = False) -> mujoco.MjModel:
+    """A model of the scene of one's own: appearance may write its colors, lights and cameras.
+
+    ``control`` adds the cameras of continuous control, and has a timestep of which its periods are multiples.
+    """
+    return copy.copy(_compiled(distractors, control))

@@ -33,6 +33,8 @@ MAX_LIFT_OFF_M = 0.006
 """An object on the table or in the palm whose origin is higher or lower by so much lies on something else."""
 _IN_THE_AIR_M = 0.15
 """What is held at the observation pose is at least so far above the table."""
+_LIFTED_M = 0.05
+"""What the fingers hold so far above its place is picked."""
 _HANDS_FORWARD_X_M = 0.90
 """Fingertip or palm nearer to the robot than this say something."""
 _VAIN_M = 0.09
@@ -43,11 +45,11 @@ _GRIP_SHARE = 0.5
 
 
 class PickWorld(World):
-    """One scene of pick-and-place, its appearance varied as ``level`` says."""
+    """One scene of pick-and-place, its appearance varied as ``level`` says; ``control``: for continuous control."""
 
-    def __init__(self, level: Appearance, parameters: PickPlace = _PLAIN) -> None:
+    def __init__(self, level: Appearance, parameters: PickPlace = _PLAIN, *, control: bool = False) -> None:
         objects = {spec.name: f"the {spec.name}" for spec in OBJECTS}
-        model = compile_pick_scene(parameters.distractors)
+        model = compile_pick_scene(parameters.distractors, control=control)
         materials = ("table_top", "skin", *MATERIALS)
         super().__init__(model, level, objects=objects, materials=materials, distractors=parameters.distractors)
         columns = arm_columns(model)
@@ -110,7 +112,7 @@ class PickWorld(World):
                 self._put(index, then, self._placement_noise[index])
                 if now == PICKED:
                     self._fingers(REST_OPENING_M, REST_OPENING_M)
-        self._gesture(intended[N_OBJECTS])
+        self.set_gesture(intended[N_OBJECTS])
         self.update()
 
     def execute(self, action: int, intended: State) -> MacroResult:
@@ -124,15 +126,19 @@ class PickWorld(World):
         stays = before == intended[:N_OBJECTS]
         result = self._act(action, before, stays)
         self.update()
-        self.executor.rest_holding(held_object(self._objects()[0]))
-        self.update()
+        self.rest()
         after, problem = self._objects()
         if HANDED_OVER not in after:  # a palm stays as it is under what lies in it
             as_asked = problem is None and after == intended[:N_OBJECTS]
-            self._gesture(intended[N_OBJECTS] if as_asked else WITHDRAWN)
+            self.set_gesture(intended[N_OBJECTS] if as_asked else WITHDRAWN)
             self.update()
         moving = [index for index in range(N_OBJECTS) if PICKED in (before[index], intended[index])]
         return replace(result, fault=result.fault or self._pushed(moving, poses, "by the way"))
+
+    def rest(self) -> None:
+        """Bring the arm to its observation pose, and what it holds with it."""
+        self.executor.rest_holding(held_object(self._objects()[0]))
+        self.update()
 
     def _act(self, action: int, objects: State, stays: bool) -> MacroResult:
         """What the robot does, possible or not: what it cannot do, or slips, it reaches out for in vain."""
@@ -155,9 +161,10 @@ class PickWorld(World):
 
     # --- reading -------------------------------------------------------------------------------------------------
 
-    def _read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
+    def read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
+        """Where an object is, by its pose (7), and what is wrong with how it is there."""
         spec = OBJECTS[index]
-        name = self._names[index]
+        name = self.object_names[index]
         position_m = pose[:3]
         palm_m = self.data.mocap_pos[self._palm].tolist()
         tcp_m = self.data.site_xpos[self._tcp].tolist()
@@ -178,6 +185,11 @@ class PickWorld(World):
         turned_rad = abs(orientation.yaw_rad(*pose[3:]))
         skewed = f"{name} is turned by {math.degrees(turned_rad):.0f} degrees" if turned_rad > MAX_SKEW_RAD else None
         return PLACED, self._tipped(index, pose) or skewed
+
+    def value_in_hand(self, index: int, pose: list[float], value: int, *, gripped: bool) -> int:
+        """Picked, once it is gripped and lifted by 5 cm; else as before."""
+        lifted = pose[2] > standing_m(index)[2] + _LIFTED_M
+        return PICKED if gripped and lifted else value
 
     def _read_gesture(self) -> int:
         fingertip_x_m, fingertip_y_m, _ = self.data.mocap_pos[self._hand].tolist()

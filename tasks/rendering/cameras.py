@@ -6,7 +6,7 @@ import numpy as np
 
 from imagine_bench.errors import InvalidValueError, brief
 
-from ..scenes.constants import AGENT_CAMERA, AGENT_GROUP, ARM_GROUP, SCENE_GROUP, SETTING_GROUP
+from ..scenes.constants import AGENT_CAMERA, AGENT_GROUP, ARM_GROUP, HUMAN_CAMERA, SCENE_GROUP, SETTING_GROUP
 from .renderer import View
 
 FRAME_PX = 64
@@ -42,3 +42,12 @@ def human_camera_view(camera: str, width: int, height: int, *, quick: bool = Fal
         slices=28 if coarse else 64,
         for_people=True,
     )
+
+
+CONTROL_CAMERAS = ("hand", "front")
+
+
+def control_view(camera: str, size_px: int = FRAME_PX) -> View:
+    """What agents see in continuous control."""
+    cameras = {"hand": AGENT_CAMERA, "front": HUMAN_CAMERA}
+    return View(camera=cameras[camera], width=size_px, height=size_px, groups=(SCENE_GROUP, AGENT_GROUP, ARM_GROUP))

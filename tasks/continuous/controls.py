@@ -1,0 +1,150 @@
+"""What an action of a control period says: a hand twist, a hand pose, or joints; and the servos' commands for it.
+
+Commands go on from the commands before, not from where the arm is: the hand does not drift while it is asked for
+nothing. Speeds, joint ranges and the workspace hold for every action; the servos' forces are limited in the model.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gymnasium
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.arrays import Floats
+from imagine_bench.errors import InvalidValueError, brief, require_known
+
+from ..motion.ik import ArmModel
+from ..scenes.constants import TABLE_HEIGHT_M
+from .differential import DifferentialIK
+
+HAND_SPEED_M_S = 1.0
+HAND_TURN_RAD_S = 6.0
+"""The twist of an action's largest value, along and about each axis of the world."""
+MOST_OPEN_M = 0.045
+"""Each finger's distance from the grip's middle at the largest grip command; 0 at the smallest."""
+FINGER_SPEED_M_S = 0.5
+"""The fastest that a finger's command moves."""
+WORKSPACE_LOW_M = (0.35, -0.45, TABLE_HEIGHT_M + 0.015)
+WORKSPACE_HIGH_M = (0.90, 0.45, 0.45)
+"""Corners of the box, in the world, that the point between the fingers is kept in."""
+_POSE_STEPS = 3
+"""Linear problems solved a period on the way to a pose."""
+_HAND_TWIST = tuple(f"hand velocity {axis}" for axis in "xyz") + tuple(f"hand turn about {axis}" for axis in "xyz")
+_HAND_POSE = tuple(f"hand {axis}" for axis in "xyz") + tuple(f"hand quaternion {part}" for part in "wxyz")
+_JOINTS = tuple(f"joint {index}" for index in range(7))
+CONTROL_NAMES = {
+    "twist": (*_HAND_TWIST, "grip"),
+    "pose": (*_HAND_POSE, "grip"),
+    "joint_delta": (*(f"{name} velocity" for name in _JOINTS), "grip"),
+    "joint": (*_JOINTS, "grip"),
+}
+"""What each number of an action says, by the name of the control."""
+Motion = NDArray[np.floating[Any] | np.integer[Any]]
+"""An action of continuous control."""
+
+
+class Command(NamedTuple):
+    """Where the servos are told to be at the end of a period."""
+
+    joints_rad: Floats  #: shape (7,)
+    opening_m: float  #: of each finger
+    limited: str  #: what kept it from the action: "workspace", "reach" (a joint's range, speed, a singularity), or ""
+
+
+class HandControl:
+    """Turns actions into commands.
+
+    Args:
+        control: A name of :data:`CONTROL_NAMES`. ``"twist"``: the hand's velocity and turning in the world, as shares
+            of 1 m/s and 6 rad/s, and the grip. ``"pose"``: the hand's position (m) and quaternion (w, x, y, z) in the
+            world, and the grip. ``"joint_delta"``: each joint's velocity as a share of its limit, and the grip.
+            ``"joint"``: joints (rad), and the grip. The grip is -1 (closed) to 1 (open).
+        arm: The arm alone.
+        period_s: Length of a control period.
+
+    Raises:
+        UnknownNameError: Another control.
+    """
+
+    def __init__(self, control: str, arm: ArmModel, period_s: float) -> None:
+        self.control = require_known("control", control, CONTROL_NAMES)
+        self.names = CONTROL_NAMES[control]
+        self._ik = DifferentialIK(arm)
+        self._most_rad = arm.speed_limit_rad_s * period_s
+        self._most_m = FINGER_SPEED_M_S * period_s
+        self._per_unit = np.array([HAND_SPEED_M_S] * 3 + [HAND_TURN_RAD_S] * 3) * period_s
+        self.space = self._space()
+
+    def _space(self) -> gymnasium.spaces.Box:
+        if self.control == "joint":
+            low, high = self._ik.lower_rad, self._ik.upper_rad
+        elif self.control == "pose":
+            low, high = np.array([*WORKSPACE_LOW_M, *[-1.0] * 4]), np.array([*WORKSPACE_HIGH_M, *[1.0] * 4])
+        else:
+            low, high = -np.ones(len(self.names) - 1), np.ones(len(self.names) - 1)
+        return gymnasium.spaces.Box(np.append(low, -1.0).astype(np.float32), np.append(high, 1.0).astype(np.float32))
+
+    def checked(self, action: Motion) -> Floats:
+        """An action as float64, within its space; values beyond are taken for the nearest within.
+
+        Raises:
+            InvalidValueError: Another shape, no numbers, NaN, or a quaternion of zeros.
+        """
+        words = f"give {len(self.names)} numbers: {', '.join(self.names)}"
+        try:
+            given = np.asarray(action, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InvalidValueError(f"Action {brief(action)} is no array of numbers; {words}.") from error
+        if given.shape != (len(self.names),) or not np.isfinite(given).all():
+            raise InvalidValueError(f"Action {brief(action)} has another shape or a value that is not finite; {words}.")
+        if self.control == "pose" and not given[3:7].any():
+            raise InvalidValueError("The quaternion of the action is all zeros; give (1, 0, 0, 0) for no rotation.")
+        return np.clip(given, self.space.low, self.space.high)
+
+    def command(self, action: Floats, joints_rad: Floats, opening_m: float) -> Command:
+        """The command for a checked action, from the command before: joints (7,) and the opening of each finger."""
+        wanted_m = MOST_OPEN_M * (action[-1] + 1.0) / 2.0
+        opening_m = min(max(wanted_m, opening_m - self._most_m), opening_m + self._most_m)
+        if self.control == "twist":
+            joints_rad, limited = self._by_twist(self._per_unit * action[:6], joints_rad)
+        elif self.control == "pose":
+            joints_rad, limited = self._by_pose(action[:3], action[3:7], joints_rad)
+        else:
+            most_rad = self._most_rad
+            asked_rad = action[:-1] * most_rad if self.control == "joint_delta" else action[:-1] - joints_rad
+            step_rad = np.clip(asked_rad, -most_rad, most_rad)
+            within_rad = np.clip(joints_rad + step_rad, self._ik.lower_rad, self._ik.upper_rad)
+            limited = "" if np.array_equal(joints_rad + asked_rad, within_rad) else "reach"
+            joints_rad = within_rad
+        return Command(joints_rad, opening_m, limited)
+
+    def _by_twist(self, motion: Floats, joints_rad: Floats) -> tuple[Floats, str]:
+        place_m, _ = self._ik.hand_pose(joints_rad)
+        target_m = place_m + motion[:3]
+        inside_m = np.clip(target_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
+        step_rad, missed = self._ik.step(np.concatenate([inside_m - place_m, motion[3:]]), self._most_rad)
+        outside = not np.array_equal(inside_m, target_m)
+        return joints_rad + step_rad, "workspace" if outside else "reach" if missed else ""
+
+    def _by_pose(self, target_m: Floats, quat: Floats, joints_rad: Floats) -> tuple[Floats, str]:
+        target_quat = quat / np.linalg.norm(quat)
+        room_rad = self._most_rad.copy()
+        missed = False
+        at_quat = np.empty(4)
+        in_hand_rad = np.empty(3)
+        for _ in range(_POSE_STEPS):
+            place_m, rotation = self._ik.hand_pose(joints_rad)
+            mujoco.mju_mat2Quat(at_quat, rotation.ravel())
+            mujoco.mju_subQuat(in_hand_rad, target_quat, at_quat)
+            motion = np.concatenate([target_m - place_m, rotation @ in_hand_rad])
+            step_rad, missed = self._ik.step(motion, room_rad)
+            joints_rad = joints_rad + step_rad
+            room_rad = np.maximum(room_rad - np.abs(step_rad), 0.0)
+        return joints_rad, "reach" if missed else ""
+
+    def hand_pose(self, joints_rad: Floats) -> tuple[Floats, Floats]:
+        """Position (3,) in m and rotation matrix (3, 3) of the point between the fingers, by forward kinematics."""
+        return self._ik.hand_pose(joints_rad)

@@ -1,0 +1,382 @@
+"""The Gymnasium environment of continuous control: commands at 25 Hz, rewards for events that the rules know."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from numbers import Real
+
+import gymnasium
+import mujoco
+import numpy as np
+
+from imagine_bench.arrays import Floats, Frame, Info, Ints, Observed, State
+from imagine_bench.errors import InvalidValueError, brief, require_integer, require_known
+from imagine_bench.interfaces import PhysicsSettings, TaskSpec
+from imagine_bench.rules import states_of
+from imagine_bench.values import Json
+
+from ..macro_env import options_of, start_of
+from ..motion.executor import blew_up
+from ..motion.ik import ArmModel
+from ..observations import Observer
+from ..parameters.parameters import delivered, hides
+from ..rendering.cameras import FRAME_PX, human_camera_view
+from ..rendering.window import HAS_PYGAME, Window
+from ..scene_reader import FilmedScene
+from ..scenes.appearance import Appearance
+from ..scenes.appearance import appearance as appearance_level
+from ..scenes.arm import ARM_JOINTS, arm_columns
+from ..scenes.constants import FAR_CAMERA, HUMAN_CAMERA
+from ..world import World, WorldState
+from .controls import HandControl, Motion
+from .referee import GRIPPED, Event, Referee
+
+RATE_HZ = 25.0
+SECONDS_PER_MACRO_ACTION = 3.0
+"""An episode is truncated after so many seconds for each macro-action of the task's horizon; planned, one takes 2.2."""
+_BUILT = PhysicsSettings()
+
+
+@dataclass
+class Episode:
+    """Where an episode stands, beside its scene."""
+
+    begun: bool = False
+    macrostate: State = ()
+    periods: int = 0  #: control periods so far
+    events: int = 0  #: changes of the macrostate so far
+    gripping: bool = False  #: whether the fingers have gripped something since they last opened
+    slipping: bool = False  #: whether this grip slips
+    latest: Event | None = None  #: the event of the latest period
+    limited: str = ""  #: what limited the latest command
+    observations: tuple[Observed, ...] = ()  #: of the latest moment before each of the latest events
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionState:
+    """A snapshot of an environment: scene, looks, randomness and the episode so far. It can be pickled."""
+
+    kind: tuple[object, ...]  #: of which environments it is
+    world: WorldState
+    generator: Mapping[str, Json]
+    episode: Episode
+
+
+class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
+    """A task by hand commands: the same scene, rules and truth as its macro-actions, at a finer time scale.
+
+    Action Space: by ``control``, as :class:`.controls.HandControl` says; the names of an action's numbers are
+    ``env.unwrapped.control_names``. By default ``Box(-1, 1, (7,), float32)``: the hand's velocity along x, y, z, its
+    turning about x, y, z, and the grip (-1 closed, 1 open).
+
+    Observation Space: by ``observation``, a dict of the parts that :class:`.observations.Observer` explains, or one
+    part as it is.
+
+    Rewards: those of the rules, charged at each event: a change of the macrostate that is read of the scene. A change
+    that is no macro-action is a fault, which ends the episode with -5.
+
+    Starting State: the arm at its observation pose, the objects as one of the rules' start states says.
+
+    Episode End: terminated where the rules say so, or at a fault; truncated after 3 s for each macro-action of the
+    task's horizon, or when the simulation blew up, with reward 0 and ``fault_reason``.
+
+    Info: ``macrostate`` (int64, (M,)), ``event`` (whether the macrostate changed in this period), ``macro_action`` (the
+    macro-action that the event amounts to, or -1), ``is_success``, ``success``, ``legal``, ``fault``, ``fault_reason``,
+    ``limited`` (what kept the command from the action, or empty), ``sim_time_s`` (since the start), ``instruction``.
+
+    Args:
+        spec: The task.
+        make_world: Its world, at an appearance level, made for continuous control.
+        instruct: The goal of a macrostate in words.
+        slip: Probability that a grip slips: its friction and force fall until the fingers open.
+        control: ``"twist"``, ``"pose"``, ``"joint_delta"`` or ``"joint"``.
+        rate_hz: Commands a second; a period is a whole number of the simulation's steps.
+        appearance: A name, or factors; drawn at the start and anew after each event.
+        observation: What is observed: some of ``hand``, ``front``, ``proprio``, ``objects``, ``state``.
+        size: Edge of observed images in pixels, 32 to 256.
+        told: Whether ``info["instruction"]`` says the goal in words, and no image shows the pointing hand.
+        time_limit_s: Seconds before truncation; None is 3 s for each macro-action of the horizon.
+        render_mode: None, ``"rgb_array"``, or ``"human"``, a window.
+        width: Pixels of :meth:`render`.
+        height: Pixels of :meth:`render`.
+        camera: Camera of :meth:`render`: ``"human"`` or ``"far"``.
+        physics: What decides whether a grasp holds: settings, or a mapping of some of their names to values.
+
+    Raises:
+        UnknownNameError: An unknown control, appearance, render mode, camera, physics setting or observation.
+        InvalidValueError: A rate, size, factor or physics setting out of range.
+
+    Version History: v0, the first.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"][: 1 + HAS_PYGAME], "render_fps": round(RATE_HZ)}  # noqa: RUF012
+    KEYWORDS = (
+        "control",
+        "rate_hz",
+        "appearance",
+        "observation",
+        "size",
+        "told",
+        "time_limit_s",
+        "render_mode",
+        "width",
+        "height",
+        "camera",
+        "physics",
+    )
+    """The keyword arguments of its constructor."""
+
+    def __init__(
+        self,
+        spec: TaskSpec,
+        make_world: Callable[[Appearance], World],
+        *,
+        instruct: Callable[[State], str],
+        slip: float = 0.0,
+        control: str = "twist",
+        rate_hz: float = RATE_HZ,
+        appearance: str | Mapping[str, float] = "clean",
+        observation: str = "hand,front,proprio",
+        size: int = FRAME_PX,
+        told: bool = False,
+        time_limit_s: float | None = None,
+        render_mode: str | None = None,
+        width: int = 640,
+        height: int = 480,
+        camera: str = HUMAN_CAMERA,
+        physics: PhysicsSettings | Mapping[str, float | str] = _BUILT,
+    ) -> None:
+        modes = ("rgb_array", "human")
+        self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
+        level = appearance_level(appearance)
+        if level.pool is not None:
+            raise InvalidValueError(
+                f"Appearance {level.name!r} patches images of macrostates; give clean, mild, strong or factors."
+            )
+        settings = PhysicsSettings.of(physics)
+        self.task = spec
+        self._known = {state: state for state in states_of(spec.rules)}
+        self._instruct = instruct
+        self._slip = slip
+        self._told = told
+        self._sight = spec.sight
+        self._lag = spec.sight.lag if spec.sight else 0
+        FilmedScene.__init__(self, make_world(level), 0.0)
+        self.world.set_physics(settings)
+        self._window = Window(spec.title) if self.render_mode == "human" else None
+        self._n_steps = steps_in_period(rate_hz, self.model.opt.timestep)
+        self.period_s = self._n_steps * self.model.opt.timestep
+        self.controls = HandControl(control, ArmModel(), self.period_s)
+        self.control_names = self.controls.names
+        self.action_space: gymnasium.spaces.Box = self.controls.space
+        self._columns = arm_columns(self.model)
+        self._ramp = (np.arange(1, self._n_steps + 1) / self._n_steps)[:, None]
+        self._referee = Referee(self.world, spec.rules)
+        self._observer = Observer(observation, size, self.world, spec.macrostate_values, self.camera, control=True)
+        self.observation_space = self._observer.space
+        self.time_limit_s = SECONDS_PER_MACRO_ACTION * spec.horizon if time_limit_s is None else time_limit_s
+        require_known("camera", camera, (HUMAN_CAMERA, FAR_CAMERA))
+        human_camera_view(camera, width, height)
+        self._image_of = (camera, width, height)
+        self._kind = (spec.id, "motion", control, self._n_steps, level.name, settings, slip, told)
+        self.episode = Episode()
+
+    # --- Gymnasium -----------------------------------------------------------------------------------------------
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
+        """Start an episode.
+
+        Args:
+            seed: Seeds everything random in this environment.
+            options: ``{"macrostate": ...}`` to start there; any macrostate of the rules.
+
+        Raises:
+            UnknownNameError: An unknown option.
+            InvalidValueError: A seed that is no integer from 0 on, or not a macrostate of this task.
+        """
+        super().reset(seed=None if seed is None else require_integer("seed", seed, 0))
+        start = start_of(options_of(options), self.task, self._known, self.np_random)
+        self.world.place(start, self.np_random)
+        reading = self.world.read()
+        self.episode = Episode(begun=True, macrostate=reading.macrostate)
+        self.world.set_slipping(False)
+        self._vary()
+        self._show()
+        return self._observe(), self._info(success=False, fault=reading.problem)
+
+    def step(self, action: Motion) -> tuple[Observed, float, bool, bool, Info]:
+        """Carry out the command of one control period.
+
+        Raises:
+            InvalidValueError: No such action, or no episode was begun.
+        """
+        episode = self.episode
+        if not episode.begun:
+            raise InvalidValueError("There is no episode to go on with; call reset() first.")
+        self._simulate(self.controls.checked(action))
+        episode.periods += 1
+        if blew_up(self.data):
+            episode.begun = False
+            info = self._info(success=False, fault="the simulation blew up")
+            return copy.deepcopy(episode.observations[-1]), 0.0, False, True, info
+        event = self._judge()
+        self.world.update()
+        self._show()
+        reward = 0.0 if event is None else float(event.outcome.reward)
+        terminated = event is not None and event.outcome.terminated
+        truncated = self.elapsed_s >= self.time_limit_s - self.period_s / 2
+        success = event is not None and event.outcome.success
+        fault = None if event is None else event.fault
+        return self._observe(), reward, terminated, truncated, self._info(success=success, fault=fault)
+
+    def render(self) -> Frame | None:
+        """The scene as ``camera`` sees it, for ``"rgb_array"``; else None. Shape (height, width, 3)."""
+        return self._image() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free the OpenGL contexts and close the window; may be called again."""
+        for camera in self._cameras:
+            camera.close()
+        if self._window is not None:
+            self._window.close()
+
+    # --- states --------------------------------------------------------------------------------------------------
+
+    @property
+    def elapsed_s(self) -> float:
+        """Simulated seconds since the episode began."""
+        return self.episode.periods * self.period_s
+
+    @property
+    def instruction(self) -> str:
+        """The goal in words, as the pointing hand says it now."""
+        return self._instruct(self.episode.macrostate)
+
+    def get_state(self) -> MotionState:
+        """All that decides how the episode goes on, copied; of a wrapper it knows nothing."""
+        return MotionState(
+            kind=self._kind,
+            world=self.world.get_state(),
+            generator=copy.deepcopy(self.np_random.bit_generator.state),
+            episode=copy.deepcopy(self.episode),
+        )
+
+    def set_state(self, state: MotionState) -> None:
+        """Go on from where :meth:`get_state` was called, in this or another environment of the same kind, to the bit.
+
+        Raises:
+            InvalidValueError: A state of another kind of environment, or none at all.
+        """
+        if not isinstance(state, MotionState) or state.kind != self._kind:
+            given = state.kind if isinstance(state, MotionState) else state
+            words = "get_state() of an environment made alike"
+            raise InvalidValueError(f"{brief(given)} is no state of {brief(self._kind)}; give one of {words}.")
+        self.world.set_state(state.world)
+        self.np_random.bit_generator.state = copy.deepcopy(state.generator)
+        self.episode = copy.deepcopy(state.episode)
+        self.world.set_slipping(self.episode.slipping)
+
+    # --- details -------------------------------------------------------------------------------------------------
+
+    def _simulate(self, action: Floats) -> None:
+        """Move the servos' commands to where the action says, in equal steps, and simulate the period."""
+        data = self.data
+        columns = self._columns.ctrl
+        before = data.ctrl[columns]
+        n_arm = len(ARM_JOINTS)
+        command = self.controls.command(action, before[:n_arm], float(before[-1]))
+        after = np.array([*command.joints_rad, command.opening_m, command.opening_m])
+        self.episode.limited = command.limited
+        for ctrl in before + self._ramp * (after - before):
+            data.ctrl[columns] = ctrl
+            mujoco.mj_step(self.model, data)
+
+    def _judge(self) -> Event | None:
+        """The event of the period that is over, with all that it changes in the scene."""
+        episode = self.episode
+        touched = self._referee.touched()
+        if self._slip:
+            self._slip_or_hold(touched)
+        event = self._referee.event(episode.macrostate, touched, self.np_random)
+        episode.latest = event
+        if event is None:
+            return None
+        before = episode.macrostate
+        episode.macrostate = event.outcome.macrostate
+        episode.events += 1
+        if episode.macrostate[-1] != before[-1]:
+            self.world.set_gesture(episode.macrostate[-1])
+        self._vary(move_objects=False)
+        return event
+
+    def _slip_or_hold(self, touched: Ints) -> None:
+        """Draw at the beginning of a grip whether it slips; it is over when the fingers open and touch nothing."""
+        episode = self.episode
+        if not episode.gripping and bool((touched & GRIPPED == GRIPPED).any()):
+            episode.gripping = True
+            episode.slipping = bool(self.np_random.random() < self._slip)
+            self.world.set_slipping(episode.slipping)
+        elif episode.gripping and not (touched & GRIPPED).any() and self._fingers_open():
+            episode.gripping = False
+            episode.slipping = False
+            self.world.set_slipping(False)
+
+    def _fingers_open(self) -> bool:
+        """Whether the fingers are told to be wider apart than they are."""
+        return bool(self.data.ctrl[self._columns.ctrl[-1]] > self.data.qpos[self._columns.qpos[-1]])
+
+    def _vary(self, *, move_objects: bool = True) -> None:
+        """Draw how the scene looks, and where that is hidden by chance, whether the gesture is seen."""
+        hidden = self._told
+        if self._sight is not None:
+            hidden |= hides(self._sight, self.episode.macrostate, self.episode.events, self.np_random)
+        self.world.hide_gesture(hidden)
+        self.world.vary(self.np_random, move_objects=move_objects)
+
+    def _observe(self) -> Observed:
+        (seen,) = self._observer.observe([(self._observer, self.world.observed(self.episode.macrostate))])
+        if self.episode.latest is not None or not self.episode.observations:
+            self.episode.observations = delivered(self.episode.observations, seen, self._lag)
+        elif not self._lag:
+            self.episode.observations = (seen,)
+        return copy.deepcopy(self.episode.observations[0])
+
+    def _image(self) -> Frame:
+        return self.renderer_for_people(*self._image_of).frame(self.data)
+
+    def _show(self) -> None:
+        if self._window is not None:
+            self._window.show(self._image(), 1.0 / self.period_s)
+
+    def _info(self, *, success: bool, fault: str | None) -> Info:
+        episode = self.episode
+        event = episode.latest
+        return {
+            "macrostate": np.array(episode.macrostate, dtype=np.int64),
+            "event": np.bool_(event is not None),
+            "macro_action": np.int64(-1 if event is None else event.action),
+            "is_success": np.bool_(success),
+            "success": np.bool_(success),
+            "legal": np.bool_(success or event is None or not event.outcome.terminated),
+            "fault": np.bool_(fault is not None),
+            "fault_reason": fault or "",
+            "limited": episode.limited,
+            "sim_time_s": np.float64(self.elapsed_s),
+            "instruction": self.instruction if self._told else "",
+        }
+
+
+def steps_in_period(rate_hz: float, timestep_s: float) -> int:
+    """Steps of a simulation in a control period. Raises InvalidValueError: they are no whole number."""
+    if isinstance(rate_hz, Real) and not isinstance(rate_hz, bool) and 0 < rate_hz <= 1 / timestep_s + 1e-6:
+        steps = 1.0 / (float(rate_hz) * timestep_s)
+        if abs(steps - round(steps)) < 1e-6:
+            return round(steps)
+        near = sorted({max(1, int(steps)), int(steps) + 1}, reverse=True)
+        named = " or ".join(f"{1.0 / (each * timestep_s):.6g}" for each in near)
+        raise InvalidValueError(
+            f"At {rate_hz:g} Hz a period is no whole number of steps of {1e3 * timestep_s:g} ms; give {named} Hz."
+        )
+    raise InvalidValueError(f"Rate {brief(rate_hz)} must be a number of Hz, up to {1 / timestep_s:g}.")

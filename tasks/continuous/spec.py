@@ -1,0 +1,56 @@
+"""The environments of continuous control, a line for each family of worlds."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import TaskSpec
+
+from ..arrows import spec as arrows
+from ..arrows.rules import Arrows
+from ..parameters.parameters import WorldParameters
+from ..pick_place import spec as pick_place
+from ..pick_place.rules import PickPlace
+from ..specs import world_maker
+
+if TYPE_CHECKING:
+    from .env import MotionEnv
+
+_MEANINGLESS = {
+    "shuffle": "the order of macro-actions, of which a hand knows none",
+    "coupling": "that a macro-action turns two cubes, which one hand cannot at once",
+}
+
+
+def make_arrows(**options: Any) -> MotionEnv:
+    """A world of arrow cubes by hand commands.
+
+    Args:
+        **options: Fields of :class:`..arrows.rules.Arrows`, and the keyword arguments of :class:`.env.MotionEnv`.
+
+    Raises:
+        InvalidValueError, UnknownNameError: A value out of its range, or a parameter that has no meaning here.
+    """
+    return _make(Arrows, arrows.spec_of, options)
+
+
+def make_pick_place(**options: Any) -> MotionEnv:
+    """Pick-and-place with a human by hand commands; options as of :func:`make_arrows`, of its own world."""
+    return _make(PickPlace, pick_place.spec_of, options)
+
+
+def _make(kind: type[WorldParameters], spec_of: Callable[..., TaskSpec], options: dict[str, Any]) -> MotionEnv:
+    from .env import MotionEnv  # noqa: PLC0415  (MuJoCo loads with the first environment)
+    from .instructions import instruction  # noqa: PLC0415  (likewise)
+
+    world = kind.taken_from(options, MotionEnv.KEYWORDS)
+    for name, means in _MEANINGLESS.items():
+        if getattr(world, name, None) != getattr(kind, name, None):
+            raise InvalidValueError(f"{name}={getattr(world, name)} says {means}; leave it out at this level.")
+    task = spec_of(**vars(replace(world, slip=0.0)))
+    make_world = functools.partial(world_maker(world), control=True)
+    return MotionEnv(task, make_world, instruct=functools.partial(instruction, task), slip=world.slip, **options)

@@ -1,0 +1,172 @@
+"""Continuous control: what motions do to macrostates, and what no motion can do."""
+
+from __future__ import annotations
+
+import functools
+import math
+import pickle
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrows.rules import Arrows
+from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
+from imagine_bench.tasks.continuous.env import MotionEnv, steps_in_period
+from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
+from imagine_bench.tasks.parameters.parameters import WorldParameters
+from imagine_bench.tasks.pick_place.rules import PickPlace
+from imagine_bench.tasks.scenes.appearance import appearance
+from imagine_bench.tasks.specs import world_maker
+
+from imagine_bench.errors import InvalidValueError
+
+FREE = {"goal": "000", "forbid": "none"}
+"""Arrow puzzle in which nothing but the goal ends an episode."""
+
+
+@functools.cache
+def environment(family: str, control: str = "twist", **options: Any) -> tuple[MotionEnv, Expert]:
+    """An environment without images, and an expert of it."""
+    make = make_arrows if family == "arrows" else make_pick_place
+    env = make(control=control, observation="proprio,objects", **options)
+    kind: type[WorldParameters] = Arrows if family == "arrows" else PickPlace
+    return env, Expert(env, world_maker(kind())(appearance("clean"), control=True))
+
+
+def carry_out(env: MotionEnv, expert: Expert, action: int) -> list[dict[str, Any]]:
+    """A macro-action by the expert; the info of every event, and the last one."""
+    expert.begin(action)
+    seen = []
+    while not expert.is_done:
+        _, reward, terminated, truncated, info = env.step(expert.act())
+        if info["event"]:
+            seen.append({**info, "reward": reward})
+        if terminated or truncated:
+            break
+    return seen
+
+
+@pytest.mark.parametrize("control", CONTROL_NAMES)
+def test_each_turn_by_hand_is_one_event_and_that_macro_action(control: str) -> None:
+    env, expert = environment("arrows", control, **FREE)
+    env.reset(seed=3, options={"macrostate": (1, 2, 3, 0)})
+    for action in (0, 3, 4):
+        expected = env.task.rules.outcomes(env.episode.macrostate, action)[0]
+        (event,) = carry_out(env, expert, action)
+        assert event["macro_action"] == action
+        assert tuple(event["macrostate"]) == expected.macrostate
+        assert event["reward"] == expected.reward
+        assert not event["fault"]
+
+
+@pytest.mark.parametrize("control", CONTROL_NAMES)
+def test_pick_and_hand_over_by_hand(control: str) -> None:
+    env, expert = environment("pick_place", control)
+    env.reset(seed=1, options={"macrostate": (0, 0, 0, 1)})
+    total = 0.0
+    for _ in range(12):
+        action = env.task.rules.optimal_action(env.episode.macrostate)
+        (event,) = carry_out(env, expert, action)
+        assert event["macro_action"] == action
+        total += event["reward"]
+        if event["success"]:
+            break
+    assert event["success"]
+    assert total >= 6.0
+
+
+def test_a_grasp_that_turns_twice_passes_the_state_between() -> None:
+    """Turned by half a turn in one grasp: the first quarter is judged while the cube is held."""
+    env, expert = environment("arrows", "joint", **FREE)
+    env.reset(seed=0, options={"macrostate": (1, 1, 2, 0)})
+    expert.begin(1)  # counter-clockwise
+    due = list(expert._due)
+    turned = [target.joints_rad[-1] for target in due]
+    held = max(index for index, target in enumerate(due) if target.opening_m < 0.0255)
+    target = due[held]
+    for each in due[: held + 1]:
+        env.step(np.append(each.joints_rad, 2.0 * each.opening_m / 0.045 - 1.0).astype(np.float32))
+    assert env.episode.events == 0
+    sense = math.copysign(1.0, turned[held] - turned[0])
+    events = []
+    for step in range(1, 40):
+        joints_rad = target.joints_rad.copy()
+        joints_rad[-1] += sense * min(0.08 * step, 1.4)
+        *_, info = env.step(np.append(joints_rad, 2.0 * target.opening_m / 0.045 - 1.0).astype(np.float32))
+        if info["event"]:
+            events.append(info["macro_action"])
+    assert events == [1]
+    assert env.episode.macrostate[0] == 0
+
+
+def test_a_state_set_in_the_middle_of_a_motion_goes_on_to_the_bit() -> None:
+    env, expert = environment("arrows", **FREE)
+    env.reset(seed=5, options={"macrostate": (1, 2, 3, 0)})
+    expert.begin(0)
+    actions = []
+    while not expert.is_done:
+        actions.append(expert.act())
+        env.step(actions[-1])
+    env.reset(seed=5, options={"macrostate": (1, 2, 3, 0)})
+    for action in actions[:25]:
+        env.step(action)
+    state = env.get_state()
+    first = [env.step(action)[0]["objects"] for action in actions[25:]]
+    env.reset(seed=9)
+    for action in actions[:7]:
+        env.step(action)
+    env.set_state(state)
+    copied = pickle.loads(pickle.dumps(env))
+    another = make_arrows(observation="proprio,objects", **FREE)
+    another.set_state(state)
+    for each in (env, copied, another):
+        again = [each.step(action)[0]["objects"] for action in actions[25:]]
+        np.testing.assert_array_equal(first, again)
+        assert each.episode.macrostate == (2, 2, 3, 0)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "named"), [(30.0, "25 or 31.25"), (26, "25 or 31.25"), (0, "number"), ("x", "number")]
+)
+def test_a_rate_that_is_no_whole_number_of_steps_names_the_nearest(rate_hz: Any, named: str) -> None:
+    with pytest.raises(InvalidValueError, match=named):
+        steps_in_period(rate_hz, 0.008)
+    assert steps_in_period(25.0, 0.008) == 5
+    assert steps_in_period(1 / 0.064, 0.008) == 8
+
+
+@pytest.mark.parametrize("control", CONTROL_NAMES)
+def test_commands_keep_the_limits_of_speed_and_range_whatever_is_asked(control: str) -> None:
+    env, _ = environment("arrows", control, **FREE)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    columns = env._columns.ctrl
+    most_rad = env.controls._most_rad + 1e-12
+    before = env.data.ctrl[columns].copy()
+    for _ in range(60):
+        low, high = env.action_space.low, env.action_space.high
+        _, _, terminated, _, _ = env.step(np.where(rng.random(len(low)) < 0.5, low, high))
+        now = env.data.ctrl[columns].copy()
+        assert (np.abs(now - before)[:7] <= most_rad).all()
+        assert (now[:7] >= env.model.jnt_range[:7, 0]).all()
+        assert (now[:7] <= env.model.jnt_range[:7, 1]).all()
+        before = now
+        if terminated:
+            env.reset()
+            before = env.data.ctrl[columns].copy()
+
+
+@pytest.mark.parametrize("name", ["ArrowPuzzle", "ArrowPuzzleHard", "PickPlace", "Arrows"])
+def test_ids_are_known_to_gymnasium(name: str) -> None:
+    env = gymnasium.make(f"imagine_bench/{name}Motion-v0", observation="proprio")
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    env.close()
+
+
+@pytest.mark.parametrize("option", [{"shuffle": 3}, {"coupling": "neighbour"}])
+def test_parameters_without_meaning_for_a_hand_are_refused(option: dict[str, Any]) -> None:
+    with pytest.raises(InvalidValueError, match="leave it out"):
+        make_arrows(**option)
