@@ -170,7 +170,7 @@ class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
         self.period_s = self._n_steps * self.model.opt.timestep
         self.controls = HandControl(control, ArmModel(), self.period_s)
         self.control_names = self.controls.names
-        self.action_space: gymnasium.spaces.Box = self.controls.space
+        self.action_space = self.controls.space
         self._columns = arm_columns(self.model)
         self._ramp = (np.arange(1, self._n_steps + 1) / self._n_steps)[:, None]
         self._referee = Referee(self.world, spec.rules)

@@ -87,7 +87,7 @@ class Expert:
         target = self._due.popleft()
         grip = 2.0 * target.opening_m / MOST_OPEN_M - 1.0
         action = np.append(self._arm_action(target.joints_rad, ctrl[: len(ARM_JOINTS)]), grip)
-        space = env.action_space
+        space = env.controls.space
         return np.clip(action.astype(space.dtype), space.low, space.high)
 
     def _arm_action(self, target_rad: Floats, joints_rad: Floats) -> Floats:
