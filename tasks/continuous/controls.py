@@ -78,7 +78,7 @@ class HandControl:
         self._per_unit = np.array([HAND_SPEED_M_S] * 3 + [HAND_TURN_RAD_S] * 3) * period_s
         self.space = self._space()
 
-    def _space(self) -> gymnasium.spaces.Box:
+    def _space(self) -> gymnasium.spaces.Box[Any]:
         if self.control == "joint":
             low, high = self._ik.lower_rad, self._ik.upper_rad
         elif self.control == "pose":
