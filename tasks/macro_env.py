@@ -1,4 +1,4 @@
-"""The one Gymnasium environment: exact rules, a world that acts and can be read, and what is observed of it."""
+"""The Gymnasium environment of macro-actions: exact rules, a world that acts, and what is observed of it."""
 
 from __future__ import annotations
 
@@ -12,27 +12,21 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Floats, Frame, Info, Observed, State
-from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_integer, require_known
+from imagine_bench.arrays import Floats, Info, Observed, State
+from imagine_bench.errors import DivergedError, InvalidValueError, brief, require_known
 from imagine_bench.interfaces import EXECUTIONS, Outcome, PhysicsSettings, TaskSpec
-from imagine_bench.rules import states_of
 from imagine_bench.values import Json
 
 from .motion.executor import MacroResult
 from .observations import Observer
 from .parameters.parameters import delivered, hides
-from .rendering.cameras import FRAME_PX, human_camera_view
-from .rendering.window import HAS_PYGAME, Window
-from .scene_reader import FilmedScene
+from .rendering.cameras import FRAME_PX
+from .scene_env import BUILT, RENDER_MODES, WINDOW_HZ, SceneEnv, Step
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import AGENT_CAMERA, FAR_CAMERA, HUMAN_CAMERA
 from .world import World, WorldState
 
-Step = tuple[float, bool, bool, Info]
-"""Reward, whether the episode has terminated, whether the simulation blew up, and info."""
-_BUILT = PhysicsSettings()
-_WINDOW_HZ = 25.0  # images a second of a window
 _MOST_KEPT = 20_000
 """Macro-actions whose outcomes a process keeps, some 3 KB each; the oldest go first."""
 _outcomes: OrderedDict[tuple[Hashable, ...], tuple[MacroResult, Floats]] = OrderedDict()
@@ -53,38 +47,7 @@ _EPISODE = ("begun", "latest", "_people", "_steps", "_observations", "_observed"
 """Attributes that say where an episode stands: latest macro-action, and what lag keeps back."""
 
 
-def options_of(options: Info | None) -> Info:
-    """Options of a reset, copied. Raises InvalidValueError: they are no mapping."""
-    if options is not None and not isinstance(options, Mapping):
-        raise InvalidValueError(
-            f"Reset options {brief(options)} are no mapping; give {{'macrostate': ...}} or nothing."
-        )
-    return dict(options or {})
-
-
-def start_of(options: Info, task: TaskSpec, known: Mapping[State, State], rng: np.random.Generator) -> State:
-    """The macrostate of ``known`` that options of a reset name, or one of the task's start states, drawn.
-
-    Raises:
-        UnknownNameError: An unknown option.
-        InvalidValueError: Not a macrostate of the task.
-    """
-    for key in options:
-        require_known("reset option", key, ("macrostate",))
-    starts = task.rules.start_states
-    if "macrostate" not in options:
-        return starts[int(rng.integers(len(starts)))]
-    given = options["macrostate"]
-    start: State | None = None
-    with contextlib.suppress(Exception):  # what holds no numbers can fail in any way
-        start = known.get(tuple(np.asarray(given)))
-    if start is None:
-        listed = f"one of the {len(known)} of imagine_bench.registry.task({task.id!r}).rules.states"
-        raise InvalidValueError(f"No macrostate {brief(given)}; give {listed}, such as {starts[0]}.")
-    return start
-
-
-class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
+class MacroEnv(SceneEnv):
     """Macro-actions on a real scene, seen by the wrist camera.
 
     Action Space: ``Discrete(A)``, the macro-actions. Their names, in this order, are ``env.unwrapped.action_names``.
@@ -127,8 +90,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
     Version History: v0, the first.
     """
 
-    # Gymnasium's own declaration, whose checker opens a window for "human".
-    metadata = {"render_modes": ["rgb_array", "human"][: 1 + HAS_PYGAME], "render_fps": 1}  # noqa: RUF012
+    metadata = {"render_modes": RENDER_MODES, "render_fps": 1}  # noqa: RUF012  (Gymnasium's own declaration)
     KEYWORDS = (
         "execution",
         "appearance",
@@ -154,17 +116,23 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         width: int = 640,
         height: int = 480,
         camera: str = HUMAN_CAMERA,
-        physics: PhysicsSettings | Mapping[str, float | str] = _BUILT,
+        physics: PhysicsSettings | Mapping[str, float | str] = BUILT,
         motion_hz: float = 0.0,
         observation: str = "frame",
         size: int = FRAME_PX,
     ) -> None:
-        modes = ("rgb_array", "human")
-        self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
         self.execution = require_known("execution", execution, EXECUTIONS)
-        self._task = spec
-        self._known = {state: state for state in states_of(spec.rules)}
-        self._rules = spec.rules
+        level = appearance_level(appearance)
+        super().__init__(
+            spec,
+            make_world,
+            level,
+            physics=physics,
+            motion_hz=motion_hz,
+            render_mode=render_mode,
+            image=(camera, width, height),
+            cameras=(HUMAN_CAMERA, FAR_CAMERA, AGENT_CAMERA),
+        )
         self.preprocessing = spec.preprocessing
         self.action_names = spec.action_names
         self.horizon = spec.horizon
@@ -172,45 +140,19 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         self._lag = spec.sight.lag if spec.sight else 0
         self._steps = 0
         self._observations: tuple[Observed, ...] = ()
-        settings = PhysicsSettings.of(physics)
-        level = appearance_level(appearance)
-        self._window = Window(spec.title) if self.render_mode == "human" else None
-        FilmedScene.__init__(self, make_world(level), motion_hz or (_WINDOW_HZ if self._window else 0.0))
-        self.world.set_physics(settings)
-        self.begun = False
-        self._kind = (spec.id, self.execution, level.name, settings)
+        self._kind = (spec.id, self.execution, level.name, self.physics)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._n_actions = spec.n_actions
+        self.takes_long = self.execution == "physics"
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self.camera)
         self.observation_space = self._observer.space
-        require_known("camera", camera, (HUMAN_CAMERA, FAR_CAMERA, AGENT_CAMERA))
-        human_camera_view(camera, width, height)  # refuses a size out of range now, not at the first image
-        self._image_of = (camera, width, height)
         self._macrostate = spec.rules.start_states[0]
         self._observed: tuple[State, ...] = ()
         self._reuses = False
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
-        """Start an episode.
-
-        Args:
-            seed: Seeds everything random in this environment.
-            options: ``{"macrostate": ...}`` to start there; any macrostate of the rules, terminal ones included.
-
-        Raises:
-            UnknownNameError: An unknown option.
-            InvalidValueError: A seed that is no integer from 0 on, or not a macrostate of this task.
-        """
-        info = self.restart(seed=seed, options=options)
-        self._show()
-        return self.observe([self])[0], info
-
-    def restart(self, *, seed: int | None = None, options: Info | None = None) -> Info:
-        """As :meth:`reset`, without an observation."""
-        super().reset(seed=None if seed is None else require_integer("seed", seed, 0))
-        start = start_of(options_of(options), self._task, self._known, self.np_random)
+    def _begin(self, start: State) -> Info:
         self.begun = True
         self.latest = None
         self._steps = 0
@@ -222,22 +164,14 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         self._reach(reading.macrostate)
         return self._info(success=False, legal=self._rules.is_legal(reading.macrostate), fault=reading.problem)
 
-    def step(self, action: np.int64 | int) -> tuple[Observed, float, bool, bool, Info]:
-        """Carry out one macro-action; also out of a terminal macrostate, as the rules continue there.
-
-        Raises:
-            InvalidValueError: No such action, or no episode was begun.
-        """
-        reward, terminated, blew_up, info = self.act(action)
-        self._show()
-        seen = copy.deepcopy(self._observations[0]) if blew_up else self.observe([self])[0]
-        return seen, reward, terminated, blew_up, info
+    def _latest_observation(self) -> Observed:
+        return self._observations[0]
 
     def act(self, action: np.int64 | int) -> Step:
-        """As :meth:`step`, without an observation. Nothing is drawn, so any thread may call it.
+        """Carry out one macro-action, without an observation; also out of a terminal macrostate, as the rules go on.
 
-        Returns:
-            Reward, whether the episode has terminated, whether the simulation blew up, and info.
+        Raises:
+            InvalidValueError: As :meth:`step`.
         """
         if not self.begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
@@ -253,7 +187,7 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         if self.execution == "physics":
             standing = self.world.get_state()
             self._people = self._mocap()
-            self.world.executor.capture_motion_hz = self.capture_motion_hz
+            self.prepare()
             try:
                 self.latest = self._execute(chosen, intended.macrostate)
             except DivergedError as error:
@@ -272,6 +206,10 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         info = self._info(success=outcome.success, legal=outcome.success or not outcome.terminated, fault=fault)
         return float(outcome.reward), outcome.terminated, False, info
 
+    def prepare(self) -> None:
+        """Compile the executor of macro-actions, if it is not yet."""
+        self.world.executor.capture_motion_hz = self.capture_motion_hz
+
     def reuse_outcomes(self) -> None:
         """From now on, simulate no macro-action twice in this process; results stay the same to the bit.
 
@@ -289,21 +227,6 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
             env._observations = delivered(env._observations, observation, env._lag)
             due.append(copy.deepcopy(env._observations[0]) if env._lag else observation)
         return due
-
-    def render(self) -> Frame | None:
-        """The scene as ``camera`` sees it, for ``"rgb_array"``; else None. Shape (height, width, 3)."""
-        return self.rendered([self])[0] if self.render_mode == "rgb_array" else None
-
-    def rendered(self, envs: Sequence[MacroEnv]) -> list[Frame]:
-        """What :meth:`render` returns of environments like this, drawn by its camera."""
-        return self.renderer_for_people(*self._image_of).frames([(env.model, env.data) for env in envs])
-
-    def close(self) -> None:
-        """Free the OpenGL contexts and close the window; may be called again."""
-        for camera in self._cameras:
-            camera.close()
-        if self._window is not None:
-            self._window.close()
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
@@ -342,8 +265,8 @@ class MacroEnv(FilmedScene, gymnasium.Env[Observed, np.int64]):
         if self._window is None:
             return
         for _ in self.replay():
-            self._window.show(self.rendered([self])[0], self.capture_motion_hz or _WINDOW_HZ)
-        self._window.show(self.rendered([self])[0], _WINDOW_HZ)
+            self._window.show(self.rendered([self])[0], self.capture_motion_hz or WINDOW_HZ)
+        self._window.show(self.rendered([self])[0], WINDOW_HZ)
 
     def _vary(self, *, move_objects: bool = True) -> None:
         """Draw how this moment looks, and where that is hidden by chance, whether the gesture is seen."""

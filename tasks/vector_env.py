@@ -1,7 +1,9 @@
 """Many environments at once: each lane's macro-action runs on a thread, and contact physics uses all cores.
 
 MuJoCo simulates without holding Python's lock, each lane on its own data, so the lanes are equal to single environments
-bit for bit. Kinematic lanes have nothing to simulate: they act one after another.
+bit for bit. Kinematic lanes have nothing to simulate, and a command of continuous control is shorter than handing it to
+a thread: they act one after another. For continuous control on several cores take
+``gymnasium.make_vec(..., vectorization_mode="async")``.
 One camera draws all lanes, in the thread that calls.
 """
 
@@ -23,7 +25,7 @@ from imagine_bench.arrays import Floats, Frame, Info, Observed
 from imagine_bench.cores import usable_cores
 from imagine_bench.errors import InvalidValueError, brief, require_integer, require_known
 
-from .macro_env import MacroEnv, Step, options_of
+from .scene_env import SceneEnv, Step, options_of
 
 _MODES = {mode.value: mode for mode in AutoresetMode}
 Batch = tuple[Observed, Floats, NDArray[np.bool_], NDArray[np.bool_], Info]
@@ -62,7 +64,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
 
     def __init__(
         self,
-        lanes: Sequence[MacroEnv],
+        lanes: Sequence[SceneEnv],
         *,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
@@ -73,7 +75,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         self.envs = tuple(lanes)
         self.num_envs = require_integer("num_envs", len(self.envs), 1)
         for lane in self.envs:
-            if not isinstance(lane, MacroEnv):
+            if not isinstance(lane, SceneEnv):
                 raise InvalidValueError(
                     f"{brief(lane)} is no environment that this suite can run in one process with others; give "
                     "gymnasium.make_vec the id of the single environment."
@@ -97,7 +99,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         self._over = np.ones(self.num_envs, dtype=np.bool_)
         self._acting: dict[int, _Acting] = {}
         self._clock_s = 0.0
-        self._simulates = lanes[0].execution == "physics"
+        self._simulates = lanes[0].takes_long
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
@@ -234,10 +236,10 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
         infos = self._restart(again, [None] * self.num_envs, {}, infos)
         return self._stacked(lanes), rewards, terminated, truncated, infos
 
-    def _begin(self, env: MacroEnv, action: int) -> Future[Step]:
+    def _begin(self, env: SceneEnv, action: Any) -> Future[Step]:
         """Begin a macro-action on another thread; a kinematic one is done here and now."""
         if self._simulates:
-            env.world.executor.capture_motion_hz = env.capture_motion_hz  # made here: one thread at a time may compile
+            env.prepare()  # one thread at a time may compile
             return self._pool.submit(env.act, action)
         done = Future[Step]()
         done.set_result(env.act(action))

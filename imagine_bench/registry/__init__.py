@@ -261,22 +261,25 @@ def register_env(entry: TaskEntry) -> None:
         max_episode_steps=entry.horizon,
         kwargs=dict(entry.options),
     )
-    if entry.env.startswith("imagine_bench."):
-        gymnasium.register(
-            vector_id(entry.env_id),
-            vector_entry_point="imagine_bench.tasks.vector_env:make",
-            reward_threshold=entry.reward_threshold,
-            max_episode_steps=entry.horizon,
-            kwargs={"env": entry.env, **entry.options},
-        )
-
+    own = entry.env.startswith("imagine_bench.")
+    if own:
+        _register_vector(entry.env_id, entry.env, entry, entry.horizon)
     if entry.motion:
-        gymnasium.register(
-            motion_id(entry.env_id),
-            entry.motion,
-            reward_threshold=entry.reward_threshold,
-            kwargs=dict(entry.options),
-        )
+        env_id = motion_id(entry.env_id)
+        threshold = entry.reward_threshold
+        gymnasium.register(env_id, entry.motion, reward_threshold=threshold, kwargs=dict(entry.options))
+        if own:
+            _register_vector(env_id, entry.motion, entry, None)
+
+
+def _register_vector(env_id: str, env: str, entry: TaskEntry, horizon: int | None) -> None:
+    gymnasium.register(
+        vector_id(env_id),
+        vector_entry_point="imagine_bench.tasks.vector_env:make",
+        reward_threshold=entry.reward_threshold,
+        max_episode_steps=horizon,
+        kwargs={"env": env, **entry.options},
+    )
 
 
 def motion_id(env_id: str) -> str:

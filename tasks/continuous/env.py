@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 
-import gymnasium
 import mujoco
 import numpy as np
 
-from imagine_bench.arrays import Floats, Frame, Info, Ints, Observed, State
-from imagine_bench.errors import InvalidValueError, brief, require_integer, require_known
+from imagine_bench.arrays import Floats, Info, Ints, Observed, State
+from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.interfaces import PhysicsSettings, TaskSpec
-from imagine_bench.rules import states_of
 from imagine_bench.values import Json
 
-from ..macro_env import options_of, start_of
 from ..motion.executor import blew_up
 from ..motion.ik import ArmModel
 from ..observations import Observer
 from ..parameters.parameters import delivered, hides
-from ..rendering.cameras import FRAME_PX, human_camera_view
-from ..rendering.window import HAS_PYGAME, Window
-from ..scene_reader import FilmedScene
+from ..rendering.cameras import FRAME_PX
+from ..scene_env import BUILT, RENDER_MODES, SceneEnv, Step
 from ..scenes.appearance import Appearance
 from ..scenes.appearance import appearance as appearance_level
 from ..scenes.arm import ARM_JOINTS, arm_columns
@@ -36,14 +32,12 @@ from .referee import GRIPPED, Event, Referee
 RATE_HZ = 25.0
 SECONDS_PER_MACRO_ACTION = 3.0
 """An episode is truncated after so many seconds for each macro-action of the task's horizon; planned, one takes 2.2."""
-_BUILT = PhysicsSettings()
 
 
 @dataclass
 class Episode:
     """Where an episode stands, beside its scene."""
 
-    begun: bool = False
     macrostate: State = ()
     periods: int = 0  #: control periods so far
     events: int = 0  #: changes of the macrostate so far
@@ -61,10 +55,11 @@ class MotionState:
     kind: tuple[object, ...]  #: of which environments it is
     world: WorldState
     generator: Mapping[str, Json]
+    begun: bool
     episode: Episode
 
 
-class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
+class MotionEnv(SceneEnv):
     """A task by hand commands: the same scene, rules and truth as its macro-actions, at a finer time scale.
 
     Action Space: by ``control``, as :class:`.controls.HandControl` says; the names of an action's numbers are
@@ -84,7 +79,8 @@ class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
 
     Info: ``macrostate`` (int64, (M,)), ``event`` (whether the macrostate changed in this period), ``macro_action`` (the
     macro-action that the event amounts to, or -1), ``is_success``, ``success``, ``legal``, ``fault``, ``fault_reason``,
-    ``limited`` (what kept the command from the action, or empty), ``sim_time_s`` (since the start), ``instruction``.
+    ``limited`` (what kept the command from the action, or empty), ``sim_time_s`` (of this period), ``elapsed_s`` (since
+    the start), ``instruction`` (empty unless ``told``).
 
     Args:
         spec: The task.
@@ -111,7 +107,7 @@ class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
     Version History: v0, the first.
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"][: 1 + HAS_PYGAME], "render_fps": round(RATE_HZ)}  # noqa: RUF012
+    metadata = {"render_modes": RENDER_MODES, "render_fps": round(RATE_HZ)}  # noqa: RUF012  (Gymnasium's own)
     KEYWORDS = (
         "control",
         "rate_hz",
@@ -146,30 +142,32 @@ class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
         width: int = 640,
         height: int = 480,
         camera: str = HUMAN_CAMERA,
-        physics: PhysicsSettings | Mapping[str, float | str] = _BUILT,
+        physics: PhysicsSettings | Mapping[str, float | str] = BUILT,
     ) -> None:
-        modes = ("rgb_array", "human")
-        self.render_mode = None if render_mode is None else require_known("render mode", render_mode, modes)
         level = appearance_level(appearance)
         if level.pool is not None:
             raise InvalidValueError(
                 f"Appearance {level.name!r} patches images of macrostates; give clean, mild, strong or factors."
             )
-        settings = PhysicsSettings.of(physics)
-        self.task = spec
-        self._known = {state: state for state in states_of(spec.rules)}
+        super().__init__(
+            spec,
+            make_world,
+            level,
+            physics=physics,
+            motion_hz=0.0,
+            render_mode=render_mode,
+            image=(camera, width, height),
+            cameras=(HUMAN_CAMERA, FAR_CAMERA),
+        )
         self._instruct = instruct
         self._slip = slip
         self._told = told
         self._sight = spec.sight
         self._lag = spec.sight.lag if spec.sight else 0
-        FilmedScene.__init__(self, make_world(level), 0.0)
-        self.world.set_physics(settings)
-        self._window = Window(spec.title) if self.render_mode == "human" else None
         self._n_steps = steps_in_period(rate_hz, self.model.opt.timestep)
         self.period_s = self._n_steps * self.model.opt.timestep
         self.controls = HandControl(control, ArmModel(), self.period_s)
-        self.control_names = self.controls.names
+        self.control_names = self.action_names = self.controls.names
         self.action_space = self.controls.space
         self._columns = arm_columns(self.model)
         self._ramp = (np.arange(1, self._n_steps + 1) / self._n_steps)[:, None]
@@ -177,70 +175,59 @@ class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self.camera, control=True)
         self.observation_space = self._observer.space
         self.time_limit_s = SECONDS_PER_MACRO_ACTION * spec.horizon if time_limit_s is None else time_limit_s
-        require_known("camera", camera, (HUMAN_CAMERA, FAR_CAMERA))
-        human_camera_view(camera, width, height)
-        self._image_of = (camera, width, height)
-        self._kind = (spec.id, "motion", control, self._n_steps, level.name, settings, slip, told)
+        self._kind = (spec.id, "motion", control, self._n_steps, level.name, self.physics, slip, told)
         self.episode = Episode()
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
 
-    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
-        """Start an episode.
+    def checked(self, action: Motion) -> Floats:
+        """As :meth:`.controls.HandControl.checked`."""
+        return self.controls.checked(action)
 
-        Args:
-            seed: Seeds everything random in this environment.
-            options: ``{"macrostate": ...}`` to start there; any macrostate of the rules.
-
-        Raises:
-            UnknownNameError: An unknown option.
-            InvalidValueError: A seed that is no integer from 0 on, or not a macrostate of this task.
-        """
-        super().reset(seed=None if seed is None else require_integer("seed", seed, 0))
-        start = start_of(options_of(options), self.task, self._known, self.np_random)
+    def _begin(self, start: State) -> Info:
         self.world.place(start, self.np_random)
         reading = self.world.read()
-        self.episode = Episode(begun=True, macrostate=reading.macrostate)
+        self.begun = True
+        self.episode = Episode(macrostate=reading.macrostate)
         self.world.set_slipping(False)
         self._vary()
-        self._show()
-        return self._observe(), self._info(success=False, fault=reading.problem)
+        return self._info(success=False, fault=reading.problem)
 
-    def step(self, action: Motion) -> tuple[Observed, float, bool, bool, Info]:
-        """Carry out the command of one control period.
+    def act(self, action: Motion) -> Step:
+        """Carry out the command of one control period, without an observation.
 
         Raises:
-            InvalidValueError: No such action, or no episode was begun.
+            InvalidValueError: As :meth:`step`.
         """
-        episode = self.episode
-        if not episode.begun:
+        if not self.begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
-        self._simulate(self.controls.checked(action))
-        episode.periods += 1
+        self._simulate(self.checked(action))
+        self.episode.periods += 1
         if blew_up(self.data):
-            episode.begun = False
-            info = self._info(success=False, fault="the simulation blew up")
-            return copy.deepcopy(episode.observations[-1]), 0.0, False, True, info
+            self.begun = False
+            return 0.0, False, True, self._info(success=False, fault="the simulation blew up")
         event = self._judge()
         self.world.update()
-        self._show()
-        reward = 0.0 if event is None else float(event.outcome.reward)
-        terminated = event is not None and event.outcome.terminated
         truncated = self.elapsed_s >= self.time_limit_s - self.period_s / 2
-        success = event is not None and event.outcome.success
-        fault = None if event is None else event.fault
-        return self._observe(), reward, terminated, truncated, self._info(success=success, fault=fault)
+        if event is None:
+            return 0.0, False, truncated, self._info(success=False, fault=None)
+        outcome = event.outcome
+        info = self._info(success=outcome.success, fault=event.fault)
+        return float(outcome.reward), outcome.terminated, truncated, info
 
-    def render(self) -> Frame | None:
-        """The scene as ``camera`` sees it, for ``"rgb_array"``; else None. Shape (height, width, 3)."""
-        return self._image() if self.render_mode == "rgb_array" else None
+    def observe(self, envs: Sequence[MotionEnv]) -> list[Observed]:
+        """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
+        now = self._observer.observe([(env._observer, env.world.observed(env.episode.macrostate)) for env in envs])
+        for env, seen in zip(envs, now, strict=True):
+            episode = env.episode
+            if episode.latest is not None or not episode.observations:
+                episode.observations = delivered(episode.observations, seen, env._lag)
+            elif not env._lag:
+                episode.observations = (seen,)
+        return [copy.deepcopy(env.episode.observations[0]) if env._lag else env.episode.observations[0] for env in envs]
 
-    def close(self) -> None:
-        """Free the OpenGL contexts and close the window; may be called again."""
-        for camera in self._cameras:
-            camera.close()
-        if self._window is not None:
-            self._window.close()
+    def _latest_observation(self) -> Observed:
+        return self.episode.observations[0]
 
     # --- states --------------------------------------------------------------------------------------------------
 
@@ -260,6 +247,7 @@ class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
             kind=self._kind,
             world=self.world.get_state(),
             generator=copy.deepcopy(self.np_random.bit_generator.state),
+            begun=self.begun,
             episode=copy.deepcopy(self.episode),
         )
 
@@ -275,6 +263,7 @@ class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
             raise InvalidValueError(f"{brief(given)} is no state of {brief(self._kind)}; give one of {words}.")
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
+        self.begun = state.begun
         self.episode = copy.deepcopy(state.episode)
         self.world.set_slipping(self.episode.slipping)
 
@@ -335,20 +324,9 @@ class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
         self.world.hide_gesture(hidden)
         self.world.vary(self.np_random, move_objects=move_objects)
 
-    def _observe(self) -> Observed:
-        (seen,) = self._observer.observe([(self._observer, self.world.observed(self.episode.macrostate))])
-        if self.episode.latest is not None or not self.episode.observations:
-            self.episode.observations = delivered(self.episode.observations, seen, self._lag)
-        elif not self._lag:
-            self.episode.observations = (seen,)
-        return copy.deepcopy(self.episode.observations[0])
-
-    def _image(self) -> Frame:
-        return self.renderer_for_people(*self._image_of).frame(self.data)
-
     def _show(self) -> None:
         if self._window is not None:
-            self._window.show(self._image(), 1.0 / self.period_s)
+            self._window.show(self.rendered([self])[0], 1.0 / self.period_s)
 
     def _info(self, *, success: bool, fault: str | None) -> Info:
         episode = self.episode
@@ -363,7 +341,8 @@ class MotionEnv(FilmedScene, gymnasium.Env[Observed, Motion]):
             "fault": np.bool_(fault is not None),
             "fault_reason": fault or "",
             "limited": episode.limited,
-            "sim_time_s": np.float64(self.elapsed_s),
+            "sim_time_s": np.float64(self.period_s if episode.periods else 0.0),
+            "elapsed_s": np.float64(self.elapsed_s),
             "instruction": self.instruction if self._told else "",
         }
 
