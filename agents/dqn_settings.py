@@ -28,9 +28,8 @@ class GreedySettings:
 
     #: Gamma in [0, 1], a macro-action. The thesis gives none; see docs/explanation/deviations.md.
     discount: float = setting(0.95, PROBABILITY)
-    #: Exploration probability in the limit; ``epsilon_max`` that at step 0.
-    epsilon_min: float = setting(0.001, PROBABILITY)
-    epsilon_max: float = setting(0.8, PROBABILITY)
+    epsilon_min: float = setting(0.001, PROBABILITY)  #: probability of a random macro-action in the limit
+    epsilon_max: float = setting(0.8, PROBABILITY)  #: probability of a random macro-action at step 0
     epsilon_decay: float = setting(0.03, NOT_NEGATIVE)  #: decay rate lambda, a real step
 
     def __post_init__(self) -> None:
@@ -45,8 +44,8 @@ class GreedySettings:
 class ControllerSettings(GreedySettings):
     """The action-value network, its updates and its exploration (thesis 5.2.2)."""
 
-    hidden: tuple[int, ...] = setting((512, 256, 128), LAYERS)
-    learning_rate: float = setting(1e-3, POSITIVE)
+    hidden: tuple[int, ...] = setting((512, 256, 128), LAYERS)  #: units of each hidden layer
+    learning_rate: float = setting(1e-3, POSITIVE)  #: step size of Adam
     batch_size: int = setting(64, COUNT)  #: transitions an update, real or imagined
     updates_per_step: int = setting(1, UPDATES)  #: updates on real transitions a real step, N_R
     #: How far the target network moves toward the learning one after each update, in (0, 1]: 1 is no target network
@@ -58,7 +57,7 @@ class ControllerSettings(GreedySettings):
 class ReplaySettings:
     """How many real transitions are kept; the oldest go first (thesis 5.2.2)."""
 
-    real: int = setting(50_000, ROWS)
+    real: int = setting(50_000, ROWS)  #: transitions that are kept
     #: The controller replays real transitions in proportion to |Bellman error| to this power (prioritised replay,
     #: Schaul et al. 2016); 0, the thesis: all alike.
     priority: float = setting(0.0, NOT_NEGATIVE)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, Union, get_args, get_or
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
 from imagine_bench.interfaces import AgentContext
-from imagine_bench.values import Setting
+from imagine_bench.values import Setting, kind_in_words
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -187,5 +187,4 @@ def _typed(name: str, hint: type, value: Setting) -> Setting:
                 return tuple(value)
         elif isinstance(option, type) and type(value) is option:
             return value
-    wanted = " or ".join(getattr(option, "__name__", str(option)) for option in options)
-    raise InvalidValueError(f"Setting {name!r} was given {brief(value)}; it takes {wanted}.")
+    raise InvalidValueError(f"Setting {name!r} was given {brief(value)}; it takes {kind_in_words(hint)}.")

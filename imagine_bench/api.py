@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.adapters.tracking import Tracked
 from imagine_bench.arrays import Array, Arrays
 from imagine_bench.cli import torch_as_it_was
 from imagine_bench.cli.benches import Budget, Learner, Tests, WorldOptions, carry_out, page_of
@@ -29,7 +28,8 @@ from imagine_bench.cli.observers import Observed
 from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownKeywordError, brief, require_known
 from imagine_bench.interfaces import Agent, AgentContext
 from imagine_bench.judge.judgement import Judgement
-from imagine_bench.protocols.data import Launcher, Result
+from imagine_bench.protocols.data import Result
+from imagine_bench.registry.builtin import OUR_AGENTS
 from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import AgentEntry, parse_settings
 from imagine_bench.registry.machine import CALL
@@ -38,7 +38,7 @@ from imagine_bench.running.launchers.jobs import launcher as launcher_named
 from imagine_bench.seeding import SEEDS
 from imagine_bench.store.bench_folder import is_archive, read_protocol_values
 from imagine_bench.store.files import expanded, read_json, reading
-from imagine_bench.values import Setting, unpack
+from imagine_bench.values import KINDS, Setting, unpack
 
 if TYPE_CHECKING:
     import pandas
@@ -51,8 +51,6 @@ MakeAgent = Callable[[AgentContext], Agent]
 _MAIN_TABLES = ("results", "scores")
 _NOTEBOOK = "ipykernel"
 """The module that carries out the cells of a notebook."""
-_KINDS = {int: "a whole number", float: "a number", str: "a text", bool: "True or False"}
-"""The values that options take, in words."""
 _SETTINGS = ("set", "physics")
 """Options that are mappings."""
 _OWN = ("preset", "workers", "launcher", "track", "out")
@@ -228,11 +226,13 @@ def bench(
         with torch_as_it_was():
             changes = protocol_changes(given)
             until, most = changes.pop("until_decided", False), changes.pop("most_seeds", None)
-            launch: Launcher = Observed(launcher_named(launcher, processes))
-            if track is not None:
-                launch = Tracked(launch, track, task)
-            *_, whole = carry_out(task, preset, changes, root=root, launcher=launch, until=until, most=most)
+            launch = Observed(launcher_named(launcher, processes))
+            *_, whole = carry_out(
+                task, preset, changes, root=root, launcher=launch, until=until, most=most, track=track
+            )
             return _of_bench(whole)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("interrupted; the same call goes on from the last checkpoints") from None
     finally:
         CALL.reset(call)
 
@@ -246,7 +246,8 @@ def protocol_changes(given: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in given.items():
         if name not in known:
             raise UnknownKeywordError.of(name, [*known, *_OWN])
-        changes[name] = value if name in _SETTINGS else _fitting(name, _plain(value), known[name])
+        fitting = _texts(value) if name == "variants" else _plain(value)
+        changes[name] = value if name in _SETTINGS else _fitting(name, fitting, known[name])
     if isinstance(_plain(given.get("seeds")), int):
         changes["seeds"] = _first_seeds(*changes["seeds"])
     if "set" in changes:
@@ -266,9 +267,9 @@ def _fitting(name: str, value: Any, kind: Any) -> Any:
     element = get_args(one)[0] if several else one
     is_list = several and isinstance(value, list | tuple | range)
     plain = tuple(_plain(each) for each in (value if is_list else (value,)))
-    element = str if element not in _KINDS else element  # a path, or the repeated words of a command
+    element = str if element not in KINDS else element  # a path, or the repeated words of a command
     if not all(type(each) is element or (element is float and type(each) is int) for each in plain):
-        raise InvalidValueError(f"{name} is {brief(value)}; give {_KINDS[element]}{' or a list of them' * several}.")
+        raise InvalidValueError(f"{name} is {brief(value)}; give {KINDS[element]}{' or a list of them' * several}.")
     return plain if several else plain[0]
 
 
@@ -279,6 +280,14 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Iterator):
         return list(value)
     return str(value) if isinstance(value, PurePath) else value
+
+
+def _texts(value: Any) -> Any:
+    """A variant, or a list of them, with numbers of samples as texts."""
+    plain = _plain(value)
+    if isinstance(plain, list | tuple | range):
+        return [_texts(each) for each in plain]
+    return str(plain) if type(plain) is int else plain
 
 
 def _first_seeds(number: int) -> tuple[int, ...]:
@@ -312,6 +321,7 @@ def register_agent(name: str, make: MakeAgent | str, **options: Any) -> None:
     Raises:
         InvalidValueError: The name is no name or taken, the class cannot be sent to another process, or an
             option has a value of another kind.
+        UnknownNameError: No such kind of encoder, or no such part of an observation.
         UnknownKeywordError: An option that agents do not have.
     """
     known = get_type_hints(AgentEntry)
@@ -325,9 +335,7 @@ def register_agent(name: str, make: MakeAgent | str, **options: Any) -> None:
             f"An agent cannot be called {brief(name)}; give a name of letters, digits and underscores that begins with "
             "one of a to z or A to Z. register_agent gives a class another name than its own."
         )
-    taken = registry.AGENTS.get(name)
-    is_ours = taken is not None and str(taken.make).startswith("imagine_bench.")
-    if is_ours or name in registry.usable(registry.AGENT_GROUP):
+    if name in OUR_AGENTS or name in registry.usable(registry.AGENT_GROUP):
         raise InvalidValueError(f"There is an agent {name!r} already; give yours another name.")
     text = (getattr(make, "__doc__", None) or "").strip().partition("\n")[0]
     described = {"description": text} if text and not isinstance(make, str) else {}
@@ -374,7 +382,7 @@ def load(path: Path | str) -> Comparison:
     if (folder / "config.json").exists():
         raise ArtefactError(f"{folder} is the folder of one run; give that of its bench, {folder.parent.parent}.")
     for place in places:
-        if any(place.glob("*.csv")):
+        if any((place / f"{name}.csv").is_file() for name in _MAIN_TABLES):
             return Comparison(place, None)
     raise ArtefactError(
         f"{folder} holds no results; give the folder of a bench (runs/<task>/<preset>-<hash>), of a judgement, a "

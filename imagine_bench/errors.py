@@ -16,7 +16,7 @@ from typing import Self, SupportsIndex
 
 _LONGEST = 200
 _FEW = 8
-LISTED = ("task", "agent", "regressor", "world model", "encoder", "grid")
+LISTED = ("task", "agent", "regressor", "world model", "task, agent or world model", "encoder", "grid")
 """Kinds of names that 'imagine-bench list' lists; a message has the nearest alone if there are many."""
 _LONGEST_REASON = 1000
 """Characters of a library's own complaint that are handed on."""

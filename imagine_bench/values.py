@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types
 from collections.abc import Mapping, Sequence
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -16,6 +16,25 @@ Setting = Scalar | tuple[Scalar, ...] | list[Scalar] | dict[str, Scalar]
 """The value of an agent's setting, as JSON has it."""
 Json = Scalar | Sequence["Json"] | Mapping[str, "Json"]
 """A value that a JSON file can hold."""
+
+
+KINDS = {int: "a whole number", float: "a number", str: "a text", bool: "True or False", types.NoneType: "none"}
+"""The kinds of plain values, in words."""
+
+
+def kind_in_words(hint: Any) -> str:
+    """A type of a setting or of a field of a protocol, in words; other classes are tables of a file."""
+    arguments = get_args(hint)
+    if get_origin(hint) in (Union, types.UnionType):
+        return " or ".join(dict.fromkeys(map(kind_in_words, arguments)))
+    if get_origin(hint) is tuple:
+        return f"a list, each item {kind_in_words(arguments[0])}" if arguments[-1] is Ellipsis else "a list"
+    return KINDS.get(hint, "a table")
+
+
+def has_switch(value: object) -> bool:
+    """Whether a value, or one in a sequence, is true or false; Python takes these for whole numbers, too."""
+    return isinstance(value, bool) or (isinstance(value, list | tuple) and any(map(has_switch, value)))
 
 
 def dotted(settings: Mapping[str, Setting], before: str = "") -> dict[str, Setting]:

@@ -76,8 +76,8 @@ class MacroEnv(SceneEnv):
             motion as long as it took.
         width: Pixels of :meth:`render`.
         height: Pixels of :meth:`render`.
-        camera: Camera of :meth:`render`: ``"human"`` looks at the table from nearby, ``"far"`` at the whole arm, and
-            ``"wrist"`` is the agent's.
+        camera: Camera of :meth:`render` and of the window: ``"human"`` looks at the table from nearby, ``"far"`` at the
+            whole arm, and ``"wrist"`` is the agent's.
         physics: What decides whether a grasp holds: settings, or a mapping of some of their names to values.
         motion_hz: :attr:`capture_motion_hz`.
         observation: What is observed, of one moment: ``"frame"``, or others and several, as :class:`.Observer` says.

@@ -81,6 +81,7 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
         require_known("camera", camera, cameras)
         human_camera_view(camera, width, height)  # refuses a size out of range now, not at the first image
         self._image_of = image
+        self.camera_for_people = image[0]
         self.begun = False
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:

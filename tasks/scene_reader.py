@@ -91,6 +91,7 @@ class FilmedScene:
         self._capture_motion_hz: float
         self.capture_motion_hz = motion_hz
         self._cameras: list[Renderer] = []
+        self.camera_for_people = HUMAN_CAMERA
         self.latest: MacroResult | None = None
         self._people = self._mocap()
         self._replaying = False
@@ -170,8 +171,8 @@ class FilmedScene:
         return self.world.composite(self.camera(agent_camera_view()).frame(self.data))
 
     def human_view(self, width: int = 640, height: int = 480) -> Frame:
-        """An image for people: the table and the objects on it, with the arm. Shape (height, width, 3)."""
-        return self.renderer_for_people(HUMAN_CAMERA, width, height).frame(self.data)
+        """An image for people from their camera: the table and the objects, with the arm. Shape (height, width, 3)."""
+        return self.renderer_for_people(self.camera_for_people, width, height).frame(self.data)
 
     def renderer_for_people(self, camera: str, width: int, height: int) -> Renderer:
         """The renderer of images for people from a camera, by name.

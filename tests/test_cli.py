@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import pickle
+import re
 import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import bench_fakes  # noqa: F401 - registers the fakes
 import pytest
@@ -22,11 +26,14 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 from imagine_bench.registry import AGENTS, TASKS, WORLD_MODELS
+from imagine_bench.registry.entries import Entrant, entrant
 from imagine_bench.running.bench import task_types
 from imagine_bench.running.launchers.jobs import LAUNCHERS
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.encoders import bundled
 from imagine_bench.sweep.grid import GRIDS
+from imagine_bench.tools.describe import describe
+from imagine_bench.values import dotted
 from imagine_bench.version import __version__
 
 DRAWING = {"MUJOCO_GL", "LP_NUM_THREADS", "PYOPENGL_PLATFORM"}
@@ -70,6 +77,10 @@ def test_wrong_words_get_one_line_and_exit_code_2(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
+        ("report a b", "'report' was also given 'b', which it does not take; leave it out. 'imagine-bench report"),
+        ("doctor x y", "'doctor' was also given 'x' 'y', which it does not take; leave it out."),
+        ("merge a b", "No command 'merge'."),
+        ("lst", "No command 'lst'. Did you mean 'list'?"),
         ("report a --merge", "--merge has no value; give at least one behind it, or leave it out."),
         ("plan HERE --max-epistemic=-1", "more epistemic uncertainty than -1.0: give at least 0."),
         ("sweep toy_regression", "toy_regression is a regression task, in which no agent acts"),
@@ -86,6 +97,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
         ("play arrow_puzzle --out x.gif", "--out goes with --film; leave it out"),
         ("play arrow_puzzle --film --execution kinematic", "A film is of the oracle in a task, in contact physics"),
         ("play arrow_puzzle --encoder x", "--encoder goes with --model"),
+        ("play arrow_puzzle --camera up", "No camera 'up'. Known: human, far."),
         ("play arrow_puzzle --execution no", "No execution 'no'"),
         ("play arrow_puzzle --seed -1", "seed is -1; give an integer from 0 on."),
         ("verify --nonce x", "--nonce goes with --train; leave it out"),
@@ -133,7 +145,7 @@ def test_a_task_is_the_first_word_or_an_option(capsys: pytest.CaptureFixture[str
         for task in (["nowhere"], ["--task", "nowhere"], ["--task=nowhere"]):
             assert main([command[0], *task, *command[1:]]) == 2
             said.add(capsys.readouterr().err)
-        assert len(said) == 1 and "No task 'nowhere'" in said.pop()
+        assert re.search("No task(, agent or world model)? 'nowhere'", said.pop()) and not said
 
 
 def test_a_command_called_from_python_leaves_the_process_as_it_was(
@@ -246,6 +258,30 @@ def test_whoever_launches_names_every_launcher(command: str, capsys: pytest.Capt
     assert f"--launcher {{{','.join(LAUNCHERS)}}}" in said
 
 
+@pytest.mark.parametrize("group", [registry.agents, registry.world_models, registry.regressors])
+def test_describe_says_what_every_setting_means(
+    group: Callable[[], Mapping[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each as it is typed, with a meaning beside its range; those of an agent are all that its settings name."""
+    for name, entry in group().items():
+        if ":" not in name:
+            assert main(["describe", name]) == 0
+        found = describe(name).partition("\nSettings of the preset quick")[2]
+        heads = re.findall(r"\n  (\S+) = (\S+)", found)
+        assert len(re.findall(r"\n {6}(?!must|may|one of| )", found)) >= len(heads), name
+        if target := getattr(entry, "settings", ""):
+            settings = registry.load(target)
+            assert {head for head, _ in heads} == settings.names()
+            default = dotted(dataclasses.asdict(settings.resolve("fast", {}, "chapter_5")))
+            for head, value in heads:
+                typed = f"{name}{',' if ':' in name else ':'}{head}={value}"
+                assert str(entrant(typed)) == str(Entrant(name, {head: default[head]})), typed
+    assert "controller.epsilon_decay = 0.003 (preset thesis: 0.03; pick_place: 0.001;" in describe("dqn")
+    capsys.readouterr()
+    assert main(["describe", "dqm"]) == 2
+    assert "No task, agent or world model 'dqm'. Did you mean 'dqn'?" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_shell_can_complete_every_command(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
@@ -277,7 +313,7 @@ def test_who_stops_reading_gets_no_traceback() -> None:
         (["report", "x" * 900], "File name too long"),
         (["bench", "arrow_puzzle", "--encoder", "~nobody_at_all/x.safetensors"], "knows no such home folder"),
         (["new", "agent", "mine", "--out", "~nobody_at_all/x"], "knows no such home folder"),
-        (["bench", "--task", "arrow_puzzle", "--set", "memory.real=" + "[" * 900], "it takes int"),
+        (["bench", "--task", "arrow_puzzle", "--set", "memory.real=" + "[" * 900], "it takes a whole number"),
     ],
 )
 def test_a_word_nobody_means_is_one_line(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:

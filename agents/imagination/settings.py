@@ -43,12 +43,14 @@ class WorldModelSettings:
     Sizes are units a hidden layer, of one network with two outputs or of two networks, else: InvalidValueError.
     """
 
-    dynamics_hidden: tuple[int, ...] = setting((256, 256, 256), LAYERS)
+    dynamics_hidden: tuple[int, ...] = setting((256, 256, 256), LAYERS)  #: units of each hidden layer of the dynamics
     components: int = setting(5, FEW)  #: gaussians in the mixture of the dynamics network, K
     #: Dynamics networks that differ by their first weights and dropout masks, E: a deep ensemble (Lakshminarayanan et
     #: al. 2017); the thesis has one.
     members: int = setting(1, FEW)
+    #: units of each hidden layer of the reward network
     reward_hidden: tuple[int, ...] = setting((512, 512, 512), SIZES)
+    #: units of each hidden layer of the termination network
     termination_hidden: tuple[int, ...] = setting((256, 256), SIZES)
     #: Of one network for reward and termination, instead of the two (thesis 3.2.2).
     shared_hidden: tuple[int, ...] = setting((), SIZES)
@@ -58,13 +60,13 @@ class WorldModelSettings:
     #: rare large reward weighs little; the thesis counts in plain units, 1.
     reward_scale: float = setting(1.0, POSITIVE)
     dropout: float = setting(0.5, DROPOUT)  #: probability of dropping a hidden unit, the same in every network
-    learning_rate: float = setting(1e-3, POSITIVE)
+    learning_rate: float = setting(1e-3, POSITIVE)  #: step size of Adam, of every network of the model
     #: Largest norm of the incoming weights of a unit; None limits nothing.
     max_norm: float | None = setting(3.0, POSITIVE)
     updates_per_step: int = setting(
         16, between(1, 1000)
     )  #: model updates a real step, N_E, of ``batch_size`` transitions each
-    batch_size: int = setting(512, COUNT)
+    batch_size: int = setting(512, COUNT)  #: transitions a model update
     #: Latents of a batch are sampled from N(mu, (spread sigma)^2), anew for each batch; the thesis with 1. Where an
     #: encoder's posteriors are narrower than the appearance of one macrostate varies, networks learn the few frames
     #: they saw by heart; a larger spread keeps them from it.
@@ -151,7 +153,7 @@ class ImaginationSettings:
 class MemorySettings(ReplaySettings):
     """How many real and imagined transitions are kept; the oldest go first (thesis 5.2.2)."""
 
-    imagined: int = setting(3_000, ROWS)
+    imagined: int = setting(3_000, ROWS)  #: imagined transitions that are kept
 
 
 @dataclass(frozen=True, kw_only=True)

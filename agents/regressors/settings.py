@@ -22,41 +22,36 @@ _BATCH_SIZE = between(8, 1_000_000, "layers are standardised over a batch")
 class RegressorSettings:
     """A regressor: Bayesian mixture density networks, and how long they train.
 
-    Attributes:
-        hidden: Units a hidden layer.
-        components: Gaussians in the mixture, K.
-        dropout: Probability of dropping a unit of a hidden layer that another one follows.
-        weight_decay: Of the hidden layers, weights and biases alike, added to the gradient: the term
-            ``weight_decay / 2 * |w|^2`` of the loss. Were biases spared, the bend of a ReLU unit, at ``-b / w``, would
-            leave the data as ``w`` shrinks, and a third of the first layer die.
-        gradient_clip: Largest gradient norm of each network.
-        sigma_floor, sigma_ceiling: Range of a component's standard deviation, in units of the network's outputs.
-        precision: Products between hidden layers while training.
-        final_rate: Last epoch's learning rate as a share of the first's, to which it falls as a cosine (Loshchilov &
-            Hutter 2017). 1 keeps it, as the thesis does.
-        batch_size: Rows an update, at most; None for all, as the thesis names none.
-        members: Networks of an ensemble, M; 1 is a single network with dropout.
-        weight_samples: Dropout masks, T; of an ensemble, each member is one sample.
-        divergence_draws: Values sampled from each weight sample's mixture to estimate their divergence.
-
     Raises:
         InvalidValueError: Dropout without two hidden layers, or all weight samples would be the same.
     """
 
-    hidden: tuple[int, ...] = setting((256, 256, 256), kinds.LAYERS)
-    components: int = setting(10, between(1, 1_000))
+    hidden: tuple[int, ...] = setting((256, 256, 256), kinds.LAYERS)  #: units of each hidden layer
+    components: int = setting(10, between(1, 1_000))  #: Gaussians in the mixture, K
+    #: probability of dropping a unit of a hidden layer that another one follows
     dropout: float = setting(0.2, _DROPOUT)
+    #: Of the hidden layers, weights and biases alike, added to the gradient: the term ``weight_decay / 2 * |w|^2`` of
+    #: the loss. Were biases spared, the bend of a ReLU unit, at ``-b / w``, would leave the data as ``w`` shrinks, and
+    #: a third of the first layer die.
     weight_decay: float = setting(0.02, kinds.NOT_NEGATIVE)
-    learning_rate: float = setting(1e-3, kinds.RATE)
-    gradient_clip: float = setting(10.0, POSITIVE)
+    learning_rate: float = setting(1e-3, kinds.RATE)  #: step size of Adam in the first epoch
+    gradient_clip: float = setting(10.0, POSITIVE)  #: largest gradient norm of each network
+    #: smallest standard deviation of a component, in units of the network's outputs
     sigma_floor: float = setting(1e-3, between(1e-9, 1.0))
+    #: largest standard deviation of a component, in units of the network's outputs
     sigma_ceiling: float = setting(10.0, between(1.0, 1e9))
+    #: number format of products between hidden layers while training
     precision: str = setting("float32", kinds.PRECISIONS)
-    epochs: int = setting(3000, kinds.ROWS)
+    epochs: int = setting(3000, kinds.ROWS)  #: passes over the data
+    #: Last epoch's learning rate as a share of the first's, to which it falls as a cosine (Loshchilov & Hutter 2017). 1
+    #: keeps it, as the thesis does.
     final_rate: float = setting(1.0, PROBABILITY)
+    #: rows an update, at most; None for all, as the thesis names none
     batch_size: int | None = setting(None, _BATCH_SIZE)
-    members: int = setting(1, between(1, 1_000))
+    members: int = setting(1, between(1, 1_000))  #: networks of an ensemble, M; 1 is a single network with dropout
+    #: dropout masks, T; of an ensemble, each member is one sample
     weight_samples: int = setting(50, between(2, 1_000, "the spread of one sample is 0"))
+    #: values sampled from each weight sample's mixture to estimate their divergence
     divergence_draws: int = setting(1, COUNT)
 
     def __post_init__(self) -> None:

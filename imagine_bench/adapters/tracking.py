@@ -6,6 +6,7 @@ They come from the ``metrics.csv`` of each run, which has a row for every budget
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import ClassVar, Protocol
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, lacking, plain, require_known, require_modules
-from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, Progress
+from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, Progress, Result
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import make_folder, reading, table_rows
 
@@ -98,9 +99,11 @@ class Tracked:
         self._launcher = launcher
         self._tool = tool
         self._failed = False
+        self._launched: set[Path] = set()
 
     def launch(self, jobs: Sequence[Job], on_progress: OnProgress) -> tuple[Failure, ...]:
         """Carry out every job by the launcher within; see :class:`.Launcher`."""
+        self._launched.update(job.folder for job in jobs)
         runs = {(job.spec.protocol.hash, job.spec.agent, job.spec.seed): _Run(self, job.folder) for job in jobs}
 
         def show(progress: Progress) -> None:
@@ -112,6 +115,15 @@ class Tracked:
         finally:
             for run in runs.values():
                 self.guarded(run.close)
+
+    def note(self, result: Result) -> None:
+        """Print a sentence if some runs of a bench were finished before, so that they were not tracked."""
+        before = sum(run.folder not in self._launched for run in result.runs)
+        if before:
+            print(
+                f"Note: {before} of {len(result.runs)} runs were finished before and are not tracked: 'imagine-bench "
+                f"report {shlex.quote(str(result.folder))} --track {self._tool}' writes the tests of all runs."
+            )
 
     def writer(self, run: Path) -> RunWriter:
         """The writer of the run of a folder."""

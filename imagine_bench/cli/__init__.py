@@ -11,7 +11,7 @@ import unicodedata
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import Annotated, TextIO, get_args
 
 import tyro
 from tyro.conf import subcommand
@@ -29,7 +29,17 @@ from imagine_bench.cli.tools import (
     Play,
     ViewCommand,
 )
-from imagine_bench.errors import EXTRAS, ImagineBenchError, InvalidValueError, SetupError, brief, lacking, plain, reason
+from imagine_bench.errors import (
+    EXTRAS,
+    ImagineBenchError,
+    InvalidValueError,
+    SetupError,
+    brief,
+    lacking,
+    plain,
+    reason,
+    require_known,
+)
 from imagine_bench.store.files import expanded
 from imagine_bench.version import __version__
 
@@ -52,8 +62,13 @@ Command = (
     | New
     | Doctor
 )
+COMMANDS = tuple(
+    getattr(kind, "__origin__", kind).__name__.removesuffix("Command").lower() for kind in get_args(Command)
+)
+"""The names of the commands."""
 
-
+_PROGRAM = "imagine-bench"
+_CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 _LONGEST_WORD = 1000
 _SETS_UP_TORCH = "imagine_bench.agents.encoders.perception"
 FORMER = {
@@ -82,14 +97,18 @@ def parsed(words: Sequence[str]) -> Command:
 
     Raises:
         SystemExit: The words are no command, or ask for help, which is then printed.
-        InvalidValueError: As :func:`understood`, or an option was given a value that is no number.
+        UnknownNameError: As :func:`understood`.
+        InvalidValueError: As :func:`understood`, or an option was given a value that is no number, or the command
+            takes no such word.
         SetupError: A shell's completion is asked for that needs a package which is not installed.
     """
     given = understood(words)
     said = io.StringIO()
     try:
         with redirect_stderr(said):
-            command = _parsed(given)
+            command, others = _parsed(given)
+            if any(word.startswith("-") for word in others):  # the parser names the nearest options
+                tyro.cli(Command, prog=_PROGRAM, args=given, config=_CONFIG)
     except ImportError as error:  # the completion of some shells needs another package
         raise SetupError(f"{plain(error)}.") from error
     except SystemExit:
@@ -99,20 +118,27 @@ def parsed(words: Sequence[str]) -> Command:
             raise InvalidValueError(f"{wrong[1]} was given {_values(given, wrong[1])!r}; it takes {kind}.") from None
         print(said.getvalue(), end="", file=sys.stderr)
         raise
+    if others:
+        added = " '--merge FOLDER' adds another bench." if isinstance(command, Report) else ""
+        raise InvalidValueError(
+            f"'{given[0]}' was also given {' '.join(map(repr, others))}, which it does not take; leave it out. "
+            f"'imagine-bench {given[0]} --help' names all that it takes.{added}"
+        )
     require_values(command)
     return command
 
 
-def _parsed(words: Sequence[str]) -> Command:
-    command: Command = tyro.cli(
+def _parsed(words: Sequence[str]) -> tuple[Command, list[str]]:
+    """The command, and the words that it does not take."""
+    return tyro.cli(
         Command,
-        prog="imagine-bench",
+        prog=_PROGRAM,
         description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs. "
         "'imagine-bench list' names all tasks, agents, presets and models; --version says which version this is.",
         args=words,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+        config=_CONFIG,
+        return_unknown_args=True,
     )
-    return command
 
 
 def _values(words: Sequence[str], option: str) -> str:
@@ -125,6 +151,7 @@ def understood(words: Sequence[str]) -> list[str]:
     """The words that are parsed. A former command is replaced, after one line on standard error.
 
     Raises:
+        UnknownNameError: No such command.
         InvalidValueError: A word that no terminal could show, a task given twice, or a former command that is no
             command any more.
     """
@@ -139,6 +166,8 @@ def understood(words: Sequence[str]) -> list[str]:
     if command in FORMER:
         given = [*FORMER[command], *given[1:]]
         print(f"imagine-bench: '{command}' is now: imagine-bench {shlex.join(given)}", file=sys.stderr)
+    if given and not given[0].startswith("-"):
+        require_known("command", given[0], [*COMMANDS, *ALSO])
     return _with_task_first(given) if given and given[0] in _TASK_FIRST else given
 
 

@@ -174,11 +174,15 @@ class Bench:
 
     def __call__(self) -> None:
         """Plan, run, report."""
-        launcher = self.launch.chosen()
-        if self.track is not None:
-            launcher = Tracked(launcher, self.track, self.task)
-        until, most = self.budget.until_decided, self.budget.most_seeds
-        for result in carry_out(*self.asked(), root=self.launch.out, launcher=launcher, until=until, most=most):
+        results = carry_out(
+            *self.asked(),
+            root=self.launch.out,
+            launcher=self.launch.chosen(),
+            until=self.budget.until_decided,
+            most=self.budget.most_seeds,
+            track=self.track,
+        )
+        for result in results:
             _show(result)
 
 
@@ -191,6 +195,7 @@ def carry_out(
     launcher: Launcher,
     until: bool = False,
     most: int | None = None,
+    track: str | None = None,
 ) -> list[Result]:
     """Carry out the missing runs of a bench, or with ``until`` of its stages, and read it.
 
@@ -202,6 +207,7 @@ def carry_out(
         launcher: Carries out the runs.
         until: Whether seeds are added until the headlines are decided.
         most: With it, seeds an agent at most; 15 by default.
+        track: Tool for which metrics are also written, as the runs go.
 
     Returns:
         The bench; or the bench of the first stage and, if there were more, that of all seeds.
@@ -212,6 +218,11 @@ def carry_out(
     """
     if most is not None and not until:
         raise InvalidValueError("--most-seeds goes with --until-decided; leave it out, or give both.")
+    if track is not None:
+        tracked = Tracked(launcher, track, task)
+        results = carry_out(task, preset, options, root=root, launcher=tracked, until=until, most=most)
+        tracked.note(results[-1])
+        return results
     wanted, encoders = plan(task, preset, **options)
     if not until:
         return [bench(wanted, encoders, root=root, launcher=launcher)]

@@ -70,7 +70,8 @@ class BenchObserver(RunObserver):
     def at_end(self, run: Run) -> AtEnd:
         """``imagined`` from several starts and ``sampled_rollouts`` from one, of an agent that imagines; a recording.
 
-        The recording, of some greedy episodes, lies beside the results; the file appears whole or not at all.
+        The recording, of some greedy episodes, lies beside the results; the file appears whole or not at all. The first
+        of them that was solved and the first that was not are ``recorded``.
         """
         found: AtEnd = {}
         if isinstance(run.agent, Imaginer) and run.protocol.shows_frames_alone:
@@ -85,7 +86,7 @@ class BenchObserver(RunObserver):
 
             run.tell("recording", at_once=True)
             with closing(make_env(run.protocol, run.protocol.task, testing=True)) as env:
-                record_run(
+                found["recorded"] = record_run(
                     run.protocol.task,
                     run.agent,
                     name=run.spec.agent,

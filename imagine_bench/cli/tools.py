@@ -21,15 +21,17 @@ from imagine_bench.cli.options import (
     Word,
     one_of,
     require_with,
+    shown,
 )
 from imagine_bench.data.folder import FORMATS, read_dataset, require_format, require_new, write_dataset
 from imagine_bench.errors import CheckFailedError, InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.registry.entries import file_name
-from imagine_bench.running.collect import collect, describe, policy_of
+from imagine_bench.running.collect import collect, policy_of
+from imagine_bench.running.collect import describe as describe_episodes
 from imagine_bench.store.bench_folder import newest_recording
 from imagine_bench.store.files import require_writable
-from imagine_bench.tools.describe import describe_task, names
+from imagine_bench.tools.describe import describe, names
 from imagine_bench.tools.doctor import examine
 from imagine_bench.tools.standard_data import standard_sets
 
@@ -69,12 +71,12 @@ class DatasetCommand:
         if [self.task is None, self.describe is None, not self.standard].count(False) != 1:
             raise InvalidValueError("Give exactly one of a task to collect episodes of, --describe and --standard.")
         if self.describe is not None:
-            print(describe(read_dataset(self.describe)))
+            print(describe_episodes(read_dataset(self.describe)))
             return
         require_format(self.format)
         if self.task is None:
             for folder in standard_sets(self.out or Path("datasets"), self.format, self.episodes):
-                print(f"{folder}\n{describe(read_dataset(folder))}\n")
+                print(f"{folder}\n{describe_episodes(read_dataset(folder))}\n")
             return
         spec = registry.task(self.task)
         policy = policy_of(self.policy, spec, self.seed, self.encoder)
@@ -90,7 +92,7 @@ class DatasetCommand:
             appearance=self.appearance,
             motion_hz=self.motion_hz,
         )
-        print(f"{folder}\n{describe(write_dataset(folder, episodes, files, card, self.format))}")
+        print(f"{folder}\n{describe_episodes(write_dataset(folder, episodes, files, card, self.format))}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,14 +146,17 @@ class ViewCommand(OfBench):
 
 @dataclass(frozen=True, kw_only=True)
 class Describe:
-    """Say what a task is, exactly: macro-actions, chance, optimum, plan lengths. Without a task, name everything."""
+    """Describe a task exactly (macro-actions, chance, optimum, plan lengths), or an agent with its settings.
 
-    task: MaybeTaskWord = None
-    """Task to describe, also as --task TASK."""
+    Without a name, name everything.
+    """
+
+    task: Annotated[str | None, tyro.conf.Positional, shown("[NAME]")] = None
+    """Task, agent, regressor or world model; a task also as --task TASK."""
 
     def __call__(self) -> None:
         """Describe, or list."""
-        print(names() if self.task is None else describe_task(self.task))
+        print(names() if self.task is None else describe(self.task))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,6 +173,8 @@ class Play:
     """Appearance: a level, or factors; by default likewise."""
     encoder: EncoderWord = None
     """Name or file of the encoder that the model used."""
+    camera: Annotated[str, one_of("human", "far")] = "human"
+    """Camera of the scene: human looks at the table from nearby, far at the whole arm."""
     seed: int = 0
     """Chooses the episodes."""
     film: bool = False
@@ -182,14 +189,15 @@ class Play:
         if not self.film:
             require_with("--film", self, "out")
             options = {"execution": self.execution, "appearance": self.appearance, "encoder": self.encoder}
-            print(play.play(self.task, model=self.model, seed=self.seed, **options))
+            print(play.play(self.task, model=self.model, seed=self.seed, camera=self.camera, **options))
             return
         if self.task is None or self.model or self.execution or self.encoder:
             raise InvalidValueError(
                 "A film is of the oracle in a task, in contact physics; give a task, and no --model, --execution or "
                 "--encoder."
             )
-        print(play.film(self.task, self.out, seed=self.seed, appearance=self.appearance or APPEARANCES[0]))
+        look = self.appearance or APPEARANCES[0]
+        print(play.film(self.task, self.out, seed=self.seed, appearance=look, camera=self.camera))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,10 +23,10 @@ from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, Untaught, WorldModel, until_the_end
 from imagine_bench.judge.predictions import imagined_by
 from imagine_bench.judge.reading import RenderedFrameIndex
-from imagine_bench.registry.entries import WorldModelEntry, entrant
+from imagine_bench.registry.entries import WorldModelEntry, agent_label, entrant
 from imagine_bench.registry.loading import importable
 from imagine_bench.running.isolation import Isolated
-from imagine_bench.running.trained import KeptAgent, agent_of, imaginer_of, read_agent
+from imagine_bench.running.trained import KeptAgent, agent_of, imaginer_of, kept_entry, read_agent
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import read_sealed
@@ -247,13 +247,19 @@ def runs_of(model: str) -> dict[int, Path]:
 
 
 def model_entry(model: str) -> WorldModelEntry:
-    """The registry line of a world model, or one for the agent of the runs of a folder. Raises UnknownNameError."""
+    """The registry line of a world model, or one for the agent of the runs of a folder.
+
+    Raises:
+        UnknownNameError: No such world model.
+        ArtefactError: This process does not know the agent.
+    """
     runs = runs_of(model)
     if not runs:
         return registry.world_model_entry(model)
     seed, folder = next(iter(runs.items()))
-    agent = read_sealed(folder / _CONFIG, "a run's configuration")["agent"]
-    entry = registry.agent_entry(agent)
+    config = read_sealed(folder / _CONFIG, "a run's configuration")
+    agent = agent_label(config["agent"], config["protocol"])
+    entry = kept_entry(agent, folder)
     title = entry.title or agent
     if folder == Path(model):
         title = f"{title}, seed {seed}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import DEVICES
 from imagine_bench.registry.entries import FIRST, TODAY, agent_label, edition_of, entrant, name_in_edition_1
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
-from imagine_bench.values import Json, Setting
+from imagine_bench.values import Json, Setting, has_switch, kind_in_words
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -121,10 +122,11 @@ def require_types(one: DataclassInstance) -> None:
             value = tuple(tuple(item) if isinstance(item, list) else item for item in value)
             object.__setattr__(one, name, value)
         try:
+            if has_switch(value) and not re.search("bool|Any", str(hint)):
+                raise TypeCheckError("true or false is no number")
             check_type(value, hint, collection_check_strategy=CollectionCheckStrategy.ALL_ITEMS)
         except TypeCheckError:
-            wanted = next(field.type for field in dataclasses.fields(one) if field.name == name)
-            raise InvalidValueError(f"{name} was given {brief(value)}; it takes {wanted}.") from None
+            raise InvalidValueError(f"{name} was given {brief(value)}; it takes {kind_in_words(hint)}.") from None
 
 
 def require_different(name: str, values: tuple[str, ...]) -> None:
@@ -196,6 +198,10 @@ Encoders = Mapping[str, Path]
 
 class FinishedRun(Interface):
     """What runs of every type leave."""
+
+    @property
+    def folder(self) -> Path:
+        """Where its files lie."""
 
     @property
     def recording(self) -> Path | None:

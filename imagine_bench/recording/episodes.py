@@ -32,7 +32,7 @@ from imagine_bench.recording.filmstrips import DARK, filmstrip, sampled_filmstri
 from imagine_bench.recording.stream import KINDS, Recording, recording_file, scene_view, sheet_view
 from imagine_bench.rules import ending, is_random
 from imagine_bench.seeding import SeedTree, episode_seed
-from imagine_bench.store.results import ComparedRollout
+from imagine_bench.store.results import ComparedRollout, RecordedEpisode
 
 IMAGINED_DEPTH = 6  # macro-actions imagined at each step; as many as a strip shows legibly
 _STILL_S = 1.5
@@ -49,12 +49,15 @@ def record_run(
     appearance: str,
     episodes: int,
     path: Path,
-) -> Path:
+) -> tuple[RecordedEpisode, ...]:
     """Record greedy real episodes of a trained agent, with what it imagines at every step if it imagines.
 
     ``env`` is the task's at ``appearance``, and stays open; nothing changes in the agent, registered as ``name``. The
-    episodes' seeds follow from the run's and are used for nothing else. ``path``, which is returned, ends in ``.rrd``;
-    until complete it is called ``<stem>.partial.rrd``.
+    episodes' seeds follow from the run's and are used for nothing else. ``path`` ends in ``.rrd``; until complete it is
+    called ``<stem>.partial.rrd``.
+
+    Returns:
+        The first episode that was solved and the first that was not, as far as there are such, in their order.
 
     Raises:
         UnknownNameError: Unknown task or agent.
@@ -66,7 +69,7 @@ def record_run(
         recorder = _EpisodeRecorder(recording, spec, agent, appearance, privileged, seed)
         for episode in range(1, episodes + 1):
             recorder.record(env, episode)
-    return path
+    return tuple(recorder.first.values())
 
 
 def q_table(names: Sequence[str], values: NDArray[np.float32], chosen: int) -> str:
@@ -98,9 +101,12 @@ class _EpisodeRecorder:
     privileged: bool
     seed: int
     states: list[State] = field(default_factory=list)  #: of the episode so far
+    frames: list[Frame] = field(default_factory=list)  #: likewise
+    first: dict[bool, RecordedEpisode] = field(default_factory=dict)  #: the first solved one and the first other one
 
     def record(self, env: Env, episode: int) -> None:
         """One greedy real episode, numbered from 1."""
+        self.frames = []
         names = self.spec.action_names
         recording = self.recording
         seen, info = env.reset(seed=episode_seed("recording", self.seed, episode))
@@ -109,6 +115,8 @@ class _EpisodeRecorder:
         if episode == 1:
             self._log_learning_to_see()
         self.states = []
+        actions: list[int] = []
+        rewards: list[float] = []
         done = False
         step = 0
         heading = f"### Episode {episode}: a new start"
@@ -123,15 +131,30 @@ class _EpisodeRecorder:
             self.recording.act()
             observation = self._log_frame(episode, seen, info)
             recording.curves("/real", {"reward": float(reward)})
+            actions.append(action)
+            rewards.append(float(reward))
             done = terminated or truncated
             step = step + 1
             fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
             outcome = f"Done: {names[action]}. Reward {float(reward):+.0f}.{fault}"
             heading = f"### Episode {episode}, after macro-action {step}\n\n{outcome}"
-        self._describe(heading, info, f"{ending(info, terminated=terminated).capitalize()}.", observation.frame)
+        end = ending(info, terminated=terminated)
+        self._describe(heading, info, f"{end.capitalize()}.", observation.frame)
+        self._keep(actions, rewards, success=bool(info["is_success"]), end=end)
         recording.clear("/real/q_table")  # nothing more is carried out
         recording.clear("/imagined")
         recording.clock_s += _STILL_S
+
+    def _keep(self, actions: Sequence[int], rewards: Sequence[float], *, success: bool, end: str) -> None:
+        """Keep the episode if it is the first that ended so."""
+        played = RecordedEpisode(
+            frames=np.array(self.frames),
+            actions=np.array(actions),
+            rewards=np.array(rewards),
+            success=np.array(success),
+            end=np.array(end),
+        )
+        self.first.setdefault(success, played)
 
     def _log_learning_to_see(self) -> None:
         """What it saw whenever that changed in training, a moment each, while the scene stands still."""
@@ -153,6 +176,7 @@ class _EpisodeRecorder:
         self.recording.show(episode=episode)
         frame = observation.frame if observation.frame.size else self._unseen_frame(info)
         self.recording.log("/real/frame", rr.Image(frame))
+        self.frames.append(frame)
         return observation
 
     def _unseen_frame(self, info: Info) -> Frame:

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from imagine_bench.arrays import Pixels
 from imagine_bench.interfaces import Macrostate, Rules, TaskSpec
 from imagine_bench.rules import states_of
-from imagine_bench.store.results import ComparedRollout
+from imagine_bench.store.results import ComparedRollout, RecordedEpisode
 
 CELL_PX = 128  # a 64-pixel frame at 2x, nearest, so that no pixel is made up
 STEP_PX = 144  # from column to column
@@ -97,6 +97,22 @@ def _row(name: str, tiles: Sequence[Tile], width: int, colors: SheetColors) -> P
             draw.line([(left - 9, 0), (left - 9, canvas.height)], colors.cut, 3)
         draw.multiline_text((left, bottom + 4), tile.below, color, font(), spacing=3)
     return np.asarray(canvas)
+
+
+def episode_strip(episode: RecordedEpisode, action_names: Sequence[str], columns: int = 4) -> Pixels:
+    """Draw the frames of an episode, ``columns`` in a row, each with the macro-action that led to it and its reward.
+
+    The last frame has a border, blue where the episode was solved and orange where not, and says below how it ended.
+    The image has shape (height, width, 3), uint8.
+    """
+    tiles = [Tile(episode.frames[0], "start")]
+    steps = zip(episode.frames[1:], episode.actions.tolist(), episode.rewards.tolist(), strict=True)
+    for step, (frame, action, reward) in enumerate(steps, 1):
+        tiles.append(Tile(frame, f"{step}. {action_names[action]}", f"reward {reward:+.0f}"))
+    words = textwrap.fill(str(episode.end), _LETTERS)
+    tiles[-1] = tiles[-1]._replace(below=f"{tiles[-1].below}\n{words}", right=bool(episode.success))
+    rows = [tiles[first : first + columns] for first in range(0, len(tiles), columns)]
+    return sheet([("" if index else "real frames", row) for index, row in enumerate(rows)], columns)
 
 
 def filmstrip(

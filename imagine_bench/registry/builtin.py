@@ -127,6 +127,8 @@ AGENTS: dict[str, AgentEntry] = {
     ),
 }
 
+OUR_AGENTS = frozenset(AGENTS)
+"""The names of this suite's agents, which nobody else may take."""
 DEMONSTRATOR = "oracle"
 """The registered agent, privileged and optimal, that plays the episodes which learners are shown."""
 

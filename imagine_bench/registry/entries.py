@@ -9,18 +9,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from imagine_bench.errors import ArtefactError, InvalidValueError, brief, plain
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief, plain, require_known
+from imagine_bench.interfaces import OBSERVATIONS
 from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.values import Setting
 
 _BETWEEN = re.compile(r",(?=[\w.]+=)")
 _LONGEST = 100
+ENCODER_KINDS = ("latents", "codes")
+"""What an encoder gives of a frame: real numbers, or the values of discrete factors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +50,12 @@ class TaskEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class AgentEntry:
-    """A registered agent."""
+    """A registered agent.
+
+    Raises:
+        UnknownNameError: No such kind of encoder, or no such part of an observation.
+        InvalidValueError: The relative cost is not above 0.
+    """
 
     make: str | CodeByValue  #: ``"module:attr"`` of a function from AgentContext to Agent, or the function itself
     learns: bool = True  #: Whether training changes it; others are only evaluated
@@ -64,6 +73,13 @@ class AgentEntry:
     relative_cost: float = 1.0
     title: str = ""  #: For headings, legends and tables; by default the registered name in plain words
     description: str = "A registered agent."  #: One sentence for a reader who knows none of this
+
+    def __post_init__(self) -> None:
+        require_known("kind of encoder", self.encoder_kind, ENCODER_KINDS)
+        for part in self.observes:
+            require_known("part of an observation", part, OBSERVATIONS)
+        if not 0.0 < self.relative_cost < math.inf:
+            raise InvalidValueError(f"relative_cost is {brief(self.relative_cost)}; give a number above 0.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -115,7 +115,7 @@ def verdict(data: ReportData) -> list[str]:
         if (agent, BASE_AGENT) not in pairs:
             by_agent.setdefault(agent, []).append(_against_dqn(data, agent))
     lines = [f"{agent}: {'; '.join(found)}." for agent, found in by_agent.items()]
-    lines = lines or ["Nothing is compared: that needs dqn and another learner side by side."]
+    lines = lines or [f"Nothing is compared, as {BASE_AGENT} or another learner is missing; name both with --agents."]
     return [*amiss, *lines] if data.result.missing else [*lines, *amiss]
 
 
@@ -226,7 +226,7 @@ def _left_out(result: BenchResult) -> list[str]:
 def _not_installed(data: ReportData) -> list[str]:
     names = [] if data.installed else [f"task {data.spec.id}"]
     names += [f"agent {agent}" for agent in data.result.protocol.agents if not known_agent(agent).make]
-    return [f"Not installed here: {', '.join(names)}. What follows from their code is not shown."] if names else []
+    return [f"Not installed here: {', '.join(names)}. Numbers that need missing code are not shown."] if names else []
 
 
 # Tables ------------------------------------------------------------------------------------------------------------
@@ -425,6 +425,7 @@ def _band(data: ReportData, record: Record) -> Estimate:
 
 
 SECTIONS: tuple[Callable[[ReportData], Section | None], ...] = (
+    sections.episodes,
     compared,
     success,
     gain,

@@ -7,7 +7,7 @@ import functools
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,6 +104,7 @@ class Section:
     images: Sequence[Image] = ()  # in their order
     tables: Sequence[Table] = ()  # in their order
     answers: Sequence[str] = ()  # its lines of the verdict at the top
+    links: Mapping[str, str] = field(default_factory=dict)  # files beside the page: their paths from it, by name
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,10 @@
-"""Sections of a bench's page on why agents failed, and what they imagine."""
+"""Sections of a bench's page on single episodes, on why agents failed, and on what they imagine."""
 
 from __future__ import annotations
 
 import csv
+import functools
+import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,12 +13,14 @@ from matplotlib.figure import Figure
 
 from imagine_bench.arrays import Arrays
 from imagine_bench.judge.causes import CAUSES
-from imagine_bench.recording.filmstrips import filmstrip, png, sampled_filmstrips
+from imagine_bench.recording.filmstrips import episode_strip, filmstrip, png, sampled_filmstrips
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
-from imagine_bench.report.data import ReportData, open_loop_means
+from imagine_bench.report.data import SCORE, ReportData, open_loop_means
 from imagine_bench.report.page import DASH, Image, Section, Table, percent
 from imagine_bench.store.files import reading
+from imagine_bench.store.results import RecordedEpisode
+from imagine_bench.store.run_folder import recording_path
 
 HEAD = ("agent", "seed", "episodes", "tests", "test", "cause")
 """Columns of ``why/causes.csv``: a row a failure, and one a test without any, whose cause is empty."""
@@ -35,6 +39,37 @@ _MEASURES = {
     "modal": "modal",
 }
 _KINDS = ("epistemic", "aleatoric", "modal")
+
+
+# Episodes ---------------------------------------------------------------------------------------------------------
+
+
+def episodes(data: ReportData) -> Section | None:
+    """A recorded episode that was solved and one that was not, both of the best agent that has such, as filmstrips."""
+    last = {agent: data.of(agent)[-1][SCORE[0]] for agent in data.result.protocol.agents}
+    best_first = sorted(last, key=lambda agent: (agent in data.learners, last[agent]), reverse=True)
+    runs = [run for agent in best_first for run in data.result.of(agent) if run.recorded]
+    if not runs or not data.installed:
+        return None
+    images = []
+    for name, wanted in (("solved", True), ("failed", False)):
+        found = [(run, each) for run in runs for each in run.recorded if bool(each.success) is wanted]
+        for run, episode in found[:1]:
+            strip = functools.partial(_strip, episode, data.spec.action_names)
+            images.append(Image(f"episode_{name}", strip, f"{run.agent}, seed {run.seed}: {episode.end}."))
+    words = (
+        "These are greedy episodes after the last training. They are recorded beside the tests, from starts of their "
+        "own, and count in no table. Shown are the first that was solved and the first that was not, of the best "
+        "learner that has such. The recordings below hold all such episodes, with the scene and the agent's "
+        "predictions; “imagine-bench view FILE” opens one.",
+    )
+    page = data.result.folder / "report"
+    links = {f"{run.agent}, seed {run.seed}": os.path.relpath(recording_path(run.folder), page) for run in runs}
+    return Section("One episode that was solved, and one that was not", words, images, links=links)
+
+
+def _strip(episode: RecordedEpisode, action_names: Sequence[str]) -> bytes:
+    return png(episode_strip(episode, action_names))
 
 
 # Why agents failed ------------------------------------------------------------------------------------------------

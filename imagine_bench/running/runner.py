@@ -38,7 +38,7 @@ from imagine_bench.running.evaluation import (
 from imagine_bench.running.run_state import CountVisits, Run, environments, make_env, reuse_outcomes
 from imagine_bench.seeding import episode_seed, evaluation_split
 from imagine_bench.store import run_folder
-from imagine_bench.store.results import Checkpoint, ComparedRollout, OpenLoop, PolicyTable
+from imagine_bench.store.results import Checkpoint, ComparedRollout, OpenLoop, PolicyTable, RecordedEpisode
 
 
 class AtBudget(TypedDict, total=False):
@@ -53,6 +53,7 @@ class AtEnd(TypedDict, total=False):
 
     imagined: tuple[ComparedRollout, ...]
     sampled_rollouts: tuple[ComparedRollout, ...]
+    recorded: tuple[RecordedEpisode, ...]
 
 
 class RunObserver:

@@ -14,7 +14,7 @@ from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import Result, RunSpec
 from imagine_bench.registry.by_value import CodeByValue
-from imagine_bench.registry.entries import agent_label, entrant
+from imagine_bench.registry.entries import AgentEntry, agent_label, entrant
 from imagine_bench.registry.loading import importable
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
@@ -86,7 +86,8 @@ def read_agent(folder: Path, *, encoder: str | None = None) -> KeptAgent:
     path, where the run used an encoder that is not bundled.
 
     Raises:
-        ArtefactError: No run of an agent, no checkpoint, another encoder, or a snapshot that does not fit this version.
+        ArtefactError: No run of an agent, an agent that this process does not know, no checkpoint, another encoder, or
+            a snapshot that does not fit this version.
         UnknownNameError: No such encoder.
         InvalidValueError: An agent that sees other observations than frames.
     """
@@ -104,16 +105,27 @@ def read_agent(folder: Path, *, encoder: str | None = None) -> KeptAgent:
             f"{folder} is of an agent that sees {protocol.observation} at {protocol.observation_size} pixels, and it "
             "would be asked with 64 x 64 frames alone; give the run of one that sees these."
         )
+    make = kept_entry(name, folder).make
     spec = RunSpec(protocol=protocol, agent=name, seed=seed, encoder=encoder_of_run(protocol, name, encoder))
     snapshot = load_newest(folder / run_folder.CHECKPOINTS)
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
     as_it_ran = registry.own_settings(entrant(name).agent, settings)  # whatever presets say by now
     context = dataclasses.replace(context_of(spec), overrides=as_it_ran)
-    make = registry.agent_entry(name).make
     if isinstance(make, str):
         make = importable(make)
     return KeptAgent(make, context, snapshot.agent, spec, snapshot.episode, folder)
+
+
+def kept_entry(agent: str, folder: Path) -> AgentEntry:
+    """The registry line of the agent of a run. Raises ArtefactError: this process does not know the agent."""
+    try:
+        return registry.agent_entry(agent)
+    except UnknownNameError as error:
+        raise ArtefactError(
+            f"The agent {agent!r} of {folder} is that of a script, or of a package that is not installed here. Install "
+            f"the package, or call imagine_bench.register_agent({agent!r}, ...) first, in the same Python process."
+        ) from error
 
 
 def require_control(task: str, what: str) -> None:

@@ -157,7 +157,7 @@ def _runs_of(part: Protocol, runs: Runs) -> tuple[RunResult, ...]:
 
 
 def cut(result: RunResult, part: Protocol) -> RunResult:
-    """Return a run with the budgets of ``part`` alone; what it imagined at its end is left out if it goes further."""
+    """Return a run with the budgets of ``part`` alone, and if it goes further, without what was measured at its end."""
     episodes = part.budgets[-1]
     whole = result.checkpoints[-1].episodes == episodes
     return dataclasses.replace(
@@ -167,6 +167,7 @@ def cut(result: RunResult, part: Protocol) -> RunResult:
         training_length=result.training_length[:episodes],
         imagined=result.imagined if whole else (),
         sampled_rollouts=result.sampled_rollouts if whole else (),
+        recorded=result.recorded if whole else (),
     )
 
 

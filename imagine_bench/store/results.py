@@ -66,6 +66,17 @@ class ComparedRollout:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RecordedEpisode:
+    """A greedy episode of a run's recording, of L macro-actions."""
+
+    frames: Pixels  #: The frame at its start and after each macro-action. Shape (L + 1, H, W, 3), uint8.
+    actions: Ints  #: Its macro-actions. Shape (L,).
+    rewards: Floats  #: Their rewards. Shape (L,).
+    success: Bools  #: Whether it ended in success. Shape ().
+    end: NDArray[np.str_]  #: Its end in words, such as "solved". Shape ().
+
+
+@dataclass(frozen=True, kw_only=True)
 class PolicyTable:
     """What an agent does, and what its model expects, in every macrostate of its task, S of them, in a frame of each.
 
@@ -156,6 +167,9 @@ class RunResult(OneRun):
     imagined: tuple[ComparedRollout, ...] = ()  #: Example rollouts at the last budget, for agents that imagine
     #: Several from one beginning at the last budget, where the rules leave something to chance.
     sampled_rollouts: tuple[ComparedRollout, ...] = ()
+    #: Of its recording, the first episode that was solved and the first that was not, in the order of their play; none
+    #: in results of versions that kept no episodes of recordings.
+    recorded: tuple[RecordedEpisode, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,9 @@
 """The files of one run: what was run, its metrics, one checkpoint, and the digests of all that is finished.
 
 ``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``checkpoints/`` (the newest holds everything that
-was measured), ``imagined.npz`` (rollouts of agents that imagine), ``recording.rrd``, ``log.txt``, and last ``DONE``,
-with the digests of the others. Finished runs of before 2026-11-28 have more files, which nobody reads.
+was measured), ``imagined.npz`` (rollouts of agents that imagine, and two recorded episodes), ``recording.rrd``,
+``log.txt``, and last ``DONE``, with the digests of the others. Finished runs of before 2026-11-28 have more files,
+which nobody reads.
 
 A checkpoint is a folder ``checkpoint_000007_episode_120`` (the seventh of its run) of ``agent.safetensors``,
 ``runner.safetensors`` and ``state.json``, which has its own digest and those of the other two. It is complete once it
@@ -51,7 +52,7 @@ from imagine_bench.store.files import (
     write_bytes,
     write_json,
 )
-from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RunResult
+from imagine_bench.store.results import Checkpoint, ComparedRollout, KeptEpisodes, RecordedEpisode, RunResult
 from imagine_bench.values import Json, grouped, pack, unpack
 
 _SNAPSHOT = "imagine_bench checkpoint 2"
@@ -309,10 +310,15 @@ def forget(folder: Path) -> None:
 
 
 def finish(
-    folder: Path, *, imagined: Sequence[ComparedRollout] = (), sampled_rollouts: Sequence[ComparedRollout] = ()
+    folder: Path,
+    *,
+    imagined: Sequence[ComparedRollout] = (),
+    sampled_rollouts: Sequence[ComparedRollout] = (),
+    recorded: Sequence[RecordedEpisode] = (),
 ) -> None:
-    """Keep what an agent imagined at its end and mark its run as done, or raise SetupError and leave it unmarked."""
-    write_arrays(folder / _IMAGINED, pack({"imagined": imagined, "sampled_rollouts": sampled_rollouts})[1])
+    """Keep what observers measured at a run's end and mark it as done, or raise SetupError and leave it unmarked."""
+    shown = {"imagined": imagined, "sampled_rollouts": sampled_rollouts, "recorded": recorded}
+    write_arrays(folder / _IMAGINED, pack(shown)[1])
     newest = _checkpoints(folder / CHECKPOINTS)[-1].relative_to(folder)
     parts = [(newest / name).as_posix() for name in (_STATE, _AGENT, _RUNNER)]
     mark_done(folder, [_CONFIG, _METRICS, _IMAGINED, *parts])
@@ -373,6 +379,7 @@ def load_run(folder: Path) -> RunResult:
         result,
         imagined=unpack(_ROLLOUTS, None, rollouts.get("imagined", {})),
         sampled_rollouts=unpack(_ROLLOUTS, None, rollouts.get("sampled_rollouts", {})),
+        recorded=unpack(tuple[RecordedEpisode, ...], None, rollouts.get("recorded", {})),
         recording=recording if recording.is_file() else None,
     )
 

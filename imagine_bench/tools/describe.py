@@ -1,4 +1,4 @@
-"""What a task is, in a dozen lines, with the exact facts of its rules: ``imagine-bench describe``."""
+"""A task with the exact facts of its rules, or a learner with its settings: ``imagine-bench describe``."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.errors import ImagineBenchError
+from imagine_bench.errors import ImagineBenchError, UnknownNameError
 from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, TaskSpec, bundled_name
 from imagine_bench.protocols.data import ProtocolData, TaskType
-from imagine_bench.registry.entries import AgentEntry, EncoderEntry, RegressorEntry, WorldModelEntry
+from imagine_bench.registry.entries import ENCODER_KINDS, AgentEntry, EncoderEntry, RegressorEntry, WorldModelEntry
 from imagine_bench.rules import evaluate, greedy, is_random, optimal_policy, states_of, tabulate
 from imagine_bench.running.bench import task_types
 from imagine_bench.running.launchers.jobs import LAUNCHERS
 from imagine_bench.store.encoders import bundled
 from imagine_bench.sweep.grid import Study, all_grids
+from imagine_bench.tools.settings import OF_AGENTS, Cases, settings_in_words
 
 _EXECUTIONS = (
     "The arm moves in contact physics: the default.",
@@ -43,8 +44,56 @@ _LAUNCHERS = (
     "One run after another in this process, for a debugger.",
 )
 """Descriptions of executions, appearances and launchers, in their order."""
+_REGRESSOR_SETTINGS = "imagine_bench.agents.regressors.settings:HYPERPARAMETERS"
 _MOST = 10
 """Plan lengths that are listed one by one."""
+
+
+def describe(name: str) -> str:
+    """A task, an agent, a regressor or a world model, in words and numbers.
+
+    Raises:
+        UnknownNameError: There is none of this name.
+        SetupError: It is in a package that is not installed.
+    """
+    is_task = registry.has_task(name) or name in registry.regressions()
+    pages = [describe_task(name)] if is_task else []
+    learners = (
+        (registry.agents(), OF_AGENTS),
+        (registry.regressors(), {"": ("fast", name), "preset thesis": ("published", name)}),
+        (registry.world_models(), OF_AGENTS),
+    )
+    for known, cases in learners:
+        if name in known:
+            pages.append(_learner(name, known[name], cases))
+    if not pages:
+        for guest in registry.absent_guests():
+            if name in guest.names.get(registry.AGENT_GROUP, ()):
+                registry.agent_entry(name)
+        known_names = [*registry.tasks(), *registry.regressions(), *(each for known, _ in learners for each in known)]
+        raise UnknownNameError("task, agent or world model", name, dict.fromkeys(known_names))
+    return "\n\n".join(pages)
+
+
+def _learner(name: str, entry: AgentEntry | RegressorEntry | WorldModelEntry, cases: Cases) -> str:
+    """An agent, a regressor or a world model: how it is named in commands, what it is given, and its settings."""
+    rows: dict[str, str] = {}
+    target = _REGRESSOR_SETTINGS if isinstance(entry, RegressorEntry) else entry.settings
+    command = f"judge TASK --models {name}" if isinstance(entry, WorldModelEntry) else f"bench TASK --agents {name}"
+    rows["command"] = f"imagine-bench {command}"
+    if isinstance(entry, AgentEntry):
+        seen = f"the {entry.encoder_kind} that the task's encoder gives of a frame" if entry.needs_encoder else "frames"
+        rows["observes"] = ", ".join(entry.observes) or seen
+        rows["learns"] = "yes" if entry.learns else "no"
+    if not isinstance(entry, RegressorEntry) and entry.privileged:
+        rows["privileged"] = "yes: it is shown the true state, or the rules"
+    page = _page(entry.title or name, entry.description, rows)
+    if not target:
+        return f"{page}\n\nIt has no settings."
+    option = "" if isinstance(entry, WorldModelEntry) else "with --set NAME=VALUE, or "
+    colon = "," if ":" in name else ":"
+    head = f"Settings of the preset quick, in brackets of others; changed {option}as {name}{colon}NAME=VALUE"
+    return f"{page}\n\n{head}\n{settings_in_words(target, cases)}"
 
 
 def describe_task(name: str) -> str:
@@ -168,5 +217,5 @@ def _plan_lengths(spec: TaskSpec) -> str:
 
 
 def _encoders(spec: TaskSpec) -> str:
-    names = [bundled_name(spec.encoder, look, kind) for look in APPEARANCES for kind in ("latents", "codes")]
+    names = [bundled_name(spec.encoder, look, kind) for look in APPEARANCES for kind in ENCODER_KINDS]
     return ", ".join(name for name in names if name in bundled()) or "trained on first use"

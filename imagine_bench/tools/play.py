@@ -22,7 +22,7 @@ from PIL import Image, ImageDraw, ImageFont
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Action, Frame, Info, State
-from imagine_bench.errors import InvalidValueError, SetupError, require_integer
+from imagine_bench.errors import InvalidValueError, SetupError, require_integer, require_known
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
 from imagine_bench.rules import ending
@@ -33,6 +33,8 @@ from imagine_bench.store.files import make_folder, write_bytes
 
 KEYS = "123456789" + string.ascii_lowercase
 """Of the macro-actions, in their order."""
+CAMERAS = ("human", "far")
+"""From where a person sees the scene: near the table, or far enough for the whole arm."""
 _FPS = 25
 _FILM_FPS = 10
 """Images a second of the window, and of a film."""
@@ -199,11 +201,13 @@ def play(
     execution: str | None = None,
     appearance: str | None = None,
     encoder: str | None = None,
+    camera: str = "human",
 ) -> str:
     """Open a window in which a person plays until it is closed, and say how often the person succeeded.
 
     ``model`` is a run's folder, whose agent imagines beside the person; it also says what is None, else the task's
-    environment does. ``encoder`` is as of :func:`imagine_bench.running.trained.load_trained`.
+    environment does. ``encoder`` is as of :func:`imagine_bench.running.trained.load_trained`, ``camera`` as of
+    :func:`film`.
 
     Raises:
         ImagineBenchError: Nothing to play, unknown names, a model of another task or that does not imagine, what
@@ -223,6 +227,7 @@ def play(
     if encoder is not None and model is None:
         raise InvalidValueError("--encoder goes with --model; a person needs none.")
     spec = registry.task(task)
+    chosen |= _view(camera)
     if execution is not None:
         chosen["execution"] = spec.execution(execution)
     if appearance is not None:
@@ -239,7 +244,12 @@ def play(
     return game.summary()
 
 
-def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> Path:
+def _view(camera: str) -> dict[str, Any]:
+    """The keyword of an environment that is seen by a camera other than its own."""
+    return {} if require_known("camera", camera, CAMERAS) == CAMERAS[0] else {"camera": camera}
+
+
+def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean", camera: str = "human") -> Path:
     """Film one episode of optimal macro-actions in contact physics.
 
     Args:
@@ -247,9 +257,10 @@ def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> P
         out: The GIF; an existing file is not overwritten.
         seed: Chooses the episode.
         appearance: Appearance level.
+        camera: ``"human"`` looks at the table from nearby, ``"far"`` at the whole arm.
 
     Raises:
-        UnknownNameError: No such task or appearance.
+        UnknownNameError: No such task, appearance or camera.
         InvalidValueError: ``out`` is no GIF.
         SetupError: ``out`` exists or cannot be written, or there is no GL.
     """
@@ -259,7 +270,7 @@ def film(task: str, out: Path, *, seed: int = 0, appearance: str = "clean") -> P
         raise SetupError(f"{out} exists and is not overwritten; delete it or give another --out.")
     make_folder(out.parent)
     spec = registry.task(task)
-    env = gymnasium.make(spec.env_id, appearance=appearance, disable_env_checker=True)
+    env = gymnasium.make(spec.env_id, appearance=appearance, disable_env_checker=True, **_view(camera))
     scene: Any = env.unwrapped
     with closing(KeyboardGame(env, spec, None, episode_seed("recording", seed, 0))) as game:
         scene.capture_motion_hz = float(_FILM_FPS)

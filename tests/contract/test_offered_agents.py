@@ -83,7 +83,7 @@ def test_a_packages_agent_is_compared_like_one_of_ours(
     guests.offer(site, {})
     assert main(["report", str(folder)]) == 0, "what was measured can be read without the package"
     said = capsys.readouterr().out
-    assert "Not installed here: agent their_agent. What follows from their code is not shown." in said
+    assert "Not installed here: agent their_agent. Numbers that need missing code are not shown." in said
     assert re.search(r"^their_agent +\d", said, re.MULTILINE)
     assert main([*words, *size, "--out", str(tmp_path / "runs")]) == 2
     assert "No agent 'their_agent'" in capsys.readouterr().err

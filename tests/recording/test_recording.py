@@ -28,6 +28,7 @@ from imagine_bench.recording.episodes import q_table, record_run
 from imagine_bench.recording.stream import entity_name, log_motion, log_shapes, open_in_viewer, recording_file
 from imagine_bench.rules import ending
 from imagine_bench.running.bench import bench
+from imagine_bench.seeding import episode_seed
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
@@ -45,7 +46,8 @@ def record(
 ) -> Path:
     settings = {"seed": 3, "appearance": "mild", "episodes": 2, **changes}
     with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution=execution, appearance="mild")) as env:
-        return record_run("arrow_puzzle", agent, name=name, env=env, path=path, **settings)  # type: ignore[arg-type]
+        record_run("arrow_puzzle", agent, name=name, env=env, path=path, **settings)  # type: ignore[arg-type]
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -131,12 +133,47 @@ def test_how_it_learned_to_see_comes_before_it_acts_and_what_it_does_not_know_be
     assert view in view_names(path) and view not in view_names(imagined)
 
 
+class _Repeats(FakeAgent):
+    """Always takes one macro-action."""
+
+    def __init__(self, action: int) -> None:
+        super().__init__()
+        self.action = action
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        return self.action
+
+
+@pytest.mark.parametrize("action", [0, 4])
+def test_the_first_solved_and_the_first_lost_episode_are_kept_as_they_were_seen(tmp_path: Path, action: int) -> None:
+    path = tmp_path / "recording.rrd"
+    with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")) as env:
+        given = {"name": "random", "env": env, "seed": 3, "appearance": "clean"}
+        kept = record_run("arrow_puzzle", _Repeats(action), path=path, episodes=12, **given)  # type: ignore[arg-type]
+        played = []
+        for episode in range(1, 13):
+            seen, info = env.reset(seed=episode_seed("recording", 3, episode))
+            frames, rewards, over = [seen], [], False
+            while not over:
+                seen, reward, terminated, truncated, info = env.step(action)
+                frames.append(seen)
+                rewards.append(reward)
+                over = terminated or truncated
+            played.append((bool(info["is_success"]), np.array(frames), rewards))
+    wanted = {success: (frames, rewards) for success, frames, rewards in reversed(played)}
+    assert {bool(each.success) for each in kept} == set(wanted) and len(kept) == len(wanted)
+    for each in kept:
+        frames, rewards = wanted[bool(each.success)]
+        assert np.array_equal(each.frames, frames) and each.rewards.tolist() == rewards
+        assert set(each.actions.tolist()) == {action} and (str(each.end) == "solved") == bool(each.success)
+
+
 def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, tmp_path: Path) -> None:
     with closing(gymnasium.make("imagine_bench/PickPlace-v0")) as env:
-        path = record_run(
-            "pick_place", _HandsOver(), name="imagination", seed=0, env=env, appearance="clean", episodes=1,
-            path=tmp_path / "chance.rrd",
-        )  # fmt: skip
+        path = tmp_path / "chance.rrd"
+        record_run(
+            "pick_place", _HandsOver(), name="imagination", seed=0, env=env, appearance="clean", episodes=1, path=path
+        )
     assert contents(path)["/imagined/sampled_rollouts"] >= {"sim_time", "env_step", "episode"}
     assert "/imagined/sampled_rollouts" not in contents(imagined)
     (store,) = RrdReader(imagined).blueprints()

@@ -7,6 +7,7 @@ import textwrap
 from pathlib import Path
 
 import numpy as np
+import pytest
 from fake_results import bench_result, compared_rollout
 
 from imagine_bench import registry
@@ -15,7 +16,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.recording import filmstrips
 from imagine_bench.recording.filmstrips import CELL_PX, LABELS_PX, RIGHT, TITLE_PX, WRONG, changes, sampled_filmstrips
 from imagine_bench.report import bench_page
-from imagine_bench.store.results import ComparedRollout
+from imagine_bench.store.results import ComparedRollout, RecordedEpisode
 
 PICK_PLACE = registry.task("pick_place")
 START, ASKS_RIGHT, IMPOSSIBLE = np.array([[0, 0, 0, 0], [1, 0, 0, 2], [1, 1, 0, 2]])
@@ -76,6 +77,49 @@ def test_real_frames_are_shown_unaltered_and_upright() -> None:
     strip = filmstrips.filmstrip(compared, tuple("abcdef"))
     shown = strip[TITLE_PX : TITLE_PX + CELL_PX : 2, LABELS_PX : LABELS_PX + CELL_PX : 2]
     np.testing.assert_array_equal(shown, compared.start_frame)
+
+
+def recorded(length: int, success: bool) -> RecordedEpisode:
+    """An episode; each frame has a color of its own."""
+    colors = np.arange(1, length + 2, dtype=np.uint8)[:, None, None, None] * np.array([20, 7, 3], dtype=np.uint8)
+    return RecordedEpisode(
+        frames=np.broadcast_to(colors, (length + 1, 64, 64, 3)),
+        actions=np.arange(length) % 4,
+        rewards=np.zeros(length),
+        success=np.array(success),
+        end=np.array("solved" if success else "lost, because no macro-actions are left"),
+    )
+
+
+@pytest.mark.parametrize("length", [1, 3, 6])
+def test_an_episode_s_strip_shows_every_frame_in_order_and_how_it_ended(length: int) -> None:
+    for success in (True, False):
+        episode = recorded(length, success)
+        strip = filmstrips.episode_strip(episode, PICK_PLACE.action_names)
+        assert colored(strip) == [success, not success]
+        cells = [np.argwhere((strip == frame[0, 0]).all(axis=-1)) for frame in episode.frames]
+        assert all(len(cell) == CELL_PX**2 for cell in cells), "each frame once, whole"
+        places = [tuple(cell[0]) for cell in cells]
+        assert places == sorted(places)
+        assert strip.shape[1] < 700, "it fits a page"
+
+
+def test_a_report_begins_with_a_solved_and_a_lost_episode_and_links_recordings(tmp_path: Path) -> None:
+    protocol = Protocol(task="pick_place", preset="quick", agents=("random", "dqn"), seeds=(0, 1), budgets=(5,))
+    plain = bench_result(tmp_path, protocol=protocol)
+    assert not any(section.links for section in bench_page(plain).sections), "older runs kept no episodes"
+    shown = {("random", 0): [True, False], ("dqn", 0): [True], ("dqn", 1): [True]}
+    for failures, captions in (([], "random, seed 0"), ([False], "dqn, seed 1")):
+        kept = {**shown, ("dqn", 1): [True, *failures]}
+        runs = [
+            dataclasses.replace(run, recorded=tuple(recorded(2, each) for each in kept.get((run.agent, run.seed), ())))
+            for run in plain.runs
+        ]
+        first = bench_page(dataclasses.replace(plain, runs=tuple(runs))).sections[0]
+        solved, lost = first.images
+        assert solved.caption == "dqn, seed 0: solved." and lost.caption.startswith(f"{captions}: lost, because")
+        assert list(first.links.values()) == [f"../{agent}/seed_{seed}/recording.rrd" for agent, seed in
+                                              [("dqn", 0), ("dqn", 1), ("random", 0)]]  # fmt: skip
 
 
 def test_changes_are_named_and_judged_by_the_rules() -> None:

@@ -245,7 +245,7 @@ def test_one_seed_gets_an_interval_over_episodes_and_no_verdict(tmp_path: Path) 
 def test_agents_that_do_not_learn_are_not_compared(tmp_path: Path) -> None:
     protocol = Protocol(task="arrow_puzzle_hard", preset="quick", agents=("random", "oracle"), budgets=(5,))
     page = bench_page(bench_result(tmp_path, protocol=protocol))
-    assert page.answers == ["Nothing is compared: that needs dqn and another learner side by side."]
+    assert page.answers == ["Nothing is compared, as dqn or another learner is missing; name both with --agents."]
     assert [section.title for section in page.sections] == [
         "What was compared", "Success against real experience", "What it cost, and what went wrong",
     ]  # fmt: skip

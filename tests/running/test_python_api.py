@@ -32,6 +32,7 @@ from imagine_bench.errors import (
     UnknownNameError,
 )
 from imagine_bench.interfaces import AgentContext
+from imagine_bench.judge.models import model_entry
 from imagine_bench.registry.by_value import CodeByValue, code_digest
 from imagine_bench.running.trained import learners, load_trained
 
@@ -197,8 +198,9 @@ def test_a_changed_class_resumes_no_run(
     run = results.folder / "Shifting/seed_0"
     content = {path: path.read_bytes() for path in results.folder.rglob("*") if path.is_file()}
     again = {**_FEW, "agents": ["random", Shifting], "out": results.folder.parents[1]}
-    assert imagine_bench.bench("arrow_puzzle", **again).folder == results.folder
-    assert "All runs lie in" in capsys.readouterr().out
+    assert imagine_bench.bench("arrow_puzzle", **again, track="tensorboard").folder == results.folder
+    said = capsys.readouterr().out
+    assert "All runs lie in" in said and "Note: 2 of 2 runs were finished before and are not tracked" in said
     monkeypatch.setattr(Shifting, "shift", 1)
     with pytest.raises(ArtefactError, match=r"code of agent Shifting is not that of this bench"):
         imagine_bench.register_agent("Shifting", Shifting)
@@ -213,8 +215,9 @@ def test_a_changed_class_resumes_no_run(
     assert load_trained(run).episodes == 2, "the former class, again"
     assert learners(results.folder) == (run,)
     del registry.AGENTS["Shifting"]
-    with pytest.raises(ArtefactError, match="of a script"):
-        learners(results.folder)
+    for read in (lambda: learners(results.folder), lambda: load_trained(run), lambda: model_entry(str(run))):
+        with pytest.raises(ArtefactError, match="of a script"):
+            read()
 
 
 def test_a_frame_is_the_table_of_the_report(results: api.Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -279,6 +282,7 @@ def test_kept_results_are_loaded_as_they_were_written(kept: str) -> None:
 
 
 def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "commands.csv").write_text("name,command\n")
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(ArtefactError, match="holds no results; give the folder of a bench"):
             imagine_bench.load(folder)
@@ -306,6 +310,8 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         given = api.protocol_changes({"agents": ["dqn"], **options})
         wanted, _ = api.benches.plan("arrow_puzzle", "quick", **given)
         assert wanted == command.planned()[0], words
+    variants = {"variants": [np.int64(50), "100"]}
+    assert api.protocol_changes(variants) == {"variants": ("50", "100")}
     with pytest.raises(UnknownKeywordError, match=r"'episodes'.*evaluation_episodes"):
         imagine_bench.bench("arrow_puzzle", episodes=3)
     with pytest.raises(UnknownKeywordError, match=r"'worker'. Did you mean 'workers'"):
@@ -348,13 +354,16 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         ("_mine", Shifting, {}, "begins with one of a to z"),
         ("mine", Shifting, {"needs_encoder": "no"}, "needs_encoder is 'no'; give True or False"),
         ("mine", Shifting, {"observes": 3}, "observes is 3; give a text"),
+        ("mine", Shifting, {"encoder_kind": "q"}, "No kind of encoder 'q'. Known: latents, codes."),
+        ("mine", Shifting, {"observes": "pixels"}, "No part of an observation 'pixels'"),
+        ("mine", Shifting, {"relative_cost": 0.0}, "relative_cost is 0.0; give a number above 0."),
         ("mine", Shifting, {"learn": False}, "'learn'. Did you mean 'learns'?"),
     ],
 )
 def test_what_cannot_be_registered_is_one_sentence(
     name: str, make: Callable[..., Any], options: dict[str, Any], sentence: str
 ) -> None:
-    with pytest.raises((InvalidValueError, UnknownKeywordError)) as found:
+    with pytest.raises((InvalidValueError, UnknownKeywordError, UnknownNameError)) as found:
         imagine_bench.register_agent(name, make, **options)
     assert sentence in str(found.value)
 
@@ -370,6 +379,18 @@ def test_a_class_that_is_changed_keeps_its_name_and_fields(monkeypatch: pytest.M
     now = registry.AGENTS["mine"]
     assert "Shifting" not in registry.AGENTS and "make" not in registry.AGENTS and "MyAgent" in registry.AGENTS
     assert now.make != first.make and dataclasses.replace(now, make=first.make) == first
+    for make in ("imagine_bench.agents:nope", Shifting):
+        imagine_bench.register_agent("mine", make)
+    assert registry.AGENTS["mine"].make == now.make, "a second call replaces it"
+
+
+def test_an_interrupted_call_says_that_it_goes_on(tmp_path: Path) -> None:
+    class Stopped(Shifting):
+        def act(self, observation: Any, *, explore: bool) -> int:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="the same call goes on from the last checkpoints"):
+        imagine_bench.bench("arrow_puzzle", agents=[Stopped], out=tmp_path, **_FEW)
 
 
 def test_a_class_that_fails_is_named_and_its_log(tmp_path: Path) -> None:

@@ -144,7 +144,8 @@ def test_settings_in_a_file_may_be_nested(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("budgets = [2]", "budgets = 2", "budgets was given 2; it takes tuple"),
+        ("budgets = [2]", "budgets = 2", "budgets was given 2; it takes a list, each item a whole number"),
+        ("budgets = [2]", "budgets = [true]", "budgets was given (True,); it takes a list, each item a whole number"),
         ("budgets = [2]", "budgets = [", "is no study: Invalid value (at"),
         ("test_appearance", "looks", "No field that a variant may change 'looks'"),
         ('preset = "smoke"', 'name = "a/b"', "a name is 1 to 60 letters"),

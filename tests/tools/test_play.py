@@ -73,6 +73,17 @@ def test_keys_do_what_the_environment_does():
     plain.close()
 
 
+def test_people_see_a_scene_through_the_camera_that_is_named():
+    views = []
+    for camera in ("human", "far"):
+        game = game_of(camera=camera)
+        game.reset()
+        views.append(game.unwrapped.human_view(64, 48))
+        np.testing.assert_array_equal(views[-1], game.env.render())
+        game.close()
+    assert not np.array_equal(*views)
+
+
 def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
     asked = []
 

@@ -39,12 +39,12 @@ class DreamerSettings:
     batch_size: int = setting(16, COUNT)  #: sequences
     sequence_length: int = setting(64, between(2, 1024))  #: macro-actions
     horizon: int = setting(15, between(1, 256))  #: imagined macro-actions
-    discount: float = setting(0.997, PROBABILITY)
+    discount: float = setting(0.997, PROBABILITY)  #: discount of rewards, a macro-action
     return_decay: float = setting(0.95, PROBABILITY)  #: lambda of the returns
     entropy: float = setting(3e-4, NOT_NEGATIVE)  #: weight of the policy's entropy
-    model_learning_rate: float = setting(1e-4, POSITIVE)
-    actor_learning_rate: float = setting(3e-5, POSITIVE)
-    critic_learning_rate: float = setting(3e-5, POSITIVE)
+    model_learning_rate: float = setting(1e-4, POSITIVE)  #: step size of the world model's optimiser
+    actor_learning_rate: float = setting(3e-5, POSITIVE)  #: step size of the actor's optimiser
+    critic_learning_rate: float = setting(3e-5, POSITIVE)  #: step size of the critic's optimiser
     buffer_size: int = setting(100_000, ROWS)  #: macro-actions remembered
 
 

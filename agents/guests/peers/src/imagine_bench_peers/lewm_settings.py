@@ -26,10 +26,10 @@ class ModelSettings:
 
     patch: int = setting(8, between(4, 32))  #: pixels of a patch's side; in the paper a 16th of the image's
     embedding: int = setting(192, between(4, 1024))  #: numbers that stand for a frame
-    encoder_depth: int = setting(12, between(1, 24))
-    encoder_heads: int = setting(3, between(1, 16))
-    predictor_depth: int = setting(6, between(1, 24))
-    predictor_heads: int = setting(16, between(1, 32))
+    encoder_depth: int = setting(12, between(1, 24))  #: layers of the encoder
+    encoder_heads: int = setting(3, between(1, 16))  #: attention heads of a layer of the encoder
+    predictor_depth: int = setting(6, between(1, 24))  #: layers of the predictor
+    predictor_heads: int = setting(16, between(1, 32))  #: attention heads of a layer of the predictor
     units: int = setting(2048, COUNT)  #: of the predictor's hidden layers and of both projections
     dropout: float = setting(0.1, DROPOUT)  #: in the predictor
     slices: int = setting(1024, COUNT)  #: directions in which the embeddings' distribution is compared
@@ -48,8 +48,8 @@ class LeWMSettings:
 
     model: ModelSettings = field(default_factory=ModelSettings)
     regularisation: float = setting(0.09, NOT_NEGATIVE)  #: weight of SIGReg, lambda
-    learning_rate: float = setting(5e-5, POSITIVE)
-    weight_decay: float = setting(1e-3, NOT_NEGATIVE)
+    learning_rate: float = setting(5e-5, POSITIVE)  #: step size of the optimiser
+    weight_decay: float = setting(1e-3, NOT_NEGATIVE)  #: weight decay of the optimiser, a gradient update
     batch_size: int = setting(128, between(2, 4096))  #: transitions
     replay_ratio: float = setting(1.0, between(0.0, 64.0))  #: gradient updates a macro-action
     learning_starts: int = setting(100, between(2, 10_000_000))  #: macro-actions before the first update, all random

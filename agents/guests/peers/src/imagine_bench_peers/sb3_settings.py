@@ -26,10 +26,10 @@ from imagine_bench.agents.settings import (
 class SB3Settings:
     """Keywords of ``stable_baselines3.DQN`` and ``sb3_contrib.QRDQN`` that differ from the library's own."""
 
-    learning_rate: float = setting(1e-3, POSITIVE)
+    learning_rate: float = setting(1e-3, POSITIVE)  #: step size of the optimiser
     buffer_size: int = setting(50_000, ROWS)  #: transitions of the replay buffer
     learning_starts: int = setting(100, ROWS)  #: macro-actions before the first update, all of them random
-    batch_size: int = setting(64, COUNT)
+    batch_size: int = setting(64, COUNT)  #: transitions an update
     gamma: float = setting(0.95, PROBABILITY)  #: discount a macro-action, the same as our agents'
     train_freq: int = setting(1, COUNT)  #: macro-actions between updates
     gradient_steps: int = setting(8, COUNT)  #: updates then
@@ -51,14 +51,14 @@ class QuantileSettings(SB3Settings):
 class PPOSettings:
     """Keywords of ``stable_baselines3.PPO`` that differ from the library's own, chosen on seeds 1001 and 1002."""
 
-    learning_rate: float = setting(3e-3, POSITIVE)
+    learning_rate: float = setting(3e-3, POSITIVE)  #: step size of the optimiser
     n_steps: int = setting(64, between(2, 10_000))  #: macro-actions between updates
-    batch_size: int = setting(64, between(2, 10_000))
+    batch_size: int = setting(64, between(2, 10_000))  #: transitions an update
     n_epochs: int = setting(10, COUNT)  #: how often each of them is learned from
     gamma: float = setting(0.95, PROBABILITY)  #: discount a macro-action, the same as our agents'
     ent_coef: float = setting(0.01, NOT_NEGATIVE)  #: weight of the policy's entropy
     vf_coef: float = setting(0.5, NOT_NEGATIVE)  #: weight of the value's loss
-    max_grad_norm: float = setting(5.0, POSITIVE)
+    max_grad_norm: float = setting(5.0, POSITIVE)  #: largest norm of the gradient
 
 
 @dataclass(frozen=True, kw_only=True)
