@@ -126,7 +126,7 @@ uv_lock = PATH="$$PATH:$(BIN)" uv pip compile -q --python-version 3.11 --generat
 lock:  ## Pin every package after a change of pyproject.toml, in .ci/*.lock; ARGS=--upgrade takes the newest
 	@$(uv_lock) pyproject.toml --extra dev --extra docs --universal --fork-strategy fewest --no-emit-package torch --config-file .ci/lock.toml -o .ci/requirements.lock $(ARGS) >/dev/null
 	@$(uv_lock) pyproject.toml --extra mutants --universal --constraint .ci/requirements.lock --no-emit-package torch --config-file .ci/lock.toml -o .ci/mutants.lock $(ARGS) >/dev/null
-	@$(uv_lock) pyproject.toml .ci/lowest.in --extra all --extra data --extra play --resolution lowest-direct --no-config -o .ci/lowest.lock $(ARGS) >/dev/null
+	@$(uv_lock) pyproject.toml .ci/lowest.in --extra all --extra data --extra play --resolution lowest-direct --no-config -o .ci/lowest.lock --upgrade $(filter-out --upgrade,$(ARGS)) >/dev/null
 
 speed: ready  ## Measure how fast everything is, as ratios to plain code in the same run
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/measure/speed.py $(ARGS)

@@ -1,4 +1,4 @@
-"""The site: Sphinx with MyST and furo. ``make docs`` builds it into build/docs; warnings are errors."""
+"""The site: Sphinx with MyST-NB and furo. ``make docs`` builds it into build/docs; warnings are errors."""
 
 import os
 from importlib import metadata
@@ -9,10 +9,12 @@ author = "The imagine_bench developers"
 copyright = "2026, the imagine_bench developers"
 release = metadata.version("imagine-bench")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 4
-exclude_patterns = ["results/**/report", "**/*.ipynb"]
+exclude_patterns = ["results/**/report"]
+nb_execution_mode = "off"  # the notebook shows the outputs that its last run left in it
+nb_output_stderr = "remove"
 
 os.environ["MUJOCO_GL"] = "off"  # the site builds where there is no OpenGL
 autodoc_member_order = "bysource"

@@ -25,7 +25,7 @@ from small_runs import do
 import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import ELSEWHERE, Bench, parsed
-from imagine_bench.registry import REGRESSIONS, has_task
+from imagine_bench.registry import AGENTS, REGRESSIONS, has_task
 
 WRITTEN = [*PAGES, ROOT / "CHANGELOG.md"]
 COMMAND = re.compile(r"(?:^|`)imagine-bench ([a-z]+ [^`\n#]+)", re.MULTILINE)
@@ -78,9 +78,9 @@ def test_commands_could_be_carried_out() -> None:
             command = parsed(shlex.split(said))
         except SystemExit:
             pytest.fail(f"{page} names a command that is not understood: imagine-bench {said}")
-        assert getattr(command, "task", None) in (None, "TASK", "my_task", *REGRESSIONS) or has_task(command.task), (
-            f"{page}: {said}"
-        )
+        assert getattr(command, "task", None) in (None, "TASK", "my_task", *REGRESSIONS, *AGENTS) or has_task(
+            command.task
+        ), f"{page}: {said}"
         if isinstance(command, Bench) and not (
             command.learner.dataset or str(command.learner.encoder).endswith(".safetensors")
         ):
@@ -149,6 +149,17 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     exec(code, variables)
     pyplot.close("all")
     assert len(list(tmp_path.glob("runs/arrow_puzzle/*/MyAgent/seed_1/DONE"))) == 1
+
+
+def test_the_notebook_keeps_the_outputs_of_a_run_without_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    """The printed steps are those that the environment gives; the site shows these outputs."""
+    cells = json.loads((ROOT / "docs/tutorial/notebook.ipynb").read_text())["cells"]
+    _, first, *others = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] for cell in (first, *others) if "class MyAgent" in "".join(cell["source"]))
+    assert "error" not in {each["output_type"] for cell in cells for each in cell.get("outputs", [])}
+    assert sum("image/png" in each.get("data", {}) for cell in others for each in cell["outputs"]) == 2
+    exec("".join(first["source"]), {})
+    assert capsys.readouterr().out == "".join(first["outputs"][0]["text"]) and "reward 50.0" in str(first["outputs"])
 
 
 def test_the_first_cell_of_the_notebook_installs_this_checkout() -> None:
