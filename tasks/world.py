@@ -301,6 +301,10 @@ class World(abc.ABC):
         """
 
     @abc.abstractmethod
+    def progress(self, index: int, pose: list[float], before: int, after: int) -> float:
+        """How much of the way an object has made from one value to another, by its pose (7): 0 to 1, or beyond."""
+
+    @abc.abstractmethod
     def _hands_m(self, gesture: int) -> dict[int, Point]:
         """Where people's hands are, by the number of their mocap body."""
 

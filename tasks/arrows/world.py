@@ -113,10 +113,21 @@ class ArrowWorld(World):
             problem = f"{self.object_names[index]} stands {math.degrees(skew_rad):.0f} degrees off a right angle"
         return -quarters % 4, problem
 
+    def progress(self, index: int, pose: list[float], before: int, after: int) -> float:
+        """The share of its quarter turn that a cube has made."""
+        del index
+        sense = math.remainder(after - before, 4)
+        return sense * self._turned_rad(pose, before) / _QUARTER_RAD
+
+    @staticmethod
+    def _turned_rad(pose: list[float], value: int) -> float:
+        """How far a cube is turned clockwise, as seen in the frame, from a direction. In (-pi, pi]."""
+        return math.remainder(-orientation.yaw_rad(*pose[3:]) - value * _QUARTER_RAD, 2 * math.pi)
+
     def value_in_hand(self, index: int, pose: list[float], value: int, *, gripped: bool) -> int:
         """The direction that a cube has been turned past by more than 20 degrees: one quarter further, or its own."""
         del index, gripped
-        turned_rad = math.remainder(-orientation.yaw_rad(*pose[3:]) - value * _QUARTER_RAD, 2 * math.pi)
+        turned_rad = self._turned_rad(pose, value)
         if abs(turned_rad) <= _QUARTER_RAD + MAX_SKEW_RAD:
             return value
         return (value + (1 if turned_rad > 0 else -1)) % 4

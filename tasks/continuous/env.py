@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from imagine_bench.arrays import Floats, Info, Ints, Observed, State
-from imagine_bench.errors import InvalidValueError, brief
+from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import PhysicsSettings, TaskSpec
 from imagine_bench.values import Json
 
@@ -27,9 +27,11 @@ from ..scenes.arm import ARM_JOINTS, arm_columns
 from ..scenes.constants import FAR_CAMERA, HUMAN_CAMERA
 from ..world import World, WorldState
 from .controls import HandControl, Motion
+from .dense import Potential
 from .referee import GRIPPED, Event, Referee
 
 RATE_HZ = 25.0
+REWARDS = ("sparse", "dense")
 SECONDS_PER_MACRO_ACTION = 3.0
 """An episode is truncated after so many seconds for each macro-action of the task's horizon; planned, one takes 2.2."""
 
@@ -44,6 +46,7 @@ class Episode:
     gripping: bool = False  #: whether the fingers have gripped something since they last opened
     slipping: bool = False  #: whether this grip slips
     latest: Event | None = None  #: the event of the latest period
+    potential: float = 0.0  #: with the dense reward, of the latest moment
     limited: str = ""  #: what limited the latest command
     observations: tuple[Observed, ...] = ()  #: of the latest moment before each of the latest events
 
@@ -70,7 +73,7 @@ class MotionEnv(SceneEnv):
     part as it is.
 
     Rewards: those of the rules, charged at each event: a change of the macrostate that is read of the scene. A change
-    that is no macro-action is a fault, which ends the episode with -5.
+    that is no macro-action is a fault, which ends the episode with -5. With ``reward="dense"`` a shaping term is added.
 
     Starting State: the arm at its observation pose, the objects as one of the rules' start states says.
 
@@ -90,6 +93,7 @@ class MotionEnv(SceneEnv):
         control: ``"twist"``, ``"pose"``, ``"joint_delta"`` or ``"joint"``.
         rate_hz: Commands a second; a period is a whole number of the simulation's steps.
         appearance: A name, or factors; drawn at the start and anew after each event.
+        reward: ``"sparse"``, the rules' alone; or ``"dense"``, with the growth of :class:`.dense.Potential` added.
         observation: What is observed: some of ``hand``, ``front``, ``proprio``, ``objects``, ``state``.
         size: Edge of observed images in pixels, 32 to 256.
         told: Whether ``info["instruction"]`` says the goal in words, and no image shows the pointing hand.
@@ -112,6 +116,7 @@ class MotionEnv(SceneEnv):
         "control",
         "rate_hz",
         "appearance",
+        "reward",
         "observation",
         "size",
         "told",
@@ -134,6 +139,7 @@ class MotionEnv(SceneEnv):
         control: str = "twist",
         rate_hz: float = RATE_HZ,
         appearance: str | Mapping[str, float] = "clean",
+        reward: str = "sparse",
         observation: str = "hand,front,proprio",
         size: int = FRAME_PX,
         told: bool = False,
@@ -159,7 +165,10 @@ class MotionEnv(SceneEnv):
             image=(camera, width, height),
             cameras=(HUMAN_CAMERA, FAR_CAMERA),
         )
+        self._make_world = make_world
         self._instruct = instruct
+        self.reward = require_known("reward", reward, REWARDS)
+        self._potential = Potential(self.world, spec.rules) if reward == "dense" else None
         self._slip = slip
         self._told = told
         self._sight = spec.sight
@@ -191,6 +200,8 @@ class MotionEnv(SceneEnv):
         self.episode = Episode(macrostate=reading.macrostate)
         self.world.set_slipping(False)
         self._vary()
+        if self._potential is not None:
+            self.episode.potential = self._potential(reading.macrostate)
         return self._info(success=False, fault=reading.problem)
 
     def act(self, action: Motion) -> Step:
@@ -208,12 +219,16 @@ class MotionEnv(SceneEnv):
             return 0.0, False, True, self._info(success=False, fault="the simulation blew up")
         event = self._judge()
         self.world.update()
+        reward = 0.0 if event is None else float(event.outcome.reward)
+        terminated = event is not None and event.outcome.terminated
+        if self._potential is not None:
+            before = self.episode.potential
+            self.episode.potential = 0.0 if terminated else self._potential(self.episode.macrostate)
+            reward += self.episode.potential - before
         truncated = self.elapsed_s >= self.time_limit_s - self.period_s / 2
-        if event is None:
-            return 0.0, False, truncated, self._info(success=False, fault=None)
-        outcome = event.outcome
-        info = self._info(success=outcome.success, fault=event.fault)
-        return float(outcome.reward), outcome.terminated, truncated, info
+        success = event is not None and event.outcome.success
+        fault = None if event is None else event.fault
+        return reward, terminated, truncated, self._info(success=success, fault=fault)
 
     def observe(self, envs: Sequence[MotionEnv]) -> list[Observed]:
         """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
@@ -228,6 +243,10 @@ class MotionEnv(SceneEnv):
 
     def _latest_observation(self) -> Observed:
         return self.episode.observations[0]
+
+    def another_world(self) -> World:
+        """A scene like this environment's, for a planner or for a goal."""
+        return self._make_world(self.world.level)
 
     # --- states --------------------------------------------------------------------------------------------------
 

@@ -35,6 +35,8 @@ _IN_THE_AIR_M = 0.15
 """What is held at the observation pose is at least so far above the table."""
 _LIFTED_M = 0.05
 """What the fingers hold so far above its place is picked."""
+_FAR_M = 0.30
+"""What is held so far from where it shall be has made no progress."""
 _HANDS_FORWARD_X_M = 0.90
 """Fingertip or palm nearer to the robot than this say something."""
 _VAIN_M = 0.09
@@ -185,6 +187,14 @@ class PickWorld(World):
         turned_rad = abs(orientation.yaw_rad(*pose[3:]))
         skewed = f"{name} is turned by {math.degrees(turned_rad):.0f} degrees" if turned_rad > MAX_SKEW_RAD else None
         return PLACED, self._tipped(index, pose) or skewed
+
+    def progress(self, index: int, pose: list[float], before: int, after: int) -> float:
+        """The share of its lift, or of its way to its place or to the palm, that an object has made."""
+        del before
+        if after == PICKED:
+            return (pose[2] - standing_m(index)[2]) / _LIFTED_M
+        place_m = standing_m(index) if after == PLACED else PALM_M
+        return 1.0 - math.dist(pose[:3], place_m) / _FAR_M
 
     def value_in_hand(self, index: int, pose: list[float], value: int, *, gripped: bool) -> int:
         """Picked, once it is gripped and lifted by 5 cm; else as before."""

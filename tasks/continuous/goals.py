@@ -1,0 +1,113 @@
+"""Continuous control with goals, as hindsight experience replay takes it (Andrychowicz et al., 2017)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.arrays import Arrays, Floats, Info, Observed, State
+from imagine_bench.errors import InvalidValueError
+
+from ..motion.orientation import yaw_rad
+from ..world import MAX_SKEW_RAD
+from .dense import macro_actions_to_go
+from .env import MotionEnv
+
+WITHIN_M = 0.02
+"""An object so near its goal, and turned off it by less than 20 degrees, has reached it."""
+_PER_OBJECT = 5
+GoalObservation = dict[str, NDArray[Any]]
+
+
+class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
+    """Bring each object to where a goal says; whatever the rules make of it, and with their ends.
+
+    Observations are a dict: ``observation``, the parts of the environment's in one vector; ``achieved_goal`` and
+    ``desired_goal``, for each object x, y, z (m), and the cosine and sine of its yaw, float32 (5 N,). A goal is where
+    the objects of a macrostate stand that the optimal policy reaches by success. The reward is 0 where it is reached
+    and -1 elsewhere. ``info["is_success"]`` says so.
+
+    Args:
+        env: Whose observation has vectors only: parts of ``proprio``, ``objects`` and ``state``.
+
+    Raises:
+        InvalidValueError: Images among the observed parts.
+    """
+
+    def __init__(self, env: MotionEnv) -> None:
+        super().__init__(env)
+        parts = env.observation_space
+        self._names: tuple[str, ...] = tuple(parts.spaces) if isinstance(parts, gymnasium.spaces.Dict) else ()
+        spaces = [parts[name] for name in self._names] if self._names else [parts]
+        if any(space.dtype == np.uint8 for space in spaces):
+            raise InvalidValueError(
+                'Goals take vectors; make the environment with observation="proprio,objects,state" or parts of it.'
+            )
+        self._motion = env
+        self._planned = env.another_world()
+        self._to_go = macro_actions_to_go(env.task.rules)
+        low, high = (np.concatenate([getattr(space, end).ravel() for space in spaces]) for end in ("low", "high"))
+        goal = gymnasium.spaces.Box(-2.0, 2.0, (_PER_OBJECT * len(env.world.object_names),), np.float32)
+        vector = gymnasium.spaces.Box(low, high, dtype=np.float32)
+        named: dict[str, gymnasium.Space[Any]] = {"observation": vector, "achieved_goal": goal, "desired_goal": goal}
+        self.observation_space: gymnasium.Space[Any] = gymnasium.spaces.Dict(named)
+        self._goal = np.zeros(goal.shape, dtype=np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
+        """Start an episode, as of :class:`.env.MotionEnv`; its goal follows from the start."""
+        seen, info = self.env.reset(seed=seed, options=options)
+        self._planned.place(self._wanted(self._motion.episode.macrostate), np.random.default_rng(0))
+        self._goal = _goal_of(self._planned.object_poses())
+        observation = self._observation(seen)
+        return observation, {**info, "is_success": self._reached(observation) == 0.0}
+
+    def step(self, action: Any) -> tuple[Observed, float, bool, bool, Info]:
+        """Carry out a command."""
+        seen, _, terminated, truncated, info = self.env.step(action)
+        observation = self._observation(seen)
+        reward = self._reached(observation)
+        return observation, reward, terminated, truncated, {**info, "is_success": reward == 0.0}
+
+    def compute_reward(self, achieved_goal: Floats, desired_goal: Floats, info: object) -> Floats:
+        """0 where each object is at its goal, -1 elsewhere; goals (..., 5 N) give rewards (...)."""
+        del info
+        shape = (*np.shape(achieved_goal)[:-1], -1, _PER_OBJECT)
+        achieved = np.reshape(achieved_goal, shape)
+        desired = np.reshape(desired_goal, shape)
+        away_m = np.linalg.norm(achieved[..., :3] - desired[..., :3], axis=-1)
+        aligned = (achieved[..., 3:] * desired[..., 3:]).sum(axis=-1)
+        reached = (away_m < WITHIN_M) & (aligned > math.cos(MAX_SKEW_RAD))
+        return np.where(reached.all(axis=-1), 0.0, -1.0)
+
+    def _reached(self, observation: Arrays) -> float:
+        return float(self.compute_reward(observation["achieved_goal"], observation["desired_goal"], None))
+
+    def _observation(self, seen: Observed) -> GoalObservation:
+        parts = [seen[name] for name in self._names] if isinstance(seen, dict) else [seen]
+        return {
+            "observation": np.concatenate([np.asarray(part, dtype=np.float32).ravel() for part in parts]),
+            "achieved_goal": _goal_of(self._motion.world.object_poses()),
+            "desired_goal": self._goal.copy(),
+        }
+
+    def _wanted(self, start: State) -> State:
+        """The macrostate in which the optimal policy succeeds, where chance is as kind as it can be."""
+        rules = self._motion.task.rules
+        macrostate = start
+        while self._to_go.get(macrostate, 0) > 0:
+            outcomes = rules.outcomes(macrostate, rules.optimal_action(macrostate))
+            best = min(outcomes, key=lambda outcome: 0 if outcome.success else self._to_go[outcome.macrostate])
+            macrostate = best.macrostate
+            if best.terminated:
+                break
+        return macrostate
+
+
+def _goal_of(poses: Floats) -> NDArray[np.float32]:
+    """Positions, and cosine and sine of the yaw, of poses (N, 7). Shape (5 N,)."""
+    yaws = [yaw_rad(*pose[3:]) for pose in poses.tolist()]
+    return np.column_stack([poses[:, :3], np.cos(yaws), np.sin(yaws)]).ravel().astype(np.float32)
