@@ -21,7 +21,8 @@ from .parameters.distractors import Distraction
 from .parameters.parameters import HIDDEN
 from .scenes.appearance import Appearance, AppearanceSampler, looks_of
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
-from .scenes.constants import AGENT_CAMERA, Point
+from .scenes.constants import Point
+from .scenes.control_views import varied_by_appearance
 from .scenes.fragments import Composite, draw_composite
 
 MAX_TILT_RAD = math.radians(10.0)
@@ -88,7 +89,8 @@ class World(abc.ABC):
         self.level = level
         self.object_names = tuple(objects.values())
         self._varies = level.varies_every_frame
-        self._appearance = AppearanceSampler(model, level, camera=AGENT_CAMERA, materials=materials)
+        cameras, varied = varied_by_appearance(model, materials)
+        self._appearance = AppearanceSampler(model, level, cameras=cameras, materials=varied)
         self._composite: Composite | None = None
         self._distraction = Distraction(model, distractors) if distractors else None
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]

@@ -6,7 +6,7 @@ import numpy as np
 
 from imagine_bench.errors import InvalidValueError, brief
 
-from ..scenes.constants import AGENT_CAMERA, AGENT_GROUP, ARM_GROUP, HUMAN_CAMERA, SCENE_GROUP, SETTING_GROUP
+from ..scenes.constants import AGENT_CAMERA, AGENT_GROUP, ARM_GROUP, CONTROL_GROUP, SCENE_GROUP, SETTING_GROUP
 from .renderer import View
 
 FRAME_PX = 64
@@ -18,6 +18,17 @@ DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
 def agent_camera_view(size_px: int = FRAME_PX) -> View:
     """What agents see: no arm, hard edges, no shadows."""
     return View(camera=AGENT_CAMERA, width=size_px, height=size_px, groups=(SCENE_GROUP, AGENT_GROUP))
+
+
+def control_view(camera: str, size_px: int = FRAME_PX) -> View:
+    """What agents see in continuous control: objects, table, hands and a coarse arm; hard edges, no shadows.
+
+    Args:
+        camera: One of :data:`.constants.CONTROL_CAMERAS`, in a scene with :func:`.control_views.add_control_views`.
+        size_px: Edge of the square image; from 64 pixels on, arrows can be read.
+    """
+    groups = (SCENE_GROUP, AGENT_GROUP, CONTROL_GROUP)
+    return View(camera=camera, width=size_px, height=size_px, groups=groups)
 
 
 def human_camera_view(camera: str, width: int, height: int, *, quick: bool = False) -> View:
@@ -42,12 +53,3 @@ def human_camera_view(camera: str, width: int, height: int, *, quick: bool = Fal
         slices=28 if coarse else 64,
         for_people=True,
     )
-
-
-CONTROL_CAMERAS = ("hand", "front")
-
-
-def control_view(camera: str, size_px: int = FRAME_PX) -> View:
-    """What agents see in continuous control."""
-    cameras = {"hand": AGENT_CAMERA, "front": HUMAN_CAMERA}
-    return View(camera=cameras[camera], width=size_px, height=size_px, groups=(SCENE_GROUP, AGENT_GROUP, ARM_GROUP))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,8 +27,8 @@ class Appearance:
     hand_yaw_rad: float = 0.0  #: of the human's hand about the vertical through its fingertip, every frame
     light_fraction: float = 0.0  #: of the brightness of all lights together, every frame
     color_fraction: float = 0.0  #: of each color channel of each material, every frame
-    camera_offset_m: float = 0.0  #: of the agent's camera, along each axis, every frame
-    camera_angle_rad: float = 0.0  #: of the agent's camera, about each axis, every frame
+    camera_offset_m: float = 0.0  #: of each agent's camera, along each axis, every frame
+    camera_angle_rad: float = 0.0  #: of each agent's camera, about each axis, every frame
     #: None, or the seed of the finite pools of :mod:`.fragments`, which then decide poses, light and colors
     pool: int | None = None
     gamma_half_width: float = 0.0  #: of gamma about 1, every frame; with a pool only
@@ -118,19 +118,21 @@ def looks_of(model: mujoco.MjModel) -> tuple[Floats, ...]:
 
 
 class AppearanceSampler:
-    """Writes samples of light, colors and camera into one model.
+    """Writes samples of light, colors and cameras into one model.
 
     Args:
         model: The scene; its arrays are changed by :meth:`vary`.
         level: How much varies.
-        camera: Name of the camera that moves.
+        cameras: Names of the cameras that move, each by a draw of its own.
         materials: Names of the materials whose colors vary.
     """
 
-    def __init__(self, model: mujoco.MjModel, level: Appearance, *, camera: str, materials: tuple[str, ...]) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, level: Appearance, *, cameras: Sequence[str], materials: Sequence[str]
+    ) -> None:
         self._model = model
         self._level = level
-        self._camera = model.camera(camera).id
+        self._cameras = [model.camera(name).id for name in cameras]
         self._materials = np.array([model.material(name).id for name in materials])
         self._nominal = [each.copy() for each in looks_of(model)]
 
@@ -147,8 +149,9 @@ class AppearanceSampler:
             tint = 1.0 + level.color_fraction * rng.uniform(-1.0, 1.0, (len(self._materials), _CHANNELS))
             rgba[self._materials, :_CHANNELS] = np.minimum(nominal_rgba[self._materials, :_CHANNELS] * tint, 1.0)
         if level.camera_offset_m or level.camera_angle_rad:
-            shift, turn = rng.uniform(-1.0, 1.0, (2, 3))
-            cam_pos[self._camera] = nominal_pos[self._camera] + level.camera_offset_m * shift
-            quat = nominal_quat[self._camera].copy()
-            mujoco.mju_quatIntegrate(quat, level.camera_angle_rad * turn, 1.0)
-            cam_quat[self._camera] = quat
+            for camera in self._cameras:
+                shift, turn = rng.uniform(-1.0, 1.0, (2, 3))
+                cam_pos[camera] = nominal_pos[camera] + level.camera_offset_m * shift
+                quat = nominal_quat[camera].copy()
+                mujoco.mju_quatIntegrate(quat, level.camera_angle_rad * turn, 1.0)
+                cam_quat[camera] = quat

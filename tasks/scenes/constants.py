@@ -32,13 +32,19 @@ SCENE_GROUP = 0
 AGENT_GROUP = 1
 ARM_GROUP = 2
 SETTING_GROUP = 3
+CONTROL_GROUP = 4
 COLLISION_GROUP = 5
 """Geom groups: loose objects; the plain table top and hands that only agents' frames show; the arm, so that a view can
-leave it out; those that only views for people show (floor, legs, person, wood, smooth hands); those of contact."""
+leave it out; those that only views for people show (floor, legs, person, wood, smooth hands); the coarse arm that only
+agents' images of continuous control show; those of contact."""
 
 AGENT_CAMERA = "wrist"
 HUMAN_CAMERA = "human"
 FAR_CAMERA = "far"
+HAND_CAMERA = "hand"
+FRONT_CAMERA = "front"
+CONTROL_CAMERAS = (HAND_CAMERA, FRONT_CAMERA)
+"""Those of continuous control, in scenes that have them."""
 
 FINGERTIP_IN_SLOT_M = (0.048, 0.0, 0.040)
 """Nominal tip of the pointing index finger relative to the centre of the cube it points at."""

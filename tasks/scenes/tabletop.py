@@ -145,15 +145,20 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         )
 
 
+def add_room_camera(spec: mujoco.MjSpec, name: str, place_m: c.Point, target_m: c.Point, fovy_deg: float) -> None:
+    """Add a camera that stands at a place in the world and looks at a target, upright."""
+    backward = np.subtract(place_m, target_m)
+    backward /= np.linalg.norm(backward)
+    right = np.cross((0.0, 0.0, 1.0), backward)
+    right /= np.linalg.norm(right)
+    up = np.cross(backward, right)
+    spec.worldbody.add_camera(name=name, pos=place_m, fovy=fovy_deg, xyaxes=(*right, *up))
+
+
 def _add_cameras(spec: mujoco.MjSpec) -> None:
     """The views for people, from the human's left: of the objects on the table, and of everything."""
-    for name, (place, target, fovy_deg) in _CAMERAS.items():
-        backward = np.subtract(place, target)
-        backward /= np.linalg.norm(backward)
-        right = np.cross((0.0, 0.0, 1.0), backward)
-        right /= np.linalg.norm(right)
-        up = np.cross(backward, right)
-        spec.worldbody.add_camera(name=name, pos=place, fovy=fovy_deg, xyaxes=(*right, *up))
+    for name, (place_m, target_m, fovy_deg) in _CAMERAS.items():
+        add_room_camera(spec, name, place_m, target_m, fovy_deg)
 
 
 def add_tabletop(spec: mujoco.MjSpec, timestep_s: float = c.TIMESTEP_S) -> None:

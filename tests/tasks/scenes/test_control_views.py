@@ -1,0 +1,185 @@
+"""The images of continuous control: they show what matters, and leave physics and other views as they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from imagine_bench.tasks.arrows.rules import Arrows
+from imagine_bench.tasks.arrows.scene import layout
+from imagine_bench.tasks.arrows.world import ArrowWorld
+from imagine_bench.tasks.pick_place.rules import OPEN_PALM
+from imagine_bench.tasks.pick_place.world import PickWorld
+from imagine_bench.tasks.rendering import Renderer
+from imagine_bench.tasks.rendering.cameras import agent_camera_view, control_view, human_camera_view
+from imagine_bench.tasks.scenes import constants as c
+from imagine_bench.tasks.scenes.appearance import AppearanceSampler, appearance, looks_of
+from imagine_bench.tasks.scenes.arm import FINGER_JOINTS, TIP_IN_NAME
+from imagine_bench.tasks.scenes.control_views import varied_by_appearance
+
+
+def world(cubes, *, control):
+    if cubes:
+        return ArrowWorld(appearance("clean"), Arrows(cubes=cubes), control=control)
+    return PickWorld(appearance("clean"), control=control)
+
+
+CUBES = (1, 2, 3, 4, 5, 6)
+PICK = 0
+"""In place of a number of cubes: pick-and-place."""
+OBJECTS = ("ball", "car", "cup")
+
+
+class Scene:
+    """A world with the views of continuous control."""
+
+    def __init__(self, cubes):
+        self.cubes = cubes
+        self.world = world(cubes, control=True)
+        self.model, self.data = self.world.model, self.world.data
+        self.objects = [f"cube_{cube}" for cube in range(cubes)] or OBJECTS
+        self.cameras = {name: Renderer(self.model, control_view(name)) for name in c.CONTROL_CAMERAS}
+
+    def place(self, macrostate, rng):
+        self.world.place(tuple(int(each) for each in macrostate), rng)
+
+    def frame(self, camera):
+        return self.cameras[camera].frame(self.data)
+
+    def shown_px(self, camera, names):
+        """How many pixels change when the geoms whose names begin so are not drawn."""
+        shown = self.frame(camera)
+        geoms = [index for index in range(self.model.ngeom) if self.model.geom(index).name.startswith(names)]
+        groups = self.model.geom_group[geoms]
+        self.model.geom_group[geoms] = c.COLLISION_GROUP
+        hidden = self.frame(camera)
+        self.model.geom_group[geoms] = groups
+        return int((shown != hidden).any(axis=-1).sum())
+
+    def at_px(self, camera, point_m):
+        """Column and row of a point of the world."""
+        index = self.model.camera(camera).id
+        x, y, z = self.data.cam_xmat[index].reshape(3, 3).T @ (point_m - self.data.cam_xpos[index])
+        per_px = -z * np.tan(np.radians(self.model.cam_fovy[index] / 2)) / 32
+        return 32 + x / per_px, 32 - y / per_px
+
+
+def act(scene, index):
+    """The motion of turning or picking an object of a world at its start."""
+    scene.executor.capture_motion_hz = 20
+    if isinstance(scene, PickWorld):
+        return scene.executor.pick(index=index).motion
+    return scene.executor.turn(cube=index, clockwise=True).motion
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    made = {}
+    return lambda cubes: made.setdefault(cubes, Scene(cubes))
+
+
+@pytest.mark.parametrize("cubes", [PICK, 1, 3, 6])
+def test_control_views_leave_motions_as_they_are_to_the_bit(cubes):
+    plain, drawn = world(cubes, control=False), world(cubes, control=True)
+    drawn.model.opt.timestep = plain.model.opt.timestep  # pick-and-place has another in continuous control
+    drawn.model.geom_solref[:] = plain.model.geom_solref[0] if cubes == PICK else drawn.model.geom_solref
+    motions = []
+    for each in (plain, drawn):
+        each.place((0,) * (len(each.object_qpos) + 1), np.random.default_rng(0))
+        motions.append(act(each, len(each.object_qpos) - 1))
+    assert len(motions[0].qpos) > 20
+    for now, then in zip(*motions, strict=True):
+        np.testing.assert_array_equal(now, then)
+    np.testing.assert_array_equal(plain.data.qpos, drawn.data.qpos)
+
+
+def test_other_views_of_a_scene_with_control_views_stay_as_they_are(scenes):
+    plain, drawn = world(3, control=False), scenes(3).world
+    for view in (agent_camera_view(), human_camera_view(c.HUMAN_CAMERA, 64, 48)):
+        images = []
+        for each in (plain, drawn):
+            each.place((0, 1, 2, 1), np.random.default_rng(0))
+            images.append(Renderer(each.model, view).frame(each.data))
+        assert np.array_equal(*images)
+
+
+@pytest.mark.parametrize("cubes", [PICK, *CUBES])
+def test_at_rest_both_cameras_show_each_object_the_human_and_both_fingers(scenes, cubes):
+    scene = scenes(cubes)
+    gestures = range(OPEN_PALM + 1) if cubes == PICK else range(cubes)
+    for gesture in gestures:
+        scene.place([*[0] * len(scene.objects), gesture], np.random.default_rng(gesture))
+        for camera in c.CONTROL_CAMERAS:
+            for name in scene.objects:
+                assert scene.shown_px(camera, name) >= 12, (camera, gesture, name)
+            assert scene.shown_px(camera, ("hand_", "palm_")) >= 30, (camera, gesture)
+            for finger in ("left", "right"):
+                assert scene.shown_px(camera, f"control_finger_{finger}") >= 8, (camera, finger)
+
+
+@pytest.mark.parametrize("cubes", [PICK, 1, 3, 6])
+def test_the_hand_camera_shows_the_fingertips_and_all_of_what_they_hold(scenes, cubes):
+    scene = scenes(cubes)
+    for index, name in enumerate(scene.objects):
+        scene.place([0] * (len(scene.objects) + 1), np.random.default_rng(0))
+        motion = act(scene.world, index)
+        opening_m = motion.qpos[:, [scene.model.joint(each).qposadr[0] for each in FINGER_JOINTS]].mean(axis=1)
+        scene.data.qpos[:] = motion.qpos[opening_m.argmin()]
+        scene.world.update()
+        tips = [geom for geom in range(scene.model.ngeom) if TIP_IN_NAME in scene.model.geom(geom).name]
+        held_m = scene.data.xpos[scene.model.body(name).id]
+        assert np.linalg.norm(scene.data.geom_xpos[tips].mean(axis=0) - held_m) < 0.01, "it is not held"
+        at = [scene.at_px("hand", point_m) for point_m in (*scene.data.geom_xpos[tips], held_m)]
+        assert np.min(at) > 2 and np.max(at) < 62
+        assert scene.shown_px("hand", name) > 200
+        for finger in ("left", "right"):
+            assert scene.shown_px("hand", f"control_finger_{finger}") > 100
+
+
+@pytest.mark.parametrize("camera", c.CONTROL_CAMERAS)
+@pytest.mark.parametrize("cubes", [1, 3, 6])
+def test_an_arrow_can_be_read_from_the_11_by_11_pixels_around_it(scenes, cubes, camera):
+    """By the nearest of 24 other images a direction, whatever the other arrows and the pointing hand show."""
+    scene, rng = scenes(cubes), np.random.default_rng(0)
+    crops, directions = [], []
+    for trial in range(100):
+        arrows = rng.integers(4, size=cubes)
+        arrows[0] = trial % 4
+        scene.place([*arrows, rng.integers(cubes)], rng)
+        image = np.pad(scene.frame(camera), ((8, 8), (8, 8), (0, 0))).astype(np.float32)
+        slot_m = [*layout(cubes).slots_xy_m[0], c.TABLE_HEIGHT_M + c.CUBE_EDGE_M]
+        column, row = (int(each) + 8 for each in scene.at_px(camera, slot_m))
+        crops.append(image[row - 5 : row + 6, column - 5 : column + 6].ravel())
+        directions.append(trial % 4)
+    away = np.linalg.norm(np.array(crops)[:, None] - np.array(crops), axis=-1)
+    np.fill_diagonal(away, np.inf)
+    assert np.mean(np.array(directions)[away.argmin(axis=1)] == directions) >= 0.98
+
+
+@pytest.mark.parametrize("camera", c.CONTROL_CAMERAS)
+@pytest.mark.parametrize("cubes", [PICK, 3, 6])
+def test_gestures_can_be_read_by_the_nearest_image(scenes, cubes, camera):
+    scene = scenes(cubes)
+    gestures = range(OPEN_PALM + 1) if cubes == PICK else range(cubes)
+    objects = [0] * len(scene.objects)
+    images = np.empty((2, len(gestures), 64, 64, 3), dtype=np.float32)
+    for draw in (0, 1):
+        for gesture in gestures:
+            scene.place([*objects, gesture], np.random.default_rng(draw))
+            images[draw, gesture] = scene.frame(camera)
+    away = np.abs(images[0][:, None] - images[1]).sum(axis=(2, 3, 4))
+    assert away.argmin(axis=1).tolist() == list(gestures)
+
+
+@pytest.mark.parametrize(("control", "cameras", "materials"), [(False, 1, 1), (True, 3, 4)])
+def test_strong_appearance_varies_each_camera_and_the_coarse_arm(control, cameras, materials):
+    model = world(3, control=control).model
+    before = [each.copy() for each in looks_of(model)]
+    names, varied = varied_by_appearance(model, ["cube"])
+    sampler = AppearanceSampler(model, appearance("strong"), cameras=names, materials=varied)
+    sampler.vary(np.random.default_rng(0))
+    *_, colors, places, turns = (now - then for now, then in zip(looks_of(model), before, strict=True))
+    for change in (places, turns):
+        moved = change[np.abs(change).sum(axis=1) > 0]
+        assert len(moved) == len(np.unique(moved, axis=0)) == cameras
+    assert np.abs(places[model.camera(c.AGENT_CAMERA).id]).max() > 0
+    assert (np.abs(colors).sum(axis=1) > 0).sum() == materials
