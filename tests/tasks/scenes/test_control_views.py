@@ -9,19 +9,12 @@ from imagine_bench.tasks.arrows.scene import layout
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.pick_place.rules import OPEN_PALM
 from imagine_bench.tasks.pick_place.world import PickWorld
-from imagine_bench.tasks.rendering import Renderer
-from imagine_bench.tasks.rendering.cameras import agent_camera_view, control_view, human_camera_view
+from imagine_bench.tasks.rendering import Renderer, View
+from imagine_bench.tasks.rendering.cameras import DRAWN_GROUPS, agent_camera_view, control_view
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import AppearanceSampler, appearance, looks_of
 from imagine_bench.tasks.scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from imagine_bench.tasks.scenes.control_views import varied_by_appearance
-
-
-def world(cubes, *, control):
-    if cubes:
-        return ArrowWorld(appearance("clean"), Arrows(cubes=cubes), control=control)
-    return PickWorld(appearance("clean"), control=control)
-
 
 CUBES = (1, 2, 3, 4, 5, 6)
 PICK = 0
@@ -29,12 +22,17 @@ PICK = 0
 OBJECTS = ("ball", "car", "cup")
 
 
+def world_of(cubes, *, control):
+    if cubes:
+        return ArrowWorld(appearance("clean"), Arrows(cubes=cubes), control=control)
+    return PickWorld(appearance("clean"), control=control)
+
+
 class Scene:
     """A world with the views of continuous control."""
 
     def __init__(self, cubes):
-        self.cubes = cubes
-        self.world = world(cubes, control=True)
+        self.world = world_of(cubes, control=True)
         self.model, self.data = self.world.model, self.world.data
         self.objects = [f"cube_{cube}" for cube in range(cubes)] or OBJECTS
         self.cameras = {name: Renderer(self.model, control_view(name)) for name in c.CONTROL_CAMERAS}
@@ -63,12 +61,12 @@ class Scene:
         return 32 + x / per_px, 32 - y / per_px
 
 
-def act(scene, index):
+def act(world, index):
     """The motion of turning or picking an object of a world at its start."""
-    scene.executor.capture_motion_hz = 20
-    if isinstance(scene, PickWorld):
-        return scene.executor.pick(index=index).motion
-    return scene.executor.turn(cube=index, clockwise=True).motion
+    world.executor.capture_motion_hz = 20
+    if isinstance(world, PickWorld):
+        return world.executor.pick(index=index).motion
+    return world.executor.turn(cube=index, clockwise=True).motion
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +77,7 @@ def scenes():
 
 @pytest.mark.parametrize("cubes", [PICK, 1, 3, 6])
 def test_control_views_leave_motions_as_they_are_to_the_bit(cubes):
-    plain, drawn = world(cubes, control=False), world(cubes, control=True)
+    plain, drawn = world_of(cubes, control=False), world_of(cubes, control=True)
     drawn.model.opt.timestep = plain.model.opt.timestep  # pick-and-place has another in continuous control
     drawn.model.geom_solref[:] = plain.model.geom_solref[0] if cubes == PICK else drawn.model.geom_solref
     motions = []
@@ -93,8 +91,8 @@ def test_control_views_leave_motions_as_they_are_to_the_bit(cubes):
 
 
 def test_other_views_of_a_scene_with_control_views_stay_as_they_are(scenes):
-    plain, drawn = world(3, control=False), scenes(3).world
-    for view in (agent_camera_view(), human_camera_view(c.HUMAN_CAMERA, 64, 48)):
+    plain, drawn = world_of(3, control=False), scenes(3).world
+    for view in (agent_camera_view(), View(camera=c.HUMAN_CAMERA, groups=DRAWN_GROUPS)):
         images = []
         for each in (plain, drawn):
             each.place((0, 1, 2, 1), np.random.default_rng(0))
@@ -172,7 +170,7 @@ def test_gestures_can_be_read_by_the_nearest_image(scenes, cubes, camera):
 
 @pytest.mark.parametrize(("control", "cameras", "materials"), [(False, 1, 1), (True, 3, 4)])
 def test_strong_appearance_varies_each_camera_and_the_coarse_arm(control, cameras, materials):
-    model = world(3, control=control).model
+    model = world_of(3, control=control).model
     before = [each.copy() for each in looks_of(model)]
     names, varied = varied_by_appearance(model, ["cube"])
     sampler = AppearanceSampler(model, appearance("strong"), cameras=names, materials=varied)
