@@ -61,7 +61,7 @@ class WorldModel(Protocol):
 class Untaught:
     """The methods that a world model that learns nothing shares with others."""
 
-    def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
+    def fit(self, dataset: object, rng: np.random.Generator) -> None:
         """Learn nothing."""
 
     def parameters(self) -> int:

@@ -177,7 +177,7 @@ def source_of(
         return ModelSource(name=name, make=entry.make, kept=kept, privileged=entry.privileged, encoder=seen_through)
     if entry.privileged:
         return ModelSource(name=name, make=entry.make, given=(spec, index), privileged=True)
-    path = None if entry.encoder_kind is None else _encoder(spec, appearance, entry.encoder_kind, encoder)
+    path = None if entry.encoder_kind is None else encoder_for(spec, appearance, entry.encoder_kind, encoder)
     context = AgentContext(
         n_actions=spec.n_actions,
         preprocessing=spec.preprocessing,
@@ -279,7 +279,7 @@ def _visited(run: Path) -> set[tuple[State, int]]:
     return {(tuple(row[:-2]), row[-2]) for row in tried.tolist()}
 
 
-def _encoder(spec: TaskSpec, appearance: str, kind: str, given: str | None) -> Path:
+def encoder_for(spec: TaskSpec, appearance: str, kind: str, given: str | None) -> Path:
     """The given encoder, where it gives latents or codes as the model reads them; else the task's own."""
     if given is not None:
         path = encoders.resolve(spec, appearance, given)

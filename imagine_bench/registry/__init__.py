@@ -18,6 +18,7 @@ from imagine_bench.interfaces.regression import RegressionSpec, Regressor, Regre
 from imagine_bench.registry.builtin import (
     AGENTS,
     DEMONSTRATOR,
+    MOTION_MODELS,
     REGRESSIONS,
     REGRESSORS,
     TASKS,
@@ -43,6 +44,7 @@ from imagine_bench.values import Setting
 __all__ = [
     "AGENTS",
     "DEMONSTRATOR",
+    "MOTION_MODELS",
     "REGRESSIONS",
     "REGRESSORS",
     "TASKS",
