@@ -2,7 +2,8 @@
 
 - A context is made at the first image, in the process that draws it; one inherited through a fork is left alone.
 - Every call makes its own context current first, closing included: MuJoCo frees whatever context is current.
-- Renderers that draw the same scene from the same view share one context, which costs as much as 700 frames to make.
+- Renderers that draw the same scene in the same size and quality share one context, whichever camera they draw from. A
+  context costs as much as 700 frames to make, and about 30 us to change to.
   The few that were used last are kept for the next renderer.
 - Any thread may draw, one at a time. The contexts of the main thread stay current there. Other threads share contexts
   that are released after each image; without EGL, which alone can release one, each thread has its own.
@@ -54,6 +55,11 @@ class View:
     samples: int = 0  # multisampling; 0 draws hard edges
     slices: int = 12  # corners of a drawn cylinder
     for_people: bool = False  # whether to draw the sky, by all lights of the model
+
+    @property
+    def canvas(self) -> tuple[int, ...]:
+        """Size and quality: views of one scene that differ only in camera and groups share a context."""
+        return self.width, self.height, self.shadow_px, self.samples, self.slices
 
 
 def _is_egl() -> bool:
@@ -202,18 +208,18 @@ def _drawn_as(model: mujoco.MjModel) -> bytes:
 
 
 class _Canvases:
-    """The contexts of this process, by scene, view and thread; the one used last comes last."""
+    """The contexts of this process, by scene, size and quality, and thread; the one used last comes last."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self._canvases: dict[tuple[bytes, View, int | None], _Canvas] = {}
+        self._canvases: dict[tuple[bytes, tuple[int, ...], int | None], _Canvas] = {}
         self._others: list[_Canvas] = []
 
     def find(self, scene: bytes, model: mujoco.MjModel, view: View, known: _Canvas | None) -> _Canvas:
-        """The context of a scene and a view, made if there is none, or if one that is not the known one is damaged."""
+        """The context for a view of a scene, made if there is none, or if one that is not the known one is damaged."""
         is_main = threading.current_thread() is threading.main_thread()
         thread = None if _is_egl() and not is_main else threading.get_ident()
-        canvas = self._canvases.pop((scene, view, thread), None)
+        canvas = self._canvases.pop((scene, view.canvas, thread), None)
         if canvas is not None and canvas is not known and not canvas.is_whole():
             canvas.close()
             canvas = None
@@ -221,7 +227,7 @@ class _Canvases:
             self.close(_KEPT - 1)
             canvas = _Canvas(model, view, thread)
             _close_at_exit()
-        self._canvases[scene, view, thread] = canvas
+        self._canvases[scene, view.canvas, thread] = canvas
         return canvas
 
     def of_others(self) -> tuple[Any, ...] | None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -76,6 +77,24 @@ def test_renderers_of_one_scene_and_view_share_a_context(world, made):
     for camera, each, frame in zip(cameras, worlds, frames, strict=True):
         assert np.array_equal(camera.frame(each.data), frame), "a new context draws the same"
     assert len(made) == 4
+
+
+def test_views_from_other_cameras_share_a_context_and_views_of_other_quality_do_not(world, made):
+    wrist = agent_camera_view(62)
+    views = [wrist, replace(wrist, camera="human", groups=DRAWN_GROUPS)]
+    others = [replace(wrist, width=63), replace(wrist, shadow_px=256), replace(wrist, samples=4)]
+    alone = []
+    for view in views:
+        alone.append(Renderer(world.model, view).frame(world.data))
+        rendering.close_contexts()
+    made.clear()
+    cameras = [Renderer(world.model, view) for view in views]
+    for camera, frame in zip(cameras * 2, alone * 2, strict=True):
+        assert np.array_equal(camera.frame(world.data), frame)
+    assert len(made) == 1
+    for view in others:
+        Renderer(world.model, view).frame(world.data)
+    assert len(made) == 1 + len(others)
 
 
 @pytest.fixture
