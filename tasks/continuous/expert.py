@@ -38,12 +38,12 @@ class Expert:
 
     Args:
         env: The environment; its scene is read, never changed.
-        planner: A world like the environment's, this expert's own.
+        planner: A world like the environment's, this expert's own; by default a new one.
     """
 
-    def __init__(self, env: MotionEnv, planner: World) -> None:
+    def __init__(self, env: MotionEnv, planner: World | None = None) -> None:
         self._env = env
-        self._planner = planner
+        self._planner = env.another_world() if planner is None else planner
         self._arm = ArmModel()
         self._columns = arm_columns(env.model)
         self._due: deque[HandTarget] = deque()
