@@ -57,7 +57,7 @@ class RandomAgent(_FixedPolicy):
 class OracleAgent(_FixedPolicy):
     """An optimal action of the rules, given what every frame of the episode has shown of the macrostate.
 
-    It reads frames without error and remembers them, but what they hide or show late it does not know.
+    It reads frames without error and remembers them, but it does not know coordinates that they hide or show late.
     """
 
     def __init__(self, optimal_policy: Callable[[tuple[int, ...], int], int]) -> None:

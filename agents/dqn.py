@@ -201,7 +201,7 @@ class DQN:
         return {**self.meters.read(), "epsilon": epsilon(self.steps, self.settings.controller), **counters}
 
     def parts(self) -> dict[str, snapshot.Part]:
-        """What a snapshot holds arrays of, by name."""
+        """The parts whose arrays a snapshot holds, by name."""
         return {"controller": self.controller, "real": self.real, "generator/replay": self._replay}
 
     def state(self) -> AgentState:

@@ -1,4 +1,4 @@
-"""Running means of what a learner measures, emptied each time they are read."""
+"""Running means of a learner's measurements, emptied each time they are read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Meters:
         self.add(name, time.process_time() - start, 0.0)
 
     def count(self, *names: str) -> None:
-        """Count one more of what ``names`` are means of, such as a real step for CPU seconds a step."""
+        """Count one more of the events that ``names`` are means of, such as a real step for CPU seconds a step."""
         for name in names:
             self.add(name, 0.0)
 

@@ -1,6 +1,6 @@
 """The memories of algorithm 1, real and imagined, of different kinds and never one buffer (thesis 5.2.2).
 
-The real memory keeps what the encoder saw, mean and standard deviation, and draws ``z ~ N(mu, sigma)`` anew
+The real memory keeps the encoder's output, mean and standard deviation, and draws ``z ~ N(mu, sigma)`` anew
 for every batch; the imagined memory keeps imagined latents and is short, since recent imagination is the better one.
 A row is one transition with both its ends, so no batch ever pairs states of two episodes.
 """
@@ -25,7 +25,7 @@ class Batch:
     """B transitions between latents ``z`` and ``next_z`` (B, Z) by ``action`` (B,), int64, with ``reward`` (B,).
 
     ``terminated`` (B,) is 1 where the episode ended in a terminal state, else 0; truncation is 0. ``weight`` (B,) is
-    what their errors count, at most 1; of prioritised draws ``rows`` (B,), int64, are where the memory holds them.
+    the weight of their errors, at most 1; of prioritised draws ``rows`` (B,), int64, are where the memory holds them.
     """
 
     z: Tensor
@@ -113,7 +113,7 @@ class RealMemory(Ring):
         mu, sigma = posterior
         next_mu, next_sigma = next_posterior
         row = {"mu": mu, "sigma": sigma, "next_mu": next_mu, "next_sigma": next_sigma}
-        if "error" in self._columns:  # what was never replayed comes first
+        if "error" in self._columns:  # transitions that were never replayed come first
             row["error"] = self._columns["error"][: len(self)].max() if len(self) else torch.ones(())
         self._put(**row, action=action, reward=reward, terminated=float(terminated))
 
@@ -178,7 +178,7 @@ class StartMemory(Ring):
 
 
 class ImaginedMemory(Ring):
-    """Transitions that were imagined; with ``weighted``, each with what its error counts."""
+    """Transitions that were imagined; with ``weighted``, each with the weight of its error."""
 
     _latents = ("z", "next_z")
 

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 _HUGE = 10**300  # integers beyond it are no floats, and in no range
 CONFIG_GROUPS = ("chapter_3", "chapter_5")
-"""What a task may name: the chapter of the thesis whose settings it is measured with."""
+"""Groups that a task may name: the chapter of the thesis whose settings it is measured with."""
 SETS = ("minimal", "fast", "published")
-"""Named sets of values: ``published`` is the thesis', ``fast`` what fits minutes, ``minimal`` what only shows that all
-parts work."""
+"""Named sets of values: ``published`` is the thesis', ``fast`` values that fit minutes, ``minimal`` values that only
+show that all parts work."""
 
 S = TypeVar("S", bound="DataclassInstance")
 V = TypeVar("V")
@@ -87,7 +87,7 @@ class ConfigGroup(Generic[S]):
     """The settings of one chapter of the thesis, or of one kind of agent."""
 
     published: S
-    sets: Mapping[str, Mapping[str, Override]]  #: by name of a set, what it changes of them, by dotted name
+    sets: Mapping[str, Mapping[str, Override]]  #: by name of a set, its changes of them, by dotted name
     #: Settings that this group does without: an override of one is checked and left out.
     unused: frozenset[str] = frozenset()
 
@@ -120,7 +120,7 @@ class Hyperparameters(Generic[S]):
             group: A name of :attr:`groups`.
 
         Raises:
-            UnknownNameError: No such group, set, setting or word; the message lists what exists.
+            UnknownNameError: No such group, set, setting or word; the message lists all that exist.
             InvalidValueError: A value of the wrong type or out of its range.
         """
         chosen = self.groups[require_known("config group", group, self.groups)]

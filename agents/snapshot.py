@@ -20,7 +20,7 @@ from .networks.adam import MOMENTS, Adam, TrainedModule
 from .replay import Ring
 
 Part = TrainedModule | torch.Generator | Ring
-"""What an agent's arrays belong to."""
+"""The owners of an agent's arrays."""
 
 
 def prefixed(prefix: str, arrays: Mapping[str, Array]) -> Arrays:

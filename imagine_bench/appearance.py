@@ -22,7 +22,7 @@ POINTS: Mapping[str, Mapping[str, float]] = {
     "mild": {"light": 0.5, "pose": 0.5, "hand": 0.5},
     "strong": dict.fromkeys(FACTORS, 1.0),
 }
-"""Levels by their factors, ascending; what is not named is 0."""
+"""Levels by their factors, ascending; a factor that is not named is 0."""
 _EXAMPLE = "light=0.5,camera=0.2"
 
 

@@ -33,7 +33,7 @@ Arrays = dict[str, NDArray[Any]]
 """Arrays by name, as a file or a state holds them: each has a dtype and a shape of its own."""
 D = TypeVar("D", bound=np.generic)
 Observed = NDArray[Any] | Arrays
-"""What is observed of one moment: one part, an image or a vector, or several by name."""
+"""An observation of one moment: one part, an image or a vector, or several by name."""
 Action = np.int64 | int
 """The number of a macro-action."""
 Info = dict[str, Any]

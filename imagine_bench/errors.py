@@ -1,4 +1,4 @@
-"""The family of errors a user can cause, each one sentence: what was given, what is allowed, what to do."""
+"""The family of errors a user can cause, each one sentence: the given value, the allowed ones, the remedy."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class UnknownNameError(ImagineBenchError, ValueError):
     """A name that is not among the known ones.
 
     Args:
-        kind: What was named, for example ``"task"``.
+        kind: The kind of thing that was named, for example ``"task"``.
         given: The value as the user wrote it.
         known: Every allowed name.
     """

@@ -1,4 +1,4 @@
-"""What a task may declare about how its frames are read. Numpy only, so that both sides share it.
+"""The ways of reading frames that a task may declare. Numpy only, so that both sides share it.
 
 The thesis makes the arrow puzzle's frames gray and cuts them into three vertical strips, one cube each, fed as
 three channels (section 5.2.2); those of the task with a human stay whole and in color (section 3.2.1). Here other
@@ -64,7 +64,7 @@ def gray_cells(frames: Pixels, cubes: int = 3) -> Floats32:
 def join_cells(cells: Floats32) -> Floats32:
     """Undo :func:`gray_cells` for pictures: (..., cubes, H, W) to (..., 64, 64).
 
-    What several channels show is the left one's, and what none does is gray.
+    A place that several channels show is the left one's, and a place that none shows is gray.
     """
     windows = _windows(cells.shape[-3])
     if len(windows) not in _STRIP_STARTS:

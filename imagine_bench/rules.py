@@ -57,7 +57,7 @@ class Rules(Protocol):
         """Every possible result of ``action``, also out of a terminal macrostate: there its dynamics hold too."""
 
     def judge(self, macrostate: State, action: int, reached: State) -> Outcome:
-        """What the rules give for ``reached`` as it was read back, also where a fault led somewhere unexpected."""
+        """The outcome by the rules for ``reached`` as it was read back, also where a fault led somewhere unexpected."""
 
     def is_legal(self, macrostate: State) -> bool:
         """Whether ``macrostate`` breaks no rule."""
@@ -75,7 +75,7 @@ Dynamics = Callable[[State, int], Sequence[Outcome]]
 
 @dataclass(frozen=True, kw_only=True)
 class RuleFacts:
-    """What the rules alone say about a task, computed by enumeration."""
+    """The facts of a task's rules, computed by enumeration."""
 
     chance_level: float  #: success probability of a uniformly random agent within the horizon
     optimum: float  #: largest success probability of any policy within the horizon
@@ -139,7 +139,8 @@ def states_of_play(rules: Rules) -> list[State]:
 
 
 def tabulate(rules: Rules, depth: int | None = None) -> RuleTables:
-    """Write the machine out as arrays: what it lists, or what is reached from its starts, where ends have empty rows.
+    """Write the machine out as arrays: the macrostates that it lists, or those that are reached from its starts, where
+    ends have empty rows.
 
     Macrostates that are more than ``depth`` macro-actions away have empty rows, too.
 
@@ -286,7 +287,7 @@ def shortest_plans(tables: RuleTables) -> Ints:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyValues:
-    """What a policy reaches within a horizon, from each macrostate. Shapes (S,)."""
+    """The results of a policy within a horizon, from each macrostate. Shapes (S,)."""
 
     success: Floats  #: success probability
     failure: Floats  #: probability of an end that is no success; the rest of them is still going on at the horizon
@@ -322,7 +323,7 @@ def ending(info: Mapping[str, Any], *, terminated: bool) -> str:
     if info["is_success"]:
         return "solved"
     if terminated:
-        return "lost, because the rules forbid what the last macro-action led to"
+        return "lost, because the rules forbid the result of the last macro-action"
     return f"lost, because {info['fault_reason'] or 'no macro-actions are left'}"
 
 
@@ -376,14 +377,14 @@ def facts(rules: Rules, horizon: int) -> RuleFacts:
 
 
 def outcomes_by_depth(rules: Rules, state: State, actions: Sequence[int]) -> tuple[Outcomes, ...]:
-    """What may come of macro-actions from a macrostate, after each of them."""
+    """The possible outcomes of macro-actions from a macrostate, after each of them."""
     start: Outcomes = {(state, False): (1.0, 0.0)}
     reached = itertools.accumulate(actions, functools.partial(advance, rules), initial=start)
     return tuple(reached)[1:]
 
 
 def advance(rules: Rules, outcomes: Outcomes, action: int) -> Outcomes:
-    """What may come of one more macro-action, the same whatever has come before.
+    """The possible outcomes of one more macro-action, the same whatever has come before.
 
     Dynamics hold after the end of an episode, too; rewards stop there.
     """

@@ -76,7 +76,7 @@ def is_tuning_seed(seed: int) -> bool:
 
 
 def evaluation_split(seed: int) -> Purpose:
-    """What a run of this seed is tested on; a run for choosing settings meets no start of a reported one."""
+    """The starts of the tests of a run of this seed; a run for choosing settings meets no start of a reported one."""
     return "tuning" if is_tuning_seed(seed) else "evaluation"
 
 

@@ -1,4 +1,4 @@
-"""What a handful of seeds allows one to say: pure functions on one score a run, shape (runs,); no random draws.
+"""Conclusions from a handful of seeds: pure functions on one score a run, shape (runs,); no random draws.
 
 The score of an agent is the interquartile mean over seeds (Agarwal et al., "Deep RL at the edge of the statistical
 precipice", 2021): the middle half, so that one seed that is stuck does not decide. Of three seeds that is their mean.
@@ -154,7 +154,7 @@ def running_means(budgets: Sequence[int], scores: ArrayLike, at_zero: float) -> 
 
 
 class PairedTests(NamedTuple):
-    """Tests of two trained agents from the same starts, by who alone solved them."""
+    """Tests of two trained agents from the same starts, by those that one alone solved."""
 
     first: int  #: Solved by the first alone
     second: int  #: Solved by the second alone
@@ -214,7 +214,7 @@ def differences(treated: ArrayLike, base: ArrayLike, *, trials: int | None = Non
     the chance of that, 2 / 4^n of n runs each. All but the differences is NaN with fewer than :data:`FEWEST_TESTED`
     runs of either.
 
-    Runs of one seed share starts and first weights, but what training makes of them does not agree: of the kept benches
+    Runs of one seed share starts and first weights, but the trained results do not agree: of the kept benches
     the correlation over seeds is about 0.1, so they are not paired. ``trials`` are tests behind each score: the error
     of a mean is at least theirs. Starts that are equally hard for both agents cancel.
     """

@@ -56,7 +56,7 @@ def bench_words(out: Path, *more: str) -> list[str]:
             "--encoder pick_place-clean",
             "Encoder 'pick_place-clean.safetensors' reads frames as 'small_rgb', the task declares",
         ),
-        ("--agents random --encoder pick_place-clean", "No agent of this bench reads what an encoder gives; leave"),
+        ("--agents random --encoder pick_place-clean", "No agent of this bench sees through an encoder; leave"),
         ("--variants base", "arrow_puzzle takes no --variants; leave it out."),
         ("--set controller.discnt=0.9", "No setting 'controller.discnt'. Did you mean 'controller.discount'? Known: "),
         ("--workers 0", "0 workers cannot run anything; give at least 1."),

@@ -109,7 +109,9 @@ def compare(new: EncoderCard, bundled: EncoderCard | None) -> str:
 
 
 def summary(card: EncoderCard) -> str:
-    """What an encoder reads of held-out frames, by the stored probe, from sampled latents and by a linear reader."""
+    """The reading of held-out frames through an encoder, by the stored probe, from sampled latents and by a linear
+    reader.
+    """
     read = ", ".join(f"{name} {share:.2%}" for name, share in card.probe.items())
     cost = f"{card.kl_nats:.1f} nats from the prior, {card.cpu_s['total']:.0f} CPU s"
     return (
@@ -121,9 +123,10 @@ def summary(card: EncoderCard) -> str:
 def sample_sheet(
     encoder: Encoder, spec: TaskSpec, frames: Frame, macrostates: Ints, generator: torch.Generator
 ) -> Figure:
-    """A figure of what an encoder keeps, one column a frame: camera, network input, decoded mean and decoded sample.
+    """A figure of the information that an encoder keeps, one column a frame: camera, network input, decoded mean and
+    decoded sample.
 
-    Below each column of ``frames`` (N, 64, 64, 3) stands what the probe reads, red where it is not ``macrostates``
+    Below each column of ``frames`` (N, 64, 64, 3) stands the probe's reading, red where it is not ``macrostates``
     (N, M).
     """
     latents = Latents(*encoder.encode(frames))

@@ -32,7 +32,7 @@ _CHUNK = 512  # frames encoded at once, to bound memory
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderCard:
-    """Where an encoder comes from and what it can do."""
+    """The origin and the abilities of an encoder."""
 
     task: str
     appearance: str
@@ -43,7 +43,7 @@ class EncoderCard:
     cardinalities: tuple[int, ...]  #: values of each. Length M.
     seed: int
     command: str  #: makes it again
-    data: str  #: what the frames were, in words
+    data: str  #: the frames, in words
     versions: dict[str, str]
     cpu_s: dict[str, float]  #: CPU seconds spent in ``total``
     kl_nats: float  #: KL from the prior on held-out frames, mean a frame
@@ -53,7 +53,7 @@ class EncoderCard:
     probe: dict[str, float]
     #: Where latents are one-hot codes of factors: the number of values of each factor; else empty.
     code_sizes: tuple[int, ...] = ()
-    offer: str = ""  #: ``"module:attr"`` of what another package offers, in place of a network of this suite
+    offer: str = ""  #: ``"module:attr"`` of another package's offer, in place of a network of this suite
 
     def to_json(self) -> str:
         """The card as indented JSON."""
@@ -122,13 +122,13 @@ class Encoder:
         return view(self.network.decode(latents, height, width).cpu().numpy(), self.card.preprocessing)
 
     def read_macrostate(self, latents: Tensor) -> Ints:
-        """What the evaluation-only probe reads from ``latents`` (N, Z); agents must not use it. Shape (N, M)."""
+        """The evaluation-only probe's reading of ``latents`` (N, Z); agents must not use it. Shape (N, M)."""
         return self.probe.read(latents.to(self.device))
 
     def save(self, path: Path, picture: bytes = b"") -> None:
         """Write the artefact (``.safetensors``, float16) and its card beside it (``.json``), the artefact last.
 
-        What a killed process leaves is written anew; a whole artefact never.
+        A part that a killed process left is written anew; a whole artefact never.
 
         Raises:
             ArtefactError: Either file exists already; it is left untouched.

@@ -1,4 +1,4 @@
-"""Frames to latents for any Gymnasium learner: what the suite's own DQN sees, for a library's."""
+"""Frames to latents for any Gymnasium learner: those of the suite's own DQN, for a library's."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class EncoderNetwork(nn.Module, abc.ABC):
     code_sizes: tuple[int, ...] = ()  #: numbers of values of each factor, where latents are codes
 
     def target(self, images: Tensor) -> Tensor:
-        """What :meth:`mean` should give back for ``images`` (N, C, H, W), in the network's own units."""
+        """The target that :meth:`mean` should give back for ``images`` (N, C, H, W), in the network's own units."""
         return images
 
     def mean(self, latents: Tensor) -> Tensor:
@@ -89,6 +89,6 @@ def read_whole(frames: Frame) -> Floats32:
 
 
 def image_shape(preprocessing: str) -> tuple[int, int, int]:
-    """(C, H, W) of what a preprocessing gives."""
+    """(C, H, W) of the output of a preprocessing."""
     _, channels, height, width = preprocess(preprocessing)(np.zeros((1, 64, 64, 3), dtype=np.uint8)).shape
     return channels, height, width

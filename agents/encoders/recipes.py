@@ -38,7 +38,7 @@ class Recipe:
 
     @property
     def kind(self) -> str:
-        """What the encoder gives: ``"latents"`` (continuous) or ``"codes"`` (categorical)."""
+        """The output of the encoder: ``"latents"`` (continuous) or ``"codes"`` (categorical)."""
         return "codes" if self.architecture == "factors" else "latents"
 
     def __post_init__(self) -> None:

@@ -162,11 +162,11 @@ def train_vae(
 ) -> float:
     """Minimise the beta-VAE loss with Adam, in place, and return the CPU seconds that earlier processes spent on it.
 
-    The VAE stays on its device; what is drawn is drawn by ``generator``, on the CPU.
+    The VAE stays on its device; random numbers are drawn by ``generator``, on the CPU.
 
     Raises:
         DivergedError: The loss is not finite any more; the message names the step.
-        ArtefactError: What is unfinished is damaged or another training.
+        ArtefactError: The unfinished training is damaged or another one.
     """
     optimiser = torch.optim.Adam(vae.parameters(), lr=recipe.learning_rate, fused=True)
     kept: dict[str, Any] = {"step": 0, "order": torch.empty(0, dtype=torch.int64), "cpu_s": 0.0}
@@ -222,14 +222,14 @@ def train_encoder(
     from its ``encoder_probe`` branch, of looks kept for tests where the appearance has such. ``unfinished`` is a file
     in which a VAE's training is kept once a minute and from which one that was killed goes on; when all is done it is
     removed. ``device`` is where a VAE's gradient steps are made; all else is the CPU's. ``offer`` is the
-    ``"module:attr"`` of what another package offers, in the recipe :data:`OFFERED`.
+    ``"module:attr"`` of another package's offer, in the recipe :data:`OFFERED`.
 
     Raises:
         UnknownNameError: An unknown appearance or device.
         SetupError: The machine has no such device.
         DivergedError: The loss became NaN or infinite.
-        InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames, or what is
-            offered gives no latents.
+        InvalidValueError: A recipe of codes found no factor with two values in so few or such like frames, or the
+            offered object gives no latents.
         ArtefactError: The unfinished training is damaged or another one.
     """
     if recipe.kind == "codes":
@@ -284,7 +284,7 @@ def _card(
         command += " --device cuda"
     if offer:
         command = f"imagine-bench bench --task {spec.id} --appearance {appearance} --encoder {recipe.name}"
-    training = f"what {offer} was trained on, {recipe.frames}" if offer else f"{recipe.frames} training"
+    training = f"those of {offer}, {recipe.frames}" if offer else f"{recipe.frames} training"
     return EncoderCard(
         task=spec.id,
         appearance=appearance,
@@ -318,7 +318,7 @@ def latents_of(network: EncoderNetwork, data: FrameSet) -> Latents:
 
 @torch.no_grad()
 def _measured(network: EncoderNetwork, probe: Probe, linear: Probe, held_out: FrameSet, seed: int) -> dict[str, Any]:
-    """What a card says of an encoder on frames that no training saw."""
+    """The entries of a card about an encoder on frames that no training saw."""
     latents = latents_of(network, held_out)
     sampled = latents.sample(torch.Generator().manual_seed(seed))
     right = held_out.macrostates
@@ -342,17 +342,17 @@ def _measured(network: EncoderNetwork, probe: Probe, linear: Probe, held_out: Fr
 
 
 def fit_offered(spec: TaskSpec, *, name: str, offer: str, appearance: str, path: Path) -> None:
-    """Measure the scale of what another package offers, train the probe and write the artefact.
+    """Measure the scale of another package's offer, train the probe and write the artefact.
 
     Raises:
-        InvalidValueError: What is offered gives no latents.
+        InvalidValueError: The offered object gives no latents.
         ArtefactError: The file exists.
     """
     train_encoder(spec, recipe=replace(OFFERED, name=name), appearance=appearance, seed=0, offer=offer).save(path)
 
 
 def _fitted_offer(offer: str, data: FrameSet) -> OfferedNetwork:
-    """What another package offers; latents that are no codes are brought to mean 0 and standard deviation 1."""
+    """The offer of another package; latents that are no codes are brought to mean 0 and standard deviation 1."""
     network = OfferedNetwork(offer)
     if not network.code_sizes:
         mu = latents_of(network, data).mu

@@ -59,7 +59,9 @@ class Vae(EncoderNetwork):
         return kl_from_standard_normal(mu, log_variance).mean()
 
     def fit_appearance(self, images: Tensor) -> None:
-        """Take what :meth:`decode` cannot know of latents from training images (N, C, H, W): here nothing."""
+        """Take the constants that :meth:`decode` cannot know of latents from training images (N, C, H, W): here
+        nothing.
+        """
 
     def elbo(self, images: Tensor, noise: Tensor, beta: float) -> Elbo:
         """The beta-VAE loss (Higgins et al. 2017; thesis equation 5.1, corrected) of images (N, C, H, W) in [0, 1].
@@ -99,7 +101,7 @@ class MlpVae(Vae):
         sizes = (channels // groups * height * width, *recipe.widths)
         self.encoder = relu_layers((*sizes, 2 * recipe.latents))
         self.decoder = relu_layers((recipe.latents, *reversed(sizes)))
-        # What a person expects to see: the mean brightness and contrast of the training images.
+        # As a person expects it: the mean brightness and contrast of the training images.
         self.register_buffer("brightness", torch.tensor(0.5))
         self.register_buffer("contrast", torch.tensor(0.2))
 

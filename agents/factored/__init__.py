@@ -1,7 +1,7 @@
 """The agent ``factored``: a structured world model over discrete codes of a scene's factors, and planning in it.
 
 Read in this order: ``perception`` (frames to codes and back), ``factors`` (codes, transitions, replay), ``dynamics``
-(what an action does to each factor), ``outcomes`` (what is rewarded, what ends), ``model`` (both together),
+(the effect of an action on each factor), ``outcomes`` (rewards and ends), ``model`` (both together),
 ``exploration`` (which query to ask an oracle), ``planner`` (values, novelty and what follows from a code), ``agent``.
 Nothing here knows a task: no macrostate, no rule, no reward, no number of objects.
 """

@@ -25,7 +25,7 @@ from .planner import TIE, Objective, Planner
 from .settings import HYPERPARAMETERS, FactoredSettings
 
 ACCEPTED = 0.5
-"""A transition of which more than this is unknown is not accepted, and neither is what follows from it."""
+"""A transition of which more than this is unknown is not accepted, nor is a transition that follows from it."""
 _EXPECTED = 0.9
 """A transition held less probable than this is unexpected, as is any that would still be explored."""
 _TERMINAL = 0.5
@@ -65,7 +65,7 @@ class CodeAgent:
 
     @property
     def _ready(self) -> bool:
-        """Whether anything is known of what this task rewards, so that there is something to plan for."""
+        """Whether anything is known of this task's rewards, so that there is something to plan for."""
         return self.model.outcomes.causes is not None
 
     @property
@@ -133,7 +133,7 @@ class CodeAgent:
         """Keep the dynamics, and earlier causes as priors; see :meth:`.outcomes.OutcomeModel.reset_for_new_task`."""
         self.learn()
         self._begin_task()
-        self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
+        self.meters = Meters()  # a measurement on an earlier task is no diagnosis of this one
 
     def _begin_task(self) -> None:
         self.tasks.append(self.learned)
@@ -163,7 +163,7 @@ class CodeAgent:
         return {**self.meters.read(), **{name: float(value) for name, value in counters.items()}}
 
     def state(self) -> AgentState:
-        """A snapshot: what is replayed, how much of it is learned, the generator, measurements."""
+        """A snapshot: the replayed transitions, how much of them is learned, the generator, measurements."""
         sizes = self.perception.sizes
         values = {
             "learned": self.learned,
@@ -192,14 +192,14 @@ class CodeAgent:
 
 
 class FactoredAgent(CodeAgent):
-    """Sees with an encoder, and so can show what it imagines, be read by a probe, and ask an oracle."""
+    """Sees with an encoder, and so can show its imagination, be read by a probe, and ask an oracle."""
 
     perception: CodePerception
 
     def query(self, observation: Observation) -> Ints | None:
         """The macro-actions (D,) whose last one has the most uncertain outcome; the fewest among equals.
 
-        None where nothing is uncertain enough; what got no label is not asked about again.
+        None where nothing is uncertain enough; a question that got no label is not asked again.
         """
         if not self._ready:
             return None
@@ -288,11 +288,11 @@ class FactoredAgent(CodeAgent):
         return following, (reward, p_terminated, unknown, 1.0 - p_likeliest)
 
     def read_frames(self, frames: Frame) -> Ints:
-        """What a probe reads; see :class:`.capabilities.FrameReader`."""
+        """The reading of a probe; see :class:`.capabilities.FrameReader`."""
         return self.perception.macrostates(self.perception.codes(frames))
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
-        """What its planner plans with; see :class:`.capabilities.OutcomePredictor`."""
+        """The predictions of its planner; see :class:`.capabilities.OutcomePredictor`."""
         codes = self.perception.codes(frames)
         if not self._ready:
             nothing = np.zeros((len(codes), self.n_actions))

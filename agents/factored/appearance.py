@@ -6,8 +6,8 @@ are groups of crops (average linkage) below the widest gap among the heights at 
 one if that tells much better what follows an action. Tints, brightness and the jitter of a pose change neither. A crop
 that is like no exemplar of its factor has no known value.
 
-Where hardly a look is seen twice there is noise: of each pixel only colors that are usual or stay are seen, so that
-what stands in front of noise is a factor as any.
+Where hardly a look is seen twice there is noise: of each pixel only colors that are usual or stay are seen, so that an
+    object in front of noise is a factor as any.
 
 Sources: frame differences as motion segments (Jain & Nagel 1979); a few usual colors a pixel (Stauffer & Grimson 1999);
 states split where that predicts better (McCallum 1996); a table's marginal likelihood (Cooper & Herskovits 1992);
@@ -34,7 +34,7 @@ SHIFT_PX = 5
 """Crops are compared at all shifts of so many pixels up, down, left and right."""
 _CHANGE = 0.3  # of the median brightness: a pixel that changes by less shows no change
 _CHANGES = (2, 0.03)  # times, and share of the steps, that a pixel must change to belong to a factor
-_STARTS = (3, 0.2)  # the same of the starts of episodes: what no action changes may change there alone
+_STARTS = (3, 0.2)  # the same of the starts of episodes: factors that no action changes may change there alone
 _ENOUGH = 500  # steps that a share is taken of at most: the more things there are, the more rarely each changes
 _LEAST_PX = 36  # pixels of a factor
 _LEAST_INNER_PX = 16  # the same of what is all in the inner of the image: at its border, slivers come into view
@@ -76,7 +76,7 @@ class Part(NamedTuple):
 
     mask: Mask  #: its pixels. Shape (64, 64).
     exemplars: Images  #: crops. Shape (E, D).
-    values: Ints  #: what each shows. Shape (E,).
+    values: Ints  #: the content of each. Shape (E,).
     flat: float  #: energy that crops without contours count as
     reach: float  #: distance beyond which a crop is like no exemplar
     rests: Images | None = None  #: where it is in front of noise, what :func:`quiet` needs. Shape (K, 64, 64, 3).
@@ -137,7 +137,7 @@ def _parts(images: Images, shapes: Images, begins: Mask, actions: Ints) -> list[
     often = _often(change, begins)
     found = [(mask, *_part(shapes, mask, actions)) for mask in regions(change, often)]
     noise = np.any([mask & (singles > _NOISE) for mask, _, singles in found] or [often & False], axis=0)
-    noise = scipy.ndimage.binary_propagation(noise, np.ones((3, 3)), often)  # what hangs together with it, too
+    noise = scipy.ndimage.binary_propagation(noise, np.ones((3, 3)), often)  # all that hangs together with it, too
     seen = [part for mask, part, _ in found if part is not None and not (mask & noise).any()]
     parts = [(part, part.read(shapes)[0]) for part in seen]
     if noise.any():
@@ -225,7 +225,7 @@ def contours(images: Images) -> Images:
 
 
 def _beyond(one: Images, other: Images) -> Images:
-    """How far ``other`` lies outside of what ``one`` shows there and a pixel around."""
+    """How far ``other`` lies outside of the pixels that ``one`` shows there and one pixel around."""
     around = (1, 3, 3, 1)
     low = scipy.ndimage.minimum_filter(one, around)
     high = scipy.ndimage.maximum_filter(one, around)
@@ -233,7 +233,7 @@ def _beyond(one: Images, other: Images) -> Images:
 
 
 def changes(images: Images) -> Mask:
-    """Where one of two successive images (N, 64, 64, 3) shows what the other does not show within a pixel.
+    """Where one of two successive images (N, 64, 64, 3) shows a contour that the other does not show within a pixel.
 
     Small holes are closed. Shape (N - 1, 64, 64).
     """
@@ -250,7 +250,7 @@ def regions(change: Mask, pixels: Mask) -> list[Mask]:
     A pixel belongs to the region of a neighbour if both change together: in a share of the times when either does, and
     in each half of the time, too, where it tells. Else a habit of the agent, kept for a while, would bind two things.
     Pixels that hang together, up to two pixels apart, are parted so only if most of them are in a region then; else
-    they are one. Much of what is left that hangs together and is no thin rim is a small thing that a large one touches.
+    they are one. A remaining connected region that is not a thin border is a small object touching a large one.
     """
     place = np.cumsum(pixels).reshape(pixels.shape) - 1
     change = change[:, pixels].astype(np.float32)  # [N - 1, pixels]

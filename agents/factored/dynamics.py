@@ -1,4 +1,4 @@
-"""What an action does to each factor of a code: a factored, categorical dynamics model with learned structure.
+"""The effect of an action on each factor of a code: a factored, categorical dynamics model with learned structure.
 
 Each factor's next value depends on a few factors only (factored MDPs: Boutilier, Dearden & Goldszmidt 2000; Kearns &
 Koller 1999). Which ones is learned, a factor and an action, by Bayesian averaging over sets of parents that hold the
@@ -27,7 +27,7 @@ _LARGEST_TABLE = 1 << 16
 _NEGLIGIBLE = 1e-12
 """Structures of no more posterior probability are left out of predictions."""
 _GROWTH = 1.1
-"""What all actions teach together is learned anew once so many times the transitions of the last time were seen."""
+"""The joint knowledge of all actions is learned anew once so many times the transitions of the last time were seen."""
 _AT_ONCE = 64
 """Codes whose counts are read at once, so that tables of many values need little memory."""
 _TABLES = 2
@@ -35,7 +35,7 @@ _TABLES = 2
 
 
 class FactorPrediction(NamedTuple):
-    """What each action would make of one factor in N codes."""
+    """The next value of one factor after each action in N codes."""
 
     expected: Floats  #: predictive probability of each value. Shape (N, A, K).
     unknown: Floats  #: weight of the prior in ``expected``; 0 where it is negligible. Shape (N, A).
@@ -216,5 +216,5 @@ class Dynamics:
             factor.fails = float((own_stayed + pseudo * fails) / (own_tried + pseudo))
 
     def predict(self, codes: Codes) -> list[FactorPrediction]:
-        """What each action would make of each factor in ``codes`` (N, P)."""
+        """The next value of each factor after each action in ``codes`` (N, P)."""
         return [factor.predict(codes) for factor in self.factors]

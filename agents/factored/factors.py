@@ -1,4 +1,4 @@
-"""Codes of factors, transitions between them, and what is remembered of an episode.
+"""Codes of factors, transitions between them, and the memory of an episode.
 
 A *factor* is one independent object of the scene as a discrete encoder finds it; a *code* holds one value a factor.
 Shapes: ``N`` codes, ``P`` factors, ``A`` macro-actions.
@@ -33,7 +33,7 @@ def strides(factors: Sequence[int], sizes: Sequence[int]) -> Ints:
 class CodeTransition(NamedTuple):
     """One transition between codes.
 
-    ``has_dynamics``: it happened, and so shows what follows what; False if it was only asked about.
+    ``has_dynamics``: it happened, and so shows the order of codes; False if it was only asked about.
     ``has_reward``: reward and end are known; False if a query about it got no label.
     """
 
@@ -67,14 +67,14 @@ def from_arrays(arrays: Arrays) -> list[CodeTransition]:
 class Memory(NamedTuple):
     """The last value of a factor in an episode but one, which tells nothing and stands for never.
 
-    A code with a memory ends with what is remembered.
+    A code with a memory ends with the remembered values.
     """
 
     factor: int
     hidden: int
 
     def after(self, remembered: int, code: Code) -> int:
-        """What is remembered once a code was seen."""
+        """The memory once a code was seen."""
         value = code[self.factor]
         return remembered if value == self.hidden else value
 
@@ -85,7 +85,7 @@ class Memory(NamedTuple):
 
 
 def remembering(rows: Sequence[CodeTransition], begins: Iterable[bool], memory: Memory | None) -> list[CodeTransition]:
-    """Transitions whose codes end with what is remembered; ``begins`` tells which are the first of an episode."""
+    """Transitions whose codes end with the remembered values; ``begins`` tells which are the first of an episode."""
     if memory is None:
         return list(rows)
     found = []

@@ -29,7 +29,7 @@ from .settings import LEARNED, LearnedSettings
 _CONTRADICTIONS = 0.01
 """Share of transitions that may contradict one another by a misread frame."""
 _SCALE = 5
-"""Times that the image of what is seen is drawn larger."""
+"""Times that the image of the perception is drawn larger."""
 _COLORS = np.array(
     [[0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [213, 94, 0], [86, 180, 233], [240, 228, 66]]
 )
@@ -65,7 +65,7 @@ class LearnedPerceptionAgent(CodeAgent):
         return action
 
     def observe(self, transition: Transition, *, episode: int) -> None:
-        """Remember what was seen, see anew if that is due, and learn as from any codes."""
+        """Remember the frame, find factors anew if that is due, and learn as from any codes."""
         perception = self.perception
         self._observed += 1
         if transition.truncated:
@@ -89,7 +89,8 @@ class LearnedPerceptionAgent(CodeAgent):
     def _recode(self, found: list[appearance.SeenFactor], found_in: int) -> None:
         """Give every replayed transition the codes that its frames have now, and learn from all of them once more.
 
-        What was ``found`` before is kept where outcomes contradict what is found now and did not contradict that.
+        The factors ``found`` before are kept where outcomes contradict the present factors and did not contradict
+        those.
         """
         perception = self.perception
         count = len(self.replay)
@@ -114,7 +115,7 @@ class LearnedPerceptionAgent(CodeAgent):
             perception.recall(self.replay[-1].following[-1])
 
     def _rows(self) -> list[CodeTransition]:
-        """What is replayed, with the codes that its frames have now, as far as they are seen."""
+        """The replayed transitions, with the codes that its frames have now, as far as they are seen."""
         codes, _ = self.perception.codes(np.stack(self.perception.frames))
         return [
             row._replace(code=codes[before], following=codes[after])
@@ -122,7 +123,7 @@ class LearnedPerceptionAgent(CodeAgent):
         ]
 
     def perceived(self) -> Iterator[Perceived]:
-        """What it saw whenever that changed; see :class:`.capabilities.SeeingLearner`."""
+        """Its perception whenever that changed; see :class:`.capabilities.SeeingLearner`."""
         perception = self.perception
         for count in perception.history:
             seen = perception.first(count)
@@ -131,7 +132,7 @@ class LearnedPerceptionAgent(CodeAgent):
             yield Perceived(begun, tuple(len(factor.joint) for factor in found), image(found, seen[0]))
 
     def diagnostics(self) -> dict[str, float]:
-        """Also what it sees."""
+        """Also its perception."""
         return {**super().diagnostics(), **self.perception.diagnostics()}
 
     def state(self) -> AgentState:

@@ -1,4 +1,4 @@
-"""The world model: dynamics and outcomes together, what they predict, and how much of it is unknown."""
+"""The world model: dynamics and outcomes together, their predictions, and how much of these is unknown."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ _ROUNDING = 1e-9
 _FEWEST = 3
 """Values of a factor worth remembering: one that tells nothing, and two to tell apart."""
 _NONE_SEEN = 1e6
-"""Pseudo-count beside which no transition counts that was seen: it would explain a part of what a memory explains."""
+"""Pseudo-count beside which no transition counts that was seen: it would explain a part of the same that a memory
+explains.
+"""
 
 
 class Moves(NamedTuple):
@@ -34,7 +36,7 @@ class Moves(NamedTuple):
 
 
 class Results(NamedTuple):
-    """What these moves would bring."""
+    """The results of these moves."""
 
     p_continues: Floats  #: probability that this branch comes about and the episode goes on. Shape (N, A, B).
     reward: Floats  #: expected reward. Shape (N, A), as of all that follow.
@@ -45,7 +47,7 @@ class Results(NamedTuple):
 class FactoredModel:
     """Learns from transitions between codes and predicts them; ``sizes`` are the numbers of values of the P factors.
 
-    With a ``memory`` the last factor is what it remembers of the others, which follows from what they become.
+    With a ``memory`` the last factor is its memory of the others, which follows from their next values.
     """
 
     def __init__(
@@ -60,7 +62,7 @@ class FactoredModel:
         self.outcomes = OutcomeModel(sizes, n_actions, settings.outcomes)
 
     def add(self, row: CodeTransition) -> None:
-        """Take in one transition, as far as it shows what follows what and what it brings."""
+        """Take in one transition, as far as it shows the order of codes and their rewards."""
         if row.has_dynamics:
             self.dynamics.add(np.array(row.code), row.action, np.array(row.following[: self._moving]))
         if row.has_reward:
@@ -99,7 +101,7 @@ class FactoredModel:
         return Moves(following, chance, known)
 
     def results(self, codes: Codes, moves: Moves) -> Results:
-        """What the moves of every action from ``codes`` (N, P) would bring."""
+        """The results of the moves of every action from ``codes`` (N, P)."""
         chance = moves.chance
         reward = np.zeros(chance.shape)
         ends = np.zeros(chance.shape)
@@ -182,8 +184,8 @@ def choose(
     """The memory that explains transitions between codes best; None unless it does so much better than none.
 
     Which factor is remembered, and which of its values tells nothing, is learned: where the same code and action have
-    brought different outcomes, every such memory is tried. What is learned with it from every second episode predicts
-    the others, and these the first. ``begins`` tells which transitions are the first of an episode.
+    brought different outcomes, every such memory is tried. The model that is learned with it from every second episode
+    predicts the others, and these the first. ``begins`` tells which transitions are the first of an episode.
     """
     if not contradictions(rows):
         return None

@@ -1,12 +1,12 @@
-"""What is rewarded and what ends an episode: causes among conjunctions of values, and which of them are untested.
+"""Rewards and ends of episodes: causes among conjunctions of values, and which of them are untested.
 
 An *outcome* is a pair (reward, whether the episode ended) that was seen. One of them is the default; each other has
 causes: conjunctions of a few values of the next code, or of an action and values of the code before it. Any active
 cause brings its outcome about: a noisy-OR (Pearl 1988, 4.3.2), whose causes are learned by expectation maximisation
 with sparse Beta priors. How likely a conjunction of each order is a cause at all is learned too (empirical Bayes), so
-the agent finds out by itself which causes its task has. They are the base measure of a Dirichlet prior: what a
-transition brought when it was seen soon weighs more. Learning conjunctions that trigger effects: DOORmax (Diuk, Cohen &
-Littman 2008). What no test has covered is known to be unknown (KWIK, Li et al. 2011), and novelty counts by
+the agent finds out by itself which causes its task has. They are the base measure of a Dirichlet prior: the outcomes of
+a transition that was seen soon weigh more. Learning conjunctions that trigger effects: DOORmax (Diuk, Cohen & Littman
+2008). A conjunction that no test has covered is known to be unknown (KWIK, Li et al. 2011), and novelty counts by
 conjunctions rather than by whole states (width-based search, Lipovetzky & Geffner 2012).
 """
 
@@ -192,8 +192,8 @@ class OutcomeModel:
     def reset_for_new_task(self) -> None:
         """Forget all that was seen; earlier causes become priors, until a test of this task refutes them.
 
-        A cause of an earlier task that no test refuted is still a prior in the one after the next. What was *not* a
-        cause earlier says nothing: goals change, and a task's own are to be found.
+        A cause of an earlier task that no test refuted is still a prior in the one after the next. A conjunction that
+        was *not* a cause earlier says nothing: goals change, and a task's own are to be found.
         """
         causes = self.causes
         if causes is not None:
@@ -230,7 +230,9 @@ class OutcomeModel:
         return probability / probability.sum(axis=1, keepdims=True), unknown
 
     def _spared_by(self, conjunctions: _Templates, codes: Ints) -> tuple[Ints, Floats]:
-        """The numbers of codes (N, P), and the sums of :attr:`_spared` over what holds in them, (N, O + 1)."""
+        """The numbers of codes (N, P), and the sums of :attr:`_spared` over the conjunctions that hold in them, (N, O +
+        1).
+        """
         numbers = codes @ conjunctions.strides
         _, which, place = np.unique(numbers, return_index=True, return_inverse=True)
         active = conjunctions.numbers(codes[which])
@@ -276,7 +278,7 @@ class OutcomeModel:
     def _causes(self, evidence: _Evidence, best: _Explanation) -> Causes:
         """Those of the best explanation, of all conjunctions, and how often each was tested.
 
-        Tests are where nothing happened, and where a conjunction was itself what decided.
+        Tests are where nothing happened, and where a conjunction itself decided.
         """
         settings = self.settings
         all_of = self.conjunctions.of_each

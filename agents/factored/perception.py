@@ -1,4 +1,4 @@
-"""Frames to codes of factors: by an encoder that is given, or by what is found in an agent's own frames."""
+"""Frames to codes of factors: by an encoder that is given, or by factors that are found in an agent's own frames."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class CodePerception:
     """
 
     memory: Memory | None = None
-    """A code is what one frame shows; nothing is remembered."""
+    """A code is the content of one frame; nothing is remembered."""
 
     def __init__(self, encoder: Encoder, *, factored: bool) -> None:
         self._encoder = encoder
@@ -62,7 +62,7 @@ class CodePerception:
         return torch.cat([functional.one_hot(torch.tensor(value), size) for value, size in pairs], dim=1).float()
 
     def macrostates(self, codes: Sequence[Code] | Codes) -> Codes:
-        """What the evaluation's probe reads from N codes; the agent must not use it. Shape (N, M)."""
+        """The evaluation probe's reading of N codes; the agent must not use it. Shape (N, M)."""
         return self._encoder.read_macrostate(self.latents(codes))
 
     def images(self, codes: Sequence[Code] | Codes) -> appearance.Images:
@@ -88,7 +88,9 @@ def _rows(codes: Codes, sizes: Sequence[int], *, factored: bool) -> list[Code]:
 
 
 class LearnedPerception:
-    """Frames seen so far, and the codes that they have by what was found in the first ``looked_at`` of them."""
+    """Frames seen so far, and the codes that they have by the factors that were found in the first ``looked_at`` of
+    them.
+    """
 
     def __init__(self, settings: LearnedPerceptionSettings, *, factored: bool) -> None:
         self._settings = settings
@@ -117,7 +119,7 @@ class LearnedPerception:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """The same, and last of what is remembered, if anything is."""
+        """The same, and last the remembered values, if there are any."""
         sizes = self.seen_sizes
         return sizes if self.memory is None else (*sizes, sizes[self.memory.factor])
 
@@ -135,7 +137,7 @@ class LearnedPerception:
         self._remembered = remembered
 
     def code(self, frame: Frame) -> Code:
-        """The code of the newest frame (64, 64, 3) of an episode, with what is remembered of those before."""
+        """The code of the newest frame (64, 64, 3) of an episode, with the memory of those before."""
         code = self._read(frame)[0]
         if self.memory is None:
             return code
@@ -183,7 +185,7 @@ class LearnedPerception:
         self.unknown = False
 
     def first(self, count: int) -> tuple[Frame, Mask, Ints]:
-        """The first ``count`` frames remembered, which begin an episode, and what was done then: as ``find`` asks."""
+        """The first ``count`` frames remembered, which begin an episode, and the actions then: as ``find`` asks."""
         begins = np.isin(np.arange(count), [before for before, _ in compress(self.transitions, self.begins)])
         actions = np.full(count, -1)
         for (before, after), action in zip(self.transitions, self.actions, strict=True):
@@ -207,7 +209,7 @@ class LearnedPerception:
         }
 
     def values(self) -> dict[str, Json]:
-        """What belongs to :meth:`arrays` in a snapshot."""
+        """The part of a snapshot that belongs to :meth:`arrays`."""
         return {
             "looked_at": self.looked_at,
             "found_in": self.found_in,
@@ -217,7 +219,9 @@ class LearnedPerception:
         }
 
     def load(self, state: AgentState) -> None:
-        """Take up what :meth:`arrays` and :meth:`values` gave, and the agent's ``replay/action``: find the same."""
+        """Take up the parts that :meth:`arrays` and :meth:`values` gave, and the agent's ``replay/action``: find the
+        same.
+        """
         values = state.values
         self.frames = list(state.arrays["replay/frames"])
         self.transitions = [(before, after) for before, after in state.arrays["replay/frame_pairs"].tolist()]

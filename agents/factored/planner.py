@@ -1,4 +1,4 @@
-"""Planning with the model: what follows from a code is predicted once, and values are backed up through it.
+"""Planning with the model: the next codes of a code are predicted once, and values are backed up through it.
 
 Two values are planned. The *value* of an action is the expected discounted reward (value iteration in the learned
 model, Sutton 1990). Its *novelty* is the largest discounted chance of meeting something unknown on the way: the best
@@ -33,9 +33,9 @@ Objective = Literal["value", "optimistic", "novelty"]
 class Planner:
     """Plans with one model, which must say when it :meth:`learned`.
 
-    A plan holds everything within reach of a code, and then all its codes share it, or, where too much is within
-    reach, what is nearest to that code: so values never depend on what was asked before, and a resumed agent finds the
-    same. Codes that were met are numbered in rows; what is predicted of them is kept until the model learns.
+    A plan holds everything within reach of a code, and then all its codes share it, or, where too much is within reach,
+        the nearest ones to that code: so values never depend on earlier questions, and a resumed agent finds the
+    same. Codes that were met are numbered in rows; their predictions are kept until the model learns.
     """
 
     def __init__(self, model: FactoredModel, settings: PlanningSettings) -> None:
@@ -71,7 +71,7 @@ class Planner:
         """Action values (A,) by row, of each objective and depth."""
 
     def values(self, code: Code, objective: Objective = "value", left: int | None = None) -> Floats:
-        """What each action in ``code`` is worth, with so many macro-actions left, or as many as it plans: (A,).
+        """The value of each action in ``code``, with so many macro-actions left, or as many as it plans: (A,).
 
         ``"value"`` is the expected discounted reward; ``"optimistic"`` the same if whatever is unknown brought the
         largest reward seen; ``"novelty"`` the largest discounted chance of meeting something unknown, of which only the
@@ -101,7 +101,7 @@ class Planner:
         return self._rows.setdefault(number, len(self._rows))
 
     def _expand(self, rows: Ints) -> None:
-        """Predict what follows from those of ``rows`` of which it is not known."""
+        """Predict the next codes of ``rows``, as far as they are not predicted yet."""
         self._grow()
         rows = rows[~self._predicted[rows]]
         if not len(rows):
@@ -147,7 +147,7 @@ class Planner:
         return {root: values[0].copy()} if len(front) else dict(zip(rows.tolist(), values, strict=True))
 
     def _discovery(self, rows: Ints, depth: int) -> Floats | None:
-        """Novelty (A,) of the first of ``rows``; None where what lies beyond them may change the best actions."""
+        """Novelty (A,) of the first of ``rows``; None where codes beyond them may change the best actions."""
         near = self._back_up(rows, "novelty", depth)[0]
         far = self._back_up(rows, "novelty", depth, beyond=1.0)[0]
         return None if ((far > near) & (far >= near.max() - TIE)).any() else near

@@ -9,7 +9,7 @@ from ..settings import COUNT, INSIDE, POSITIVE, PROBABILITY, RATE, SWITCH, Hyper
 
 @dataclass(frozen=True, kw_only=True)
 class DynamicsSettings:
-    """What an action does to each factor; see :mod:`.dynamics`."""
+    """The effect of an action on each factor; see :mod:`.dynamics`."""
 
     #: Whether each factor has a model of its own; otherwise the whole code is one factor (an ablation).
     factored: bool = setting(True, SWITCH)
@@ -18,7 +18,7 @@ class DynamicsSettings:
     parent_decay: float = setting(0.2, RATE)  #: multiplies the prior for each further parent
     #: Pseudo-count of each value in a Dirichlet prior (Heckerman et al. 1995).
     concentration: float = setting(0.03, POSITIVE)
-    #: Unless the prior weighs so much, what follows counts as known: of chance there is always more to learn.
+    #: Unless the prior weighs so much, the next value counts as known: of chance there is always more to learn.
     least_unknown: float = setting(0.03, PROBABILITY)
     slip: float = setting(0.005, INSIDE)  #: probability with which a factor that is left alone is misread
     by_itself: float = setting(0.02, INSIDE)  #: prior probability that a factor which changes does so by itself
@@ -29,7 +29,7 @@ class DynamicsSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class OutcomeSettings:
-    """What is rewarded and what ends an episode; see :mod:`.outcomes`."""
+    """Rewards and ends of episodes; see :mod:`.outcomes`."""
 
     #: Most values in a conjunction that may be a cause. The whole code may always be one and, unless this is below 2,
     #: the whole code less any one value.
@@ -39,7 +39,7 @@ class OutcomeSettings:
     pseudo_tests: float = setting(0.2, POSITIVE)  #: how many tests of one conjunction the prior is worth
     pseudo_conjunctions: float = setting(3.0, POSITIVE)  #: how many conjunctions of one order the prior is worth
     leak: float = setting(1e-3, INSIDE)  #: probability of an outcome without a cause
-    #: How many sightings of a transition what its causes say of it is worth.
+    #: Sightings of a transition that the prediction of its causes is worth.
     pseudo_seen: float = setting(0.2, POSITIVE)
     masked_weight: float = setting(0.1, PROBABILITY)  #: weight of a test in which some other cause decided
     sweeps: int = setting(25, COUNT)  #: steps of expectation maximisation
@@ -60,7 +60,7 @@ class PlanningSettings:
     #: ``"curiosity"`` goes where most is unknown, ``"optimism"`` values the unknown at the best reward seen,
     #: ``"random"`` acts greedily but for random actions (the last two are ablations).
     exploration: str = setting("curiosity", ("curiosity", "optimism", "random"))
-    novelty_discount: float = setting(0.95, PROBABILITY)  #: of what is unknown, a macro-action
+    novelty_discount: float = setting(0.95, PROBABILITY)  #: of novelty, a macro-action
     #: Novelty within reach below which the agent acts greedily.
     exploration_threshold: float = setting(0.01, PROBABILITY)
     epsilon: float = setting(0.1, PROBABILITY)  #: probability of a random action where exploration is random

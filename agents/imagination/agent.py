@@ -115,7 +115,7 @@ class ImaginingAgent(DQN):
         return {**super().diagnostics(), "imagined_transitions": float(self.imagination.memory.added)}
 
     def parts(self) -> dict[str, snapshot.Part]:
-        """What a snapshot holds arrays of: world model and imagined memory, too."""
+        """The parts whose arrays a snapshot holds: world model and imagined memory, too."""
         own = {f"imagination/{name}": part for name, part in self.imagination.parts().items()}
         return {**super().parts(), **own}
 
@@ -141,7 +141,7 @@ class ImaginingAgent(DQN):
         self.imagination.reset_for_new_task()
         self.controller = self.new_controller(self._replay)  # a generator that snapshots hold
         self.real.clear()
-        self.meters = Meters()  # what was measured on an earlier task is no diagnosis of this one
+        self.meters = Meters()  # a measurement on an earlier task is no diagnosis of this one
         self.steps = self.updates = 0
 
     def novelty(self, observation: Observation, rng: np.random.Generator) -> Floats32 | None:

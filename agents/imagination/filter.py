@@ -1,6 +1,6 @@
 """The epistemic filter: which imagined transitions a controller may learn from (thesis 5.2.2).
 
-Weight samples of the dynamics that disagree say that the model has not learned what happens there. Dynamics may be
+Weight samples of the dynamics that disagree say that the model has not learned the outcomes there. Dynamics may be
 certain of a place where no reward was ever seen, so the filter can also read how much samples of the reward network
 disagree there, and how certain the end is.
 """
@@ -27,7 +27,7 @@ def weight_samples(settings: Settings) -> int:
 
 
 class EpistemicFilter:
-    """Epistemic uncertainty above a threshold discards a transition, and the rollout discards what would follow.
+    """Epistemic uncertainty above a threshold discards a transition, and the rest of its rollout.
 
     ``active`` is false for the agents that keep everything, which the filter then lets pass.
 
@@ -48,7 +48,7 @@ class EpistemicFilter:
         for who, (reads, enough) in readers.items():
             if reads and not enough:
                 raise InvalidValueError(
-                    f"{who} compares what several networks say, and here is one. Set model.dropout above 0 and "
+                    f"{who} compares several networks, and here is one. Set model.dropout above 0 and "
                     "imagination.weight_samples above 1, or do without it; of all but the reward, model.members above "
                     "1 is enough."
                 )

@@ -145,7 +145,7 @@ class ModelOnlyAgent(ImaginingAgent):
         return {**super().diagnostics(), "imagined_transitions": float(self.imagined_steps)}
 
     def parts(self) -> dict[str, snapshot.Part]:
-        """What a snapshot holds arrays of: the training in the model and the starts of episodes, too."""
+        """The parts whose arrays a snapshot holds: the training in the model and the starts of episodes, too."""
         return {
             **super().parts(),
             "model_only/controller": self.trained,

@@ -53,7 +53,7 @@ class ImaginedStep:
     next_z: Tensor  #: shape (N, Z), within +-1e6; where that is reached, the closed loop has run away
     reward: Tensor
     p_terminated: Tensor
-    samples: Mixture  #: what each weight sample of each member predicted, with leading axes (E T, N)
+    samples: Mixture  #: the predictions of each weight sample of each member, with leading axes (E T, N)
     #: Standard deviation of the reward over its network's weight samples, in units of reward; None where the filter
     #: does not read it. Shape (N,).
     reward_std: Tensor | None
@@ -148,7 +148,7 @@ class Imagination:
         return ImaginedStep(next_z, reward, p_terminated, samples, reward_std)
 
     def state_after(self, z: Tensor, action: Tensor, predicted: Tensor) -> Tensor:
-        """The states that follow N states ``z`` after actions (N,), given what was predicted of them: all there is."""
+        """The states that follow N states ``z`` after actions (N,), given the predictions of them: all there is."""
         del z, action
         return predicted
 
@@ -195,7 +195,7 @@ class Imagination:
         return bounded & self.filter.passes(gathered + self.uncertainty(step), step.p_terminated, step.reward_std)
 
     def confidence(self, step: ImaginedStep, gathered: Tensor) -> Tensor | None:
-        """What each of N transitions counts in updates, in (0, 1]; None where all count alike. Shape (N,)."""
+        """The weight of each of N transitions in updates, in (0, 1]; None where all count alike. Shape (N,)."""
         scale = self.settings.confidence_scale
         if scale is None:
             return None
@@ -240,7 +240,7 @@ class Imagination:
             z: Where they begin. Shape (N, Z).
             act: Chooses the actions (N,) of states (N, Z).
             weights: Weight samples of all steps.
-            generator: Draws what happens.
+            generator: Draws the outcomes.
             depth: Most steps.
             cut: Whether a rollout ends where the model says that the episode does, or with its first transition that
                 :meth:`admits` discards; else all go on to the end, and :meth:`keeps` says what is kept.
@@ -261,12 +261,12 @@ class Imagination:
                 return
 
     def rollouts(self, controller: Controller, current: Tensor, real: RealMemory, epsilon: float) -> Counts:
-        """Imagine ``I_B`` rollouts and store what the filter keeps.
+        """Imagine ``I_B`` rollouts and store those that the filter keeps.
 
         Args:
             controller: Chooses the actions, epsilon-greedily.
             current: The state the robot just acted in. Shape (Z,).
-            real: What really happened so far.
+            real: The real transitions so far.
             epsilon: Probability of a random action; that of the settings counts where it is larger.
         """
         settings = self.settings
@@ -302,11 +302,11 @@ class Imagination:
         return torch.where(explores, random, greedy)
 
     def parts(self) -> dict[str, Part]:
-        """What snapshots hold arrays of, by name; the filter's threshold is not among it."""
+        """The parts whose arrays snapshots hold, by name; the filter's threshold is not among it."""
         generators = {f"generator/{name}": generator for name, generator in self.generators.items()}
         return {"model": self.model, "memory": self.memory, **generators}
 
 
 def _require_numbers(imagined: Tensor) -> None:
     if bool(imagined.isnan().any()):
-        raise DivergedError("What the world model imagines is no longer a number. Lower model.learning_rate.")
+        raise DivergedError("The imagination of the world model is no longer a number. Lower model.learning_rate.")

@@ -54,7 +54,7 @@ class WorldModelSettings:
     termination_hidden: tuple[int, ...] = setting((256, 256), SIZES)
     #: Of one network for reward and termination, instead of the two (thesis 3.2.2).
     shared_hidden: tuple[int, ...] = setting((), SIZES)
-    #: What reward and termination are read from: ``"next_state"`` (the thesis) or ``"transition"``.
+    #: The input of reward and termination: ``"next_state"`` (the thesis) or ``"transition"``.
     head_input: str = setting("next_state", ("next_state", "transition"))
     #: Reward that the reward network counts as 1. Log-cosh is quadratic below an error of 1 and linear above, where a
     #: rare large reward weighs little; the thesis counts in plain units, 1.
@@ -73,7 +73,7 @@ class WorldModelSettings:
     spread: float = setting(1.0, NOT_NEGATIVE)
     #: How much batches make up for rare outcomes: a transition is sampled in proportion to n ** -balance, with n the
     #: number of replayed ones of the same reward and end. In the thesis all are equally likely, 0. A good policy fails
-    #: rarely, and a model that has forgotten what fails imagines that nothing does.
+    #: rarely, and a model that has forgotten failures imagines none.
     balance: float = setting(0.0, NOT_NEGATIVE)
     predict_change: bool = setting(False, SWITCH)  #: whether the mixture describes z' - z instead of z'
     sigma_floor: float = setting(0.01, POSITIVE)  #: smallest standard deviation of a component, in units of z
@@ -116,7 +116,7 @@ class ImaginationSettings:
     #: Smallest exploration probability inside rollouts; the real one counts where it is larger.
     exploration: float = setting(0.0, PROBABILITY)
     #: Reward that the controller learns from on top of a real transition's own, for each squared unit of z of epistemic
-    #: variance in what the model predicts there, up to 1: artificial curiosity (thesis 6). Noise pays nothing. 0: none.
+    #: variance in the model's prediction there, up to 1: artificial curiosity (thesis 6). Noise pays nothing. 0: none.
     curiosity: float = setting(0.0, NOT_NEGATIVE)
     #: Dropout samples of the dynamics, T (thesis 4.5: 50; chapter 5 names none).
     weight_samples: int = setting(50, between(1, 1000))
@@ -137,8 +137,8 @@ class ImaginationSettings:
     #: If given, the filter reads the reward network too: the largest standard deviation of a reward over T of its
     #: dropout samples that passes, in units of reward. The thesis reads the dynamics alone.
     reward_threshold: float | None = setting(None, NOT_NEGATIVE)
-    #: If given, the filter reads the termination network too: the largest probability that passes of what the model
-    #: thinks less likely, that the episode ends there or that it goes on.
+    #: If given, the filter reads the termination network too: the largest probability that passes of the less likely of
+    #: two events, that the episode ends there or that it goes on.
     termination_threshold: float | None = setting(None, between(0.0, 0.5, "it bounds the less likely of two"))
 
     def __post_init__(self) -> None:
@@ -179,7 +179,9 @@ _FAST_5: dict[str, Override] = {
     "model.spread": Override(4.0, "posteriors are narrower than the looks of a state; 1: 12 points less (factors)"),
     "model.balance": Override(0.5, "a good policy fails rarely; alone no gain after 500 episodes (factors)"),
     "model.predict_change": Override(True, "a macro-action moves one cube; alone no gain shown (deviations)"),
-    "model.sigma_floor": Override(0.2, "narrow components stop learning of what they miss; no gain shown (deviations)"),
+    "model.sigma_floor": Override(
+        0.2, "narrow components stop learning from values that they miss; no gain shown (deviations)"
+    ),
     "model.gradient_clip": Override(10.0, "narrow components have steep walls; without: 12 points less (deviations)"),
     "model.precision": Override("float32", "small batches gain little from bfloat16: 12 points less (deviations)"),
     "imagination.start_episode": Override(100, "the quick model is right early; 1000 would leave nothing to compare"),
@@ -192,7 +194,9 @@ _FAST_5: dict[str, Override] = {
     "imagination.breadth": Override(8, "many short rollouts instead of few long ones; 3: 14 points less (deviations)"),
     "imagination.depth": Override(3, "at 10 latents drift to where reward and end disagree; values grow unbounded"),
     "imagination.updates_per_step": Override(4, "one, the thesis' N_I, solves 12 points less (factors)"),
-    "imagination.temperature": Override(0.0, "sampled latents leave what networks know; 1: 16 points less (factors)"),
+    "imagination.temperature": Override(
+        0.0, "sampled latents leave the region that networks know; 1: 16 points less (factors)"
+    ),
     "imagination.exploration": Override(0.2, "a greedy rollout repeats the real actions; no gain shown (deviations)"),
     "imagination.weight_samples": Override(10, "acts only where dropout is set: else the 3 members are the samples"),
     "imagination.termination_threshold": Override(

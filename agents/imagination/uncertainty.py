@@ -1,4 +1,4 @@
-"""What a Bayesian mixture density network does not know, split by cause (thesis 4.4, equations 4.25 to 4.27)."""
+"""The uncertainty of a Bayesian mixture density network, split by cause (thesis 4.4, equations 4.25 to 4.27)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ def decompose(samples: Mixture) -> Uncertainty:
 
 
 def component_variance(samples: Mixture, members: int) -> Tensor:
-    """How uncertain each component of the averaged mixture is by itself: its noise, and what weights do to its mean.
+    """How uncertain each component of the averaged mixture is by itself: its noise, and the effect of weights on its
+    mean.
 
     The law of total variance given the component: ``mean_t sigma_k^2 + var_t mu_k``. Unlike the three parts of
     :func:`decompose` it does not count that there are other components, which says nothing about a value that was

@@ -20,7 +20,7 @@ from .rollouts import LATENT_LIMIT, Imagination, ImaginedStep
 
 Latents = Floats32
 VERDICT = ("accepted", *UNCERTAINTIES)
-"""What an info says of a transition."""
+"""The entries of an info about a transition."""
 
 
 class ImaginedVectorEnv(VectorEnv[Latents, Ints, NDArray[np.generic]]):
@@ -34,7 +34,7 @@ class ImaginedVectorEnv(VectorEnv[Latents, Ints, NDArray[np.generic]]):
     A step's info holds, of the transition that it returned, ``accepted`` and the variances ``epistemic``, ``aleatoric``
     and ``modal``, in squared units of z, reduced as the filter does; all (N,). Ended episodes begin anew in the same
     step, with ``final_obs`` and ``final_info`` as in Gymnasium. Everything is drawn from :attr:`np_random`, weight
-    samples anew at every step. The model is not copied: what it learns later is imagined here.
+    samples anew at every step. The model is not copied: its later learning changes the imagination here.
 
     Args:
         imagination: The world model with its filter.

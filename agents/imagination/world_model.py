@@ -1,4 +1,4 @@
-"""The environment model: where a macro-action leads, what that earns and whether the episode ends (thesis 5.2.2).
+"""The environment model: where a macro-action leads, its reward and whether the episode ends (thesis 5.2.2).
 
 A mixture density network gives ``p(z' | z, a)``; reward and termination networks read the next state. Networks share no
 weights (but reward and termination, where they have one trunk); one backward pass through the sum of the losses trains
@@ -68,7 +68,7 @@ class RewardTerminationHead(nn.Module):
         return self.networks[0]  # type: ignore[return-value]
 
     def inputs(self, z: Tensor, action: Tensor, next_z: Tensor) -> Tensor:
-        """What the networks read of N transitions. Shape (N, in)."""
+        """The inputs of the networks for N transitions. Shape (N, in)."""
         return torch.cat([z, self._one_hot[action], next_z], dim=-1) if self._reads_transition else next_z
 
     def forward(
@@ -158,7 +158,7 @@ class EnvironmentModel(TrainedModule):
         return replace(mixture, means=mixture.means + z[..., : self.predicted].unsqueeze(-2))
 
     def keep_dynamics_of(self, other: EnvironmentModel) -> None:
-        """Take over what another model of the same shape knows of where actions lead."""
+        """Take over the dynamics of another model of the same shape."""
         self.dynamics.load_state_dict(other.dynamics.state_dict())
 
     @torch.no_grad()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 Masks = tuple[Tensor, ...]
-"""One dropout mask a hidden layer, each (E, N, H): what a unit is multiplied by, 0 or 1 / (1 - dropout)."""
+"""One dropout mask a hidden layer, each (E, N, H): the factor of each unit, 0 or 1 / (1 - dropout)."""
 
 
 def relu_layers(sizes: Sequence[int], device: torch.device | str = "cpu") -> nn.Sequential:

@@ -1,8 +1,8 @@
-"""Dense networks that standardise what goes into every layer (thesis 4.5.1), many members trained as one computation.
+"""Dense networks that standardise the input of every layer (thesis 4.5.1), many members trained as one computation.
 
 While training, activations are kept as units x rows: standardising a unit over its batch is then layer normalisation
 over the last axis, which torch has as one fused operation. For prediction the standardisation is folded into the
-weights, so what predicts is an ordinary :class:`~.mlp.MemberMLP`. Shapes: ``E`` members, ``H`` units, ``N`` rows.
+weights, so the predictor is an ordinary :class:`~.mlp.MemberMLP`. Shapes: ``E`` members, ``H`` units, ``N`` rows.
 """
 
 from __future__ import annotations

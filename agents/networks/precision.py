@@ -6,7 +6,7 @@ import torch
 
 
 def settle(precision: str, device: str) -> str:
-    """``precision``, with ``auto`` replaced by what it means on ``device``: results name what was used."""
+    """``precision``, with ``auto`` replaced by its meaning on ``device``: results name the format that was used."""
     if precision != "auto":
         return precision
     return "bfloat16" if _multiplies_bfloat16(device) else "float32"

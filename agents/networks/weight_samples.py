@@ -1,4 +1,4 @@
-"""T weight samples of one network in one batched pass: what a Bayesian prediction is made of.
+"""T weight samples of one network in one batched pass: the parts of a Bayesian prediction.
 
 Under Monte-Carlo dropout (Gal & Ghahramani 2016) a weight sample is a dropout mask that all inputs share; in a deep
 ensemble (Lakshminarayanan et al. 2017) it is a member. Shapes: ``T`` samples, ``N`` rows, ``H`` hidden units.

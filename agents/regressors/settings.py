@@ -69,7 +69,7 @@ class RegressorSettings:
 
 _SMALLEST = "shows that every part works, within seconds"
 _FALLING = Override(0.01, "a rate that stays leaves the mixtures blunt; the thesis names no schedule")
-_FORMAT = Override("auto", "CPU time; see docs/explanation/uncertainty_method.md for what it changes")
+_FORMAT = Override("auto", "CPU time; see docs/explanation/uncertainty_method.md for its effects")
 _SHORT = {
     "batch_size": Override(1000, "where there are more data: few epochs, more steps (all at once was not tried here)"),
     "learning_rate": Override(3e-3, "fewer epochs want larger steps"),
@@ -80,14 +80,14 @@ _SETS: dict[str, dict[str, Override]] = {
     "fast": {"epochs": Override(600, "CPU time"), **_SHORT, "final_rate": _FALLING},
     "published": {"final_rate": _FALLING, "precision": _FORMAT},
 }
-"""What each set changes of the thesis' values for one network with dropout."""
+"""The changes of each set to the thesis' values for one network with dropout."""
 _ENSEMBLE = {
     "members": Override(5, "as many as Lakshminarayanan et al. (2017) recommend"),
     "dropout": Override(0.0, "in an ensemble the members are the weight samples"),
     "batch_size": Override(250, "so few epochs want more steps in each"),
     "divergence_draws": Override(10, "five members then give as many values as 50 dropout samples"),
 }
-"""What a deep ensemble changes of every set, beside its epochs."""
+"""The changes of a deep ensemble to every set, beside its epochs."""
 _EPOCHS = {"minimal": 4, "fast": 120, "published": 300}
 """Epochs of each of five members in every set: a tenth of the one network's, so that the ensemble costs half and does
 not win by arithmetic. But at least 120, below which members have hardly learned, where that costs no more."""
@@ -102,5 +102,5 @@ HYPERPARAMETERS = Hyperparameters({
 
 
 def resolve_all(hyperparameters: str, overrides: Mapping[str, Setting]) -> tuple[RegressorSettings, ...]:
-    """The settings of one network and of an ensemble; raises what any regressor would raise for them."""
+    """The settings of one network and of an ensemble; raises the errors of any regressor for them."""
     return tuple(HYPERPARAMETERS.resolve(hyperparameters, overrides, group) for group in HYPERPARAMETERS.groups)

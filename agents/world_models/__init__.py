@@ -1,1 +1,1 @@
-"""World models that are judged, and the reader of what they imagine."""
+"""World models that are judged, and the reader of their images."""

@@ -1,7 +1,7 @@
-"""A convolutional next-frame predictor of plain torch: what a newcomer would write first.
+"""A convolutional next-frame predictor of plain torch: as a newcomer would write it first.
 
 The latest frame and the action go into a small U-shaped network that draws the next frame; reward and end are read from
-its narrowest layer. It imagines one future, and knows nothing of what it does not know.
+its narrowest layer. It imagines one future, and has no measure of uncertainty.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class NextFrame(nn.Module):
         seen = self.down(frames)
         hidden = self.middle(torch.cat([seen.flatten(1), functional.one_hot(actions, self.n_actions)], dim=1))
         drawn, mask = self.up(torch.cat([seen, hidden.view_as(seen)], dim=1)).chunk(2, dim=1)
-        mask = (mask - 3.0).sigmoid()  # where it paints over what was there: at first almost nowhere
+        mask = (mask - 3.0).sigmoid()  # where it paints over the former image: at first almost nowhere
         reward, logit = self.outcome(hidden).unbind(dim=1)
         return (1.0 - mask) * frames + mask * drawn.sigmoid(), reward, logit
 

@@ -45,7 +45,7 @@ class LatentModel:
         self.imagination.require_no_confidence("A world model that is judged")
 
     def new_imagination(self, context: AgentContext) -> Imagination:
-        """What imagines, of which nothing is learned yet."""
+        """The model that imagines, of which nothing is learned yet."""
         size = self.encoder.latent_size
         seeds = context.seeds
         device = self.encoder.device
@@ -65,7 +65,7 @@ class LatentModel:
             self.imagination.model.update(batch, generator)
 
     def batches(self, columns: Arrays, dataset: Episodes, generator: torch.Generator) -> Iterator[Batch]:
-        """What is learned from: :data:`UPDATES` batches of transitions, whose columns are given."""
+        """The training data: :data:`UPDATES` batches of transitions, whose columns are given."""
         del dataset
         model = self.settings.model
         rows = len(columns["action"])
@@ -75,7 +75,7 @@ class LatentModel:
             yield memory.sample(model.batch_size, generator, spread=model.spread, balance=model.balance)
 
     def states(self, frames: Frame, actions: Ints) -> Tensor:
-        """What is imagined from: here the latents (N, Z) of the latest of frames (N, K, 64, 64, 3)."""
+        """The start of imagination: here the latents (N, Z) of the latest of frames (N, K, 64, 64, 3)."""
         del actions
         return self.encoder.encode(frames[:, -1])[0]
 
@@ -97,7 +97,7 @@ class LatentModel:
             steps["pictures"].append((images * 255.0).round().astype(np.uint8))
             steps["rewards"].append(step.reward.numpy())
             steps["p_ended"].append(step.p_terminated.numpy())
-            kept = kept & each.kept  # what follows a discarded step is discarded
+            kept = kept & each.kept  # steps after a discarded one are discarded, too
             steps["accepted"].append(kept.view(rows, samples).float().mean(dim=1).numpy() >= _MOST)
             for name, values in self.imagination.uncertainties(step).items():
                 steps[name].append(values.view(rows, samples).mean(dim=1).numpy())

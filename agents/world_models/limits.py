@@ -44,7 +44,7 @@ class Copy(Untaught):
 
 
 class Exact(Untaught):
-    """The rules, and a rendered frame of each outcome; it knows what each frame of the judge shows."""
+    """The rules, and a rendered frame of each outcome; it knows the content of each frame of the judge."""
 
     def __init__(self, spec: TaskSpec, renderer: MacrostateRenderer) -> None:
         self._rules = spec.rules

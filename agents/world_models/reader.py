@@ -1,4 +1,4 @@
-"""What a picture shows: macrostates read from pictures that a model imagined, or that they show nothing of this world.
+"""The content of an image: macrostates read from images that a model imagined, or that they show nothing of this world.
 
 Trained apart, on frames that no model sees, and on spoiled ones: fog, blends of two frames, noise, blanks. A picture
 far from every real frame is none either, whatever the network says.
@@ -41,7 +41,7 @@ class Reader:
     def __init__(self, sizes: tuple[int, ...]) -> None:
         self.sizes = sizes
         self.limits = torch.tensor([0.0, -1.0])
-        """Largest logit of *nothing*, and least likeness to a real frame, of what is read."""
+        """Largest logit of *nothing*, and least likeness to a real frame, of an image that is read."""
         self.references = torch.zeros(0, 1)
         with torch.device("meta"):
             network = nn.Sequential(
@@ -84,12 +84,12 @@ def images_of(pictures: Array) -> Tensor:
 
 
 def centred(images: Tensor) -> Tensor:
-    """Images of mean 0, at their own contrast: what is hardly there is not to be read."""
+    """Images of mean 0, at their own contrast: an object that is hardly there is not to be read."""
     return (images - images.mean(dim=(1, 2, 3), keepdim=True)) / _CONTRAST
 
 
 def details(images: Tensor) -> Tensor:
-    """Unit vectors (N, 1024) of what stands out in gray images."""
+    """Unit vectors (N, 1024) of the contrasts in gray images."""
     gray = images.mean(dim=1, keepdim=True)
     sharp = gray - functional.avg_pool2d(gray, 9, stride=1, padding=4, count_include_pad=False)
     return functional.normalize(sharp.flatten(1), dim=1, eps=0.3)

@@ -38,8 +38,8 @@ class StructuredModel:
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """Futures drawn code by code; see :class:`.interfaces.model.WorldModel`.
 
-        ``epistemic`` is the probability that something untested decides, ``modal`` that something else happens than
-        what is likeliest.
+        ``epistemic`` is the probability that something untested decides, ``modal`` that the outcome is not the
+        likeliest one.
         """
         asked = actions[:, frames.shape[1] - 1 :]
         rows, depth = asked.shape

@@ -58,6 +58,6 @@ class FinalObservation(VectorWrapper):
 
 
 def _of_lane(infos: Info, lane: int) -> Info:
-    """What the infos of all lanes say of one."""
+    """The entries of all lanes' infos for one lane."""
     said = {key: value for key, value in infos.items() if f"_{key}" in infos and infos[f"_{key}"][lane]}
     return {key: _of_lane(value, lane) if isinstance(value, dict) else value[lane] for key, value in said.items()}

@@ -36,7 +36,7 @@ _STILL_S = 1.0
 """How far the viewer's clock goes on for a macro-action that took no simulated time."""
 _POSE = mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_QPOS
 _POSE |= mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
-"""What is shown of a scene at one moment: the time (s) first, then positions and mocap bodies."""
+"""The state of a scene at one moment, for a viewer: the time (s) first, then positions and mocap bodies."""
 
 
 def as_dm_env(env: Env | str, *, seed: int | None = None, motion_hz: float = 0.0, **kwargs: Any) -> DmEnvironment:
@@ -68,7 +68,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
     sample by sample: until the last sample, ``step`` ignores its action and the reward is 0.
 
     Attributes:
-        info: What Gymnasium's latest ``reset`` or ``step`` gave beside the observation.
+        info: The info that Gymnasium's latest ``reset`` or ``step`` gave beside the observation.
     """
 
     def __init__(self, env: Env, *, seed: int | None, motion_hz: float) -> None:
@@ -143,9 +143,9 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]  # dm_env is not 
 
     @property
     def physics(self) -> mujoco.Physics:
-        """dm_control's ``Physics`` of what is shown: the task's own model, and data of its own.
+        """dm_control's ``Physics`` of the scene that is shown: the task's own model, and data of its own.
 
-        What is done to the data, such as by the viewer's mouse, does not reach the task.
+        Changes of the data, such as by the viewer's mouse, do not reach the task.
 
         Raises:
             InvalidValueError: The environment is no task of imagine_bench.

@@ -30,9 +30,9 @@ from imagine_bench.interfaces.environments import Env, Wrapper
 class SuccessTerminates(Wrapper):
     """Terminates on success alone; every other end of an episode is a truncation.
 
-    The ``pixels`` that the library records and shows its models are what our agents see, info holds Python's bools,
-    which it records as columns. With equal seeds episodes are those of the environment itself: what the library draws
-    for its bookkeeping comes from a generator of the wrapper.
+    The ``pixels`` that the library records and shows its models are the frames of our agents, info holds Python's
+    bools, which it records as columns. With equal seeds episodes are those of the environment itself: the library's
+    draws for its bookkeeping come from a generator of the wrapper.
 
     Raises:
         InvalidValueError: An environment of something else.
@@ -58,7 +58,7 @@ class SuccessTerminates(Wrapper):
         return seen, float(reward), success, not success and (terminated or truncated), _plain(info)
 
     def render(self) -> Frame:
-        """What the agent sees. Shape (64, 64, 3)."""
+        """The observation of the agent. Shape (64, 64, 3)."""
         return self.env.unwrapped.agent_view()  # type: ignore[attr-defined]
 
     def start_at(self, macrostate: ArrayLike) -> None:

@@ -73,16 +73,16 @@ class WorldOptions:
     """How much frames vary: clean (the default), mild, strong, patched (from a finite pool), or factors such as
     light=0.5,camera=0.2."""
     physics: ManyWords = ()
-    """What decides whether a grasp holds, as name=value, such as pad_friction=0.5."""
+    """Settings of the physics of grasping, as name=value, such as pad_friction=0.5."""
     observation: Word = None
-    """What agents see: frame (the default), human, state (privileged) or proprio, several separated by commas."""
+    """Observation of agents: frame (the default), human, state (privileged) or proprio, several separated by commas."""
     observation_size: Count = None
     """Edge of images that agents see, 32 to 256 pixels; 64 by default."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Learner:
-    """Options of the agents and of what they learn from."""
+    """Options of the agents and of their training data."""
 
     agents: Words = None
     """Agents to compare, by default the preset's; one with settings of its own is written
@@ -239,7 +239,9 @@ def carry_out(
 
 @dataclass(frozen=True, kw_only=True)
 class Report(OfBench):
-    """Write a bench's report again, from its files, and show its table; of agents' unfinished ones, what there is."""
+    """Write a bench's report again, from its files, and show its table; of an unfinished bench of agents, the runs so
+    far.
+    """
 
     merge: Annotated[Repeated[Path], shown("PATH [PATH ...]")] = ()
     """Folders of other benches, or of results that were kept, whose agents are added, or where those are the same,
@@ -372,11 +374,11 @@ class Judge:
     appearance: str = APPEARANCES[0]
     """How much frames vary: a level, or factors such as light=0.5,camera=0.2."""
     policy: Annotated[str, one_of(*POLICIES)] = "random"
-    """Who collects the data."""
+    """The policy that collects the data."""
     order: int = 0
     """Seed of the order in which models are asked."""
     encoder: EncoderWord = None
-    """What models see through that read what it gives, latents or codes; by default the task's own."""
+    """The encoder of models that read latents or codes; by default the task's own."""
     workers: Count = None
     """Processes at a time; one a core by default."""
     out: Path = Path("runs/judge")

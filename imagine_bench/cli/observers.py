@@ -1,4 +1,4 @@
-"""What looks at the runs of a bench: how right agents imagine, example rollouts, and recordings."""
+"""Observers of the runs of a bench: they measure imagination, and keep example rollouts, and recordings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from imagine_bench.store import run_folder
 
 
 class _InTests(TypedDict):
-    """How a run's tests look and what they are for, as the judge's functions take it."""
+    """The appearance and the purpose of a run's tests, as the judge's functions take it."""
 
     appearance: str
     purpose: Purpose
@@ -100,7 +100,7 @@ class BenchObserver(RunObserver):
 
 
 OBSERVERS = (f"{__name__}:{BenchObserver.__name__}",)
-"""What looks at every run of a control task, each as ``"module:attr"``."""
+"""The observers of every run of a control task, each as ``"module:attr"``."""
 RECORDERS = {
     "toy_regression": "imagine_bench.recording.regression:record_toy",
     "robot_ik": "imagine_bench.recording.regression:record_robot",
@@ -109,7 +109,7 @@ RECORDERS = {
 
 
 def observers_of(protocol: ProtocolData) -> tuple[str, ...]:
-    """What looks at each run of a bench, by ``"module:attr"``."""
+    """The observers of each run of a bench, by ``"module:attr"``."""
     if isinstance(protocol, Protocol):
         return OBSERVERS
     return (RECORDERS[protocol.task],) if protocol.task in RECORDERS else ()

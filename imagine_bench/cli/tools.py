@@ -1,4 +1,6 @@
-"""The commands beside benches: data and encoders, viewing, playing, describing, checking, and what this machine has."""
+"""The commands beside benches: data and encoders, viewing, playing, describing, checking, and the state of this
+machine.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,7 @@ class DatasetCommand:
     task: MaybeTaskWord = None
     """Task that is played, also as --task TASK; none with --describe and --standard."""
     policy: str = "random"
-    """Who plays: random; uniform (one random macro-action from any macrostate); oracle; mixed (random and oracle in
+    """The player: random; uniform (one random macro-action from any macrostate); oracle; mixed (random and oracle in
     turn); or a run's folder, whose trained agent acts greedily."""
     episodes: int = 200
     """Episodes."""
@@ -246,7 +248,7 @@ class New:
     kind: Annotated[str, tyro.conf.Positional, one_of("task", "agent", "model")]
     """The kind of thing that the package holds."""
     name: Annotated[str, tyro.conf.Positional]
-    """Name of the package and of what it offers."""
+    """Name of the package, and of the task, agent or world model in it."""
     out: Path = Path()
     """Folder in which the package's folder is made."""
 
@@ -259,7 +261,7 @@ class New:
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
-    """Say what this machine and installation have, and in words what is wrong with them."""
+    """Describe this machine and installation, and say in words what is wrong with them."""
 
     def __call__(self) -> None:
         """Examine."""

@@ -50,12 +50,12 @@ class Dataset:
 
     folder: Path  #: Where it lies
     format: str  #: One of :data:`FORMATS`
-    episodes: Episodes  #: What is in it
-    card: Mapping[str, Any] | None  #: What it is, as :func:`.collect.collect` says; None for one of others
+    episodes: Episodes  #: The episodes in it
+    card: Mapping[str, Any] | None  #: Its description, as :func:`.collect.collect` says; None for one of others
 
     @property
     def identity(self) -> str:
-        """What stands for it in a protocol: policy, episodes, and 12 digits of its content's hash; no format."""
+        """Its identity in a protocol: policy, episodes, and 12 digits of its content's hash; no format."""
         policy = "foreign" if self.card is None else self.card["policy"]
         return f"{policy}-{len(self.episodes)}@{self.episodes.hash[:12]}"
 
@@ -91,7 +91,7 @@ def write_dataset(folder: Path, episodes: Episodes, apart: Apart, card: Mapping[
 
 
 def _readme(card: Mapping[str, Json]) -> str:
-    """The page of a dataset for readers. Its head, in YAML, is what LeRobot and the Hugging Face hub expect."""
+    """The page of a dataset for readers. Its head, in YAML, is as LeRobot and the Hugging Face hub expect it."""
     format = card["format"]
     head: dict[str, Json] = {
         "license": "apache-2.0",
@@ -134,7 +134,7 @@ def read_dataset(folder: Path) -> Dataset:
     """Read a dataset, all that is in it but the files apart, and check it against its card if it has one.
 
     Raises:
-        ArtefactError: There is none, a file is damaged, or the content is not what the card says.
+        ArtefactError: There is none, a file is damaged, or the content differs from the card.
         SetupError: The library that its format needs is not installed.
     """
     found = next(((name, path) for mark, name in _MARKS.items() for path in sorted(folder.glob(mark))), None)
@@ -150,7 +150,7 @@ def read_dataset(folder: Path) -> Dataset:
 
 
 def read_apart(dataset: Dataset) -> dict[str, Arrays]:
-    """What no learner is given, by file, such as ``privileged``: ``macrostates`` (N + E, M) and ``seeds`` (E,).
+    """Arrays that no learner is given, by file, such as ``privileged``: ``macrostates`` (N + E, M) and ``seeds`` (E,).
 
     Raises ArtefactError: a file is missing or damaged.
     """
@@ -159,14 +159,14 @@ def read_apart(dataset: Dataset) -> dict[str, Arrays]:
         path = dataset.folder / f"{name}.npz"
         found[name] = read_arrays(path, "a part of a dataset")
         if content_hash(found[name]) != digest:
-            raise ArtefactError(f"{path} is not what the card says. It was left untouched.")
+            raise ArtefactError(f"{path} differs from the card. It was left untouched.")
     return found
 
 
 def require_fits(dataset: Dataset, spec: TaskSpec, appearance: str) -> None:
     """Raise InvalidValueError for a dataset of another task, or of frames that an encoder does not expect.
 
-    What it is of is said by its card, and by its number of actions.
+    The card names the task. Without a card only the number of actions is checked.
     """
     task = None if dataset.card is None else dataset.card.get("task")
     if task not in (None, spec.id) or dataset.episodes.n_actions != spec.n_actions:

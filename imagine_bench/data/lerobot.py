@@ -1,6 +1,6 @@
 """Episodes in the layout of LeRobot datasets, version 3.0, written with pyarrow; images are PNG, without loss.
 
-A row is a macro-action: the frame before it, the action, and what came of it (``next.reward``, ``next.done``, ...). The
+A row is a macro-action: the frame before it, the action, and its result (``next.reward``, ``next.done``, ...). The
 layout has no row for the frame that an episode ends with; it lies in ``final_frames.parquet``, which only we read.
 LeRobot's own tools leave that file behind. Whoever deletes, splits or merges episodes with them copies it into the new
 folder, one ``final_frames*.parquet`` a dataset that went into it: the digest of an episode's rows finds its last frame.
@@ -99,7 +99,7 @@ def _columns(episodes: Episodes, firsts: Ints) -> Arrays:
 
 
 def _table(columns: Mapping[str, Array], frames: Frame) -> pa.Table:
-    """Columns and images, and what the ``datasets`` library is told of them."""
+    """Columns and images, as the ``datasets`` library describes them."""
     arrays: list[pa.Array] = [_pngs(frames)]
     features: dict[str, dict[str, Json]] = {_IMAGE: {"_type": "Image"}}
     for name, column in columns.items():
@@ -146,7 +146,9 @@ def _statistics(columns: Mapping[str, Array], frames: Frame) -> dict[str, dict[s
 
 
 def _tasks(text: list[str]) -> pa.Table:
-    """What pandas writes of a table whose index is the description and whose one column is ``task_index``."""
+    """The metadata that pandas writes for a table whose index is the description and whose one column is
+    ``task_index``.
+    """
     index = "__index_level_0__"
     column = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
     columns = [

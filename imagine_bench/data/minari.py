@@ -1,7 +1,7 @@
 """Episodes as a Minari dataset; its own loader reads it from the folder that ``MINARI_DATASETS_PATH`` names.
 
-Observations are kept as they are: by default Minari would make JPEGs of them. What its own recorder wrote of an
-environment of ours is read too.
+Observations are kept as they are: by default Minari would make JPEGs of them. Datasets of its own recorder, from an
+    environment of ours, are read too.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
     made = {name: card[name] for name in ("execution", "appearance")}
     written_below = mock.patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder.resolve()))
     with written_below, warnings.catch_warnings(), closing(gymnasium.make(env_id, **made)) as env:
-        warnings.simplefilter("ignore")  # about what we do not know, such as whom to write to
+        warnings.simplefilter("ignore")  # about facts that we do not know, such as an address for questions
         minari.create_dataset_from_buffers(
             f"{name}-v0", [_buffer(episodes, index) for index in range(len(episodes))], env=env,
             algorithm_name=str(card["policy"]), description=str(card["description"]), data_format="parquet",
@@ -62,7 +62,7 @@ def read(path: Path) -> Episodes:
             raise InvalidValueError(f"a file of it is missing ({error})") from error
         if len(parts) != found.total_episodes or sum(len(part["actions"]) for part in parts) != found.total_steps:
             raise InvalidValueError(
-                f"{found.total_episodes} episodes of {found.total_steps} steps are not what it holds"
+                f"{found.total_episodes} episodes of {found.total_steps} steps are not those that it holds"
             )
         return joined(parts)
 

@@ -1,6 +1,7 @@
 """The best policy with memory where frames hide something or are late: a machine of beliefs, and an agent in it.
 
-A belief is what an agent with memory can know before it acts: the distribution of the macrostate now, given every frame
+A belief is the knowledge of an agent with memory before it acts: the distribution of the macrostate now, given every
+    frame
 and every action of the episode and that it has not ended (Kaelbling, Littman and Cassandra 1998, section 3). Rewards
 are not shown. With a lag of k frames the belief is over the last k macrostates together, for the frames that are still
 to come belong to them. Beliefs are a macrostate machine of their own, enumerated from the starts within the horizon and
@@ -24,7 +25,9 @@ from imagine_bench.rules import RuleTables, horizon_optimum, states_of_play, tab
 Window = tuple[State, ...]
 """The macrostates whose frames are still to come, the newest last; without a lag the macrostate now."""
 Belief = Any
-"""``(step, ((window, probability), ...))``, sorted: macro-actions done, as far as they matter, and what may be."""
+"""``(step, ((window, probability), ...))``, sorted: macro-actions done, as far as they matter, and the possible
+macrostates.
+"""
 _ENDED: Belief = (-1, ())
 _DIGITS = 12
 MOST = 60_000
@@ -50,7 +53,7 @@ class BeliefRules:
 
     Args:
         rules: The machine that is seen.
-        sight: What frames show.
+        sight: The content of frames.
         horizon: Macro-actions of an episode.
     """
 
@@ -77,7 +80,7 @@ class BeliefRules:
 
     @property
     def start_states(self) -> tuple[Belief, ...]:
-        """What may be known after the first frame."""
+        """The possible beliefs after the first frame."""
         return tuple(belief for _, belief in self.starts.values())
 
     def outcomes(self, belief: Belief, action: int) -> tuple[Outcome, ...]:
@@ -93,7 +96,7 @@ class BeliefRules:
         )
 
     def follow(self, belief: Belief, action: int, shown: State) -> Belief | None:
-        """The belief after an action, given what the frame then shows; None where that is impossible."""
+        """The belief after an action, given the content of the next frame; None where that is impossible."""
         reached = self._reach(belief, self._advance(belief, action)[0])
         return reached.get(shown, reached.get(None, (0.0, None)))[1]
 
@@ -128,7 +131,7 @@ class BeliefRules:
     def _split(
         self, step: int, windows: dict[Window, float], *, shown_step: int | None
     ) -> dict[State | None, tuple[float, Belief]]:
-        """Share and belief by what the frame of the oldest macrostate shows; by None where no new frame comes."""
+        """Share and belief by the content of the frame of the oldest macrostate; by None where no new frame comes."""
         groups: dict[State | None, dict[Window, float]] = {}
         for window, weight in windows.items():
             frames = ((1.0, None),) if shown_step is None else self._sight.seen(window[0], shown_step)
@@ -145,10 +148,10 @@ def _normal(group: dict[Window, float]) -> tuple[tuple[Window, float], ...]:
 
 
 class OptimalPolicy:
-    """What the best agent does that has memory and the rules, but sees only what frames show; it holds one episode.
+    """The best agent that has memory and the rules but sees frames alone; it holds one episode.
 
-    With more than :data:`MOST` beliefs none is solved for: it does what is best in the most probable macrostates if all
-    will be seen from then on (Littman, Cassandra and Kaelbling 1995, QMDP).
+    With more than :data:`MOST` beliefs none is solved for: it takes the action that is best in the most probable
+    macrostates if all is seen from then on (Littman, Cassandra and Kaelbling 1995, QMDP).
     """
 
     def __init__(self, rules: Rules, sight: Sight | None, horizon: int) -> None:
@@ -165,7 +168,7 @@ class OptimalPolicy:
                 self._rows = known.index
                 self._belief_best = horizon_optimum(known, horizon).actions
         self._episode: list[tuple[Belief, int]] = []
-        """By step: what was known, and the action that was asked for then."""
+        """By step: the belief, and the action that was asked for then."""
 
     def __call__(self, seen: State, step: int) -> int:
         """The action after ``step`` macro-actions of an episode, each of which was asked for here, from step 0 on."""
@@ -178,7 +181,7 @@ class OptimalPolicy:
             belief = self._beliefs.starts.get(seen, (0.0, None))[1]
         else:
             belief = self._beliefs.follow(*self._episode[step - 1], seen) if step == len(self._episode) else None
-        if belief is None:  # what the rules call impossible: anything that would look so
+        if belief is None:  # a macrostate that the rules call impossible: anything that would look so
             belief = self._beliefs.anything_like(seen, step)
         row = self._rows.get(belief)
         action = self._vote(belief, left) if row is None else int(self._belief_best[left - 1, row])

@@ -1,4 +1,4 @@
-"""The certificate of a world: what any agent's result in it has to be read against, computed and not measured."""
+"""The certificate of a world: exact facts, computed from its rules, with which any agent's result is compared."""
 
 from __future__ import annotations
 
@@ -51,9 +51,10 @@ class Certificate:
     optimum: float  #: largest success probability with memory; the same where nothing is hidden or late
     beliefs: int | None  #: how many were enumerated for it; None: too many, and ``optimum`` is only a bound
     memoryless: float | None  #: best found of a deterministic policy without memory; None where nothing is hidden
-    memoryless_bound: float | None  #: what none of them exceeds
+    memoryless_bound: float | None  #: a success probability that none of them exceeds
     plan_lengths: tuple[tuple[int, int], ...]  #: (fewest macro-actions to a success, starts); -1 where there is none
-    dynamics: tuple[tuple[str, str, str], ...]  #: (action, coordinates that it decides, what they depend on)
+    #: (action, coordinates that it decides, coordinates that they depend on)
+    dynamics: tuple[tuple[str, str, str], ...]
     outcomes: tuple[tuple[str, str], ...]  #: (reward and end, coordinates of the conditions that force it), in order
     width: int  #: the most coordinates that decide one factor or condition
     facts: int  #: local entries and conditions that there are to know
@@ -61,7 +62,7 @@ class Certificate:
 
 
 def certificate(spec: TaskSpec) -> Certificate:
-    """Compute the certificate of a task: its rules, its horizon, and what its frames show."""
+    """Compute the certificate of a task: its rules, its horizon, and the content of its frames."""
     tables = tabulate(spec.rules)
     if len(tables.index) > _LARGE:
         long_s = len(tables.index) / _A_SECOND
@@ -151,7 +152,7 @@ def certificate_rows(found: Certificate) -> dict[str, str]:
 
 
 def _percent(share: float) -> str:
-    """Rounded down to what is not more than it is: 99.99 % is not 100."""
+    """Rounds down, so that 99.99 % is never shown as 100 %."""
     return f"{np.floor(share * 1e4 + 1e-3) / 100:.2f} %"
 
 

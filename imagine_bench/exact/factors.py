@@ -6,7 +6,7 @@ A coordinate's next value, given the action, depends on the smallest set of coor
 every macrostate of play (of equal sets, the one with the coordinate itself, then the first). Coordinates that are drawn
 together are one factor. Reward and end are a list of classes, read from the top: a class holds where one of its local
 conditions does, that is where some values of a few coordinates force it among all that no class above has claimed; the
-class that needs the smallest conditions comes first, and what is left at the end is the usual case.
+class that needs the smallest conditions comes first, and the rest at the end is the usual case.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _DIGITS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class Factor:
-    """Coordinates whose next values an action draws together, and what that depends on."""
+    """Coordinates whose next values an action draws together, and the coordinates that this depends on."""
 
     action: int
     children: Scope
@@ -82,7 +82,7 @@ class FactorGraph:
     """Which coordinates decide which. An action leaves every coordinate alone that none of its factors has."""
 
     factors: tuple[Factor, ...]
-    #: what reward and end are a function of: ``"next"``, the macrostate reached, ``"choice"``, the macrostate and the
+    #: coordinates that decide reward and end: ``"next"``, the macrostate reached, ``"choice"``, the macrostate and the
     #: action, or ``"both"``
     read: str
     point: Ints  #: the distinct point that each outcome's class is read from. Shape (N,).
@@ -248,7 +248,7 @@ def _next_claim(points: Ints, label: Ints, left: Ints) -> LocalClass:
 
 
 def _cover(class_: int, forced: list[tuple[Scope, Ints]]) -> LocalClass:
-    """A small set of scopes: again and again the one that covers the most of what is left."""
+    """A small set of scopes: again and again the one that covers most of the remaining ones."""
     covered = np.zeros(len(forced[0][1]), dtype=bool)
     scopes = []
     conditions = 0

@@ -2,7 +2,7 @@
 
 The learner sees macrostates and classes, plans exactly, and is told a local entry of the dynamics, probabilities and
 all, by the first transition that shows it; a class that does not hold rules out its conditions there, one that holds
-shows that at least one is true. What is unknown it takes for the best that is possible (optimism; Brafman and
+shows that at least one is true. It takes an unknown outcome for the best that is possible (optimism; Brafman and
 Tennenholtz 2002): an unknown entry may lead anywhere in the coordinates that it decides, an unknown class may be any.
 It goes to the nearest unknown fact that an optimistic plan from some start still rests on, and is done when from every
 start the best imaginable is reached through known facts alone: its policy is then optimal whatever the rest is.
@@ -29,7 +29,7 @@ MOST = 3_000
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerRun:
-    """What one learner needed."""
+    """The experience that one learner needed."""
 
     transitions: int
     episodes: int
@@ -69,7 +69,7 @@ class _Learner:
         self.clauses: list[Ints] = []  # conditions of which one at least is true
         read = sorted({i for claim in graph.claims for scope in claim.scopes for i in scope})
         self.alike = numbered(keys(graph.points, read))  # points that are one
-        self.class_of = np.full(int(self.alike.max()) + 1, -1)  # what was observed
+        self.class_of = np.full(int(self.alike.max()) + 1, -1)  # the observations
         self.first = np.searchsorted(machine.pair, np.arange(machine.n_actions * machine.n_play + 1))
         self.pay = np.array([reward + _SUCCESS * success for reward, _, success in machine.classes])
         self.ends = np.array([ended for _, ended, _ in machine.classes])

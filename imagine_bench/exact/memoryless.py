@@ -1,9 +1,9 @@
 """The best deterministic policy without memory: one action for each thing that a frame can show.
 
 A mixed-integer programme over occupancies: ``x[t, w, a]`` is the probability of doing ``a`` in ``w`` after ``t``
-macro-actions, where ``w`` is the macrostates whose frames are still to come and what is shown now; ``p[o, a]`` in
-{0, 1} is the policy, and ``x[t, w, a] <= u[t, w] p[o(w), a]`` with ``u`` a bound on how probable ``w`` can be made.
-HiGHS solves it by branch and bound; what it finds is then improved one action at a time.
+macro-actions, where ``w`` is the macrostates whose frames are still to come and the one that is shown now; ``p[o, a]``
+in {0, 1} is the policy, and ``x[t, w, a] <= u[t, w] p[o(w), a]`` with ``u`` a bound on how probable ``w`` can be made.
+HiGHS solves it by branch and bound; its solution is then improved one action at a time.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from imagine_bench.interfaces import Rules, Sight, State
 
 _Seen = tuple[tuple[State, ...], State]
-"""The macrostates whose frames are still to come, the newest last, and what is shown now."""
+"""The macrostates whose frames are still to come, the newest last, and the one that is shown now."""
 MOST = 30_000
 SOLVED = 8_000
 """Occupancies up to which a policy is looked for, and up to which the programme is solved."""
@@ -27,7 +27,7 @@ _GAIN = 1e-7
 
 @dataclass(frozen=True, kw_only=True)
 class Memoryless:
-    """The success probability of the best policy found, and what no other can exceed."""
+    """The success probability of the best policy found, and a bound that no other can exceed."""
 
     value: float
     bound: float
@@ -35,10 +35,10 @@ class Memoryless:
 
 @dataclass(frozen=True, kw_only=True)
 class _Layer:
-    """What may be after t macro-actions."""
+    """The possible situations after t macro-actions."""
 
     most: dict[_Seen, float]  # the largest probability that it can be given; at the start the only one
-    links: dict[tuple[_Seen, int], list[tuple[float, _Seen]]]  # by (what is, action): where the episode goes on
+    links: dict[tuple[_Seen, int], list[tuple[float, _Seen]]]  # by (situation, action): where the episode goes on
     wins: dict[tuple[_Seen, int], float]
 
 
@@ -119,7 +119,7 @@ def _climb(layers: list[_Layer], choices: dict[tuple[State, int], int], policy: 
 
 
 def _choices(layers: list[_Layer]) -> dict[tuple[State, int], int]:
-    """A column for each (what is shown, action), but for actions that can only end an episode without a success."""
+    """A column for each (observation, action), but for actions that can only end an episode without a success."""
     useful: dict[State, set[int]] = defaultdict(set)
     everything: dict[State, None] = {}
     n_actions = 1 + max(action for _, action in layers[0].links)

@@ -23,7 +23,7 @@ class Split:
         InvalidValueError: One of them is empty.
     """
 
-    name: str  #: what they differ in
+    name: str  #: their difference
     train: tuple[State, ...]
     test: tuple[State, ...]
 
@@ -39,7 +39,7 @@ class Split:
 
     @property
     def identity(self) -> str:
-        """What stands for it in a protocol: its name and its hash."""
+        """Its identity in a protocol: its name and its hash."""
         return f"{self.name}@{self.hash}"
 
 
@@ -57,8 +57,8 @@ class StartingFrom:
 def split_of(rules: Rules, text: str) -> Split:
     """The split that a text names: ``plan_length=2``, ``values=3:0:1`` or ``pairs=0:3:4``.
 
-    - ``plan_length=LONGEST``: training has the starts whose shortest plan has at most so many macro-actions; what has
-      no plan is left out.
+    - ``plan_length=LONGEST``: training has the starts whose shortest plan has at most so many macro-actions; starts
+    without a plan are left out.
     - ``values=COORDINATE:VALUE:...``: tests have the starts with some values of a coordinate, such as a goal that
       training never has.
     - ``pairs=COORDINATE:COORDINATE:COUNT``: tests have the starts with one of so many pairs of values of two

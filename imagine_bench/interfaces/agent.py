@@ -1,4 +1,4 @@
-"""The interface of an agent: what it is built from, what it does, what a checkpoint holds of it.
+"""The interface of an agent: its construction, its methods, and its state in a checkpoint.
 
 Optional abilities of agents are in :mod:`.interfaces.capabilities`. Shapes: ``A`` macro-actions, ``Z`` latents.
 """
@@ -27,7 +27,7 @@ DEVICES = ("cpu", "cuda")
 
 @dataclass(frozen=True, kw_only=True)
 class ExactWorld:
-    """What a perfect world model would know: for privileged controls."""
+    """The knowledge of a perfect world model, for privileged controls."""
 
     rules: Rules  #: the macrostate machine
     #: frames (N, 64, 64, 3) of macrostates (N, M), as training shows them
@@ -47,7 +47,7 @@ def _rendered(spec: TaskSpec, appearance: str, states: Ints, rng: np.random.Gene
 
 @dataclass(frozen=True, kw_only=True)
 class AgentContext:
-    """What an agent is built from; it learns nothing else about its task."""
+    """The arguments of an agent's factory; it learns nothing else about its task."""
 
     n_actions: int  #: number of macro-actions A
     preprocessing: str  #: name of the task's declared observation preprocessing
@@ -58,7 +58,7 @@ class AgentContext:
     #: single settings that replace the set's, by dotted name
     overrides: Mapping[str, Setting] = field(default_factory=dict)
     device: str = "cpu"  #: a torch device name, ``"cpu"`` or ``"cuda"``
-    #: makes an optimal policy, which says what to do after what is shown and so many macro-actions of an episode; only
+    #: makes an optimal policy, from the observation and so many macro-actions of an episode; only
     #: for agents registered as privileged, None for every other
     optimal_policy: Callable[[], Callable[[State, int], int]] | None = None
     exact_world: ExactWorld | None = None  #: only for agents registered as privileged, and where frames hide nothing

@@ -1,6 +1,6 @@
-"""What agents may offer beyond :class:`~.interfaces.Agent`: imagination, predictions, training of their own.
+"""Abilities that agents may offer beyond :class:`~.interfaces.Agent`: imagination, predictions, training of their own.
 
-The bench looks which of these an agent has, and uses what the protocol wants of those that do. Shapes: ``D`` imagined
+The bench looks which of these an agent has, and uses those that the protocol wants. Shapes: ``D`` imagined
 depth, ``A`` actions, ``M`` coordinates of a macrostate. A probe that reads macrostates is for evaluation only.
 """
 
@@ -40,7 +40,7 @@ class ImaginedRollout:
 
 @runtime_checkable
 class EpisodeRememberer(Protocol):
-    """An agent that remembers what it saw earlier in an episode: :meth:`Agent.act` takes its observation in."""
+    """An agent that remembers earlier frames of an episode: :meth:`Agent.act` takes its observation in."""
 
     def begin_episode(self) -> None:
         """Forget the episode so far: the next observation is another's first. No part of :meth:`Agent.state`.
@@ -60,19 +60,21 @@ class MemoryReader(Protocol):
     """An agent of which can be said what it remembers of an episode; it changes nothing in the agent."""
 
     def read_memory(self, frame: Frame, sizes: Sequence[int]) -> Ints:
-        """What a linear read-out finds in the memory after the frame that was acted on last, or the next. Shape (M,).
+        """The values that a linear read-out finds in the memory after the frame that was acted on last, or the next.
+        Shape (M,).
 
-        It is fitted on frames that the agent learned from: what a probe saw last of each coordinate of the macrostate,
+        It is fitted on frames that the agent learned from: the value of each coordinate of the macrostate that a probe
+            saw last,
         of so many values; -1 of one never seen. No agent acts on it.
         """
 
 
 @dataclass(frozen=True, slots=True)
 class Perceived:
-    """What an agent saw at some time of its training."""
+    """The perception of an agent at some time of its training."""
 
     episodes: int  #: training episodes that had begun
-    sizes: tuple[int, ...]  #: numbers of values of what it told apart
+    sizes: tuple[int, ...]  #: numbers of values of the factors that it told apart
     picture: Pixels  #: for people. Shape (H, W, 3).
 
 
@@ -81,7 +83,7 @@ class SeeingLearner(Protocol):
     """An agent that learned to see while it acted, and can show how."""
 
     def perceived(self) -> Iterable[Perceived]:
-        """What it saw whenever that changed in training, in order; nothing changes in the agent."""
+        """Its perception whenever that changed in training, in order; nothing changes in the agent."""
 
 
 @runtime_checkable
@@ -94,7 +96,7 @@ class ValueReader(Protocol):
 
 @runtime_checkable
 class NoveltyReader(Protocol):
-    """An agent that can say how much of each macro-action it does not know: what its curiosity goes by."""
+    """An agent that can say how much of each macro-action it does not know; its curiosity goes by this."""
 
     def novelty(self, observation: Observation, rng: np.random.Generator) -> Floats32 | None:
         """How unknown every macro-action is, in [0, 1] by the agent's own measure; None where it has none. Shape (A,).
@@ -110,7 +112,7 @@ class ModelOnlyTrainer(Protocol):
     def train_in_model(self) -> bool:
         """Train a little in the model as it is; False, which changes nothing, says that nothing is left to do.
 
-        The bench calls it before each test until it returns False. What it did is in :meth:`Agent.state`.
+        The bench calls it before each test until it returns False. Its steps are in :meth:`Agent.state`.
         """
 
 
@@ -132,10 +134,10 @@ class ExternalTrainer(Protocol):
 
 @runtime_checkable
 class TransferLearner(Protocol):
-    """An agent that can take what it knows of a world into another task in the same world."""
+    """An agent that can take its knowledge of a world into another task in the same world."""
 
     def reset_for_new_task(self) -> None:
-        """Keep what was learned of the dynamics; what was rewarded and what ended episodes is a prior at most.
+        """Keep the learned dynamics; the learned rewards and ends of episodes are a prior at most.
 
         The bench calls it between two tasks of one dynamics; training episodes are counted from 0 again after it.
         """
@@ -143,7 +145,7 @@ class TransferLearner(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """What an oracle says of an imagined action: the reward it would bring, and whether it would end the episode."""
+    """The oracle's judgement of an imagined action: the reward it would bring, and whether it would end the episode."""
 
     reward: float
     terminated: bool
@@ -165,7 +167,7 @@ class QueryingAgent(Protocol):
 
 @runtime_checkable
 class Imaginer(Protocol):
-    """An agent that can show what it imagines; it changes nothing in the agent."""
+    """An agent that can show its imagination; that changes nothing in the agent."""
 
     def imagine(self, frame: Frame, *, actions: Ints | None, depth: int, rng: np.random.Generator) -> ImaginedRollout:
         """Imagine up to ``depth`` transitions from a real ``frame``; ``rng`` draws components, noise, dropout masks.
@@ -185,7 +187,9 @@ class FrameReader(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ExpectedOutcomes:
-    """What a model expects of every macro-action in N frames; what is missing to probability 1 ends the episode."""
+    """The outcomes that a model expects of every macro-action in N frames; the rest to probability 1 ends the
+    episode.
+    """
 
     macrostates: Ints  #: the possible next ones, B branches, as a probe reads it. Shape (N, A, B, M).
     p_continues: Floats  #: probability that this follows and the episode goes on. Shape (N, A, B).
@@ -197,11 +201,13 @@ class OutcomePredictor(Protocol):
     """An agent whose model can be asked for all of one step; nothing changes in the agent."""
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
-        """What its model expects from frames (N, 64, 64, 3); ``rng`` draws components, noise, dropout masks."""
+        """The outcomes that its model expects from frames (N, 64, 64, 3); ``rng`` draws components, noise, dropout
+        masks.
+        """
 
 
 def planned_actions(actions: Ints | None, depth: int, n_actions: int) -> list[int] | None:
-    """What an :class:`Imaginer` is to imagine: the first ``depth`` of the actions, or None for its own choice.
+    """The question to an :class:`Imaginer`: the first ``depth`` of the actions, or None for its own choice.
 
     Raises:
         InvalidValueError: No depth to imagine, or actions that are none.

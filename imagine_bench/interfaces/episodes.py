@@ -1,4 +1,4 @@
-"""Real episodes as arrays: what a dataset holds, whatever its format, and what stands for it.
+"""Real episodes as arrays: the content of a dataset in any format, and its identity.
 
 Shapes: ``E`` episodes of ``N`` transitions in all, so ``N + E`` frames, each episode's last one included; ``A``
 actions, ``M`` coordinates of a macrostate.

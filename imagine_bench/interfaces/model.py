@@ -22,7 +22,7 @@ _SUM_TOLERANCE = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class Imagined:
-    """What a model imagines. Whatever it does not offer stays None, and is judged as not offered."""
+    """The imagination of a model. Whatever it does not offer stays None, and is judged as not offered."""
 
     #: Pictures, gray or RGB, uint8 or floats in [0, 1]. Shape (N, S, D, H, W) or (N, S, D, H, W, 3).
     pictures: Images
@@ -34,7 +34,7 @@ class Imagined:
     epistemic: Array | None = None  #: How much it does not know for want of data, in any unit. Shape (N, D).
     aleatoric: Array | None = None  #: How much is noise. Shape (N, D).
     modal: Array | None = None  #: How far several possible outcomes are apart. Shape (N, D).
-    #: Whether a filter of its own would let it learn from, or act on, what it imagines there. Shape (N, D), bool.
+    #: Whether a filter of its own would let it learn from, or act on, its imagination there. Shape (N, D), bool.
     accepted: Array | None = None
 
 
@@ -70,7 +70,7 @@ class Untaught:
 
 
 def require_imagined(imagined: object, *, name: str, rows: int, depth: int, samples: int) -> Imagined:
-    """What a model handed in, if it is what it has to be.
+    """The answer of a model, checked.
 
     Raises:
         InvalidValueError: A wrong type or shape, NaN, or probabilities out of range or not summing to 1; the message

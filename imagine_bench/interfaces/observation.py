@@ -10,7 +10,7 @@ import numpy as np
 from imagine_bench.arrays import Array, Frame, Info, Macrostate, Observed, read_only
 
 OBSERVATIONS = ("frame", "human", "state", "proprio")
-"""Parts of what an environment of ours can show of one moment."""
+"""Parts of an observation of one moment, by our environments."""
 PROPRIO_SIZE = 16
 """Joints, fingers, and the tool's position and quaternion."""
 FRAME_PX = 64
@@ -27,7 +27,8 @@ class Observation:
     frame: Frame
     #: the true state, only for agents registered as privileged, as the next; None for every other
     macrostate: Macrostate | None = None
-    shown: Macrostate | None = None  #: what ``frame`` shows of the macrostate it was taken of, -1 for what it hides
+    #: the content of ``frame``, of the macrostate it was taken of, -1 for a hidden coordinate
+    shown: Macrostate | None = None
     #: other parts of :data:`OBSERVATIONS` that the protocol shows, by name; no agent that takes frames alone gets any
     more: Mapping[str, Array] = field(default_factory=dict)
 
@@ -40,7 +41,7 @@ class Observation:
 
     @classmethod
     def of(cls, seen: Observed, info: Info, *, privileged: bool) -> Observation:
-        """What an agent may see of a frame, or of parts by name; of ``info`` only if it is privileged."""
+        """The part that an agent may see of a frame, or of parts by name; of ``info`` only if it is privileged."""
         more = {name: part for name, part in seen.items() if name != "frame"} if isinstance(seen, Mapping) else {}
         frame = seen.get("frame", np.zeros((0, 0, 3), dtype=np.uint8)) if isinstance(seen, Mapping) else seen
         if not privileged:
@@ -51,7 +52,7 @@ class Observation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Transition:
-    """One real macro-action and what it led to. ``terminated`` stops bootstrapping, ``truncated`` does not."""
+    """One real macro-action and its result. ``terminated`` stops bootstrapping, ``truncated`` does not."""
 
     observation: Observation
     action: int

@@ -46,7 +46,7 @@ class Mixtures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction(Mixtures):
-    """What E networks predict, and how uncertain they are: the mixtures that values are sampled from, and more."""
+    """The predictions of E networks and their uncertainties: the mixtures that values are sampled from, and more."""
 
     prediction: Floats  #: one value sampled from the predictive mixture. Shape (E, N, D).
     mean: Floats  #: mean over the weight samples. Shape (E, N, D).
@@ -91,7 +91,7 @@ class Regressor(Protocol):
     """E networks that learn to predict distributions. Equal seeds give equal bits."""
 
     def train(self, on_epoch: Callable[[int, int], None]) -> dict[str, float]:
-        """Train to the end, and return means of what was measured meanwhile, by slashed name.
+        """Train to the end, and return means of the measures meanwhile, by slashed name.
 
         ``on_epoch`` is told now and then how many epochs are done, and how many there are in all.
 
@@ -105,7 +105,7 @@ class Regressor(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class RegressorContext:
-    """What a regressor is built from."""
+    """The arguments of a regressor's factory."""
 
     datasets: tuple[RegressionData, ...]  #: one a network, all of the same size. Length E.
     seeds: tuple[SeedTree, ...]  #: one node of the seed tree a network. Length E.
@@ -115,7 +115,7 @@ class RegressorContext:
 
 
 Predict = Callable[[Floats, str], Prediction]
-"""Inputs (E, N, X) and a name, which stands for the random numbers, to what the networks predict for them."""
+"""Inputs (E, N, X) and a name, which stands for the random numbers, to the networks' predictions for them."""
 
 
 Evaluate = Callable[[str, Predict, tuple[SeedTree, ...]], Arrays]
@@ -148,7 +148,7 @@ class RegressionSpec:
     testing: Callable[[str, np.random.Generator, int], RegressionData]
     #: How wrong predictions are: variant, inputs (N, X), predictions (N, D) to (N,).
     errors: Callable[[str, Floats, Floats], Floats]
-    error_name: str  #: what ``errors`` gives, with its unit; above ``wrong_above`` a prediction counts as wrong
+    error_name: str  #: name of ``errors``, with its unit; above ``wrong_above`` a prediction counts as wrong
     wrong_above: float
     evaluate: Evaluate
     #: ``"module:attr"`` of the function that makes sections of the report of them; another package's task has one.

@@ -35,7 +35,7 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class ArmMotion:
-    """How the arm moved during one macro-action; joints from the base to the wrist, what is commanded holds from then.
+    """How the arm moved during one macro-action; joints from the base to the wrist, a command holds from then.
 
     Rows are the samples of :class:`Motion`: ``capture_motion_hz`` a second, and the last moment.
     """
@@ -60,7 +60,7 @@ class ArmReader(Protocol):
         """The latest macro-action's as captured; where nothing was, one sample of the standing scene (K = 1)."""
 
     def agent_film(self) -> Frame:
-        """What the agent's camera sees at each sample. Shape (K, 64, 64, 3)."""
+        """The image of the agent's camera at each sample. Shape (K, 64, 64, 3)."""
 
 
 @runtime_checkable

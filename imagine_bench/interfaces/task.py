@@ -31,7 +31,7 @@ PHYSICS_RANGES: Mapping[str, tuple[float, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class PhysicsSettings:
-    """What decides whether a grasp holds. The defaults are the scene as it is built, to the bit.
+    """The physics of grasping. The defaults are the scene as it is built, to the bit.
 
     Errors of the planner are drawn from the environment's generator, anew for each macro-action and only where they
     are not 0. How far each may go is measured by ``imagine-bench check --physics``.
@@ -70,14 +70,14 @@ class PhysicsSettings:
 
 
 class Sight(Protocol):
-    """What frames show of the macrostates of a task, exactly."""
+    """The content of frames for the macrostates of a task, exactly."""
 
     @property
     def lag(self) -> int:
         """Macro-actions that a frame is old, at least 0: after t of them the agent sees that of max(0, t - lag)."""
 
     def seen(self, macrostate: State, step: int) -> tuple[tuple[float, State], ...]:
-        """What a frame of ``macrostate`` may show, with probabilities that sum to 1; -1 for a hidden coordinate.
+        """The content of a frame of ``macrostate``, with probabilities that sum to 1; -1 for a hidden coordinate.
 
         ``step`` macro-actions of the episode were done when the frame was taken; it is delivered ``lag`` later.
         """
@@ -92,7 +92,7 @@ class RenderMacrostates(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class PerformanceTargets:
-    """What ``imagine-bench check TASK --physics`` holds a task in contact physics to."""
+    """The targets of ``imagine-bench check TASK --physics`` for a task in contact physics."""
 
     objects: tuple[str, ...]  #: bodies of the loose objects; coordinate i of a macrostate is object i's
     as_ruled: float  #: least share of random macro-actions that end exactly as the rules say, at clean
@@ -124,16 +124,16 @@ class TaskSpec:
     preprocessing: str  #: a name of :mod:`imagine_bench.preprocessing`
     encoder: str  #: base name of the bundled encoders, one an appearance level (``"<encoder>-<appearance>"``)
     rules: Rules  #: the macrostate machine
-    facts: Callable[[], RuleFacts]  #: what the rules say, as a function (enumerating costs a moment)
+    facts: Callable[[], RuleFacts]  #: the facts of the rules, as a function (enumerating costs a moment)
     render_macrostates: RenderMacrostates  #: frames of macrostates, kinematic mode
     reference: str | None = None  #: name of the thesis' table in :mod:`imagine_bench.reference`, or None
     config_group: str = "chapter_5"  #: config group of learners' settings: the thesis' chapter that the task is from
-    #: what each protocol preset changes for this task: fields of the protocol by preset
+    #: the changes of each protocol preset for this task: fields of the protocol by preset
     presets: Mapping[str, Mapping[str, Setting]] = field(default_factory=dict)
     success_threshold: float = 0.95  #: success rate, in (0, 1], at which the task counts as learned
-    #: what ``check --physics`` measures it against; None for a task whose scene another one measures
+    #: the limits that ``check --physics`` compares it with; None for a task whose scene another one measures
     targets: PerformanceTargets | None = None
-    sight: Sight | None = None  #: what frames show; None: each the whole macrostate of its own moment
+    sight: Sight | None = None  #: the content of frames; None: each the whole macrostate of its own moment
     executions: tuple[str, ...] = EXECUTIONS  #: how macro-actions can happen, the usual way first
 
     def execution(self, asked: str | None) -> str:
@@ -151,7 +151,7 @@ class TaskSpec:
         return tuple(names[int(value)] if 0 <= value < len(names) else "not seen" for names, value in pairs)
 
     def as_observed(self, shown: Sequence[int] | Macrostate) -> State:
-        """What a probe reads in a frame that shows this, -1 for what it hides. Length M.
+        """The values that a probe reads in a frame that shows this, -1 for a hidden coordinate. Length M.
 
         A hidden coordinate is read as one more than its last value.
         """

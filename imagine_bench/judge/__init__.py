@@ -1,1 +1,1 @@
-"""Hold what agents imagine, plan and predict against the exact truth of the rules."""
+"""Compare the imagination, plans and predictions of agents with the exact truth of the rules."""

@@ -1,18 +1,18 @@
 """Why an agent failed a test episode: truth is swapped in, one stage at a time, until the episode is solved.
 
-What no optimal policy would have solved with the same draws of chance was bad luck. Of all else, what the agent saw is
-made right first, then its plan, then what its model says of transitions that it never experienced, then all of its
+An episode that no optimal policy would have solved with the same draws of chance was bad luck. Of all else, the agent's
+perception is made right first, then its plan, then its model of transitions that it never experienced, then all of its
 model, then physics. Each stage keeps the truth of those before it, and the first that solves the episode names its
 cause; the last is the optimal policy, which does. So every failure has exactly one cause. A policy cannot be learned
 anew in a model that was made right; so the plan comes before the model: where perfect planning in the agent's own model
-solves the episode, that model was right enough. Nor can an agent that reads no frame of a macrostate right be asked
-about it: what is best there stands for what it would do, and the truth for what its model says.
+solves the episode, that model was right enough. If every frame of a macrostate is misread, the agent cannot be queried
+there. The optimal action and the true model are used instead.
 
-An agent without a model has, in its place, what it experienced: true where it was, and nothing elsewhere.
+An agent without a model has its experience in place of one: true where it was, and nothing elsewhere.
 
-An episode is lived again by the rules. Where a stage does in a step what the agent did there, the same happens, faults
+An episode is lived again by the rules. Where a stage takes the agent's own action in a step, the same happens, faults
 of physics included. Else a uniform number decides among the outcomes, as in an environment: in every step the one that
-decided then, as far as what happened tells where it lay. So whoever slips in a step slips there whatever they do.
+decided then, as far as the episode tells where it lay. So whoever slips in a step slips there whatever they do.
 
 Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizon.
 """
@@ -47,7 +47,7 @@ CAUSES = {
     "unexperienced": "a transition that it needed was never experienced",
     "model": "its model was wrong, though it was experienced",
     "planning": "its model was right; its plan was cut off, or its policy not greedy in it",
-    "values": "its values were wrong, though what it needed was experienced (no model)",
+    "values": "its values were wrong, though it had experienced all that it needed (no model)",
     "fault": "physics disagreed with the rules",
     "unlucky": "an optimal policy would have failed too",
 }
@@ -55,13 +55,13 @@ CAUSES = {
 MOST_STATES = 2_000
 """A task of more macrostates is too large to ask an agent about every one."""
 _TRIES = 8  # frames of a macrostate, until the agent reads one right
-_NOWHERE = -1e6  # reward of what was never experienced, for an agent that has nothing but what it experienced
+_NOWHERE = -1e6  # reward of a transition that was never experienced, for an agent that has nothing but its experience
 _TIE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
 class FailedEpisode:
-    """What happened in a failed test episode of L macro-actions."""
+    """The steps of a failed test episode of L macro-actions."""
 
     states: Sequence[State]  # length L + 1
     actions: Sequence[int]  # length L
@@ -97,7 +97,9 @@ def misread(agent: Agent, frames: Frame, states: Ints) -> Bools:
 
 
 def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator, *, privileged: bool) -> PolicyTable:
-    """What the agent would do, and what its model expects, in every macrostate, shown by ``frames``; see above."""
+    """The agent's action, and the outcomes that its model expects, in every macrostate, shown by ``frames``; see
+    above.
+    """
     states = states_of(rules)
     action = np.zeros(len(frames), dtype=np.int16)
     for row, state in enumerate(states):
@@ -118,7 +120,7 @@ class Attribution:
 
     Args:
         spec: The task.
-        held: What the agent does and expects.
+        held: The agent's actions and expectations.
         tried: Macrostate and macro-action of everything that it had experienced. Shape (pairs, M + 1).
         readable: Macrostates of which it reads some frame right; those that end episodes do not matter. Shape (S,).
     """
@@ -176,7 +178,7 @@ class Attribution:
     def _solves(self, episode: FailedEpisode, drawn: Sequence[float], plan: Bools, *, faults: bool) -> bool:
         """Whether the episode succeeds where frames are read right and a plan is followed.
 
-        Among equals of the plan is what the agent does.
+        If the agent's action is among equally good ones of the plan, it is the plan's.
         """
         state = episode.states[0]
         for step in range(self._horizon):
@@ -226,7 +228,7 @@ def _mixed(where: Bools, one: Model, other: Model) -> Model:
 
 
 def expected_rightly(rules: Rules, held: PolicyTable) -> float:
-    """How much of what the rules have come of a macro-action a model expects too, in [0, 1]; NaN without a model.
+    """The share of a macro-action's outcomes by the rules that a model expects too, in [0, 1]; NaN without a model.
 
     One less the total variation of where the episode goes on, or that it ends: the mean over every macro-action in
     every macrostate that is not terminal.
@@ -263,17 +265,19 @@ def causes_of(trained: Trained) -> tuple[Tested, ...]:
 
     Raises:
         ArtefactError: An unfinished run, or one that keeps no test episodes.
-        InvalidValueError: What it experienced is not known, or its task has too many macrostates or hides something.
+        InvalidValueError: Its experience is not known, or its task has too many macrostates or hides something.
     """
     protocol = trained.spec.protocol
     spec = trained.task
     if spec.sight is not None:
         raise InvalidValueError(
-            f"Frames of {spec.id} hide something, or are old. What an agent should have done there depends on all "
+            f"Frames of {spec.id} hide something, or are old. The right action there depends on all "
             "that it saw before, so its failures have no one cause; ask about a world without gesture and lag."
         )
     if protocol.dataset or protocol.after:
-        raise InvalidValueError("What agents saw in a dataset or an earlier task is not kept; give another bench.")
+        raise InvalidValueError(
+            "The experience of agents in a dataset or an earlier task is not kept; give another bench."
+        )
     if not protocol.shows_frames_alone:
         raise InvalidValueError("These agents saw more than frames; give a bench of --observation frame.")
     if not run_folder.is_done(trained.folder):
@@ -301,7 +305,7 @@ def causes_of(trained: Trained) -> tuple[Tested, ...]:
 
 
 def lived_again(env: Env, agent: Agent, seed: int, actions: Sequence[int]) -> FailedEpisode:
-    """A failed test episode, played again to see what the agent misread."""
+    """A failed test episode, played again to find the frames that the agent misread."""
     frame, info = env.reset(seed=seed)
     frames = []
     infos = [info]

@@ -1,7 +1,7 @@
 """Does a model notice that a rule changed, and does it know what another macro-action would have led to?
 
-A change is noticed by the model's surprise, the negative logarithm of the probability that it gives to what came, as
-its images are read. A CUSUM detector (Page, 1954) adds up how far surprise lies above its usual level and says so
+A change is noticed by the model's surprise, the negative logarithm of the probability that it gives to the next frame,
+as its images are read. A CUSUM detector (Page, 1954) adds up how far surprise lies above its usual level and says so
 above a threshold. Level and threshold come from streams of transitions of the unchanged world: of those, 1 % may raise
 an alarm. A model's prediction of a transition does not depend on the world, so the predictions of single transitions
 serve every stream.
@@ -37,11 +37,11 @@ _SLIVER = 1e-9  # of probability, which rounding may leave
 
 @dataclass(frozen=True, kw_only=True)
 class Streams:
-    """Transitions of one world, as rows of the questions about single ones, and what came of them."""
+    """Transitions of one world, as rows of the questions about single ones, and their results."""
 
     rows: Ints  #: shape (R, T)
     reached: Ints  #: index of the next macrostate. Shape (R, T).
-    states: tuple[State, ...]  #: what is reached, by index
+    states: tuple[State, ...]  #: the macrostates that are reached, by index
 
 
 def slipping(rules: Rules) -> Dynamics:
@@ -55,7 +55,7 @@ def slipping(rules: Rules) -> Dynamics:
 
 
 def coupled(rules: Rules, states: Sequence[State]) -> Dynamics:
-    """One macro-action also does what another does: the pair that leads elsewhere in most macrostates."""
+    """One macro-action also has the effect of another: the pair that leads elsewhere in most macrostates."""
 
     def both(state: State, first: int, then: int) -> list[Outcome]:
         found = []
@@ -92,7 +92,7 @@ def streams_of(spec: TaskSpec, questions: EvalSet) -> dict[str, Streams] | None:
 
 
 def _walked(spec: TaskSpec, states: Sequence[State], dynamics: Dynamics, rng: np.random.Generator) -> Streams:
-    """Random walks; what leads out of these macrostates ends an episode."""
+    """Random walks; a step out of these macrostates ends an episode."""
     n_actions = spec.n_actions
     found = branches(states, n_actions, dynamics)
     upto = found.probability.cumsum(axis=2)
@@ -156,7 +156,7 @@ def _surprise(streams: Streams, predictions: Predictions) -> Floats:
 
 
 def counterfactual_error(asked: Sequence[EvalSet], predictions: Sequence[Predictions]) -> float:
-    """How much of what a model imagines of one macro-action cannot be where it imagines what it does of another.
+    """How much of a model's imagination of one macro-action is impossible, given its imagination of another.
 
     ``asked`` has the same macrostates for each macro-action, and the model imagined each with equal draws. In the truth
     equal draws are equal uniform numbers, which choose among the outcomes in the order of the rules.

@@ -59,7 +59,7 @@ Costs = dict[str, str | float]
 
 @dataclass(frozen=True, kw_only=True)
 class Judgement:
-    """What is judged. InvalidValueError: nothing to judge, or sizes, seeds or samples out of range."""
+    """The choices of a judgement. InvalidValueError: nothing to judge, or sizes, seeds or samples out of range."""
 
     task: str
     models: tuple[str, ...]  #: Names, or folders of runs, whose agents are judged as they are
@@ -67,8 +67,8 @@ class Judgement:
     seeds: tuple[int, ...] = (0, 1, 2)
     samples: int = SAMPLES  #: Futures imagined of each question
     appearance: str = "clean"
-    policy: str = "random"  #: Who collects the data, as :data:`.running.collect.POLICIES`
-    #: A bundled name or a file, for the models that read what it gives; the others see through the task's own
+    policy: str = "random"  #: The policy that collects the data, as :data:`.running.collect.POLICIES`
+    #: A bundled name or a file, for the models that read its latents or codes; the others see through the task's own
     encoder: str | None = None
     order: int = 0  #: Seed of the order in which models are asked
 
@@ -143,7 +143,7 @@ class ModelFit(NamedTuple):
 
 @dataclass(frozen=True)
 class AskedWorld:
-    """What every model is asked, and with what it is read: the same for all."""
+    """The questions to every model, and the reader of its answers: the same for all."""
 
     spec: TaskSpec
     index: RenderedFrameIndex
@@ -155,7 +155,7 @@ class AskedWorld:
 
     @functools.cached_property
     def digest(self) -> str:
-        """Of the frames that are asked about: who has not rendered them cannot tell their order from its seed."""
+        """Of the frames that are asked about: without rendering them nobody can tell their order from its seed."""
         return content_hash({name: each.frames for name, each in self.asked.items()})
 
 
@@ -163,7 +163,7 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
     """Fit and question whatever is not kept yet.
 
     Returns:
-        The folder with a file a cell, and what went wrong with models, a sentence each.
+        The folder with a file a cell, and a sentence for each model that failed.
     """
     folder = make_folder(root / judgement.folder_name)
     for seed in judgement.seeds if judgement.learning else ():
@@ -287,7 +287,7 @@ def _judged(
 def _fit(
     judged: JudgedModel, cell: ModelFit, dataset: Dataset, rng: np.random.Generator
 ) -> tuple[set[tuple[State, int]], Costs]:
-    """Fit a model: what it has seen then, and the data's hash, CPU seconds and parameters."""
+    """Fit a model: its data, and the data's hash, CPU seconds and parameters."""
     episodes = dataset.episodes.first(cell.transitions)
     begun_s = judged.cpu_s()
     call(cell.model, "fit", judged.model.fit, copy.deepcopy(episodes), rng)  # models of this process must not change it
@@ -298,7 +298,7 @@ def _fit(
 
 
 def _named(spec: TaskSpec, outcomes: Distribution) -> dict[str, float]:
-    """Probabilities by what macrostates are called."""
+    """Probabilities by the names of macrostates."""
     return {
         "no picture" if state[0] < 0 else ", ".join(spec.value_names(state)): share for state, share in outcomes.items()
     }
@@ -349,7 +349,7 @@ def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
 def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], rng: np.random.Generator) -> Arrays:
     """Transitions and a rollout, imagined once more in one future each: before, likeliest real outcome, imagined.
 
-    ``right`` says whether what is imagined, as read, may happen.
+    ``right`` says whether the imagined macrostate, as read, may come.
     """
     chosen = {"worst": ("one_step", worst), "futures": ("rollouts", [0])}
     if "after" in world.asked:

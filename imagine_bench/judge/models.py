@@ -1,6 +1,6 @@
 """Where world models come from: those of the registry, and agents that imagine, which are world models too.
 
-What an agent says its own images show counts for nothing when it is judged: they are read as those of any model.
+An agent's own reading of its images counts for nothing when it is judged: they are read as those of any model.
 """
 
 from __future__ import annotations
@@ -160,7 +160,8 @@ def source_of(
         index: Given to privileged models.
         appearance: How frames vary.
         seeds: The model's node of the seed tree.
-        encoder: A bundled name or a file, for models that read what it gives; the others see through the task's own.
+        encoder: A bundled name or a file, for models that read its latents or codes; the others see through the task's
+            own.
 
     Raises:
         UnknownNameError: No such model.

@@ -1,7 +1,7 @@
 """How right an agent's imagination is, measured against the rules; nothing here is ever shown to the agent.
 
 Open loop: macro-actions that keep the episode alive are imagined from real starts and compared by depth. Examples:
-rollouts that the greedy controller chooses stand beside what the environment shows for the same macro-actions.
+rollouts that the greedy controller chooses stand beside the frames of the environment for the same macro-actions.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ EXAMPLES = 5  # greedy imagined rollouts kept with each run, with their real cou
 SAMPLED_ROLLOUTS = 4  # rollouts sampled from one start and kept with each run
 SAMPLED_DEPTH = 5  # macro-actions of each of them
 Real = tuple[Frame, State, float, bool]
-"""What came of a macro-action: the frame, what it shows, the reward, and whether the episode has ended."""
+"""The result of a macro-action: the frame, its content, the reward, and whether the episode has ended."""
 T = TypeVar("T")
 
 
@@ -56,8 +56,8 @@ def surviving_actions(
 
     From each of N = ``starts`` starts, D macro-actions are drawn uniformly among those that end no episode, now or by
     force later. D is ``depth``, or less where the rules cannot be kept alive as long. Frames are kinematic. The truth
-    is what the agent's frames show, as :meth:`TaskSpec.as_observed` has it; without ``sight`` that is the macrostate.
-    None where no episode can be kept alive, or no start is wanted.
+    is the content of the agent's frames, as :meth:`TaskSpec.as_observed` has it; without ``sight`` that is the
+    macrostate. None where no episode can be kept alive, or no start is wanted.
     """
     rng = SeedTree(0).child(purpose, "open_loop", spec.id).generator()
 
@@ -96,7 +96,7 @@ def surviving_actions(
 
 
 def _clearest_look(sight: Sight | None, state: State) -> State:
-    """What the first frame of an episode shows of its start where it hides as little as it can; -1 for the hidden."""
+    """The content of an episode's first frame where it hides as little as it can; -1 for the hidden."""
     if sight is None:
         return state
     return min((what for _, what in sight.seen(state, 0)), key=lambda what: sum(value < 0 for value in what))
@@ -105,7 +105,7 @@ def _clearest_look(sight: Sight | None, state: State) -> State:
 def _observed(spec: TaskSpec, reached: Sequence[Outcomes], look: State, step: int) -> Outcomes:
     """The truth of a frame after ``step`` actions, and of the reward of the latest.
 
-    ``reached`` are the outcomes after each number of actions, and ``look`` is what the first frame shows.
+    ``reached`` are the outcomes after each number of actions, and ``look`` is the content of the first frame.
     """
     if spec.sight is None:
         return reached[step]
@@ -171,7 +171,7 @@ class Moment:
 
     spec: TaskSpec
     appearance: str
-    frame: Frame  #: What the agent sees. Shape (64, 64, 3).
+    frame: Frame  #: The agent's frame. Shape (64, 64, 3).
     macrostate: State  #: Where it sees it
     before: Sequence[State] = ()  #: Macrostates of the same episode before
 
@@ -207,7 +207,9 @@ class Moment:
         return beside_reality(rollout, self.frame, self.macrostate, real)
 
     def _as_imagined(self, state: State, rollout: ImaginedRollout, step: int) -> bool:
-        """Whether a macrostate reached by action number ``step`` looks as imagined; what is late was imagined late."""
+        """Whether a macrostate reached by action number ``step`` looks as imagined; a late coordinate was imagined
+        late.
+        """
         sight = self.spec.sight
         looks = {state}
         if sight is not None:
@@ -259,7 +261,7 @@ def imagine_sampled_rollouts(
 
 
 def _in_frames(sight: Sight | None, states: Sequence[State], rng: np.random.Generator) -> Sequence[State]:
-    """What the frame shows that the agent sees in each macrostate of an episode; -1 for what it hides."""
+    """The content of the agent's frame in each macrostate of an episode; -1 for a hidden coordinate."""
     if sight is None:
         return states
     looks = [sight.seen(state, step) for step, state in enumerate(states)]
@@ -274,7 +276,8 @@ def _drawn(choices: Sequence[tuple[float, T]], rng: np.random.Generator) -> T:
 
 
 def beside_reality(rollout: ImaginedRollout, frame: Frame, macrostate: State, real: Sequence[Real]) -> ComparedRollout:
-    """An imagined rollout from a ``frame`` that is seen in ``macrostate``, and what really came of it.
+    """An imagined rollout from a ``frame`` that is seen in ``macrostate``, and the real course of the same
+    macro-actions.
 
     ``real`` has an entry for each macro-action that was carried out.
     """

@@ -1,7 +1,7 @@
 """Plans: a whole sequence of macro-actions imagined from one camera frame, then carried out without looking again.
 
 The greedy controller acts in the closed-loop model until the model says that the episode is over (thesis 5.2.3,
-"Generating Plans"). The arm then does what was planned; the frames it passes are kept for people to compare, and the
+"Generating Plans"). The arm then carries out the plan; the frames it passes are kept for people to compare, and the
 agent never sees them.
 """
 
@@ -27,11 +27,11 @@ from imagine_bench.store.results import ComparedRollout
 
 @dataclass(frozen=True, kw_only=True)
 class PlanResult:
-    """One plan and what became of it."""
+    """One plan and its outcome."""
 
     number: int  # its start, from 0; the same for every agent
     start: State  # the macrostate it starts from
-    compared: ComparedRollout  # what was imagined beside what the camera then saw, cut where the episode ended
+    compared: ComparedRollout  # the imagined frames beside those of the camera, cut where the episode ended
     refused: str  # why it was not carried out, or an empty string
     solved: bool  # whether the task was solved when the plan was done
     shortest: int  # the fewest macro-actions that can solve it from there, by the rules
@@ -61,7 +61,7 @@ class PlanResult:
 
     @property
     def outcome(self) -> str:
-        """In a few words, what became of it."""
+        """Its outcome in a few words."""
         if self.refused:
             return f"refused: {self.refused}"
         if self.solved:

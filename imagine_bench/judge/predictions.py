@@ -1,4 +1,4 @@
-"""What a model answers: it is asked an :class:`.EvalSet`, and its images are read as macrostates."""
+"""The answers of a model: it is asked an :class:`.EvalSet`, and its images are read as macrostates."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _OFFERED = ("rewards", "p_ended", "accepted", *UNCERTAINTIES)
 
 @dataclass(frozen=True, kw_only=True)
 class Predictions:
-    """What a model imagines of an :class:`.EvalSet`, as read, in S futures."""
+    """A model's imagination of an :class:`.EvalSet`, as read, in S futures."""
 
     states: Ints  #: Shape (N, S, D, M); -1 where an image shows nothing of this world.
     weights: Floats  #: Probability of each image at its depth. Shape (N, S, D).
     #: Futures that were drawn for each question, all equally likely; 0 where the model gives probabilities. Shape (N,).
     drawn: Ints
-    offered: Arrays  #: What else the model offers, by its name in :class:`.Imagined`. Shapes (N, S, D) or (N, D).
+    offered: Arrays  #: The other abilities of the model, by its name in :class:`.Imagined`. Shapes (N, S, D) or (N, D).
     cpu_s: float  #: CPU seconds of imagining, reading apart
     steps: int  #: Macro-actions imagined, N D of each future
 
@@ -53,7 +53,7 @@ class Predictions:
         )
 
     def of_one_step(self, name: str) -> Floats | None:
-        """What the model offers of the first macro-action, by name, if it does. Shape (N, S) or (N,)."""
+        """The model's offers for the first macro-action, by name, as far as it has them. Shape (N, S) or (N,)."""
         return self.offered[name][..., 0] if name in self.offered else None
 
     def futures(self, row: int, step: int) -> list[tuple[State, float]]:
@@ -148,7 +148,7 @@ def ask_together(ask: Callable[[EvalSet, str], Predictions], sets: Mapping[str, 
 
 
 def call(name: str, method: str, function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
-    """What a model's method returns; InvalidValueError, naming both, where it raises."""
+    """The answer of a model's method; InvalidValueError, naming both, where it raises."""
     try:
         return function(*arguments, **named)
     except GuestError as error:

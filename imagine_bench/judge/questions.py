@@ -1,4 +1,4 @@
-"""What every model is asked: real histories and macro-actions, the same for all, with the exact answers.
+"""The questions to every model: real histories and macro-actions, the same for all, with the exact answers.
 
 Shapes: ``N`` questions, ``K`` frames of history, ``D`` macro-actions asked about.
 """
@@ -38,7 +38,7 @@ T = TypeVar("T")
 class EvalSet:
     """Real histories and macro-actions, with the exact truth of each."""
 
-    states: tuple[State, ...]  #: What the last frame shows. Length N.
+    states: tuple[State, ...]  #: The content of the last frame. Length N.
     frames: Frame  #: Shape (N, K, 64, 64, 3).
     actions: Ints  #: Those between the frames, then those asked about. Shape (N, K - 1 + D).
     truth: tuple[tuple[Outcomes, ...], ...]  #: By question and depth. N of length D.
@@ -116,7 +116,7 @@ def counterfactuals(spec: TaskSpec, render: Render) -> tuple[EvalSet, ...]:
 
 
 SETS = {"one_step": one_step, "rollouts": rollouts, "ranked": ranked, "after": after_the_end}
-"""What makes each set of questions that all models are asked once; the last may be None."""
+"""The makers of each set of questions that all models are asked once; the last may be None."""
 
 
 def _generator(spec: TaskSpec, name: str) -> np.random.Generator:

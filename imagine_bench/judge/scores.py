@@ -1,7 +1,7 @@
 """Scores of a model's predictions against the exact truth; 0 is best in every error.
 
-The names of scores are columns of kept files and stay as they are there. NaN stands for what a model does not offer,
-and where there is nothing to tell apart.
+The names of scores are columns of kept files and stay as they are there. NaN stands where a model does not offer a
+prediction, and where there is nothing to tell apart.
 
 A model that draws futures is charged for their number by every score of probabilities: by total variation, calibration
 errors and Brier scores. Two columns make it comparable with a model that gives probabilities: the total variation that
@@ -303,7 +303,7 @@ def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Flo
 
 
 def filter_scores(epistemic: Floats | None, kept: Any, away: Floats) -> Scores:
-    """What a model's own filter keeps of N answers, and how well it chooses.
+    """The share of N answers that a model's own filter keeps, and how well it chooses.
 
     ``filter_skill`` is the share of wrong answers that it discards less that of right ones, ``best_skill`` the largest
     that any threshold of the epistemic uncertainty has.

@@ -58,7 +58,7 @@ _SEEDS_OF_COMMAND = re.compile(" bench .*--seeds[ =]([0-9]+(?: [0-9]+)*)")
 UNSHOWN = (
     "that an agent chose the macro-actions that are kept as its own (another's, or an oracle's, play again as well)",
     "that runs were not chosen: the seeds that come last may have been left out everywhere",
-    "CPU seconds, diagnostics, and what observers measured",
+    "CPU seconds, diagnostics, and the measures of observers",
     "pictures and recordings",
 )
 """Claims of any bench that playing its episodes again cannot show."""
@@ -181,7 +181,9 @@ class _RunCheck:
             "number of training episodes that end": self.trained,
             "list of their successes": self.run.training_success[first:].tolist(),
             "list of their lengths": self.run.training_length[first:].tolist(),
-            "list of what they tried where": [] if self.run.tried is None else sorted(self.run.tried.tolist()),
+            "list of the macro-actions that they tried where": []
+            if self.run.tried is None
+            else sorted(self.run.tried.tolist()),
         }
         tried = sorted(run_folder.tried_pairs(again.tried))
         _agree("the ", claimed, (again.episode, again.success, again.length, tried))
@@ -271,7 +273,7 @@ def _verify_protocol(folder: Path, protocol: Protocol, runs: Mapping[str, RunRes
         is_read = any(entry is None or (entry.needs_encoder and entry.encoder_kind == kind) for entry in entries)
         require(used is None or is_read or is_older, f"it names the encoder {used}, and no agent reads {kind}.")
         if used is not None and encoders.find(used) is None:
-            unshown.append(f"what encoder {used} is, which is not here")
+            unshown.append(f"the kind of encoder {used}, which is not here")
     if _rounded(facts.get("certificate")) != _rounded(certificate_of(protocol.task, protocol.split)):
         made_at = facts["environment"].get("commit")
         differ = "exact facts of its world, such as chance and optimum"
@@ -312,7 +314,7 @@ def _settings(protocol: Protocol, runs: Mapping[str, RunResult]) -> list[str]:
     able = {agent for agent, entry in entries.items() if entry is None or entry.settings}
     silent = [agent for agent in learners if agent in able and not learners[agent].settings]
     if silent:
-        return [f"what settings {', '.join(silent)} had"]
+        return [f"the settings that {', '.join(silent)} had"]
     if learners and not protocol.settings_digest:
         return ["that settings are those that were planned, of which the protocol has no digest"]
     found = digest({agent: dict(run.settings) if agent in able else {} for agent, run in learners.items()})

@@ -1,1 +1,1 @@
-"""What is compared: protocols, the runs they are made of, and the types of task that have them."""
+"""Protocols of comparisons, the runs they are made of, and the types of task that have them."""

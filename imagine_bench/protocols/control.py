@@ -1,4 +1,4 @@
-"""The protocol of a bench of agents that act, and its presets: what is compared, on what, how long, how often."""
+"""The protocol of a bench of agents that act, and its presets: the agents, the task, the budgets and the tests."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ def _set(section: object, name: str, value: object) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldSection:
-    """What the world is like, in training and in tests."""
+    """The world, in training and in tests."""
 
     execution: str = "physics"  #: ``"physics"`` or ``"kinematic"``
     appearance: str = "clean"  #: As :func:`imagine_bench.appearance.appearance_name` gives it
-    #: What decides whether a grasp holds: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
+    #: The physics of grasping: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
     #: (name, value) pairs.
     physics: tuple[tuple[str, float | str], ...] = field(default=(), metadata=LATER)
-    #: What agents see: parts of :data:`.interfaces.OBSERVATIONS`, separated by commas.
+    #: The observation of agents: parts of :data:`.interfaces.OBSERVATIONS`, separated by commas.
     observation: str = field(default=OBSERVATIONS[0], metadata=LATER)
     observation_size: int = field(default=FRAME_PX, metadata=LATER)  #: Edge of its images in pixels
     #: Training and tests start from different macrostates, ``"plan_length=2@<12 hex digits>"``: see :mod:`.splits`.
@@ -99,7 +99,7 @@ class WorldSection:
 
     @property
     def world(self) -> dict[str, Any]:
-        """What the environments of this protocol are made with, but for their appearance."""
+        """The arguments of this protocol's environments, but for their appearance."""
         made: dict[str, Any] = {"execution": self.execution}
         if self.physics:
             made["physics"] = dict(self.physics)
@@ -111,7 +111,7 @@ class WorldSection:
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerSection:
-    """What learners are made of; see also ``overrides`` and ``device`` of :class:`.ProtocolData`."""
+    """The choices that make learners; see also ``overrides`` and ``device`` of :class:`.ProtocolData`."""
 
     config_group: str = "chapter_5"  #: config group of the agents' settings, as the task names it
     #: Set of values of that group for every learner: ``"minimal"``, ``"fast"`` or ``"published"``.
@@ -130,12 +130,12 @@ class LearnerSection:
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetSection:
-    """What learners are given: real episodes, and help in them."""
+    """The experience of learners: real episodes, and help in them."""
 
     #: Real training episodes at which the agent is evaluated, ascending.
     budgets: tuple[int, ...] = (100, 250, 500)
-    #: Tasks of the same world that learners are trained on before, in this order; what they know of the world is
-    #: carried over, what is rewarded is learned anew. Budgets count episodes of ``task`` alone.
+    #: Tasks of the same world that learners are trained on before, in this order; their knowledge of the world is
+    #: carried over, rewards are learned anew. Budgets count episodes of ``task`` alone.
     after: tuple[str, ...] = ()
     after_episodes: int = _AFTER_EPISODES  #: Real training episodes on each of them
     #: Training episodes, the first ones, that the bench's demonstrator plays while learners merely observe; they are
@@ -178,7 +178,7 @@ class BudgetSection:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationSection:
-    """How agents are tested, and what is measured and recorded beside."""
+    """The tests of agents, and the measurements and recordings beside them."""
 
     evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
     #: Appearance of the tests where it is another one than the training's.
@@ -201,7 +201,8 @@ class EvaluationSection:
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, ProtocolData):
-    """A comparison of agents that act, in four sections; see :class:`.ProtocolData` for what it shares with others.
+    """A comparison of agents that act, in four sections; see :class:`.ProtocolData` for the part that it shares with
+    others.
 
     A new option is a field of one section, checked there. Files and hashes have all fields side by side.
     """
@@ -244,7 +245,9 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
 
     @property
     def looks(self) -> str:
-        """The appearance in words: ``clean``, or ``clean, tested at strong``; and what agents see beside frames."""
+        """The appearance in words: ``clean``, or ``clean, tested at strong``; and the observations of agents beside
+        frames.
+        """
         other = self.test_appearance not in (None, self.appearance)
         words = [appearance_typed(self.appearance)]
         if other and self.test_appearance is not None:
@@ -294,7 +297,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "open_loop_starts": 0, "recorded_episodes": 0,
     },
 }  # fmt: skip
-"""What each preset changes, but where a task says otherwise: ``smoke`` shows that everything works, ``quick`` is the
+"""The changes of each preset, except where a task has its own: ``smoke`` shows that everything works, ``quick`` is the
 default, ``thesis`` is tables 5.1-5.4 as printed, ``full`` has seeds enough to see the filter's gain (5 do not, by the
 thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents that need few, ``queries`` does so
 in little time, to compare many ways of being taught."""
@@ -326,7 +329,7 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
         few_seeds=tuple((agent, wanted.seeds[:most][-1]) for agent, most in few.items() if agent in agents),
     )
     wanted = dataclasses.replace(wanted, code=registered_code(wanted.agents))
-    for agent in wanted.agents:  # what is only read may be of a package that is not here
+    for agent in wanted.agents:  # a protocol that is only read may be of a package that is not here
         _require_takes(agent, wanted)
     _require_learner(wanted)
     require_same_world(wanted.task, wanted.after)
@@ -364,7 +367,7 @@ def _require_learner(wanted: Protocol) -> None:
 
 
 def _require_takes(agent: str, wanted: Protocol) -> None:
-    """Raise InvalidValueError for an agent that cannot take what is observed, or UnknownNameError."""
+    """Raise InvalidValueError for an agent that cannot take the observation, or UnknownNameError."""
     takes = agent_entry(agent).observes
     able = set(wanted.observation.split(",")) <= set(takes) if takes else wanted.shows_frames_alone
     if not able:
@@ -392,13 +395,13 @@ def require_same_world(name: str, earlier: tuple[str, ...]) -> None:
         for fact, words in _OF_WORLDS.items():
             if getattr(task(name), fact) != getattr(task(other), fact):
                 raise InvalidValueError(
-                    f"{name} cannot come after {other}: {words}, so what is learned of one is of no use in the other. "
+                    f"{name} cannot come after {other}: {words}, so knowledge of one is of no use in the other. "
                     "Give tasks of one world to --after, such as arrow_puzzle before arrow_puzzle_hard."
                 )
 
 
 def context_of(spec: RunSpec[Protocol]) -> AgentContext:
-    """What a run's agent is built from."""
+    """The arguments of the factory of a run's agent."""
     protocol = spec.protocol
     entry = agent_entry(spec.agent)
     _require_same_code(spec.agent, protocol)

@@ -1,4 +1,4 @@
-"""What protocols of every task type have in common, what their runs are, and what a type of task brings along.
+"""The common part of protocols of every task type, their runs, and the parts of a type of task.
 
 A protocol is data, and a hash stands for everything in it.
 """
@@ -50,8 +50,8 @@ class ProtocolData(ABC):
     seeds: tuple[int, ...]
     #: Settings that replace those of the hyper-parameter set, as sorted (dotted name, value) pairs.
     overrides: tuple[tuple[str, Setting], ...] = ()
-    #: :func:`digest` of every setting of every learner: a hyper-parameter set may be another one tomorrow, and what was
-    #: run with it is then another bench. Empty in a protocol that no plan made.
+    #: :func:`digest` of every setting of every learner: a hyper-parameter set may be another one tomorrow, and a run
+    #: with that one belongs to another bench. Empty in a protocol that no plan made.
     settings_digest: str = ""
     device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it
     #: Edition of agents' names that files and the hash of this protocol have; ``agents`` are today's labels in any.
@@ -153,7 +153,7 @@ Phase = Literal["training", "training in the model", "testing", "imagining", "re
 
 @dataclass(frozen=True, kw_only=True)
 class RunSpec(Generic[P_co]):
-    """What one run is."""
+    """One run."""
 
     protocol: P_co  #: The comparison it belongs to
     agent: str  #: Registered agent or regressor
@@ -161,7 +161,7 @@ class RunSpec(Generic[P_co]):
     encoder: Path | None = None  #: The encoder artefact, or None if the agent needs none
     dataset: Path | None = None  #: The folder of the dataset that comes first, or None
     checkpoint_every_s: float = 20.0  #: Seconds of work that a kill may cost
-    observers: tuple[str, ...] = ()  #: What looks at it, each the ``"module:attr"`` of a :class:`.runner.RunObserver`
+    observers: tuple[str, ...] = ()  #: Its observers, each the ``"module:attr"`` of a :class:`.runner.RunObserver`
 
     @property
     def work(self) -> int:
@@ -180,13 +180,13 @@ class Progress:
     agent: str  #: Registered agent
     seed: int  #: The run's seed
     bench: str = ""  #: Hash of the run's protocol
-    phase: Phase  #: What it is doing
+    phase: Phase  #: Its phase
     done: int  #: Episodes played, for training and for tests
     work: int  #: Episodes to play
     episode: int = 0  #: Training episodes done
     #: Share of successes among the last :data:`RECENT` training episodes, or in the running test; None before any.
     success: float | None = None
-    #: What a run without episodes is doing, or why one failed, in words; None where episodes say it.
+    #: The activity of a run without episodes, or why one failed, in words; None where episodes say it.
     detail: str | None = None
 
 
@@ -197,7 +197,7 @@ Encoders = Mapping[str, Path]
 
 
 class FinishedRun(Interface):
-    """What runs of every type leave."""
+    """The results of runs of every type."""
 
     @property
     def folder(self) -> Path:
@@ -209,7 +209,7 @@ class FinishedRun(Interface):
 
 
 class Result(Interface):
-    """What benches of every type measured: one run an agent and seed, in a folder."""
+    """The results of benches of every type: one run an agent and seed, in a folder."""
 
     @property
     def runs(self) -> Sequence[FinishedRun]:
@@ -221,18 +221,18 @@ class Result(Interface):
 
     @property
     def missing(self) -> Sequence[str]:
-        """What an unfinished bench lacks, one sentence a run."""
+        """The missing runs of an unfinished bench, a sentence each."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskType(Generic[P]):
-    """What a type of task brings along."""
+    """The parts of a type of task."""
 
     tasks: Callable[[], Mapping[str, object]]  #: Gives its tasks, by name
     learners: Callable[[], Mapping[str, object]]  #: Gives its agents or regressors, by name
     draws: bool  #: Whether its runs need OpenGL
     protocol: type[P]  #: The class of its protocols
-    presets: Mapping[str, Mapping[str, Setting]]  #: What each protocol preset changes, by name
+    presets: Mapping[str, Mapping[str, Setting]]  #: The changes of each protocol preset, by name
     #: Makes a protocol from a task, a preset and changes to single fields, all checked, and finds its encoders.
     plan: Callable[..., tuple[P, Encoders]]
     run: Callable[[RunSpec[P], Path, OnProgress], object]  #: Carries out a run in a folder
@@ -265,7 +265,7 @@ class Failure:
 
     @property
     def progress(self) -> Progress:
-        """What an observer is told of it."""
+        """The progress of it, for an observer."""
         spec = self.job.spec
         return Progress(
             agent=spec.agent, seed=spec.seed, bench=spec.protocol.hash, phase="failed", done=0, work=spec.work,

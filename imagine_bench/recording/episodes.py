@@ -1,4 +1,4 @@
-"""Rerun recordings of what an agent really does and of what it imagines meanwhile.
+"""Rerun recordings of an agent's real episodes, and of its imagination meanwhile.
 
 Timelines: ``sim_time`` (the arm moves; one still second and a half after each episode), ``env_step`` (one a real
 frame), ``episode``, ``imagined_depth``. Entities: ``/scene/...``, ``/real/...``, ``/imagined/...``.
@@ -50,7 +50,7 @@ def record_run(
     episodes: int,
     path: Path,
 ) -> tuple[RecordedEpisode, ...]:
-    """Record greedy real episodes of a trained agent, with what it imagines at every step if it imagines.
+    """Record greedy real episodes of a trained agent, with its imagination at every step if it imagines.
 
     ``env`` is the task's at ``appearance``, and stays open; nothing changes in the agent, registered as ``name``. The
     episodes' seeds follow from the run's and are used for nothing else. ``path`` ends in ``.rrd``; until complete it is
@@ -157,7 +157,7 @@ class _EpisodeRecorder:
         self.first.setdefault(success, played)
 
     def _log_learning_to_see(self) -> None:
-        """What it saw whenever that changed in training, a moment each, while the scene stands still."""
+        """Its perception whenever that changed in training, a moment each, while the scene stands still."""
         recording = self.recording
         for seen in self.agent.perceived() if isinstance(self.agent, SeeingLearner) else ():
             count = len(seen.sizes)
@@ -169,7 +169,7 @@ class _EpisodeRecorder:
             recording.set_clocks(env_step=self.recording.env_step, episode=1)
 
     def _log_frame(self, episode: int, seen: Observed, info: Info) -> Observation:
-        """A new real frame: set the clocks, show it and how the scene stands. Returns what the agent sees."""
+        """A new real frame: set the clocks, show it and how the scene stands. Returns the agent's observation."""
         observation = Observation.of(seen, info, privileged=self.privileged)
         if self.recording.env_step < 0:  # the timeline imagined_depth begins there and needs a scene to stand in
             self.recording.set_clocks(imagined_depth=0)
@@ -189,9 +189,9 @@ class _EpisodeRecorder:
         )[0]
 
     def _describe(self, heading: str, info: Info, last: str, frame: Frame) -> None:
-        """What has happened, what is true, and what the frame shows where that is something else; what comes next.
+        """The last step, the true macrostate, that of the frame where it differs, and the next step.
 
-        Of an agent with memory also what a read-out finds in it.
+        Of an agent with memory also the values that a read-out finds in it.
         """
         spec = self.spec
         truth: Macrostate = info["macrostate"]
@@ -219,7 +219,7 @@ class _EpisodeRecorder:
                 self.recording.curves("/real/novelty", dict(zip(names, novelty, strict=True)))
 
     def _log_imagination(self, frame: Frame, macrostate: Macrostate, episode: int, step: int) -> None:
-        """The agent's greedy plan, imagined from here and set beside what would really happen."""
+        """The agent's greedy plan, imagined from here and set beside the real outcome of the same macro-actions."""
         if not isinstance(self.agent, Imaginer):
             return
         spec = self.spec
@@ -244,7 +244,7 @@ class _EpisodeRecorder:
             places = np.arange(IMAGINED_DEPTH) + 1.0 + 0.27 * (index - 1)
             bars = rr.BarChart(values, abscissa=places, widths=np.full(IMAGINED_DEPTH, 0.25), color=color)
             self.recording.log(f"/imagined/uncertainty/{kind}", bars)
-        if is_random(spec.rules):  # several rollouts, since what happens next is partly chance
+        if is_random(spec.rules):  # several rollouts, since the next macrostate is partly chance
             branch = seeds.child("sampled_rollouts", episode, step)
             sampled = sampled_filmstrips(moment.sampled(self.agent, branch), spec, DARK)
             self.recording.sheet("/imagined/sampled_rollouts", sampled)
@@ -271,20 +271,20 @@ def _log_by_depth(recording: Recording, compared: ComparedRollout, root: str) ->
 
 
 def _layout(recording: Recording) -> rrb.Vertical:
-    """The scene large, beside it what the agent sees and predicts, below it what it imagines."""
+    """The scene large, beside it the agent's view and predictions, below it its imagination."""
     shown = recording.shown
     table = rrb.TextDocumentView(origin="/real/q_table", name="Q-values: return expected of each macro-action")
     side = rrb.Vertical(
         rrb.Horizontal(
-            rrb.TextDocumentView(origin="/real/text", name="What happens"),
+            rrb.TextDocumentView(origin="/real/text", name="Steps"),
             rrb.Spatial2DView(origin="/real/frame", name="Agent's view, 64 x 64"),
         ),
         *shown(table),
         row_shares=[1.2, 1.0],
     )
     top = rrb.Horizontal(scene_view(recording), side, column_shares=[1.1, 1.0])
-    seen = "What it has learned to see: a color a factor, and beside it a look of each of its values"
-    plan = "The agent's own plan from here: what would really happen (above), what it imagines (below)"
+    seen = "Its learned perception: a color a factor, and beside it a view of each of its values"
+    plan = "The agent's own plan from here: the real outcome (above), its imagination (below)"
     uncertainty = "Uncertainty by depth: epistemic pink, aleatoric blue, modal yellow"
     strip = sheet_view("/imagined/filmstrip", plan)
     now = rrb.Horizontal(
@@ -296,7 +296,7 @@ def _layout(recording: Recording) -> rrb.Vertical:
     over_time = shown(
         rrb.TimeSeriesView(origin="/real/reward", name="Reward of each real macro-action"),
         rrb.TimeSeriesView(origin="/real/q_values", name="Q-value of each macro-action"),
-        rrb.TimeSeriesView(origin="/real/novelty", name="What is unknown of each macro-action"),
+        rrb.TimeSeriesView(origin="/real/novelty", name="Unknown share of each macro-action"),
     )
     root = "/imagined/episode_1"
     by_depth = rrb.Horizontal(

@@ -52,7 +52,7 @@ TileRow = tuple[str, Sequence[Pixels] | Pixels, Sequence[bool] | None]
 
 
 class Tile(NamedTuple):
-    """An image of a sheet with what stands above and below it."""
+    """An image of a sheet with the words above and below it."""
 
     frame: Pixels | None  # RGB bytes of a square image; None leaves its place empty
     above: str = ""
@@ -122,10 +122,10 @@ def filmstrip(
 
     Each column names the macro-action and shows the real frame, the decoded imagined one, and the predicted reward,
     P(end) and epistemic uncertainty, with the true reward in brackets. A vertical line marks where the uncertainty
-    filter cuts; what it discards is paler. The border of an imagined frame is blue where its macrostate is what
-    the rules say and orange where it is not; the text below says the same. Where nothing real is to
-    compare with (a plan that was not carried out that far), the upper row stays empty. There is room for ``columns``
-    macro-actions, None for all. The image has shape (height, width, 3), uint8.
+    filter cuts; discarded images are paler. The border of an imagined frame is blue where its macrostate follows from
+    the rules and orange where it does not; the text below says the same. Where nothing real is to compare with (a plan
+    that was not carried out that far), the upper row stays empty. There is room for ``columns`` macro-actions, None for
+    all. The image has shape (height, width, 3), uint8.
     """
     rollout = compared.rollout
     done = len(compared.real_frames)
@@ -159,7 +159,7 @@ def sampled_filmstrips(
 ) -> Pixels:
     """Draw imagined rollouts of one start below one another, a column a macro-action; only the start is real.
 
-    Below each imagined frame stands what a probe says has changed: in blue where the rules make it possible, in
+    Below each imagined frame stands the change that a probe reads: in blue where the rules make it possible, in
     orange where not, in black where frames hide or delay a part, so that single steps cannot be judged. The image has
     shape (height, width, 3), uint8.
     """
@@ -198,7 +198,7 @@ def transition_sheet(titles: Sequence[str], rows: Sequence[TileRow]) -> Pixels:
 def _verdict(right: bool | None) -> str:
     if right is None:
         return ""
-    return "as the rules say" if right else "not what happens"
+    return "as the rules say" if right else "not as the rules say"
 
 
 def png(image: Pixels) -> bytes:
@@ -215,7 +215,7 @@ def rgb(image: NDArray[np.float32]) -> Pixels:
 
 
 def changes(before: Macrostate, now: Macrostate, spec: TaskSpec) -> str:
-    """What is different, in the task's own words."""
+    """The differences, in the task's own words."""
     named = zip(spec.macrostate_names, spec.value_names(now), before, now, strict=True)
     return ", ".join(f"{name} {value}" for name, value, was, after in named if was != after) or "nothing changes"
 

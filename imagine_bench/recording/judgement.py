@@ -1,4 +1,4 @@
-"""A judgement to step through: the truth and what each model imagines of it, side by side.
+"""A judgement to step through: the truth and each model's imagination of it, side by side.
 
 Timeline ``depth``, the macro-actions imagined so far; entities ``/real/...`` and ``/<model>/...``.
 """

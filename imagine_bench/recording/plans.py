@@ -1,4 +1,4 @@
-"""The recording of plans: the arm carries out blindly what the agent imagined from one frame, both side by side.
+"""The recording of plans: the arm carries out blindly a plan that the agent imagined from one frame, both side by side.
 
 Timelines: ``sim_time`` (the arm moves), ``env_step`` (one a macro-action), ``plan``. Entities: ``/scene/...``,
 ``/real/...``, ``/imagined/...``.
@@ -31,8 +31,8 @@ def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic:
 
     def layout(recording: Recording) -> rrb.Vertical:
         frames = rrb.Horizontal(
-            rrb.Spatial2DView(origin="/real/frame", name="What the camera sees (the agent does not)"),
-            rrb.Spatial2DView(origin="/imagined/frame", name="What the agent imagined for this moment"),
+            rrb.Spatial2DView(origin="/real/frame", name="The camera's image (the agent does not see it)"),
+            rrb.Spatial2DView(origin="/imagined/frame", name="The agent's imagination of this moment"),
         )
         side = rrb.Vertical(rrb.TextDocumentView(origin="/real/text", name="The plan"), frames)
         top = rrb.Horizontal(scene_view(recording), side, column_shares=[1.1, 1.0])
@@ -68,7 +68,7 @@ def record_plans(trained: Trained, *, count: int, execution: str, max_epistemic:
 
 
 def _words(plan: PlanResult, done: int, count: int, names: Sequence[str]) -> str:
-    """What was planned, and what has become of it when so much is done."""
+    """The plan, and its outcome when so much is done."""
     lines = [f"### Plan {plan.number} (of {count}, from 0), imagined from one frame", ""]
     for step, action in enumerate(plan.compared.rollout.actions, start=1):
         mark = "done" if step <= done else ("**now**" if step == done + 1 and done < plan.done else "")

@@ -1,4 +1,4 @@
-"""Recordings of chapter 4: the toy functions and what a network says of them, and the arm choosing and reaching."""
+"""Recordings of chapter 4: the toy functions and a network's predictions of them, and the arm choosing and reaching."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def record_robot(evaluations: Mapping[str, Arrays], *, task: RegressionSpec, nam
     view = rrb.Spatial3DView(
         origin="/", contents=[f"{ROOT}/**", "/choice/**"], name="The arm, and where it could reach"
     )
-    text = rrb.TextDocumentView(origin="/choice/text", name="What happens")
+    text = rrb.TextDocumentView(origin="/choice/text", name="Steps")
     curve = rrb.TimeSeriesView(origin="/choice/error", name="Error of each choice (m)")
     layout = rrb.Horizontal(view, rrb.Vertical(text, curve))
     with recording_file(path, task.id, lambda _: layout) as recording:

@@ -54,14 +54,14 @@ def entity_name(words: str) -> str:
 
 
 class Recording:
-    """A Rerun stream, with a short way to log what is logged often; a component that does not fit is an error.
+    """A Rerun stream, with a short way to log common components; a component that does not fit is an error.
 
     Attributes:
         clock_s: Where the timeline ``sim_time`` has come to, in seconds.
         sequences: Where the other timelines have come to.
         scene: The scene of an environment, which keeps its motion from now on; None shows nothing.
         env_step: How often that was shown, from 0.
-        look_target_m: What a view of the scene looks at. Shape (3,).
+        look_target_m: The point at which a view of the scene looks. Shape (3,).
     """
 
     def __init__(self, stream: rr.RecordingStream, env: Env | None = None) -> None:
@@ -89,7 +89,7 @@ class Recording:
             self.stream.set_time(name, sequence=value)
 
     def show(self, **sequences: int) -> None:
-        """Go on by one ``env_step``, and log how the latest macro-action moved the scene: first what there is in it.
+        """Go on by one ``env_step``, and log how the latest macro-action moved the scene: first the scene itself.
 
         The view looks at the middle of the small bodies, which are the objects and the fingers.
         """
@@ -141,7 +141,7 @@ class Recording:
         self.log(imagined, rr.Image(rgb(rollout.frames[done - 1] if done else rollout.start_frame)))
 
     def clear(self, path: str) -> None:
-        """Remove what an entity and those below it show from now on."""
+        """Remove the content of an entity, and of those below it, from now on."""
         if self.holds(path):
             self.log(path, rr.Clear(recursive=True))
 

@@ -14,7 +14,7 @@ from typing import Any
 from imagine_bench.errors import require_known
 
 NAMES = ("arrow_puzzle", "arrow_puzzle_hard", "pick_place", "robot_ik")
-"""What the thesis reports on; a TaskSpec names one of these as its ``reference``."""
+"""The parts of the thesis with results; a TaskSpec names one of these as its ``reference``."""
 
 
 def load(name: str) -> dict[str, Any]:
@@ -38,7 +38,7 @@ def success(task_reference: str, agent: str) -> dict[int, tuple[float, float]]:
 
 
 def success_source(task_reference: str) -> str:
-    """Where in the thesis :func:`success` stands, and over what; empty where it gives no success."""
+    """Where in the thesis :func:`success` stands, and of which episodes; empty where it gives no success."""
     return str(load(task_reference).get("success", {}).get("source", ""))
 
 

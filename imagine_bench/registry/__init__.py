@@ -65,7 +65,7 @@ REGRESSION_GROUP = "imagine_bench.regressions"
 REGRESSOR_GROUP = "imagine_bench.regressors"
 STUDY_GROUP = "imagine_bench.studies"
 WORLD_MODEL_GROUP = "imagine_bench.world_models"
-"""Entry points in which installed packages offer what is theirs: each the ``"module:attr"`` of a TaskEntry, AgentEntry,
+"""Entry points in which installed packages make their offers: each the ``"module:attr"`` of a TaskEntry, AgentEntry,
 EncoderEntry, RegressionSpec, RegressorEntry, Study or WorldModelEntry."""
 
 
@@ -126,18 +126,18 @@ def regressors() -> dict[str, RegressorEntry]:
 
 
 def usable(group: str) -> dict[str, Any]:
-    """What installed packages offer in a group of entry points and can be used, by name."""
+    """The usable offers of installed packages in a group of entry points, by name."""
     return {name: entry for name, entry in offers(group).items() if not isinstance(entry, SetupError)}
 
 
 def refused_offers() -> list[SetupError]:
-    """Why some of what installed packages offer cannot be used."""
+    """The reasons why some offers of installed packages cannot be used."""
     return [entry for group in _GROUPS for entry in offers(group).values() if isinstance(entry, SetupError)]
 
 
 @functools.cache
 def offers(group: str) -> Mapping[str, Any]:
-    """What installed packages offer in a group of entry points, by name: an object, or the error why it is none.
+    """The offers of installed packages in a group of entry points, by name: an object, or the error why it is none.
 
     A name of this suite's own stays this suite's.
     """
@@ -164,7 +164,7 @@ def offers(group: str) -> Mapping[str, Any]:
 
 
 def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
-    """What has a name in a group: this suite's own, or a package's. Raises as :func:`task_entry`."""
+    """The object of a name in a group: this suite's own, or a package's. Raises as :func:`task_entry`."""
     if isinstance(name, str) and name in own:
         return own[name]
     what = _GROUPS[group].what
@@ -230,7 +230,7 @@ def task_entry(name: str) -> TaskEntry:
 
 
 def _options(base: str, entry: TaskEntry, said: str) -> dict[str, Setting]:
-    """What is said after the colon, ``key=value,...`` or ``@`` and a JSON file, by option."""
+    """The options after the colon, ``key=value,...`` or ``@`` and a JSON file, by option."""
     if not entry.world:
         raise InvalidValueError(f"Task {base} takes no options; leave out {brief(':' + said)}.")
     world = load(entry.world)
@@ -435,5 +435,7 @@ def make_regressor(name: str, context: RegressorContext) -> Regressor:
 
 
 def make_world_model(name: str, *given: Any) -> WorldModel:
-    """A new world model by its registered name, from what its entry says. Raises as :func:`make_agent`."""
+    """A new world model by its registered name, from the arguments that its entry names. Raises as
+    :func:`make_agent`.
+    """
     return made(f"World model {name}", world_model_entry(name).make, *given)

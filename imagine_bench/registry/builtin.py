@@ -1,4 +1,6 @@
-"""What this suite itself offers, by name. A task, an agent, a regressor or a world model costs one entry here."""
+"""This suite's own tasks, agents and models, by name. A task, an agent, a regressor or a world model costs one entry
+here.
+"""
 
 from __future__ import annotations
 
@@ -101,7 +103,7 @@ AGENTS: dict[str, AgentEntry] = {
         needs_encoder=False,
         settings="imagine_bench.agents.factored.settings:LEARNED",
         description="Begins with nothing: from its own frames it learns discrete factors, which of them an action "
-        "changes and what is rewarded; it explores where it is uncertain and plans in its model.",
+        "changes, and the rewards; it explores where it is uncertain and plans in its model.",
     ),
     "factored:given": AgentEntry(
         make="imagine_bench.agents.factored.agent:make",
@@ -109,14 +111,14 @@ AGENTS: dict[str, AgentEntry] = {
         encoder_kind="codes",
         settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
         description="Like factored, but it is given an encoder of discrete factors and learns no perception; it can "
-        "also show what it imagines and query an oracle.",
+        "also show its imagination and query an oracle.",
     ),
     "imagination_only": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make",
         relative_cost=4.0,
         settings=_IMAGINATION_SETTINGS,
         description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
-        "world is trained in that model alone, and is what is tested.",
+        "world is trained in that model alone, and is then tested.",
     ),
     "imagination_only_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make_uncertainty",
@@ -161,7 +163,7 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
     "patches": WorldModelEntry(
         make="imagine_bench.agents.world_models.patches:Patches",
         title="patches and tables",
-        description="No network: patches that change, groups of their looks, tables of what followed; a plain model.",
+        description="No network: patches that change, groups of their looks, tables of the next groups; a plain model.",
     ),
     "convolutional": WorldModelEntry(
         make="imagine_bench.agents.world_models.convolutional:make",
@@ -238,7 +240,7 @@ class Guest:
     """A package of this suite that is installed apart from it, known by name also where it is not installed."""
 
     package: str  #: its name as pip knows it
-    names: Mapping[str, tuple[str, ...]]  #: what it offers, by group of entry points
+    names: Mapping[str, tuple[str, ...]]  #: its offers, by group of entry points
     install: str  #: the command line that installs it
 
 

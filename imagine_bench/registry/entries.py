@@ -1,4 +1,4 @@
-"""What can be registered; and entrants of a bench: an agent, ``dqn``, or ``dqn:controller.discount=0.99``.
+"""Registry entries; and entrants of a bench: an agent, ``dqn``, or ``dqn:controller.discount=0.99``.
 
 An agent that comes in variants has a registered name for each, such as ``factored:given``; settings follow after a
 comma: ``factored:given,planning.depth=1``. The text is an entrant's name in protocols, tables and files; one agent,
@@ -24,7 +24,7 @@ from imagine_bench.values import Setting
 _BETWEEN = re.compile(r",(?=[\w.]+=)")
 _LONGEST = 100
 ENCODER_KINDS = ("latents", "codes")
-"""What an encoder gives of a frame: real numbers, or the values of discrete factors."""
+"""The outputs of an encoder for a frame: real numbers, or the values of discrete factors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class AgentEntry:
 
     make: str | CodeByValue  #: ``"module:attr"`` of a function from AgentContext to Agent, or the function itself
     learns: bool = True  #: Whether training changes it; others are only evaluated
-    needs_encoder: bool = True  #: Whether it sees what an encoder gives
+    needs_encoder: bool = True  #: Whether it sees the output of an encoder
     encoder_kind: str = "latents"  #: Which of the task's bundled encoders it takes: ``"latents"`` or ``"codes"``
     #: Its settings: ``"module:attr"``, or a module, with ``names()`` and ``resolve(hyperparameters, overrides,
     #: group)``; by default it has none.

@@ -28,7 +28,7 @@ GL_RENDERER = "imagine_bench.tasks.rendering:gl_renderer"
 CALL: ContextVar[str | None] = ContextVar("CALL", default=None)
 """The command line of the call of the Python API that is carried out."""
 _CODE = ("imagine_bench", "agents", "tasks", "assets", "pyproject.toml")
-"""What decides results, in a checkout."""
+"""The folders that decide results, in a checkout."""
 
 
 def describe_environment() -> dict[str, Json]:
@@ -139,7 +139,7 @@ def gl_renderer() -> str:
 
 
 def _output(*words: str) -> str | None:
-    """What a command prints, stripped; None if it fails."""
+    """The output of a command, stripped; None if it fails."""
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=10, check=False)
     except (OSError, subprocess.TimeoutExpired):

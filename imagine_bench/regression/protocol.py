@@ -63,7 +63,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "thesis": {"hyperparameters": "published", "networks": 10},
     "full": {"hyperparameters": "published", "networks": 20, "test_points": 1000},
 }
-"""What each preset changes: ``thesis`` is chapter 4 as printed, ten networks on ten datasets; ``smoke`` has only the
+"""The changes of each preset: ``thesis`` is chapter 4 as printed, ten networks on ten datasets; ``smoke`` has only the
 first two variants."""
 
 

@@ -1,6 +1,6 @@
-"""Runs of a regression bench, and what they measured: each is one regressor, one seed, its networks on every variant.
+"""Runs of a regression bench, and their results: each is one regressor, one seed, its networks on every variant.
 
-What a variant gave is written when it is measured, so a run that was killed and started again does only the variant
+The result of a variant is written when it is measured, so a run that was killed and started again does only the variant
 anew at which it was, and ends in the same bits as one that was not; only CPU times differ.
 
 Networks that say how sure they are, are asked on points that they have never seen whether they are right about that

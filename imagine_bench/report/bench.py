@@ -235,8 +235,8 @@ def _not_installed(data: ReportData) -> list[str]:
 def compared(data: ReportData) -> Section:
     """The task, the agents and the verdict on them."""
     rows = [[agent, known_agent(agent).description] for agent in data.result.protocol.agents]
-    table = Table("agents", ["agent", "what it does"], rows, prose=True)
-    return Section("What was compared", [data.spec.description], tables=[table], answers=verdict(data))
+    table = Table("agents", ["agent", "description"], rows, prose=True)
+    return Section("Task and agents", [data.spec.description], tables=[table], answers=verdict(data))
 
 
 def success(data: ReportData) -> Section:
@@ -341,7 +341,9 @@ def gain(data: ReportData) -> Section | None:
 
 
 def _on_the_same_starts(records: Sequence[Record]) -> list[Table]:
-    """These trained agents against these trained DQNs, by who alone solved a test; nothing where that was not kept."""
+    """These trained agents against these trained DQNs, by the tests that one alone solved; nothing where that was not
+    kept.
+    """
     rows = [
         {
             "against DQN": record["agent"],
@@ -363,7 +365,7 @@ def _on_the_same_starts(records: Sequence[Record]) -> list[Table]:
 
 
 def cost(data: ReportData) -> Section:
-    """What each agent had had at the last budget, CPU seconds and faults."""
+    """The experience of each agent at the last budget, its CPU seconds and faults."""
     rows = []
     for agent in data.result.protocol.agents:
         last = data.of(agent)[-1]
@@ -382,10 +384,10 @@ def cost(data: ReportData) -> Section:
         )
     caption = (
         "Frames before training are drawn from all macrostates alike. A fault is a macro-action whose physical outcome "
-        f"was not what the rules say. The whole bench took {data.result.wall_s:,.0f} s of wall time."
+        f"was not as the rules say. The whole bench took {data.result.wall_s:,.0f} s of wall time."
     )
     table = Table.of("cost", rows, caption, "not counted by the agent, or an encoder that is not bundled")
-    return Section("What it cost, and what went wrong", tables=[table])
+    return Section("Costs and faults", tables=[table])
 
 
 def success_figure(data: ReportData) -> Figure:

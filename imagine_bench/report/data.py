@@ -27,8 +27,8 @@ from imagine_bench.store.files import csv_text
 from imagine_bench.store.results import BenchResult, OpenLoop
 
 Record = dict[str, Any]
-"""An agent at one budget: columns of summary.csv, as far as they apply to it, and what it cost until then."""
-BASE_AGENT = "dqn"  # what gains are measured against, as in the thesis
+"""An agent at one budget: columns of summary.csv, as far as they apply to it, and its costs until then."""
+BASE_AGENT = "dqn"  # the agent that gains are measured against, as in the thesis
 SCORE = ("success_iqm", "low_95", "high_95")
 DIFFERENCE = ("difference_to_dqn", "difference_low_95", "difference_high_95", "p")
 GAIN = ("gain", "gain_low_95", "gain_high_95")
@@ -226,7 +226,7 @@ def open_loop_means(result: BenchResult) -> dict[str, Arrays]:
     for agent in result.protocol.agents:
         loops = [run.checkpoints[-1].open_loop for run in result.of(agent)]
         if known := [loop for loop in loops if loop is not None]:
-            with warnings.catch_warnings(action="ignore"):  # of what is NaN in every run
+            with warnings.catch_warnings(action="ignore"):  # of a measure that is NaN in every run
                 columns = ((name, [getattr(loop, name) for loop in known]) for name in _LOOP_COLUMNS)
                 found[agent] = {name: np.nanmean(column, axis=0) for name, column in columns}
             found[agent]["count"] *= len(known)

@@ -1,4 +1,4 @@
-"""The report of a judgement: scores by question, futures beside the truth, and what models know of their errors."""
+"""The report of a judgement: scores by question, futures beside the truth, and how well models know their errors."""
 
 from __future__ import annotations
 
@@ -69,22 +69,22 @@ QUESTIONS = {
         "encoder_frames": "frames beforehand",
     },
 }  # fmt: skip
-"""Scores by question: what a column of theirs is called."""
+"""Scores by question: the name of a column of theirs."""
 COLUMNS = {name: words for columns in QUESTIONS.values() for name, words in columns.items()}
 _WORDS = {
     "Which outcomes, how likely?": "Total variation is the distance of the imagined from the exact distribution of "
     "macrostates: 0 for equal ones, 1 for two that share no macrostate. A model that draws futures instead of giving "
     "probabilities is above 0 even if it is perfect; the columns “perfect sampler's” say how far, for as many futures, "
     "and hold 0 for a model that gives probabilities. The unbiased Brier score is free of that: the sum of squared "
-    "differences of probabilities, less what sampling adds in the mean: 0 is perfect, 2 the worst, and a perfect "
+    "differences of probabilities, less the mean share of sampling: 0 is perfect, 2 the worst, and a perfect "
     "sampler may be a little below 0. Compare a model that draws with one that gives probabilities by this score only; "
     "missed and invented outcomes, calibration error and Brier score hold the sampling, too. “After the end” is the "
     "total variation of macro-actions after an episode has ended, which no data contains. Missed and invented outcomes "
     "are counted per transition. “No picture” is the share of images in which the reader recognizes nothing.",
     "Which rewards and ends?": "Error of the expected reward, in units of reward, and of the probability of the end. "
     "For calibration and Brier score a reward counts as the nearest that the rules give.",
-    "What do mistakes cost?": "Value loss is V* - V: what the best policy earns from a start, less what the policy "
-    "earns that is optimal in the model; the mean over starts, in units of reward. Regret: the model ranks five "
+    "What do mistakes cost?": "Value loss is V* - V: the return of the best policy from a start, less that of the "
+    "policy that is optimal in the model; the mean over starts, in units of reward. Regret: the model ranks five "
     "sequences of macro-actions from a start, and regret is the exact return of the best less that of the one ranked "
     "first. Both use the rewards and ends that the model itself predicts, and are a dash where it predicts none. The "
     "columns “rules' rewards” take rewards and ends from the rules, for the macrostates that the model imagines: they "
@@ -98,7 +98,7 @@ _WORDS = {
     "own filter discards.",
     "Does it notice?": f"Random transitions until a detector of surprise says that every macro-action slips with "
     f"probability {SLIP}, or that one also does what another does, at false alarms in {FALSE_ALARMS:.0%} of "
-    f"unchanged streams of {LENGTH}; {LENGTH}: never. Counterfactuals: what it imagines of two macro-actions with the "
+    f"unchanged streams of {LENGTH}; {LENGTH}: never. Counterfactuals: its imagination of two macro-actions with the "
     "same draws that cannot both be.",
     "What does it cost?": "CPU seconds are those of one core: of fitting, and of imagining 1,000 macro-actions. Frames "
     "beforehand are those on which the model's encoder had been trained before.",
@@ -116,12 +116,12 @@ _SHARES = {
 _WHY_DASH = "not offered by the model, nothing to tell apart, or judged before this score existed"
 _BY_DEPTH = {"tv": "tv_by_depth", "perfect": "perfect_by_depth", "unbiased": "unbiased_by_depth"}
 Scores = Mapping[str, Any]
-"""What is kept of a model that was fitted once."""
+"""The kept results of a model that was fitted once."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A judgement and what is kept of it."""
+    """A judgement and its kept results."""
 
     folder: Path
     judgement: Judgement
@@ -135,7 +135,9 @@ class Judged:
 
     @property
     def after(self) -> str:
-        """What models had learned from; nothing where all are trained agents, which learned in their benches."""
+        """The data that models had learned from; nothing where all are trained agents, which learned in their
+        benches.
+        """
         return f" after {self.judgement.sizes[-1]:,} transitions" if self.judgement.learning else ""
 
 
@@ -219,7 +221,7 @@ def in_short(found: Judged) -> Section:
         "own errors are in the second table: the shares of real frames that it takes for another macrostate or does "
         "not recognize, and the shares of fog, noise and blends of two frames that it wrongly takes for a real frame."
     )
-    reader = Table.of("reader", [errors], "What the reader of images gets wrong itself.")
+    reader = Table.of("reader", [errors], "The errors of the reader of images itself.")
     return Section("In short", [words], tables=[_scores(found, "short", SHORT), reader])
 
 
@@ -278,7 +280,7 @@ def _sheet(found: Judged, name: str, caption: str, kind: str, models: Mapping[st
     (one, *_) = models.values()
     titles = [found.spec.action_names[action] for action in one[f"{kind}_actions"].flat]
     real = _joined(one[f"{kind}_real"])
-    before = np.concatenate([one[f"{kind}_before"], real])[: len(real)]  # a rollout goes on from what was real
+    before = np.concatenate([one[f"{kind}_before"], real])[: len(real)]  # a rollout goes on from the real frame
     rows: list[TileRow] = [("before", before, None), ("real", real, None)]
     for model, arrays in models.items():
         rows.append((_title(model), _joined(arrays[f"{kind}_imagined"]), arrays[f"{kind}_right"].ravel().tolist()))

@@ -1,4 +1,4 @@
-"""What every report is made of: tables, images, sections and the page; how numbers are printed, and pages written."""
+"""The parts of every report: tables, images, sections and the page; how numbers are printed, and pages written."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Image:
     """An image or figure, drawn when it is first asked for: a table on a terminal needs none."""
 
     name: str  # file name without ending
-    content: bytes | Callable[[], bytes]  # the PNG, or what draws it
+    content: bytes | Callable[[], bytes]  # the PNG, or a function that draws it
     caption: str  # the text below it
     draw: Callable[[], Figure] | None = None  # draws it as a matplotlib figure, if it is one
 
@@ -113,7 +113,7 @@ class Page:
 
     title: str  # its heading
     subtitle: str  # preset, execution and the like, in one line
-    question: str  # what was asked
+    question: str  # the question
     table: Table  # the one that a terminal shows
     sections: Sequence[Section]  # in their order
     files: Mapping[str, str]  # the CSV files beside the page, by name

@@ -66,7 +66,7 @@ def report_page(result: RegressionResult) -> Page:
         subtitle=f"Preset {protocol.preset} · networks a dataset: {protocol.networks} · protocol {protocol.hash}",
         question=spec.description,
         table=tables[0],
-        sections=[Section("What was compared", (_COMPARED,)), *sections],
+        sections=[Section("Task and regressors", (_COMPARED,)), *sections],
         files={"results.csv": table_text(rows), **{f"{table.name}.csv": table.csv for table in tables}},
         facts=made(result),
     )
@@ -122,7 +122,7 @@ def _toy(result: RegressionResult) -> list[Section]:
             ],
         ),
         Section(
-            title="Figure 4.1: what is uncertain, and why",
+            title="Figure 4.1: kinds of uncertainty",
             words=(
                 "The first network of each dataset. Top: training data (gray) and predictions (blue). Below: standard "
                 "deviation of each kind of uncertainty (blue) and its true value (black). Shaded: gray where the "
@@ -142,8 +142,8 @@ def _toy(result: RegressionResult) -> list[Section]:
             words=(
                 "The expected squared error of a value drawn from one weight sample's mixture is the sum of five: "
                 "squared bias of the mean and its variance over weight samples (together equation 4.6), true noise, "
-                "true distance of the branches, and the spread of what is drawn (estimated aleatoric and modal). "
-                "Measured: against targets drawn anew; what remains is 0 but for sampling (95 %). Means over x, in y².",
+                "true distance of the branches, and the spread of the drawn values (estimated aleatoric and modal). "
+                "Measured: against targets drawn anew; the rest is 0 but for sampling (95 %). Means over x, in y².",
             ),
             tables=(
                 Table.of("decomposition", [row for pair in result.pairs.values() for row in _decomposition(pair)]),
@@ -287,7 +287,7 @@ def _robot(result: RegressionResult) -> list[Section]:
                 "Of the first network: where the arm's tip was while babbling, how far it misses a place that it "
                 "reaches for, stationarity, and the standard deviation of each joint by cause. The line is the edge of "
                 "the workspace: the arm is not sent to places outside (white in the error map), and the uncertainties "
-                "show what the network would say of them.",
+                "show the network's predictions of them.",
             ),
             [image(f"figures_4_2_4_3_{p.agent}_{p.variant}", partial(workspace, p.first), p.label) for p in pairs],
         ),

@@ -1,4 +1,4 @@
-"""Sections of a bench's page on single episodes, on why agents failed, and on what they imagine."""
+"""Sections of a bench's page on single episodes, on why agents failed, and on imagination."""
 
 from __future__ import annotations
 
@@ -79,16 +79,18 @@ def causes(data: ReportData) -> Section | None:
     """Causes by agent and budget, where 'imagine-bench verify --causes' left them in the bench's folder."""
     table = read_causes(data.result.folder)
     words = (
-        "What an optimal policy fails with the same draws of chance, too, was bad luck. Else truth is swapped in, one "
-        "stage at a time, until the episode is solved: frames read right; then a perfect plan in the agent's own "
-        "model; then the truth about transitions that it never experienced; then all of the truth; then physics as the "
+        "An episode that an optimal policy fails with the same draws of chance, too, was bad luck. Else truth is "
+        "swapped in, one stage at a time, until the episode is solved: frames read right; then a perfect plan in the "
+        "agent's own model; then the truth about transitions that it never experienced; then all of the truth; then physics as the "
         "rules say. The first stage that solves it names the cause."
     )
     return Section("Why agents failed", [words], tables=[table]) if table.rows else None
 
 
 def read_causes(bench: Path) -> Table:
-    """What was found of a bench; without rows where nothing was. Raises ArtefactError: the file is damaged."""
+    """The causes that were found of a bench; without rows where nothing was. Raises ArtefactError: the file is
+    damaged.
+    """
     path = bench / "why" / "causes.csv"
     if not path.is_file():
         return causes_table([])
@@ -123,7 +125,7 @@ def causes_table(rows: Iterable[Sequence[object]]) -> Table:
     return Table("causes", header, lines, f"Shares of the failures. {meanings}.", why_dash="nothing failed")
 
 
-# What agents see and imagine ----------------------------------------------------------------------------------------
+# Imagination ----------------------------------------------------------------------------------------
 
 
 def open_loop(data: ReportData) -> Section | None:
@@ -133,8 +135,8 @@ def open_loop(data: ReportData) -> Section | None:
         return None
     words = (
         "Imagination against the rules at the last budget: from real images, the model predicts ahead without looking "
-        "again, and a probe that the agents never use reads the macrostate (the discrete state of the task) from what "
-        "it imagines. Only chains of macro-actions that end no episode whatever chance may bring are compared. Means "
+        "again, and a probe that the agents never use reads the macrostate (the discrete state of the task) from its "
+        "images. Only chains of macro-actions that end no episode whatever chance may bring are compared. Means "
         "over seeds.",
         "AUROC: among transitions that began in the right macrostate, the probability that one that goes wrong has the "
         "higher uncertainty of two; 0.5 is chance, 1 is perfect.",
@@ -168,10 +170,10 @@ def rollouts(data: ReportData) -> Section | None:
             images.append(Image(f"sampled_rollouts_{file_name(agent)}", sheet, caption))
     words = (
         "Imagined rollouts of the trained agents, by their own greedy choice of macro-actions, decoded back into "
-        "images. Top row: what the real environment shows for the same macro-actions. Bottom row: what the agent "
-        "imagined; a blue frame where it is what the rules say, an orange one where not. The first of a few starts are "
-        "shown, which are the same for every agent; not the best.",
-        "Where what happens next is partly chance, several rollouts are sampled from one real image, a row each. Below "
-        "each image stands what has changed: in blue where the rules make it possible, in orange where not.",
+        "images. Top row: frames of the real environment for the same macro-actions. Bottom row: the agent's "
+        "imagination; a blue frame where it is as the rules say, an orange one where not. The first of a few starts "
+        "are shown, which are the same for every agent; not the best.",
+        "Where the next macrostate is partly chance, several rollouts are sampled from one real image, a row each. "
+        "Below each image stand the changes: in blue where the rules make it possible, in orange where not.",
     )
-    return Section("What the agents imagine", words, images) if images else None
+    return Section("The imagination of the agents", words, images) if images else None

@@ -31,7 +31,7 @@ Row = dict[str, float | str]
 
 
 def study_page(study: Study, lines: Sequence[Line]) -> Page:
-    """Success of every variant at every budget, and its difference from what it is compared with."""
+    """Success of every variant at every budget, and its difference from the variant that it is compared with."""
     rows: list[dict[str, str]] = []
     for line in lines:
         for place, budget in enumerate(study.budgets):
@@ -85,7 +85,7 @@ def _seeds_csv(study: Study, lines: Sequence[Line]) -> str:
 
 
 def suite_page(result: SuiteResult) -> Page:
-    """The page of what was run."""
+    """The page of the variants that were run."""
     suite = result.suite
     environments = [each.environment for levels in result.levels.values() for each in levels if each.environment]
     commits = sorted({str(each.get("commit")) for each in environments})

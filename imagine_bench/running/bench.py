@@ -1,4 +1,4 @@
-"""From a task to its results: plan a protocol, run what is still missing, and read everything back from the files.
+"""From a task to its results: plan a protocol, carry out the missing runs, and read everything back from the files.
 
 A *control* task is acted in, by agents that learn from episodes; a *regression* task is learned from data, by
 regressors. Launchers, locks, run folders, progress, store and command line are the same for both types.
@@ -90,7 +90,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
 
     def _show(self, progress: Progress) -> None:
         run = (progress.bench, progress.agent, progress.seed)
-        if progress.phase == "failed":  # what it lacks will not be done
+        if progress.phase == "failed":  # its missing work will not be done
             self._costs[run] = self._done[run]
             tqdm.write(plain(f"{progress.agent} seed {progress.seed} failed: {progress.detail}"), file=sys.stderr)
             return
@@ -292,7 +292,7 @@ def plan(task: str, preset: str, **options: Any) -> tuple[ProtocolData, Encoders
 
 
 def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launcher) -> Result:
-    """Run what is missing of a protocol, with the encoders that its agents need by kind, and read all of it.
+    """Carry out the missing runs of a protocol, with the encoders that its agents need by kind, and read all of it.
 
     Raises:
         RunFailedError: Some runs failed; the others are done, and the message names the logs.
@@ -325,7 +325,7 @@ def require_done(failures: Sequence[Failure], jobs: int) -> None:
 def carry_out(
     planned: Sequence[tuple[ProtocolData, Encoders]], *, root: Path, launcher: Launcher
 ) -> tuple[list[Failure], int]:
-    """Run what is missing of several protocols as one piece of work, shown as one.
+    """Carry out the missing runs of several protocols as one piece of work, shown as one.
 
     Returns:
         The runs that failed, and how many were missing before. Raises as :func:`bench`, but for runs that fail.
@@ -387,6 +387,6 @@ def _warn(changed: Sequence[str], folder: Path) -> None:
     if changed:
         print(
             f"Note: {folder} was begun with another {', '.join(changed)}. Runs it finished are kept as they are, "
-            "others go on from their checkpoints with what is here now; give another folder with --out to run all of "
+            "others go on from their checkpoints with the present state; give another folder with --out to run all of "
             "them anew."
         )

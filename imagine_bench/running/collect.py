@@ -41,7 +41,7 @@ MOST_EPISODES = 100_000
 
 @dataclass(frozen=True, kw_only=True)
 class Policy:
-    """Who plays, and how."""
+    """The player, and how it plays."""
 
     name: str  #: One of :data:`POLICIES`, or the agent's
     players: Sequence[tuple[Agent, bool]]  #: Play an episode each in turn; whether each is shown macrostates
@@ -117,7 +117,7 @@ def collect(
 
 
 def _watching(env: Env, motion_hz: float, motion: list[ArmMotion]) -> Callable[[], None]:
-    """What is to be done after each macro-action: nothing, or to add the arm's motion to what was seen of it."""
+    """The call after each macro-action: None, or one that adds the arm's motion to the samples so far."""
     scene = env.unwrapped
     if not motion_hz:
         return lambda: None
@@ -169,7 +169,7 @@ def _episode(
 
 
 def _card(spec: TaskSpec, policy: Policy, played: Episodes) -> dict[str, Json]:
-    """What a dataset is: task, policy, counts, success beside chance and optimum, and what made it."""
+    """The description of a dataset: task, policy, counts, success beside chance and optimum, and its origin."""
     environment = describe_environment()
     return {
         "task": spec.id, "description": spec.description, "env_id": spec.env_id,

@@ -83,7 +83,7 @@ def _rests_on_others(agent: str) -> bool:
 
 
 def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
-    """Build every learner once, to see whether it can use its encoder and do what only some can."""
+    """Build every learner once, to see whether it can use its encoder and has the abilities that are asked for."""
     for agent in wanted.agents:
         entry = registry.agent_entry(agent)
         if entry.learns:
@@ -121,7 +121,7 @@ def _encoders(wanted: Protocol, given: str | None) -> Encoders:
     path = encoders.resolve(spec, wanted.appearance, given)
     kind = encoders.kind(path)
     if not needed:
-        raise InvalidValueError(f"No agent of this bench reads what an encoder gives; leave --encoder {given} out.")
+        raise InvalidValueError(f"No agent of this bench sees through an encoder; leave --encoder {given} out.")
     if kind == "latents" and kind not in needed:
         raise InvalidValueError(
             f"No agent of this bench reads the latents that encoder {path.stem!r} gives; give one made with "

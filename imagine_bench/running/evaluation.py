@@ -1,4 +1,4 @@
-"""How episodes are played, in training and in tests, and what a learner is given beside its own.
+"""How episodes are played, in training and in tests, and the episodes that a learner is given beside its own.
 
 Test episodes are greedy: the same starts for every agent and seed, none of them ever a training start. A demonstration
 is seen as frames, a label is a reward and whether the episode would end, and feedback is reward: none shows a
@@ -146,7 +146,8 @@ def play(
     """One episode, a real transition at a time, each with the ``info`` that followed it; the agent learns nothing here.
 
     ``seed`` decides the whole episode but for the agent: the environment carries nothing over from the one before.
-    Before each macro-action, ``before_acting`` is called with what the agent sees and the ``info`` that it does not.
+    Before each macro-action, ``before_acting`` is called with the agent's observation and the ``info`` that it does not
+    see.
     ``options`` are those of the environment's ``reset``.
     """
     frame, info = env.reset(seed=seed, options=options)
@@ -175,7 +176,9 @@ def play(
 
 
 def _require_sound(env: Env, seen: Observed, reward: SupportsFloat) -> None:
-    """Raise InvalidValueError for what no agent should be shown: a package's environment can give anything."""
+    """Raise InvalidValueError for an observation that no agent should be shown: a package's environment can give
+    anything.
+    """
     if not env.observation_space.contains(seen):
         raise InvalidValueError(
             f"{env} gave an observation that is not in its space {env.observation_space}; 'imagine-bench check --task' "
@@ -281,12 +284,12 @@ def as_seen(transition: Transition) -> Transition:
 
 @dataclass(frozen=True)
 class LabelOracle:
-    """Labels what actions would bring, from the rules and the true macrostate, where these allow one outcome."""
+    """Labels the outcomes of actions, from the rules and the true macrostate, where these allow one outcome."""
 
     rules: Rules
 
     def label(self, macrostate: tuple[int, ...], actions: Ints) -> Label | None:
-        """What the last of ``actions`` (D,) from ``macrostate`` would bring.
+        """The outcome of the last of ``actions`` (D,) from ``macrostate``.
 
         The scene goes on obeying its dynamics through the ends of episodes. Where chance decides on the way, all that
         may happen is looked at; None where that differs in reward or end: a matter of chance has no label. Raises
@@ -331,7 +334,7 @@ class Teacher:
         self._row = self._rows[tuple(int(value) for value in info["macrostate"])]
 
     def told(self, transition: Transition) -> Transition:
-        """The transition that followed, with what the teacher says of it in its reward."""
+        """The transition that followed, with the teacher's feedback in its reward."""
         right = bool(self._optimal[transition.action, self._row]) != bool(self._rng.random() < self._error)
         return dataclasses.replace(
             transition, reward=transition.reward + (self._feedback if right else -self._feedback)

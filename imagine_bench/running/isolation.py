@@ -170,7 +170,7 @@ class Isolated:
         try:
             code = self._process.wait(_PATIENCE_S)
         except subprocess.TimeoutExpired:
-            return "it sent what is no answer."
+            return "it sent something that is no answer."
         how = "was killed, such as for lack of memory" if code == _KILLED else f"ended itself with exit code {code}"
         return f"its process {how}."
 

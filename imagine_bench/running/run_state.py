@@ -120,7 +120,7 @@ class CountVisits(RecordedEnv):
 
 
 def make_env(protocol: Protocol, task: str, *, testing: bool = False, **options: Any) -> Env:
-    """The environment of a task as a protocol has it, for training or for tests; ``options`` replace what it has."""
+    """The environment of a task as a protocol has it, for training or for tests; ``options`` replace its own."""
     env = gymnasium.make(
         registry.task_entry(task).env_id,
         **{**protocol.world, **options},
@@ -171,11 +171,11 @@ def require_able(agent: object, name: str, protocol: Protocol) -> None:
 
 
 class Run:
-    """A run as far as it has come: a new one, or what the newest checkpoint in its folder holds.
+    """A run as far as it has come: a new one, or the state of the newest checkpoint in its folder.
 
     Raises:
         ArtefactError: The folder was begun with something else, or the encoder is not the protocol's.
-        InvalidValueError: The agent cannot do what the protocol asks of it.
+        InvalidValueError: The agent lacks an ability that the protocol asks for.
     """
 
     def __init__(self, spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, env: Env, test_env: Env) -> None:

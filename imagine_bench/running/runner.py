@@ -42,14 +42,14 @@ from imagine_bench.store.results import Checkpoint, ComparedRollout, OpenLoop, P
 
 
 class AtBudget(TypedDict, total=False):
-    """What observers measure at a budget: fields of :class:`.Checkpoint`."""
+    """The measurements of observers at a budget: fields of :class:`.Checkpoint`."""
 
     open_loop: OpenLoop
     beliefs: PolicyTable
 
 
 class AtEnd(TypedDict, total=False):
-    """What observers measure at the end: fields of :class:`.RunResult`."""
+    """The measurements of observers at the end: fields of :class:`.RunResult`."""
 
     imagined: tuple[ComparedRollout, ...]
     sampled_rollouts: tuple[ComparedRollout, ...]
@@ -60,16 +60,16 @@ class RunObserver:
     """Looks at a run after each test and at its end, and changes nothing in it; this one measures nothing."""
 
     def at_budget(self, run: Run, budget: int) -> AtBudget:
-        """Measure what was just tested."""
+        """Measure the agent that was just tested."""
         return {}
 
     def at_end(self, run: Run) -> AtEnd:
-        """Measure, or record, what has been through all budgets."""
+        """Measure, or record, the agent after all budgets."""
         return {}
 
 
 def run(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> None:
-    """Do a run, or what is left of it, looked at by its observers.
+    """Do a run, or the rest of it, looked at by its observers.
 
     Nothing is done of a finished run.
 

@@ -1,1 +1,1 @@
-"""Keep what was measured: files, checkpoints, run folders, bench folders, results."""
+"""Keep results: files, checkpoints, run folders, bench folders, results."""

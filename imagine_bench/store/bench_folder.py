@@ -1,6 +1,6 @@
 """Where a bench lies: ``<root>/<task>/<preset>-<protocol hash>/<agent>/seed_<n>/``; other settings lie elsewhere.
 
-``protocol.json`` holds what is compared, and ``sessions.json`` what the first session ran on, the exact facts of the
+``protocol.json`` holds the protocol, and ``sessions.json`` the environment of the first session, the exact facts of the
 world, and when and with which command work went on. Nothing is ever overwritten by another protocol, for its hash is in
 the name. A bench that is kept for good is one file, ``bench.json``, and a table: see :mod:`.loading`.
 """
@@ -99,7 +99,7 @@ class BenchStore:
         return [pair for pair in self.pairs if not run_folder.is_done(self.run_folder(*pair))]
 
     def begin_session(self, environment: Mapping[str, Json], certify: Certify = lambda task, split: None) -> list[str]:
-        """Note that work starts now, in what :func:`.describe_environment` says; returns :meth:`changed`.
+        """Note that work starts now, in the facts that :func:`.describe_environment` gives; returns :meth:`changed`.
 
         The first time, the exact facts of the protocol's world are kept too, which ``certify`` gives for its task and
         split.
@@ -129,7 +129,7 @@ class BenchStore:
 
 
 def _changed(first: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Json]:
-    """Facts of an environment that decide the bits of a result, those that are not what they were at first."""
+    """Facts of an environment that decide the bits of a result, those that differ from the first session's."""
     then, facts = (
         {**{name: each.get(name) for name in _DECISIVE}, "cpu": each.get("machine", {}).get("cpu")}
         for each in (first, now)
@@ -185,7 +185,7 @@ def bench_facts(folder: Path) -> dict[str, Any]:
 
 
 def require_either(given: Path | None, task: str | None) -> None:
-    """Raise InvalidValueError where a path and a task are given: what lies at a path is of a task already."""
+    """Raise InvalidValueError where a path and a task are given: a path belongs to a task already."""
     if given is not None and task is not None:
         raise InvalidValueError(f"Both {given} and --task {task} were given; leave one of them out.")
 

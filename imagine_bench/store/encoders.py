@@ -53,7 +53,7 @@ def cache_folder() -> Path:
 
 
 def _frames(spec: TaskSpec, appearance: str) -> Frame:
-    """What a task looks like: some of its macrostates."""
+    """Some frames of a task."""
     return spec.render_macrostates(np.array(states_of(spec.rules)[:8]), appearance, np.random.default_rng(0))
 
 
@@ -72,7 +72,7 @@ def offered(spec: TaskSpec, appearance: str, name: str) -> Path:
     """The artefact of an encoder that an installed package offers, made once for the looks of a task.
 
     Raises:
-        InvalidValueError: What is offered gives no latents for frames.
+        InvalidValueError: The offered object gives no latents for frames.
         SetupError: As :func:`.registry.task_entry`.
         BusyError: Another process makes it, for longer than an hour.
     """
@@ -162,7 +162,7 @@ def kind(path: Path) -> str:
 
 
 def identity(path: Path) -> str:
-    """What stands for an encoder in a protocol: its name and 12 digits of its digest, or ArtefactError."""
+    """The identity of an encoder in a protocol: its name and 12 digits of its digest, or ArtefactError."""
     return f"{path.stem}@{sha256(path)[:12]}"
 
 

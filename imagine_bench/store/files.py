@@ -57,7 +57,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def sweep(folder: Path, *, older_than_s: float = 0.0) -> None:
-    """Remove what killed writers left half-written in ``folder``, whose lock is held or where nothing is so old."""
+    """Remove files that killed writers left half-written in ``folder``, whose lock is held or where nothing is so
+    old.
+    """
     for leftover in folder.glob(".*.partial"):
         with suppress(OSError):  # another sweeps too, or may not
             if time.time() - leftover.stat().st_mtime >= older_than_s:
@@ -92,7 +94,7 @@ def make_plain(log: Path) -> None:
 
 
 def with_null(value: Any) -> Any:
-    """What JSON gives back of ``value``, None for NaN and infinities, for which JSON has no word."""
+    """The value that JSON gives back of ``value``, None for NaN and infinities, for which JSON has no word."""
     return json.loads(json.dumps(value), parse_constant=lambda _: None)
 
 
@@ -114,7 +116,7 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 
 
 def table_text(rows: Sequence[Mapping[str, float | str]]) -> str:
-    """Rows as CSV under the names of all of them; what one lacks is an empty cell."""
+    """Rows as CSV under the names of all of them; a value that a row lacks is an empty cell."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     return csv_text([names, *([row.get(name, "") for name in names] for row in rows)])
 
@@ -157,7 +159,9 @@ def sealed(values: Mapping[str, Any]) -> dict[str, Json]:
 
 
 def read_sealed(path: Path, what: str) -> dict[str, Any]:
-    """What :func:`sealed` values a JSON file holds. Raises ArtefactError as :func:`read_json`, or where one changed."""
+    """The :func:`sealed` values of a JSON file. Raises ArtefactError as :func:`read_json`, or where one
+    changed.
+    """
     values = read_json(path, what)
     seal = values.pop("seal", None)
     if seal != _seal(values):
@@ -178,14 +182,14 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise
     except FileNotFoundError as error:
         raise ArtefactError(f"There is no {path}, {what}.") from error
-    except Exception as error:  # what is not as it was written can be wrong in any way
+    except Exception as error:  # a file that is not as it was written can be wrong in any way
         raise ArtefactError(f"{path} is not {what}: {why(error)}. It was left untouched.") from error
 
 
 def first_difference(then: Json, now: Json, name: str = "") -> tuple[str, Json, Json] | None:
     """Where two JSON values differ first, by sorted name: the dotted name and both values; None where they are equal.
 
-    What one of them lacks is None there.
+    A value that one of them lacks is None there.
     """
     if not (isinstance(then, Mapping) and isinstance(now, Mapping)):
         return None if then == now else (name, then, now)
@@ -227,7 +231,7 @@ def lock(path: Path, busy: str, *, patience_s: float = 0.0) -> Iterator[None]:
             who = brief(holder.read_text(errors="replace"))[1:-1] if holder.is_file() else "another process"
             raise BusyError(f"{busy} is in use by {who}; wait for it, stop it, or choose another folder.") from None
     try:
-        with suppress(OSError):  # a courtesy to the next who finds it held, which a full disk cannot take
+        with suppress(OSError):  # a courtesy to the next process that finds it held; a full disk does not matter
             holder.write_text(f"process {os.getpid()} on {socket.gethostname()}")
         yield
     finally:

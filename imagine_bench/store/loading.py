@@ -105,7 +105,7 @@ def results_csv(result: BenchResult) -> str:
 
 
 def _largest_part(whole: Protocol, runs: Runs, folder: Path) -> BenchResult:
-    """Return what is complete of a bench: all of it, or the table of seeds and budgets with the most results.
+    """Return the complete part of a bench: all of it, or the table of seeds and budgets with the most results.
 
     Raises:
         ArtefactError: No seed has brought every agent to the first budget, or a file is damaged.
@@ -157,7 +157,7 @@ def _runs_of(part: Protocol, runs: Runs) -> tuple[RunResult, ...]:
 
 
 def cut(result: RunResult, part: Protocol) -> RunResult:
-    """Return a run with the budgets of ``part`` alone, and if it goes further, without what was measured at its end."""
+    """Return a run with the budgets of ``part`` alone, and if it goes further, without the measurements of its end."""
     episodes = part.budgets[-1]
     whole = result.checkpoints[-1].episodes == episodes
     return dataclasses.replace(

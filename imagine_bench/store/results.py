@@ -1,4 +1,4 @@
-"""What a bench measured, as plain data: written by the runner, read by statistics, report and recordings."""
+"""The measurements of a bench, as plain data: written by the runner, read by statistics, report and recordings."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class OpenLoop:
     """
 
     count: Ints  #: Imagined transitions compared
-    #: Share whose whole macrostate, read by the evaluation-only probe, is what the rules say.
+    #: Share whose whole macrostate, read by the evaluation-only probe, follows from the rules.
     correct: Floats
     #: The same among those the uncertainty filter keeps (NaN where it keeps none).
     correct_accepted: Floats
@@ -52,14 +52,14 @@ class OpenLoop:
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedRollout:
-    """An imagined rollout beside what the real environment shows for the same start and actions."""
+    """An imagined rollout beside the real environment's frames for the same start and actions."""
 
     start_frame: Frame  #: The real frame it starts from
     start_macrostate: Macrostate  #: Where it is seen
-    rollout: ImaginedRollout  #: What the agent imagined
+    rollout: ImaginedRollout  #: The agent's imagination
     real_frames: Pixels  #: The real frames (kinematic mode) after each action. Shape (D, 64, 64, 3), uint8.
-    #: What they show: what the rules say, or where the task's frames are late or hide a coordinate, that, with one more
-    #: than its last value for what is hidden. Shape (D, M).
+    #: Their content: the macrostate by the rules, or where the task's frames are late or hide a coordinate, that of the
+    #: frame, with one more than its last value for a hidden one. Shape (D, M).
     real_macrostates: Ints
     real_rewards: Floats  #: Rewards by the rules. Shape (D,).
     real_terminated: Bools  #: Shape (D,)
@@ -78,7 +78,7 @@ class RecordedEpisode:
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyTable:
-    """What an agent does, and what its model expects, in every macrostate of its task, S of them, in a frame of each.
+    """An agent's actions, and its model's expectations, in every macrostate of its task, S of them, in a frame of each.
 
     They are in the order of :func:`imagine_bench.rules.states_of`.
     """
@@ -127,8 +127,8 @@ class Checkpoint:
     #: The agent's own means since the previous checkpoint.
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     open_loop: OpenLoop | None = None  #: Imagination against the rules, for agents that imagine
-    #: What the agent does and expects everywhere, for the causes of its failures; None for agents that do not learn,
-    #: for tasks of too many macrostates, and in results of before 2026-11-24.
+    #: The agent's actions and expectations everywhere, for the causes of its failures; None for agents that do not
+    #: learn, for tasks of too many macrostates, and in results of before 2026-11-24.
     beliefs: PolicyTable | None = field(default=None, compare=False)
     #: The test episodes themselves. None in results of before 2026-11-24.
     kept: KeptEpisodes | None = field(default=None, compare=False)
@@ -180,12 +180,12 @@ class AllRuns(Generic[P, R]):
         ArtefactError: A run is missing or doubled, or two runs of a learner had different settings.
     """
 
-    protocol: P  #: What was compared
+    protocol: P  #: The protocol
     runs: tuple[R, ...]  #: One a learner and seed
     environment: Mapping[str, Json]  #: Command, commit, versions, machine, GL renderer, threads; JSON-like
     folder: Path  #: Where the bench's files lie
     wall_s: float  #: Wall seconds of the bench, over all its sessions
-    missing: tuple[str, ...] = ()  #: What a part lacks, one sentence a run
+    missing: tuple[str, ...] = ()  #: The missing runs of a part, a sentence each
     left_out: tuple[str, ...] = ()  #: Runs of merged benches that are not shown, for not all agents have their seeds
 
     def __post_init__(self) -> None:

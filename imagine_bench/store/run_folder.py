@@ -1,7 +1,8 @@
-"""The files of one run: what was run, its metrics, one checkpoint, and the digests of all that is finished.
+"""The files of one run: its configuration, its metrics, one checkpoint, and the digests of all that is finished.
 
-``config.json`` (what was run), ``metrics.csv`` (one row a budget), ``checkpoints/`` (the newest holds everything that
-was measured), ``imagined.npz`` (rollouts of agents that imagine, and two recorded episodes), ``recording.rrd``,
+``config.json`` (the run's configuration), ``metrics.csv`` (one row a budget), ``checkpoints/`` (the newest holds
+everything that was measured), ``imagined.npz`` (rollouts of agents that imagine, and two recorded episodes),
+``recording.rrd``,
 ``log.txt``, and last ``DONE``, with the digests of the others. Finished runs of before 2026-11-28 have more files,
 which nobody reads.
 
@@ -161,7 +162,7 @@ def load_snapshot(checkpoint: Path, *, agent: bool = True) -> Snapshot:
 
 
 def _sweep_partial(folder: Path) -> None:
-    """Remove what a process left below ``folder`` that was killed while it wrote or removed a checkpoint."""
+    """Remove files that a process left below ``folder`` that was killed while it wrote or removed a checkpoint."""
     for leftover in folder.glob(f"{_PARTIAL}*"):
         if leftover.is_dir() and not leftover.is_symlink():
             shutil.rmtree(leftover)
@@ -182,7 +183,7 @@ def _number(checkpoint: Path) -> int:
 def _unpacked(path: Path, digests: Mapping[str, str]) -> Arrays:
     if sha256(path) != digests[path.name]:
         raise ArtefactError(
-            f"{path} is damaged: its content is not what was written. It was left untouched; delete the run's folder "
+            f"{path} is damaged: its content is not as it was written. It was left untouched; delete the run's folder "
             "to start that run anew."
         )
     arrays: Arrays = load(path.read_bytes())
@@ -217,7 +218,8 @@ def is_done(folder: Path) -> bool:
 
 @contextmanager
 def unfinished(folder: Path) -> Iterator[bool]:
-    """Hold a run's folder for this process, without what a killed one left; yields whether anything is left to do.
+    """Hold a run's folder for this process, without the leftovers of a killed one; yields whether anything is left to
+    do.
 
     Raises:
         BusyError: Another process is at this run.
@@ -232,7 +234,7 @@ def unfinished(folder: Path) -> Iterator[bool]:
 
 
 def check_config(folder: Path, spec: RunSpec[ProtocolData], learner: object) -> None:
-    """Write what is run into a new run folder, or compare it with what an old one holds.
+    """Write the configuration of a run into a new run folder, or compare it with that of an old one.
 
     Args:
         folder: The run's folder.
@@ -275,7 +277,9 @@ def _require_same(folder: Path, wanted: Mapping[str, Json], remedy: str) -> None
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Return what was run: protocol, agent, seed, settings. Raises ArtefactError: it is missing or damaged."""
+    """Return the configuration of a run: protocol, agent, seed, settings. Raises ArtefactError: it is missing or
+    damaged.
+    """
     path = folder / _CONFIG
     values = read_sealed(path, "a run's configuration; give a run's folder, .../<agent>/seed_<n>")
     if values.get("format") not in (FORMAT, WITHOUT_TRAINING):
@@ -286,7 +290,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 def require_run_of(folder: Path, protocol: ProtocolData, agent: str, seed: int) -> None:
     """Raise ArtefactError unless the run in ``folder`` is this agent's and seed's of this very protocol."""
     wanted: dict[str, Json] = {"agent": protocol.written_name(agent), "seed": seed, "protocol": protocol.as_dict()}
-    _require_same(folder, wanted, "Put back what its bench wrote.")
+    _require_same(folder, wanted, "Put back the file that its bench wrote.")
 
 
 def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
@@ -316,7 +320,9 @@ def finish(
     sampled_rollouts: Sequence[ComparedRollout] = (),
     recorded: Sequence[RecordedEpisode] = (),
 ) -> None:
-    """Keep what observers measured at a run's end and mark it as done, or raise SetupError and leave it unmarked."""
+    """Keep the measurements of observers at a run's end and mark it as done, or raise SetupError and leave it
+    unmarked.
+    """
     shown = {"imagined": imagined, "sampled_rollouts": sampled_rollouts, "recorded": recorded}
     write_arrays(folder / _IMAGINED, pack(shown)[1])
     newest = _checkpoints(folder / CHECKPOINTS)[-1].relative_to(folder)
@@ -385,7 +391,7 @@ def load_run(folder: Path) -> RunResult:
 
 
 def load_so_far(folder: Path) -> RunResult | None:
-    """Read a run as far as it has come: its results, or what its newest checkpoint holds; None before the first.
+    """Read a run as far as it has come: its results, or those of its newest checkpoint; None before the first.
 
     Raises ArtefactError: a file is damaged.
     """
@@ -398,7 +404,7 @@ def tried_pairs(tried: Mapping[str, int]) -> list[list[int]]:
 
 
 def _result(folder: Path) -> RunResult | None:
-    """What the newest checkpoint of a run holds, without what is kept at its end; None before the first."""
+    """The results in the newest checkpoint of a run, without those of its end; None before the first."""
     snapshot = load_newest(folder / CHECKPOINTS, agent=False)
     if snapshot is None:
         return None

@@ -85,7 +85,7 @@ class Study:
         """The study with the named variants, or all, and those they are compared with. Raises UnknownNameError."""
         known = {variant.name: variant for variant in self.variants}
         wanted: set[str | None] = {require_known("variant", name, known) for name in names or known}
-        for _ in self.variants:  # what these are compared with may be compared with others
+        for _ in self.variants:  # the variants that these are compared with may be compared with others
             wanted |= {variant.against for variant in self.variants if variant.name in wanted}
         return replace(self, variants=tuple(variant for variant in self.variants if variant.name in wanted))
 

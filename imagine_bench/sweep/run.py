@@ -56,7 +56,7 @@ class Line:
 
 
 def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tuple[Line, ...]:
-    """Run what is missing of every variant and compare. Errors are those of :func:`.bench.bench`."""
+    """Carry out the missing runs of every variant and compare. Errors are those of :func:`.bench.bench`."""
     task_type(task)  # knows every name
     require_control(task, task)
     planned = {variant.name: plan_variant(study, task, variant) for variant in study.variants}
@@ -174,7 +174,9 @@ def plan_level(suite: Suite, level: Level, agent: str) -> list[Planned]:
 
 
 def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Launcher) -> SuiteResult:
-    """Run what is missing of a suite. A run that fails costs the others nothing. Raises as :func:`plan_level`."""
+    """Carry out the missing runs of a suite. A run that fails costs the others nothing. Raises as
+    :func:`plan_level`.
+    """
     plans = {
         (each.name, agent): [plan_level(suite, level, agent) for level in each.levels]
         for each, agent in itertools.product(suite.experiments, agents)

@@ -20,7 +20,7 @@ from imagine_bench.store.results import OpenLoop
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """The ends of a level's scale: what blind choice and what perfect play reach."""
+    """The ends of a level's scale: the results of blind choice and of perfect play."""
 
     chance: float
     optimum: float

@@ -1,4 +1,4 @@
-"""What must hold of a task, an agent and a world model, a sentence each, in a task's kinematic execution."""
+"""The contract of a task, an agent and a world model, a sentence each, in a task's kinematic execution."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _METHODS = ("fit", "imagine", "parameters")
 
 
 class NotOffered(ImagineBenchError):
-    """What is checked is something that a guest may do without."""
+    """The checked ability is one that a guest may do without."""
 
 
 def require(holds: bool, otherwise: str) -> None:
@@ -92,7 +92,7 @@ def _told(info: Info) -> State:
 
 
 class _Step(NamedTuple):
-    """A random macro-action and what came of it."""
+    """A random macro-action and its result."""
 
     frame: bytes
     action: int
@@ -167,7 +167,7 @@ TASK_CHECKS: Mapping[str, Callable[[TaskSpec], None]] = {
     "the same seed gives the same episode": _same_episodes,
     "in the middle of an episode its state is kept and put back, to the bit": _kept,
 }
-"""What must hold of a task."""
+"""The contract of a task."""
 
 
 # Agents ------------------------------------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ def _goes_on(one: CheckedAgent) -> None:
     snapshot = agent.state()
     kept = copy.deepcopy(snapshot)
     here = one.train(agent, range(3, 6))
-    require(same_arrays(kept, snapshot), "what it learns later alters a state that it gave before")
+    require(same_arrays(kept, snapshot), "later learning alters a state that it gave before")
     twin = one.make()
     twin.restore(kept)
     require(one.train(twin, range(3, 6)) == here, "it acts otherwise")
@@ -276,7 +276,7 @@ AGENT_CHECKS: Mapping[str, Callable[[CheckedAgent], None]] = {
     "it acts and learns, greedily without a change": _acts,
     "taken up from its state it goes on to the same bits": _goes_on,
 }
-"""What must hold of an agent."""
+"""The contract of an agent."""
 
 
 # World models ------------------------------------------------------------------------------------------------------
@@ -301,11 +301,11 @@ class CheckedModel(NamedTuple):
         return model
 
     def imagine(self, model: WorldModel, frames: Frame, actions: Ints, samples: int) -> Imagined:
-        """What a model imagines with a generator that is always the same, if it is what it has to be."""
+        """A model's imagination with a generator that is always the same, checked."""
         return imagined_by(model, self.name, frames, actions, samples, np.random.default_rng(1))
 
     def answer(self, model: WorldModel) -> dict[str, bytes]:
-        """What it imagines when it is asked the longest questions."""
+        """Its imagination for the longest questions."""
         imagined = self.imagine(model, *_questions(self.task, _HISTORY, _DEPTH), _SAMPLES)
         given = {field.name: getattr(imagined, field.name) for field in dataclasses.fields(imagined)}
         return {name: array.tobytes() for name, array in given.items() if array is not None}
@@ -371,4 +371,4 @@ MODEL_CHECKS: Mapping[str, Callable[[CheckedModel], None]] = {
     "asked again with the same generator it imagines the same": _asked_again,
     "the same episodes and generators give the same model": _fitted_again,
 }
-"""What must hold of a world model."""
+"""The contract of a world model."""

@@ -1,4 +1,4 @@
-"""What is checked of which guest, and what was found. Each check is a sentence, and raises where it does not hold."""
+"""The checks of each guest, and their results. Each check is a sentence, and raises where it does not hold."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _USUAL = "arrow_puzzle"
 
 
 def checks(task: str | None = None, agent: str | None = None, model: str | None = None) -> Checks:
-    """What must hold of a task; or of an agent or a world model in it, in the arrow puzzle where no task is named.
+    """The contract of a task; or of an agent or a world model in it, in the arrow puzzle where no task is named.
 
     Raises:
         InvalidValueError: Nothing to check, an agent and a world model at once, or a model that is given the rules.
@@ -35,7 +35,7 @@ def checks(task: str | None = None, agent: str | None = None, model: str | None 
     if agent is not None:
         one, options = checked_agent(agent, where), CheckedOptions(agent, where)
         found = {what: functools.partial(check, one) for what, check in AGENT_CHECKS.items()}
-        found["watched episodes teach it what its own do"] = functools.partial(watching_teaches_as_living, one)
+        found["watched episodes teach it the same as its own"] = functools.partial(watching_teaches_as_living, one)
         for option in OPTION_ROWS:
             found[f"the option {option} has an effect or is refused"] = functools.partial(options.check, option)
         return found
@@ -49,7 +49,7 @@ def checks(task: str | None = None, agent: str | None = None, model: str | None 
 
 
 def report(checks: Checks) -> int:
-    """Carry all out, print what each found, and count those that failed."""
+    """Carry all out, print the result of each, and count those that failed."""
     failed = 0
     for what, check in checks.items():
         try:

@@ -1,7 +1,8 @@
-"""What must hold of an agent and every option of a protocol: the option has an effect on it, or is refused.
+"""The contract of an agent and every option of a protocol: the option has an effect on it, or is refused.
 
-A row for each option: two short runs from equal seeds, with it and without, must differ in what the agent did, earned
-or learned. Fields of the protocol without a row are in :data:`WITHOUT_ROW`, each with the reason; a new field that is
+A row for each option: two short runs from equal seeds, with it and without, must differ in the agent's actions, rewards
+    or learned arrays. Fields of the protocol without a row are in :data:`WITHOUT_ROW`, each with the reason; a new
+    field that is
 in neither fails the contract.
 """
 
@@ -49,8 +50,8 @@ class OptionRow:
     """One option of a bench."""
 
     fields: tuple[str, ...]  #: Fields of the protocol that it stands for
-    changes: Changes  #: What the bench with the option has
-    without: Changes = field(default_factory=dict)  #: What the bench that it is compared with has
+    changes: Changes  #: The values of the bench with the option
+    without: Changes = field(default_factory=dict)  #: The values of the bench that it is compared with
     world: str = ""  #: An option of the task's world, ``key=value``, in place of a field
     episodes: int = 2  #: Training episodes of either run
     #: Whether it acts through what the agent is shown: an agent may learn the same from it, as it should of light.
@@ -58,13 +59,13 @@ class OptionRow:
 
 
 class _Left(NamedTuple):
-    """What a run left, as digests."""
+    """The results of a run, as digests."""
 
     shown: str
     learned: str
 
 
-_SEEN = ("execution", "split", "appearance", "physics", "observation", "observation_size")  # what environments read
+_SEEN = ("execution", "split", "appearance", "physics", "observation", "observation_size")  # of environments
 _TASK = "the task that is checked"
 OPTION_ROWS: Mapping[str, OptionRow] = {
     "dataset": OptionRow(fields=("dataset",), changes={"dataset": "a folder of two episodes"}),
@@ -91,7 +92,7 @@ OPTION_ROWS: Mapping[str, OptionRow] = {
     "gesture": OptionRow(fields=(), changes={}, world="gesture=0.5", shown=True),
     "lag": OptionRow(fields=(), changes={}, world="lag=1", shown=True),
 }
-"""The options, by what the contract calls them."""
+"""The options, by their names in the contract."""
 
 WITHOUT_ROW: Mapping[str, str] = {
     "task": "names the world",
@@ -102,11 +103,11 @@ WITHOUT_ROW: Mapping[str, str] = {
     "budgets": "how long is trained",
     "evaluation_episodes": "how often is tested",
     "test_appearance": "the appearance in tests, which change no agent",
-    "open_loop_starts": "what observers ask, which changes no agent",
+    "open_loop_starts": "of observers, which change no agent",
     "sampled_futures": "read in older files only",
-    "recorded_episodes": "what a recording shows",
+    "recorded_episodes": "of recordings",
     "recorded_seeds": "which runs are recorded",
-    "headlines": "what the report decides, which changes no agent",
+    "headlines": "of the report, which changes no agent",
     "most_looks": "how strictly it decides",
     "few_seeds": "how many runs an agent has",
     "encoder": "found by the bench",
@@ -169,7 +170,7 @@ class CheckedOptions:
         return f"{self.task}{',' if ':' in self.task else ':'}{row.world}"
 
     def _run(self, task: str, changes: tuple[tuple[str, Setting], ...], episodes: int) -> _Left:
-        """What some episodes of training, or of tests for one that learns nothing, left: a digest."""
+        """The results of some episodes of training, or of tests for one that learns nothing, as a digest."""
         given: dict[str, Any] = {"execution": registry.task(task).executions[-1], **dict(changes)}
         wanted, paths = plan_control(
             task, "smoke", agents=(self.agent,), seeds=(0,), budgets=(episodes,), evaluation_episodes=_TESTS,
@@ -195,7 +196,7 @@ def _environment(world: Protocol, *, testing: bool) -> Env:
 
 
 def _carried_out(run: Run) -> _Left:
-    """Train, or test one whose training is a library's or none; a digest of what it did, earned and learned."""
+    """Train, or test one whose training is a library's or none; a digest of its actions, rewards and learned arrays."""
     watched: Any = _WatchedAgent(run.agent)  # all that it has not is the agent's
     if isinstance(run.agent, ExternalTrainer):
         runner.train_externally(run, run.agent, lambda budget: None)
@@ -212,7 +213,7 @@ def _carried_out(run: Run) -> _Left:
 
 
 class _WatchedAgent:
-    """An agent, what it did and was rewarded with, and how often it was told that an episode begins."""
+    """An agent, its actions and rewards, and how often it was told that an episode begins."""
 
     def __init__(self, agent: Agent) -> None:
         self._agent = agent
@@ -248,7 +249,7 @@ class _WatchedAgent:
             self._shown.update(observation.more[name].tobytes())
 
     def left(self, counters: Counters) -> _Left:
-        """Digests of what it was shown, and of actions, rewards and learned arrays; times are in none of them."""
+        """Digests of its observations, and of actions, rewards and learned arrays; times are in none of them."""
         found = self._lived.copy()
         arrays = self._agent.state().arrays
         for name in sorted(arrays):

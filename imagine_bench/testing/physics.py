@@ -38,7 +38,7 @@ HEAD = "| what | required | measured | |\n|---|---|---|---|"
 """Head of a table of figures."""
 _CLEAN = APPEARANCES[0]
 _ACTIONS_A_WALK = 200  # between two resets: errors may accumulate
-_ACTIONS_A_VARIED_WALK = 5  # where poses vary, a turn undoes what the reset drew
+_ACTIONS_A_VARIED_WALK = 5  # where poses vary, a turn undoes the draw of the reset
 _WALKS = 5  # without a reset, of each way to sense poses
 _WALK_ACTIONS = 200
 _STANDS_M = 0.02  # an object so near to its height on the table stands there
@@ -160,7 +160,7 @@ def fidelity_figures(spec: TaskSpec, turns: int, appearance: str = _CLEAN) -> It
 
 @dataclass
 class Fidelity:
-    """What a walk showed."""
+    """The results of a walk."""
 
     actions: int = 0  #: macro-actions done
     faults: list[str] = field(default_factory=list)  #: why some did not end as the rules say
@@ -327,8 +327,8 @@ def walk(spec: TaskSpec, sense: str) -> dict[str, Any]:
     """Walk at random, without a reset, among actions that move an object and leave one to move; a fault ends a walk.
 
     Returns:
-        The sense; macro-actions done, and as ruled; of each walk its length and what ended it early; and in mm the
-        furthest that a standing object came from where it stood at first.
+        The sense; macro-actions done, and as ruled; of each walk its length and the fault that ended it early; and in
+        mm the furthest that a standing object came from where it stood at first.
     """
     env = make_env(spec, physics=PhysicsSettings(sense=sense))
     rng = SeedTree(0).child("margins", "walk", spec.id).generator()

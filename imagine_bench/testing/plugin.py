@@ -46,7 +46,7 @@ class Check(pytest.Item):
         self._excuse = excuse
 
     def runtest(self) -> None:
-        """Pass, fail, or be skipped where the guest may do without what is checked."""
+        """Pass, fail, or be skipped where the guest may do without the checked ability."""
         try:
             self._check()
         except self._excuse as why:

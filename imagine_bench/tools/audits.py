@@ -68,7 +68,7 @@ _IMAGE = re.compile("base64,[A-Za-z0-9+/=]*")
 
 
 def chosen(given: Path | None, root: Path, task: str | None) -> Path:
-    """What was given, or else the newest bench of a task in which agents act, or of all such tasks.
+    """The given folder, or else the newest bench of a task in which agents act, or of all such tasks.
 
     Raises:
         ImagineBenchError: Both are given, or there is no such bench.
@@ -309,7 +309,7 @@ def with_report(folder: Path, runs: list[Verdict]) -> list[Verdict]:
         return runs
     elsewhere = [agent for agent in read_control(folder).agents if not known_agent(agent).make]
     if elsewhere:  # a script's, or of a package that is not installed here
-        unshown = f"what it says, for no package here offers {', '.join(elsewhere)}"
+        unshown = f"its words, for no package here offers {', '.join(elsewhere)}"
         return [*runs, Verdict(what="report", holds="not compared", unshown=(unshown,))]
     return [*runs, judged("report", lambda: _verify_report(folder))]
 

@@ -76,7 +76,7 @@ def describe(name: str) -> str:
 
 
 def _learner(name: str, entry: AgentEntry | RegressorEntry | WorldModelEntry, cases: Cases) -> str:
-    """An agent, a regressor or a world model: how it is named in commands, what it is given, and its settings."""
+    """An agent, a regressor or a world model: its name in commands, its observation, and its settings."""
     rows: dict[str, str] = {}
     target = _REGRESSOR_SETTINGS if isinstance(entry, RegressorEntry) else entry.settings
     command = f"judge TASK --models {name}" if isinstance(entry, WorldModelEntry) else f"bench TASK --agents {name}"

@@ -1,4 +1,4 @@
-"""What this machine and installation have, and in words what is wrong with them."""
+"""The state of this machine and installation, and in words what is wrong with them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def examine() -> tuple[str, bool]:
     """Look at versions, GL, threads, GPU and disk; draws a frame of the first task.
 
     Returns:
-        What was found, as text, and whether everything works.
+        The findings, as text, and whether everything works.
     """
     here = machine()
     complaints = unmet_requirements()
@@ -44,7 +44,7 @@ def examine() -> tuple[str, bool]:
     except ImagineBenchError as error:
         gl = "none"
         complaints.append(str(error))
-    except Exception as error:  # a broken installation fails anywhere: it is what is looked for
+    except Exception as error:  # a broken installation fails anywhere, and this looks for it
         gl = "none"
         complaints.append(f"Drawing a frame failed with {type(error).__name__}: {error}. Run 'make setup' anew.")
     free_gib = 0.0
@@ -94,7 +94,9 @@ def unmet_requirements(version_of: Callable[[str], str] = installed) -> list[str
 
 
 def _requirements() -> Iterator[tuple[Requirement, str]]:
-    """What is needed but for development, each with the extra that brings it, ``""`` where it always comes."""
+    """The needed packages but for those of development, each with the extra that brings it, ``""`` where it always
+    comes.
+    """
     for wanted in map(Requirement, metadata.requires("imagine-bench") or []):
         for extra in ("", *EXTRAS_OF_A_BENCH, _DM_CONTROL):
             if wanted.marker is None or wanted.marker.evaluate({"extra": extra}):

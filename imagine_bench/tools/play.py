@@ -1,4 +1,4 @@
-"""``imagine-bench play``: a task by keyboard, and beside it what a learned world model imagines of the same keys.
+"""``imagine-bench play``: a task by keyboard, and beside it a learned world model's imagination of the same keys.
 
 Or, with ``--film``, an episode of optimal macro-actions in the same window, as a GIF.
 """
@@ -58,7 +58,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
 
     Action ``A`` waits and lets go of the key; one that stays down acts once. While a macro-action is shown, steps
     change nothing; the last one returns its result. An ``imaginer`` sees the first frame of each episode, then keys
-    alone. ``seed`` is of the first episode, and of what the imagination draws.
+    alone. ``seed`` is of the first episode, and of the draws of the imagination.
     """
 
     render_mode = "rgb_array"
@@ -94,7 +94,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         return self._frame, self._info
 
     def step(self, action: Action) -> _Step:
-        """Show one more image, else return what came of a macro-action, else wait or carry one out."""
+        """Show one more image, else return the result of a macro-action, else wait or carry one out."""
         waits = action == self._task.n_actions
         self._released |= waits
         image = next(self._images, None)
@@ -125,10 +125,10 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         return f"{said}; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%}.{foreseen}"
 
     def act(self, action: int) -> tuple[_Step, Iterator[Frame]]:
-        """Carry out a macro-action: what came of it, and images of it, each drawn when it is due."""
+        """Carry out a macro-action: its result, and images of it, each drawn when it is due."""
         self._said = self._task.action_names[action]
         self._moves += 1
-        if self._imaginer is not None:  # the same draws each time, so that what was imagined before stays as it was
+        if self._imaginer is not None:  # the same draws each time, so that the earlier imagination stays as it was
             self._actions.append(action)
             actions = np.array(self._actions)
             rng = np.random.default_rng(self._seed)
@@ -154,9 +154,9 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
     def _window(self) -> Frame:
         """The scene with the goal below it, the agent's frame, the imagined frame, and words."""
         keys = "\n".join(f"{key}  {name}" for key, name in zip(KEYS, self._task.action_names, strict=False))
-        panels = [("what the agent sees", self._frame, f"{self._said}\n\n{keys}\n\nEsc  end the game")]
+        panels = [("the agent's frame", self._frame, f"{self._said}\n\n{keys}\n\nEsc  end the game")]
         if self._imaginer is not None:
-            panels.append(("what the model imagines", *self._imagination()))
+            panels.append(("the model's imagination", *self._imagination()))
         canvas = Image.new("RGB", (_WIDTH + len(panels) * _PANEL, _HEIGHT + _BAND), "white")
         if hasattr(self._scene, "human_view"):
             canvas.paste(Image.fromarray(self._scene.human_view(_WIDTH, _HEIGHT)))
@@ -181,7 +181,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         return "\n".join([*goal, directions + left + f"Solved: {self.solved} of {self.episodes}."])
 
     def _imagination(self) -> tuple[Frame, str]:
-        """The latest imagined image, gray or RGB, and in words what the model predicts and how sure it is."""
+        """The latest imagined image, gray or RGB, and in words its predictions and uncertainty."""
         rollout = self._rollout
         if rollout is None:
             return np.full_like(self._start, 200), "nothing yet"
@@ -210,8 +210,9 @@ def play(
     :func:`film`.
 
     Raises:
-        ImagineBenchError: Nothing to play, unknown names, a model of another task or that does not imagine, what
-            ``load_trained`` raises, or neither pygame nor desktop.
+        ImagineBenchError: Nothing to play, unknown names, a model of another task or that does not imagine, the errors
+            of
+            ``load_trained``, or neither pygame nor desktop.
     """
     chosen: dict[str, Any] = {}
     imaginer = None

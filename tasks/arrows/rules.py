@@ -1,7 +1,7 @@
 """Arrow puzzles (thesis, chapter 5): a world of the family in one line, ``arrows:cubes=5,slip=0.1``, and its rules.
 
-The rules know no physics and no images, and are exact. A world is a goal, what is forbidden, what a turn turns, the
-order of the macro-actions and its parameters.
+The rules know no physics and no images, and are exact. A world is a goal, forbidden arrangements, the effect of a turn,
+the order of the macro-actions and its parameters.
 
 A macrostate is ``(d0, ..., dn-1, pointed)``: the directions of the arrows, left to right in the agent's frame, and the
 cube that the human points at. Directions: 0 toward the human (up in the frame), 1 right, 2 toward the agent, 3 left.
@@ -49,13 +49,14 @@ class Arrows(WorldParameters):
     """
 
     cubes: int = 3  #: 1 to 6
-    #: What must come true. ``"pointed"``: the arrow of the cube pointed at, toward the human (thesis 5.2.1);
-    #: ``"toward_agent"``: the same toward the agent; ``"clockwise"``: the same to the left, and no arrow a quarter turn
-    #: clockwise of it; ``"all"``: all arrows toward the human; or a digit a cube, its direction, such as ``"0123"``.
+    #: The condition that must come true. ``"pointed"``: the arrow of the cube pointed at, toward the human (thesis
+    #: 5.2.1); ``"toward_agent"``: the same toward the agent; ``"clockwise"``: the same to the left, and no arrow a
+    #: quarter turn clockwise of it; ``"all"``: all arrows toward the human; or a digit a cube, its direction, such as
+    #: ``"0123"``.
     goal: str = "pointed"
-    #: What may not be: ``"none"``; ``"equal"``: two arrows alike (thesis); ``"neighbours"``: two alike side by side;
-    #: ``"agent"``: no goal has an arrow toward the agent (thesis 5.2.3); several joined by ``+``. None is ``"equal"``
-    #: up to 3 cubes and ``"neighbours"`` from 4 on, and becomes that.
+    #: The forbidden arrangements: ``"none"``; ``"equal"``: two arrows alike (thesis); ``"neighbours"``: two alike side
+    #: by side; ``"agent"``: no goal has an arrow toward the agent (thesis 5.2.3); several joined by ``+``. None is
+    #: ``"equal"`` up to 3 cubes and ``"neighbours"`` from 4 on, and becomes that.
     forbid: str | None = None
     coupling: str = "none"  #: ``"neighbour"``: a turn also turns the next cube to the right, the same way
     shuffle: int | None = None  #: a seed of the order of the macro-actions; None leaves it

@@ -1,7 +1,7 @@
-"""Arrow puzzles (thesis, chapter 5): what the bench needs to know of each world, and the environments.
+"""Arrow puzzles (thesis, chapter 5): the bench's description of each world, and the environments.
 
-Worlds of as many cubes share scene and encoders, whatever their goals and other parameters. What an agent has learned
-of how one of them moves is true in every other one with the same turns.
+Worlds of as many cubes share scene and encoders, whatever their goals and other parameters. An agent's knowledge of how
+one of them moves is true in every other one with the same turns.
 
 Importing this module is cheap: MuJoCo loads when an environment or a frame is made.
 """

@@ -265,7 +265,7 @@ def test_a_report_on_agents_that_are_not_installed_here_is_not_blamed(
 ) -> None:
     monkeypatch.delitem(registry.AGENTS, "table")
     *_, last = verify(finished)
-    assert str(last) == "report: not compared; not shown: what it says, for no package here offers table"
+    assert str(last) == "report: not compared; not shown: its words, for no package here offers table"
 
 
 def test_a_report_that_cannot_be_made_is_a_complaint(finished: Path, tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("npz", with_item("frames", 0, 7), "is damaged: its episodes are not those of its card"),
     ("npz", bytes_of("card.json", lambda old: old.replace(b'"mixed"', b'"oracle"')), "card.json is damaged"),
     ("npz", bytes_of("privileged.npz", flipped), "privileged.npz is not a part of a dataset"),
-    ("npz", lambda folder: np.savez(folder / "privileged.npz", seeds=np.arange(6)), "is not what the card says"),
+    ("npz", lambda folder: np.savez(folder / "privileged.npz", seeds=np.arange(6)), "differs from the card"),
     ("lerobot", lambda folder: (folder / "final_frames.parquet").unlink(), "copy it from the dataset that this"),
     ("lerobot", lambda folder: shutil.rmtree(folder / "data"), "and 0 are, in 0 files data/*/*.parquet; is one missi"),
     ("lerobot", table(lambda old: replaced(old, "timestamp", [9.0] * len(old))), "row 0 has frame_index 0 and times"),
@@ -144,7 +144,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("lerobot", info(features={"action": {}, "observation.images.top": {}}), "it has no next.reward, which 'imagine"),
     ("lerobot", info(total_frames=10**9), "1000000000 rows are said to be in it"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: b"{}"), "is not a Minari dataset of macro-actions"),
-    ("minari", bytes_of("*/data/metadata.json", steps_less_one), "steps are not what it holds"),
+    ("minari", bytes_of("*/data/metadata.json", steps_less_one), "steps are not those that it holds"),
     ("minari", lambda folder: shutil.rmtree(next(folder.glob("*/data/5"))), "a file of it is missing"),
 ]  # fmt: skip
 

@@ -129,7 +129,7 @@ def test_how_it_learned_to_see_comes_before_it_acts_and_what_it_does_not_know_be
     asked = {step - 1 for step in times(path, "/real/reward", "env_step")}
     assert len(asked) >= 2 and times(path, "/real/novelty/turn_the_left_cube_clockwise", "env_step") == asked
     assert not any("novelty" in path or "seen" in path for path in contents(imagined))
-    view = "What is unknown of each macro-action"
+    view = "Unknown share of each macro-action"
     assert view in view_names(path) and view not in view_names(imagined)
 
 
@@ -279,7 +279,7 @@ def test_every_series_has_its_name(imagined: Path) -> None:
     ("info", "terminated", "words"),
     [
         ({"is_success": True}, True, "solved"),
-        ({"is_success": False}, True, "lost, because the rules forbid what the last macro-action led to"),
+        ({"is_success": False}, True, "lost, because the rules forbid the result of the last macro-action"),
         ({"is_success": False, "fault_reason": ""}, False, "lost, because no macro-actions are left"),
         (
             {"is_success": False, "fault_reason": "the simulation blew up"},

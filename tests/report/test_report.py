@@ -247,7 +247,7 @@ def test_agents_that_do_not_learn_are_not_compared(tmp_path: Path) -> None:
     page = bench_page(bench_result(tmp_path, protocol=protocol))
     assert page.answers == ["Nothing is compared, as dqn or another learner is missing; name both with --agents."]
     assert [section.title for section in page.sections] == [
-        "What was compared", "Success against real experience", "What it cost, and what went wrong",
+        "Task and agents", "Success against real experience", "Costs and faults",
     ]  # fmt: skip
 
 

@@ -102,7 +102,7 @@ def test_a_guest_that_is_killed_or_answers_with_a_pickle_is_a_sentence(start: St
     if sys.platform == "linux":
         with pytest.raises(GuestError, match="MemoryError"):
             start(closed=False, memory=2**30).call("grows")
-        with pytest.raises(InvalidValueError, match="it sent what is no answer"):
+        with pytest.raises(InvalidValueError, match="it sent something that is no answer"):
             start(closed=False).call("sends_a_pickle", str(tmp_path / "carried_out"))
     assert not (tmp_path / "carried_out").exists()
 

@@ -246,7 +246,7 @@ class _Worker(Generic[Item, News]):
             self._pipe.send(item)
 
     def forward(self, on_news: Callable[[News], None]) -> None:
-        """Read what the process has sent so far."""
+        """Read the messages of the process so far."""
         while self.ended is None and self._pipe.poll():
             try:
                 ends, message = self._pipe.recv()

@@ -1,6 +1,7 @@
 """The same runs on a Ray cluster: a task a run, in a fresh process with one thread, resumed wherever it was lost.
 
-The folder of the bench must be on a file system that all nodes share. A worker or a whole node that dies costs what a
+The folder of the bench must be on a file system that all nodes share. A worker or a whole node that dies costs as much
+as a
 ``kill -9`` costs locally, the time since the run's last checkpoint: Ray starts its task again elsewhere, which finds
 that checkpoint.
 """

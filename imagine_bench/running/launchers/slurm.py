@@ -1,7 +1,7 @@
 """The same runs as jobs of a Slurm cluster, by submitit; where there is no Slurm, as plain processes of this machine.
 
 The folder of the bench must be on a file system that all nodes share. Jobs ask for one core each; account, partition
-and time limit are what sbatch's own variables say, such as ``SBATCH_PARTITION``. A job that is preempted or reaches its
+and time limit come from sbatch's own variables, such as ``SBATCH_PARTITION``. A job that is preempted or reaches its
 limit is queued again and goes on from its run's last checkpoint.
 """
 
@@ -78,7 +78,7 @@ class SlurmCluster:
 
 
 class _Work:
-    """What a node does with a job; submitit asks it what to queue when the job must stop."""
+    """The work of a node for a job; submitit asks it for the job to queue when this one must stop."""
 
     def __init__(self, there: Registered) -> None:
         self._there = there

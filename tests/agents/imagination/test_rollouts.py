@@ -74,7 +74,7 @@ def test_imagination_that_is_no_number_is_not_stored(part: str) -> None:
         return dataclasses.replace(sound, **{part: torch.full_like(getattr(sound, part), torch.nan)})
 
     imagination, controller = make(filtered=False, model=CountingModel(change=diverged), temperature=1.0)
-    with pytest.raises(DivergedError, match=r"imagines is no longer a number\. Lower model\.learning_rate\."):
+    with pytest.raises(DivergedError, match=r"of the world model is no longer a number\. Lower model\.learning_rate\."):
         imagination.rollouts(controller, torch.zeros(2), remembering(1), 0.5)
     assert len(imagination.memory) == 0
 

@@ -15,7 +15,7 @@ DRQN = AgentEntry(
     make="imagine_bench_controls.memory.drqn:make",
     settings="imagine_bench_controls.memory.settings:DRQN",
     title="DQN + memory",
-    description="The DQN with a recurrent network (DRQN), which remembers what the episode showed; replays "
+    description="The DQN with a recurrent network (DRQN), which remembers the frames of the episode; replays "
     "sequences as R2D2 does.",
 )
 IMAGINATION_MEMORY = AgentEntry(
@@ -23,7 +23,7 @@ IMAGINATION_MEMORY = AgentEntry(
     title="imagination + memory",
     settings="imagine_bench_controls.memory.settings:IMAGINATION_MEMORY",
     description="Like imagination + uncertainty, but the world model is recurrent (MDN-RNN), and rollouts carry "
-    "what it remembers.",
+    "its memory.",
 )
 IMAGINATION_EXACT = AgentEntry(
     make="imagine_bench_controls.exact:make",
@@ -64,7 +64,7 @@ COUNT_TABLE = AgentEntry(
     make="imagine_bench_controls.tabular.count_table:make",
     settings=_COUNT_TABLE_SETTINGS,
     encoder_kind="codes",
-    description="A control: counts what followed each action in each code of a frame, and plans by value iteration; "
+    description="A control: counts the outcomes of each action in each code of a frame, and plans by value iteration; "
     "explores by chance as DQN does.",
 )
 COUNT_TABLE_DIRECTED = AgentEntry(
@@ -72,7 +72,7 @@ COUNT_TABLE_DIRECTED = AgentEntry(
     settings=_COUNT_TABLE_SETTINGS,
     encoder_kind="codes",
     title="count table, directed",
-    description="A control: like count table, but it explores by optimism about what it never tried (R-max).",
+    description="A control: like count table, but it explores by optimism about untried actions (R-max).",
 )
 COUNT_TABLE_DIRECTED_MACROSTATE = AgentEntry(
     make="imagine_bench_controls.tabular.count_table:make_directed_macrostate",
@@ -95,8 +95,7 @@ POSTERIOR_SAMPLING = AgentEntry(
     settings=_POSTERIOR_SETTINGS,
     encoder_kind="codes",
     title="posterior sampling",
-    description="A control: a count table that follows, each episode, a model drawn from what it believes (PSRL); "
-    f"{_CODE}",
+    description=f"A control: a count table that follows, each episode, a model drawn from its beliefs (PSRL); {_CODE}",
 )
 POSTERIOR_SAMPLING_MACROSTATE = AgentEntry(
     make="imagine_bench_controls.tabular.posterior_sampling:make_macrostate",
@@ -105,7 +104,7 @@ POSTERIOR_SAMPLING_MACROSTATE = AgentEntry(
     needs_encoder=False,
     privileged=True,
     title="posterior sampling (true state)",
-    description="A control: a count table that follows, each episode, a model drawn from what it believes (PSRL); "
+    description="A control: a count table that follows, each episode, a model drawn from its beliefs (PSRL); "
     f"{_TRUE_STATE}",
 )
 Q_LEARNING = AgentEntry(
@@ -144,6 +143,6 @@ MDN_RNN = WorldModelEntry(
     make="imagine_bench_controls.memory.world_model:make",
     title="VAE + MDN-RNN",
     encoder_kind="latents",
-    description="The ensemble on what a recurrent network remembers of all frames of the history.",
+    description="The ensemble on a recurrent network's memory of all frames of the history.",
     by_default=False,
 )

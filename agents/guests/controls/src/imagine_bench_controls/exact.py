@@ -1,8 +1,8 @@
-"""What imagination could give at most: Algorithm 1 with a perfect model, and with a perfect filter (privileged).
+"""The best that imagination could give: Algorithm 1 with a perfect model, and with a perfect filter (privileged).
 
 ``imagination_exact`` imagines with the rules and with rendered frames in place of a learned model; everything else is
 the agent ``imagination``, whose settings it has. ``imagination_exact_filter`` learns the model and keeps those imagined
-transitions alone that are right: what an uncertainty could do that knew every mistake.
+transitions alone that are right, as an uncertainty that knew every mistake would.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Gallery:
 
 
 class ExactImaginationAgent(DQN):
-    """A DQN that also learns from what would really happen, from states that it was in."""
+    """A DQN that also learns from the real outcomes of other macro-actions, from states that it was in."""
 
     settings: Settings
 
@@ -86,7 +86,7 @@ class ExactImaginationAgent(DQN):
         return super().store(transition)
 
     def learn_more(self, z: Tensor, episode: int) -> None:
-        """N_I updates on what is imagined, as of :class:`.ImaginingAgent`, without a model to learn."""
+        """N_I updates on imagined transitions, as of :class:`.ImaginingAgent`, without a model to learn."""
         settings = self.settings.imagination
         if settings.end_episode is not None and episode >= settings.end_episode:
             self.learn_values(self.real, settings.updates_per_step)

@@ -1,10 +1,10 @@
 """The control ``dqn_swaps``: a DQN that also learns from real transitions with parts of others (CoDA).
 
 Counterfactual data augmentation (Pitis, Creager & Garg 2020): factors of a code that an action does not touch are taken
-from another transition, on both sides. Which those are is what was seen: the factors that the action never changed. The
-reward and end of what comes out are those that were seen of its next code; where none or several were, the real
-transition stays. What it takes for granted: touched factors change alike whatever the others are, and the outcome is
-decided by the next code. Its control is the same DQN without swaps, ``dqn_codes``.
+from another transition, on both sides. These are the factors that the action was never seen to change. The reward and
+end of the new transition are those that were seen of its next code; where none or several were, the real transition
+stays. Its assumptions: touched factors change alike whatever the others are, and the outcome is decided by the next
+code. Its control is the same DQN without swaps, ``dqn_codes``.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class SwappingDQN(DQN):
         self.outcomes: dict[Code, tuple[float, float]] = {}  #: reward and end by next code
 
     def store(self, transition: Transition) -> Tensor:
-        """As of the DQN; and which factors the action changed, and what it led to."""
+        """As of the DQN; and which factors the action changed, and its outcomes."""
         z = super().store(transition)
         then = self._codes(self.perception.posterior(transition.next_observation.frame)[0].unsqueeze(0))[0]
         self.touched[transition.action] |= self._codes(z.unsqueeze(0))[0] != then
@@ -88,7 +88,7 @@ class SwappingDQN(DQN):
         return torch.cat(hot, dim=1).float()
 
     def state(self) -> AgentState:
-        """A snapshot, with what is known of factors and outcomes."""
+        """A snapshot, with the knowledge of factors and outcomes."""
         state = super().state()
         factors = len(self._sizes)
         known = {

@@ -100,7 +100,7 @@ class Dreamer:
             optimiser.load_state_dict(kept)
 
     def begin_episode(self) -> None:
-        """Forget what was seen: the next frame is an episode's first."""
+        """Forget the earlier frames: the next frame is an episode's first."""
         self._player.init_states()
         self._first = True
         self._acted = False
@@ -131,7 +131,7 @@ class Dreamer:
         """Remember the transition, and update the networks as often as the replay ratio says.
 
         Acting and updates draw from the same generators, so a transition that was only shown takes the draws of an
-        act, too: it then teaches what an own one does.
+        act, too: it then teaches as much as one of its own.
         """
         if not self._acted:
             self.act(transition.observation, explore=True)
@@ -161,7 +161,7 @@ class Dreamer:
         self._memory.add({**self._shown(frame), "actions": action, **row})
 
     def _shown(self, frame: Frame) -> dict[str, NDArray[Any]]:
-        """What the library sees of a frame (64, 64, 3): it with its channels first, or its latents (Z,)."""
+        """The library's view of a frame (64, 64, 3): the frame with its channels first, or its latents (Z,)."""
         if self._perception is None:
             return {_PIXELS: frame.transpose(_CHANNELS_FIRST)}
         return {_LATENTS: self._perception.posterior(frame)[0].cpu().numpy()}
@@ -236,7 +236,7 @@ class Dreamer:
 
 
 class _Losses:
-    """Takes what the library measures, of which the losses are kept."""
+    """Takes the library's measurements, of which the losses are kept."""
 
     disabled = False
 
@@ -274,7 +274,7 @@ class Sequences:
         }
 
     def arrays(self, shown: dict[str, NDArray[Any]], n_actions: int) -> dict[str, NDArray[Any]]:
-        """All rows, by name, also where there are none: things like what is ``shown``, ``n_actions`` macro-actions."""
+        """All rows, by name, also where there are none: rows like ``shown``, ``n_actions`` macro-actions."""
         row = {**shown, "actions": np.zeros(n_actions, np.float32)}
         row |= {name: np.zeros(1, np.float32) for name in ("rewards", "terminated", "truncated", "is_first")}
         return {name: np.array([each[name] for each in self._rows] or array[None][:0]) for name, array in row.items()}

@@ -26,7 +26,7 @@ class LentGenerator:
 
     @contextmanager
     def lent(self) -> Iterator[None]:
-        """What is drawn in this block is drawn from here; the global generator is afterwards as it was."""
+        """Random numbers in this block are drawn from here; the global generator is afterwards as it was."""
         before = torch.get_rng_state()
         torch.set_rng_state(self.state)
         if self._device == "cuda":

@@ -98,7 +98,7 @@ class LeWMPlanner:
         """Remember the transition, and update the networks as often as the replay ratio says.
 
         Acting and updates draw from the same generator, so a transition that was only shown takes the draws of an act,
-        too: it then teaches what an own one does.
+        too: it then teaches as much as one of its own.
         """
         if not self._acted:
             self.act(transition.observation, explore=True)
@@ -142,7 +142,7 @@ class LeWMPlanner:
         self._aims = None
 
     def _pixels(self, frames: list[Frame]) -> Tensor:
-        """What the model reads of N frames. Shape (N, 1, 3, 64, 64), in [0, 1]."""
+        """The model's input for N frames. Shape (N, 1, 3, 64, 64), in [0, 1]."""
         return torch.tensor(np.array(frames), device=self._device).movedim(-1, 1).unsqueeze(1).float() / 255.0
 
     def diagnostics(self) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """Agents of Stable-Baselines3 (Raffin et al. 2021) through Gymnasium, trained by the library's own loop.
 
-They see the environment's frames, or what else the protocol shows, or an encoder's latents of frames.
+They see the environment's frames, or other observations of the protocol, or an encoder's latents of frames.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class LibraryAgent:
         learn(self._model, steps, on_episode)
 
     def _experience(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
-        """What the library trains in."""
+        """The environment in which the library trains."""
         return env if self._encoder is None else LatentObservation(env, self._encoder)
 
     def _steps_an_episode(self, horizon: int) -> int:
@@ -93,7 +93,7 @@ class LibraryAgent:
         """Learn nothing: the library learns in its own loop."""
 
     def diagnostics(self) -> dict[str, float]:
-        """What the library logged last, and its exploration probability."""
+        """The measurements that the library logged last, and its exploration probability."""
         logged = {} if self._model is None else dict(self._model.logger.name_to_value)
         values = {
             "loss/bellman": logged.get("train/loss"),

@@ -1,4 +1,4 @@
-"""What agents with memory share: they read states, and replay sequences."""
+"""The common part of agents with memory: they read states, and replay sequences."""
 
 from __future__ import annotations
 
@@ -25,16 +25,18 @@ from .settings import RecurrentDQNSettings, RecurrentSettings
 
 @dataclass(frozen=True, slots=True)
 class Past:
-    """What an episode showed so far, and the macro-action after each frame, the last of which may be still to come."""
+    """The observations of an episode so far, and the macro-action after each frame, the last of which may be still to
+    come.
+    """
 
     frames: list[Frame] = field(default_factory=list)
     actions: list[int] = field(default_factory=list)
 
 
 class RememberingAgent(DQN, ABC):
-    """A DQN whose states are the latents of a frame and what :attr:`recurrence` remembers of the episode after it.
+    """A DQN whose states are the latents of a frame and the memory by :attr:`recurrence` after it.
 
-    Snapshots are taken between two episodes, so what an agent sees of one is no part of them.
+    Snapshots are taken between two episodes, so an agent's view of one is no part of them.
     """
 
     perception: Remembering
@@ -70,14 +72,14 @@ class RememberingAgent(DQN, ABC):
     @property
     @abstractmethod
     def recurrence(self) -> Recurrence:
-        """What remembers."""
+        """The recurrent network."""
 
     def recurrence_now(self) -> Recurrence:
         """The recurrent network, for parts that ask anew each time. As a method, it is the copy's own in a copy."""
         return self.recurrence
 
     def perceive(self, frame: Frame) -> Tensor:
-        """The mean latents of a frame and what is remembered after it. Shape (Z + H,).
+        """The mean latents of a frame and the memory after it. Shape (Z + H,).
 
         A frame that was not acted on is taken for the next one of the episode, or for the first of another.
         """
@@ -87,14 +89,14 @@ class RememberingAgent(DQN, ABC):
         return self.perception.recall(frames, seen.actions[: len(frames) - 1])[0]
 
     def act(self, observation: Observation, *, explore: bool) -> int:
-        """Act as the DQN, and remember what was seen and done until the episode ends."""
+        """Act as the DQN, and remember observations and actions until the episode ends."""
         self._seen.frames.append(observation.frame)
         action = super().act(observation, explore=explore)
         self._seen.actions.append(action)
         return action
 
     def store(self, transition: Transition) -> Tensor:
-        """Add a real transition to the memory, with what was remembered before; the state it began in (Z + H,)."""
+        """Add a real transition to the memory, with the memory before it; the state it began in (Z + H,)."""
         lived = self._lived
         frame = transition.observation.frame
         plain = self.perception.plain
@@ -117,7 +119,7 @@ class RememberingAgent(DQN, ABC):
         return state
 
     def read_memory(self, frame: Frame, sizes: Sequence[int]) -> NDArray[np.int64]:
-        """What a linear read-out finds in the memory; see :class:`.capabilities.MemoryReader`."""
+        """The values that a linear read-out finds in the memory; see :class:`.capabilities.MemoryReader`."""
         if self._read_out is None or self._read_out[0] != self.steps:
             self._read_out = self.steps, fit(self.real, self.recurrence, self.perception.plain.encoder, sizes)
         return self._read_out[1](self.perceive(frame)[self.perception.plain.latent_size :])

@@ -34,7 +34,7 @@ class RecurrentValues(nn.Module):
 
 
 class DRQN(RememberingAgent):
-    """Acts and learns as the DQN, on what its controller remembers; a slowly updated target network has its own."""
+    """Acts and learns as the DQN, on the memory of its controller; a slowly updated target network has its own."""
 
     settings: RecurrentDQNSettings
 
@@ -52,7 +52,7 @@ class DRQN(RememberingAgent):
         return self.controller.network.recurrence  # type: ignore[return-value]
 
     def draw_batch(self, memory: Transitions) -> Batch:
-        """Replayed sequences as transitions between states, through which the loss reaches what remembers."""
+        """Replayed sequences as transitions between states, through which the loss reaches the recurrent network."""
         del memory
         count = self.settings.controller.batch_size
         length = self.settings.recurrence.sequence

@@ -1,8 +1,8 @@
 """Imagination that remembers: a mixture density network on a recurrent state (MDN-RNN, Ha and Schmidhuber 2018).
 
-What the recurrence remembers is learned from what the world model predicts: the next latents, reward and end. The
-controller reads the latents and what is remembered, as in that paper, and learns nothing of the recurrence. Imagined
-rollouts begin in real states and remember what they imagine; filter and members are those of the imagining agents.
+The memory of the recurrence is learned from the predictions of the world model: the next latents, reward and end. The
+    controller reads the latents and the memory, as in that paper, and learns nothing of the recurrence. Imagined
+rollouts begin in real states and remember their imagined steps; filter and members are those of the imagining agents.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .settings import IMAGINATION_MEMORY, RecurrentSettings
 
 
 class RecurrentEnvironmentModel(EnvironmentModel):
-    """A world model of states (Z + H): what it remembers (H) decides with the latents (Z) what it predicts."""
+    """A world model of states (Z + H): the memory (H) decides with the latents (Z) its predictions."""
 
     def __init__(
         self, state_size: int, n_actions: int, settings: WorldModelSettings, units: int, generator: torch.Generator
@@ -37,13 +37,13 @@ class RecurrentEnvironmentModel(EnvironmentModel):
         self.optimiser = Adam([(self.parameters(), 0.0)], settings.learning_rate)
 
     def keep_dynamics_of(self, other: EnvironmentModel) -> None:
-        """Take over what another model of the same shape knows of where actions lead, and how it remembers."""
+        """Take over the dynamics and the recurrence of another model of the same shape."""
         super().keep_dynamics_of(other)
         self.recurrence.load_state_dict(cast(RecurrentEnvironmentModel, other).recurrence.state_dict())
 
 
 class RecurrentImagination(Imagination):
-    """Imagination whose rollouts carry what is remembered."""
+    """Imagination whose rollouts carry the memory."""
 
     model: RecurrentEnvironmentModel
 
@@ -61,7 +61,7 @@ class RecurrentImagination(Imagination):
 
 
 class ImaginingMemoryAgent(RememberingAgent, ImaginingAgent):
-    """Algorithm 1 on states: a DQN on what the world model remembers, fed by recurrent imagination."""
+    """Algorithm 1 on states: a DQN on the memory of the world model, fed by recurrent imagination."""
 
     settings: RecurrentSettings
     imagination: RecurrentImagination
@@ -73,7 +73,7 @@ class ImaginingMemoryAgent(RememberingAgent, ImaginingAgent):
         return self.imagination.model.recurrence
 
     def draw_model_batches(self, generator: torch.Generator) -> Iterator[Batch]:
-        """Replayed sequences as transitions between states, through which losses reach what remembers."""
+        """Replayed sequences as transitions between states, through which losses reach the recurrent network."""
         settings = self.settings.model
         length = self.settings.recurrence.sequence
         for _ in range(settings.updates_per_step):

@@ -1,4 +1,4 @@
-"""States for a controller that has no memory of its own: the latents of a frame and what is remembered after it."""
+"""States for a controller that has no memory of its own: the latents of a frame and the memory after it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .sequences import START, Recurrence
 
 
 class StateEncoder(Encoder):
-    """An encoder whose latents (N, Z + H) are followed by what is remembered after a first frame."""
+    """An encoder whose latents (N, Z + H) are followed by the memory after a first frame."""
 
     def __init__(self, encoder: Encoder, units: int, recurrence: Callable[[], Recurrence]) -> None:
         # everything is done by the encoder that is given
@@ -29,7 +29,7 @@ class StateEncoder(Encoder):
 
     @torch.no_grad()
     def encode(self, frames: Frame) -> tuple[Tensor, Tensor]:
-        """Means and standard deviations of the states that lone frames are taken for; what is remembered is certain."""
+        """Means and standard deviations of the states that lone frames are taken for; the memory is certain."""
         return self.remembering(*self._encoder.encode(frames))
 
     @torch.no_grad()
@@ -46,7 +46,7 @@ class StateEncoder(Encoder):
         return self._encoder.decode(latents[:, : self._encoder.latent_size])
 
     def read_macrostate(self, latents: Tensor) -> NDArray[np.int64]:
-        """What the probe reads from the latents of states (N, Z + H). Shape (N, M)."""
+        """The probe's reading of the latents of states (N, Z + H). Shape (N, M)."""
         return self._encoder.read_macrostate(latents[:, : self._encoder.latent_size])
 
 
@@ -68,7 +68,7 @@ class Remembering(Perception):
 
     @torch.no_grad()
     def recall(self, frames: Sequence[Frame], actions: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """The mean state after the frames of an episode so far (Z + H,), and what was remembered before the last (H,).
+        """The mean state after the frames of an episode so far (Z + H,), and the memory before the last (H,).
 
         ``actions`` are the macro-actions between them.
         """

@@ -1,7 +1,7 @@
-"""What a memory holds of the macrostate: a linear read-out for people, which no agent acts on or learns from.
+"""The macrostate in a memory: a linear read-out for people, which no agent acts on or learns from.
 
-It is fitted on replayed episodes. Its labels are what the encoder's evaluation-only probe reads in their frames: of
-each coordinate of the macrostate the value that was seen last, which is the truth as long as nothing changes unseen.
+It is fitted on replayed episodes. Its labels are the readings of the encoder's evaluation-only probe in their frames:
+of each coordinate of the macrostate the value that was seen last, which is the truth as long as nothing changes unseen.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def last_seen(read: NDArray[np.int64], sizes: Sequence[int]) -> NDArray[np.int64
 
 @torch.no_grad()
 def fit(memory: SequenceMemory, recurrence: Recurrence, encoder: Encoder, sizes: Sequence[int]) -> ReadOut:
-    """Ridge regression from memories to what was seen last, over the newest replayed episodes."""
+    """Ridge regression from memories to the values that were seen last, over the newest replayed episodes."""
     rows = memory.arrays()
     starts = np.flatnonzero(rows["step"] == 0)[-_EPISODES:]
     features = [recurrence.blank(0)]

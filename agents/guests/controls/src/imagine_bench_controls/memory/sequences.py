@@ -1,9 +1,9 @@
 """Replay of sequences with stored memory and burn-in (Kapturowski et al. 2019, R2D2).
 
-A state is the latents of a frame and what is remembered after it. Of each real transition is kept what was remembered
-before its frame, by the network of that time. What is replayed begins some macro-actions earlier, within the episode,
-so that the network of today remembers them anew; no gradient goes there. Where these reach back to the start of the
-episode, nothing stored is used. Shapes: ``B`` sequences of ``L`` transitions, ``K`` before them, ``Z``, ``H``.
+A state is the latents of a frame and the memory after it. Of each real transition, the memory before its frame is kept,
+by the network of that time. A replayed sequence begins some macro-actions earlier, within the episode, so that the
+network of today remembers them anew; no gradient goes there. Where these reach back to the start of the episode,
+nothing stored is used. Shapes: ``B`` sequences of ``L`` transitions, ``K`` before them, ``Z``, ``H``.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ class Recurrence(nn.Module):
         self._one_hot = torch.eye(n_actions + 1, n_actions, device=device)  # the last row, START, is zero
 
     def forward(self, z: Tensor, previous: Tensor, memory: Tensor) -> Tensor:
-        """What is remembered after each observation. Shape (B, T, H).
+        """The memory after each observation. Shape (B, T, H).
 
         Args:
             z: Latents. Shape (B, T, Z).
             previous: The macro-action before each, or :data:`START`. Shape (B, T).
-            memory: What was remembered before the first. Shape (B, H).
+            memory: The memory before the first. Shape (B, H).
         """
         return self.gru(torch.cat([z, self._one_hot[previous]], dim=-1), memory.unsqueeze(0))[0]
 
     def blank(self, count: int) -> Tensor:
-        """What is remembered before an episode begins: nothing. Shape (count, H)."""
+        """The memory before an episode begins: none. Shape (count, H)."""
         return self._one_hot.new_zeros(count, self.units)
 
 
 @dataclass(frozen=True, slots=True)
 class Sequences:
-    """Replayed sequences; rows of ``valid`` that are false are of no episode, and what is there means nothing."""
+    """Replayed sequences; rows of ``valid`` that are false are padding."""
 
-    stored: Tensor  #: what was remembered before the burn-in. Shape (B, H).
+    stored: Tensor  #: the memory before the burn-in. Shape (B, H).
     burned: Tensor  #: observations of the burn-in, which come first in the next two. Shape (B,), at most K.
     burn_z: Tensor  #: shape (B, K, Z)
     burn_previous: Tensor  #: macro-action before each. Shape (B, K).
@@ -65,7 +65,7 @@ class Sequences:
     valid: Tensor  #: whether the episode got so far. Shape (B, L), bool.
 
     def states(self, recurrence: Recurrence) -> Tensor:
-        """Latents and what is remembered after each observation of the sequences. Shape (B, L + 1, Z + H)."""
+        """Latents and the memory after each observation of the sequences. Shape (B, L + 1, Z + H)."""
         start = self.stored
         if self.burn_z.shape[1]:
             with torch.no_grad():
@@ -83,7 +83,7 @@ class Sequences:
 
 
 class SequenceMemory(RealMemory):
-    """Transitions that happened, which can be replayed with what came before and after them.
+    """Transitions that happened, which can be replayed with their neighbours.
 
     ``recurrence`` gives the network that remembers now, ``burn_in`` is K.
     """
@@ -118,7 +118,7 @@ class SequenceMemory(RealMemory):
     ) -> None:
         """Store transition ``step`` of an episode, which goes on from the one stored last unless that is 0.
 
-        ``before`` is the macro-action before it, or :data:`START`; ``stored`` what was remembered then, shape (H,).
+        ``before`` is the macro-action before it, or :data:`START`; ``stored`` the memory of that time, shape (H,).
         """
         row = self.added % self.capacity
         columns = self._columns
@@ -169,7 +169,7 @@ class SequenceMemory(RealMemory):
 
     @torch.no_grad()
     def sample(self, count: int, generator: torch.Generator, *, spread: float = 1.0, balance: float = 0.0) -> Batch:
-        """Draw transitions between states, with what is remembered in them now; see :meth:`RealMemory.sample`."""
+        """Draw transitions between states, with the present memory in them; see :meth:`RealMemory.sample`."""
         sequences = self.draw(count, 1, generator, spread=spread, balance=balance)
         states = sequences.states(self._recurrence())
         return sequences.transitions(states, states)

@@ -24,10 +24,11 @@ from imagine_bench.agents.settings import (
 
 @dataclass(frozen=True, kw_only=True)
 class RecurrenceSettings:
-    """What is remembered, and how that is learned (Kapturowski et al. 2019, R2D2)."""
+    """The memory, and how it is learned (Kapturowski et al. 2019, R2D2)."""
 
     units: int = setting(256, COUNT)  #: numbers that are remembered: units of the GRU (Ha and Schmidhuber 2018)
-    #: Macro-actions before a replayed transition that only bring its memory up to date, from what was stored then.
+    #: Macro-actions before a replayed transition that only bring its memory up to date, from the memory that was stored
+    #: then.
     burn_in: int = setting(40, between(0, 1000))
     #: Macro-actions that are learned from, beginning with a replayed transition: the longest way of a gradient.
     sequence: int = setting(80, COUNT)
@@ -48,7 +49,7 @@ class RecurrentSettings(Settings):
 
 
 _FAST: Mapping[str, Override] = {
-    "recurrence.units": Override(64, "CPU time; what is to be remembered is one of a few cubes or objects"),
+    "recurrence.units": Override(64, "CPU time; one of a few cubes or objects is to be remembered"),
     "recurrence.burn_in": Override(10, "most episodes are that short, so that nothing stored is out of date"),
     "recurrence.sequence": Override(10, "as long as most episodes are"),
 }

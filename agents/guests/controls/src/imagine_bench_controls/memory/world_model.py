@@ -28,7 +28,7 @@ class RecurrentLatentModel(latent.LatentModel):
     imagination: RecurrentImagination
 
     def new_imagination(self, context: AgentContext) -> RecurrentImagination:
-        """What imagines, of which nothing is learned yet."""
+        """The model that imagines, of which nothing is learned yet."""
         size = self.encoder.latent_size + self.settings.recurrence.units
         device = self.encoder.device
         return RecurrentImagination(
@@ -58,7 +58,7 @@ class RecurrentLatentModel(latent.LatentModel):
             yield sequences.transitions(states, states)
 
     def states(self, frames: Frame, actions: NDArray[np.int64]) -> Tensor:
-        """Latents of the latest frames and what is remembered of all K (N, K, 64, 64, 3): (N, Z + H)."""
+        """Latents of the latest frames and the memory of all K (N, K, 64, 64, 3): (N, Z + H)."""
         rows, count = frames.shape[:2]
         z = self.encoder.encode(frames.reshape(-1, *frames.shape[2:]))[0].view(rows, count, -1)
         start = np.full((rows, 1), START, dtype=np.int64)
@@ -68,7 +68,7 @@ class RecurrentLatentModel(latent.LatentModel):
 
 
 def make(context: AgentContext) -> RecurrentLatentModel:
-    """An ensemble on what one GRU remembers, at the settings of ``imagination_memory``."""
+    """An ensemble on the memory of one GRU, at the settings of ``imagination_memory``."""
     settings = IMAGINATION_MEMORY.resolve(context.hyperparameters, {}, context.config_group)
     settings = replace(settings, model=replace(settings.model, members=3, dropout=0.0))
     prepare_torch(context.device)

@@ -1,4 +1,4 @@
-"""What agents with a table have in common: how they see a state, explore, act in tests, and what they report."""
+"""The common part of agents with a table: how they see a state, explore, act in tests, and report."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def load_codes(context: AgentContext) -> CodePerception:
 class TabularAgent(ABC):
     """Explores epsilon-greedily as the DQN, by chance among equals; in tests the lowest of the best actions."""
 
-    directed = False  #: Whether what it explores is left to its values alone
+    directed = False  #: Whether its values alone decide its exploration
 
     def __init__(self, read: ReadState, n_actions: int, settings: CountTableSettings, seeds: SeedTree) -> None:
         self.read = read

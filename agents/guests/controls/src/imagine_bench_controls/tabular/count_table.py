@@ -22,11 +22,11 @@ from .agent import ReadState, TabularAgent, load_codes, read_codes, read_macrost
 from .settings import HYPERPARAMETERS, CountTableSettings
 
 _LEAST = 1e-3
-"""What ``1 - discount`` counts as at least, so that the best return is finite without discount."""
+"""What ``1 - discount`` counts as, at least, so that the best return is finite without discount."""
 
 
 class CountTableAgent(TabularAgent):
-    """Plans in a table of what was seen; an untried action is worth 0 in tests.
+    """Plans in a table of its experience; an untried action is worth 0 in tests.
 
     ``directed`` says how it explores.
     """
@@ -69,7 +69,7 @@ class CountTableAgent(TabularAgent):
 
 
 class CodeCountTableAgent(CountTableAgent):
-    """One whose states are codes of frames, so that it can be asked what it sees and expects."""
+    """One whose states are codes of frames, so that its perception and expectations can be read."""
 
     def __init__(
         self, perception: CodePerception, n_actions: int, settings: CountTableSettings, seeds: SeedTree, *,
@@ -80,11 +80,11 @@ class CodeCountTableAgent(CountTableAgent):
         self.code_sizes = perception.sizes
 
     def read_frames(self, frames: Frame) -> NDArray[np.int64]:
-        """What a probe reads; see :class:`imagine_bench.interfaces.capabilities.FrameReader`."""
+        """The reading of a probe; see :class:`imagine_bench.interfaces.capabilities.FrameReader`."""
         return self.perception.macrostates(self.perception.codes(frames))
 
     def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
-        """What the table holds; see :class:`imagine_bench.interfaces.capabilities.OutcomePredictor`."""
+        """The contents of the table; see :class:`imagine_bench.interfaces.capabilities.OutcomePredictor`."""
         here = [code for (code,) in self.perception.codes(frames)]
         pairs = [self.table.expected(state, action) for state in here for action in range(self.n_actions)]
         most = max(1, *(len(branches) for branches, _ in pairs))
@@ -102,7 +102,7 @@ class CodeCountTableAgent(CountTableAgent):
         )
 
     def state(self) -> AgentState:
-        """A snapshot, which says what codes it reads, too."""
+        """A snapshot, which names the codes that it reads, too."""
         common = super().state()
         return AgentState(arrays=common.arrays, values={**common.values, "code_sizes": list(self.code_sizes)})
 

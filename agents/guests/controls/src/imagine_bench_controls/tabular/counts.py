@@ -39,7 +39,7 @@ class CountTable:
         return len(self._branches)
 
     def add(self, state: int, action: int, following: int, reward: float, terminated: bool) -> bool:
-        """Count one transition; whether that changed what the table predicts."""
+        """Count one transition; returns whether that changed the table's predictions."""
         for each in (state, following):
             self._index.setdefault(each, len(self._index))
         row = (state, action, following, reward, terminated)
@@ -73,11 +73,12 @@ class CountTable:
         return self._optimal(*self._columns(), discount, untried) if self._rows else {}
 
     def sampled_values(self, discount: float, concentration: float, rng: np.random.Generator) -> dict[int, Floats]:
-        """The same in one model that is drawn from the posterior of what each pair of known state and action does.
+        """The same in one model that is drawn from the posterior of the outcomes of each pair of known state and
+        action.
 
         The prior of a pair is a Dirichlet process (Ferguson 1973): ``concentration``, above 0, is how many counts it
-        weighs, and its mean is what any pair was seen to do, all kinds of outcome, reward and end, equally likely. What
-        was never seen of a pair is one draw from that.
+        weighs, and its mean is over the outcomes that any pair was seen to have, all kinds of outcome, reward and end,
+        equally likely. Unseen outcomes of a pair are one draw from that.
         """
         if not self._rows:
             return {}

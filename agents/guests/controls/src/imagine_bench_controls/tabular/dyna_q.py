@@ -1,7 +1,7 @@
 """Q-learning and Dyna-Q in a table (Watkins & Dayan 1992; Sutton 1990; thesis 2.2.3, 2.2.4, figure 2.7).
 
 Each real transition updates the action values and is kept in a model; ``planning_steps`` times the model then recalls
-one of the pairs of state and action that were tried, each equally likely, and what followed it, and the values are
+one of the pairs of state and action that were tried, each equally likely, and its outcome, and the values are
 updated by that in the same way (Sutton & Barto 2018, 8.2). Without planning steps this is Q-learning. Where chance
 decides what follows, one of all that followed the pair is drawn; Sutton & Barto keep the last.
 """

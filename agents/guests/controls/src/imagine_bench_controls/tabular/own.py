@@ -32,7 +32,7 @@ class OwnCountTableAgent(CountTableAgent):
         return self.eyes.code(observation.frame)[0]
 
     def observe(self, transition: Transition, *, episode: int) -> None:
-        """Remember what was seen, see anew if that is due, and count."""
+        """Remember the frame, find factors anew if that is due, and count."""
         eyes = self.eyes
         if not eyes.full:
             eyes.remember(transition.observation.frame, transition.action, transition.next_observation.frame)
@@ -52,7 +52,7 @@ class OwnCountTableAgent(CountTableAgent):
             self.table.add(codes[before][0], action, codes[after][0], reward, terminated)
 
     def diagnostics(self) -> dict[str, float]:
-        """Also what it sees."""
+        """Also its perception."""
         return {**super().diagnostics(), **self.eyes.diagnostics()}
 
     def state(self) -> AgentState:

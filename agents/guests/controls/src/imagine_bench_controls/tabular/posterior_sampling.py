@@ -2,7 +2,7 @@
 
 Strens 2000; Osband, Russo & Van Roy 2013. Before each episode a model is drawn from the posterior that the counts and a
 prior give, planned in by value iteration, and followed to the end of the episode. The prior knows neither the number of
-states nor the largest reward: what a pair was never seen to do is what others were, each kind of outcome equally likely
+states nor the largest reward: an unseen outcome of a pair is one of other pairs, each kind of outcome equally likely
 (:meth:`.counts.CountTable.sampled_values`). So it looks for no more than it has seen to pay somewhere. Tests follow the
 counts alone, as those of ``count_table``.
 """

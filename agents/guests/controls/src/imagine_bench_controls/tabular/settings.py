@@ -43,7 +43,7 @@ class DynaQSettings(CountTableSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class PriorSettings:
-    """What posterior sampling believes of a pair of state and action before it is tried."""
+    """The prior of posterior sampling for a pair of state and action."""
 
     #: How many counts the prior weighs; 0.01 to 0.3 were tried on two tuning seeds (1000, 1001), no clear winner.
     concentration: float = setting(0.3, POSITIVE)
