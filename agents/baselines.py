@@ -55,7 +55,7 @@ class RandomAgent(_FixedPolicy):
 
 
 class OracleAgent(_FixedPolicy):
-    """An optimal action of the rules, given what every frame of the episode has shown of the macrostate.
+    """An optimal action of the rules, given the coordinates that the frames of the episode have shown.
 
     It reads frames without error and remembers them, but it does not know coordinates that they hide or show late.
     """

@@ -15,7 +15,7 @@ from imagine_bench.errors import SetupError
 
 PLATFORMS = ("egl", "glfw", "osmesa")
 _ALSO = {"", "glx", *("disable", "disabled", "off", "false", "0"), *("enable", "enabled", "on", "true", "1")}
-"""What MuJoCo takes too: drawing switched off, which the first image then says, or left to it."""
+"""Values that MuJoCo takes too: drawing switched off, which the first image then says, or left to it."""
 
 
 def choose_platform() -> None:

@@ -1,4 +1,4 @@
-"""The Gymnasium environment of macro-actions: exact rules, a world that acts, and what is observed of it."""
+"""The Gymnasium environment of macro-actions: exact rules, a world that acts, and observations of it."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class EnvState:
     world: WorldState
     generator: Mapping[str, Json]  #: state of the generator that everything random is drawn from
     macrostate: State
-    episode: Mapping[str, object] = field(repr=False)  #: what else it has of :data:`_EPISODE`
+    episode: Mapping[str, object] = field(repr=False)  #: its other parts of :data:`_EPISODE`
 
 
 _EPISODE = ("begun", "latest", "_people", "_steps", "_observations", "_observed")
-"""Attributes that say where an episode stands: latest macro-action, and what lag keeps back."""
+"""Attributes that say where an episode stands: latest macro-action, and the observations that lag keeps back."""
 
 
 class MacroEnv(SceneEnv):
@@ -62,7 +62,7 @@ class MacroEnv(SceneEnv):
     Episode End: terminated where the rules say so; truncation is the registered time limit, or a simulation that blew
     up: then the reward is 0, observation and macrostate are those before, and ``fault_reason`` names the cause.
 
-    Info: ``macrostate`` and what the observation shows of it, ``shown``, late, or -1 where hidden (int64, (M,)),
+    Info: ``macrostate`` and the part of it in the observation, ``shown``, late, or -1 where hidden (int64, (M,)),
     ``is_success``, ``success``, ``legal``, ``fault`` and ``fault_reason`` (empty where there is none), ``sim_time_s``
     and ``ik_error_m`` of the latest macro-action, ``action_mask`` (int8, (A,)). All are there at every reset and step,
     as numpy scalars or arrays but the reason.
@@ -78,9 +78,9 @@ class MacroEnv(SceneEnv):
         height: Pixels of :meth:`render`.
         camera: Camera of :meth:`render` and of the window: ``"human"`` looks at the table from nearby, ``"far"`` at the
             whole arm, and ``"wrist"`` is the agent's.
-        physics: What decides whether a grasp holds: settings, or a mapping of some of their names to values.
+        physics: The physics of grasping: settings, or a mapping of some of their names to values.
         motion_hz: :attr:`capture_motion_hz`.
-        observation: What is observed, of one moment: ``"frame"``, or others and several, as :class:`.Observer` says.
+        observation: The observation of one moment: ``"frame"``, or others and several, as :class:`.Observer` says.
         size: Edge of observed images in pixels, 32 to 256.
 
     Raises:
@@ -220,7 +220,9 @@ class MacroEnv(SceneEnv):
         self._reuses = True
 
     def observe(self, envs: Sequence[MacroEnv]) -> list[Observed]:
-        """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
+        """The observations of :meth:`reset` and :meth:`step` for environments like this, by its cameras; once a
+        moment.
+        """
         now = self._observer.observe([(env._observer, env.world.observed(env._macrostate)) for env in envs])
         due = []
         for env, observation in zip(envs, now, strict=True):
@@ -229,7 +231,9 @@ class MacroEnv(SceneEnv):
         return due
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Which macro-actions can be carried out: all; what the rules punish is for the agent to learn. Shape (A,)."""
+        """Which macro-actions can be carried out: all; the agent has to learn which ones the rules punish. Shape
+        (A,).
+        """
         return np.ones(self._n_actions, dtype=np.bool_)
 
     def get_state(self) -> EnvState:

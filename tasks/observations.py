@@ -1,4 +1,4 @@
-"""What an environment shows of one moment: the agent's frame, the human's view, the macrostate, the arm's own sense.
+"""The observation of one moment: the agent's frame, the human's view, the macrostate, the arm's own sense.
 
 Frames of macrostates that nobody acted for come from one scene and one renderer a thread, world and appearance level.
 """
@@ -30,7 +30,7 @@ from .scenes.constants import CONTROL_CAMERAS, HUMAN_CAMERA
 from .world import World
 
 CONTROL_OBSERVATIONS = (*CONTROL_CAMERAS, "proprio", "objects", "state")
-"""Parts of what an environment of continuous control can show of one moment."""
+"""Parts of an observation of one moment in continuous control."""
 Part = NDArray[np.uint8] | NDArray[np.float32]
 """An image, or a vector."""
 _Space = gymnasium.Space[Any]  # of one part, or of several
@@ -51,7 +51,7 @@ class Observer:
     Args:
         choice: Names in :data:`.interfaces.OBSERVATIONS`, or in :data:`CONTROL_OBSERVATIONS`.
         size: Edge of images in pixels.
-        world: What is observed.
+        world: The parts that are observed.
         values: Names of the values of each coordinate of a macrostate.
         camera: The renderer of a view.
         control: Whether this is continuous control.

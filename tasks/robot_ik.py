@@ -106,10 +106,10 @@ def arm() -> PlanarArm:
 
 
 def distance_to_workspace(points_m: Floats) -> Floats:
-    """How far points lie outside of what the arm can reach, in metres; 0 inside. Points (..., 2), result (...).
+    """How far points lie outside of the arm's reach, in metres; 0 inside. Points (..., 2), result (...).
 
     With the elbow at polar angle t, |t| <= 120 degrees, the two outer links reach the ring of radii 0.1 and 0.5 m
-    around it. A point is outside exactly if its nearest elbow is more than 0.5 m away, by what is then missing.
+    around it. A point is outside exactly if its nearest elbow is more than 0.5 m away, by the missing distance.
     """
     radius = np.linalg.norm(points_m, axis=-1)
     angle = np.arctan2(points_m[..., 1], points_m[..., 0])

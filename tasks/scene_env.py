@@ -38,7 +38,7 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
         spec: The task.
         make_world: Its world, at an appearance level.
         level: The appearance.
-        physics: What decides whether a grasp holds.
+        physics: The physics of grasping.
         motion_hz: As :attr:`.FilmedScene.capture_motion_hz`.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
         image: Camera, width and height of :meth:`render`.
@@ -52,7 +52,7 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
     begun: bool
     """Whether there is an episode to go on with."""
     action_names: tuple[str, ...]
-    """What each macro-action does; or, in continuous control, what each number of an action says."""
+    """The effect of each macro-action; or, in continuous control, the meaning of each number of an action."""
     takes_long: bool = False
     """Whether an action is worth a thread of its own."""
 
@@ -123,7 +123,7 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
         """
 
     def prepare(self) -> None:
-        """Make what actions need, in the thread that calls; nothing by default."""
+        """Make the parts that actions need, in the thread that calls; nothing by default."""
 
     @abc.abstractmethod
     def checked(self, action: Any) -> Any:
@@ -131,7 +131,9 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
 
     @abc.abstractmethod
     def observe(self, envs: Sequence[Self]) -> list[Observed]:
-        """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
+        """The observations of :meth:`reset` and :meth:`step` for environments like this, by its cameras; once a
+        moment.
+        """
 
     @abc.abstractmethod
     def _begin(self, start: State) -> Info:
@@ -139,7 +141,7 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
 
     @abc.abstractmethod
     def _latest_observation(self) -> Observed:
-        """What was observed before the simulation blew up."""
+        """The observation before the simulation blew up."""
 
     @abc.abstractmethod
     def _show(self) -> None:
@@ -150,7 +152,7 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
         return self.rendered([self])[0] if self.render_mode == "rgb_array" else None
 
     def rendered(self, envs: Sequence[SceneEnv]) -> list[Frame]:
-        """What :meth:`render` returns of environments like this, drawn by its camera."""
+        """The images of :meth:`render` for environments like this, drawn by its camera."""
         return self.renderer_for_people(*self._image_of).frames([(env.model, env.data) for env in envs])
 
     def close(self) -> None:
@@ -168,7 +170,7 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
             return starts[int(self.np_random.integers(len(starts)))]
         given = options["macrostate"]
         start: State | None = None
-        with contextlib.suppress(Exception):  # what holds no numbers can fail in any way
+        with contextlib.suppress(Exception):  # a value without numbers can fail in any way
             start = self._known.get(tuple(np.asarray(given)))
         if start is None:
             listed = f"one of the {len(self._known)} of imagine_bench.registry.task({self.task.id!r}).rules.states"

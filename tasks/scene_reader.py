@@ -124,7 +124,7 @@ class FilmedScene:
     def motion(self) -> Motion:
         """The motion of the latest macro-action as captured, else one sample of the standing scene.
 
-        People stand still meanwhile; what they do when it is over is one sample more.
+        People stand still meanwhile; their gesture when it is over is one sample more.
         """
         data = self.data
         times_s = []
@@ -186,7 +186,7 @@ class FilmedScene:
         return np.stack([self.human_view(width, height) for _ in self.replay()])
 
     def agent_film(self) -> Frame:
-        """What the agent's camera sees at each sample that :meth:`arm_motion` gives. Shape (K, 64, 64, 3)."""
+        """The image of the agent's camera at each sample that :meth:`arm_motion` gives. Shape (K, 64, 64, 3)."""
         return np.stack([self.agent_view() for _ in self.replay()])
 
     def replay(self) -> Iterator[float]:

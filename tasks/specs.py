@@ -1,4 +1,4 @@
-"""What the specs of worlds with parameters share. MuJoCo loads when an environment or a frame is made."""
+"""The common part of specs of worlds with parameters. MuJoCo loads when an environment or a frame is made."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @functools.cache
 def world_maker(parameters: WorldParameters) -> Callable[..., World]:
-    """Makes the scene of a world, given an appearance; always the same one, so that what draws it is shared."""
+    """Makes the scene of a world, given an appearance; always the same one, so that its renderers are shared."""
     module, name = parameters.SCENE.split(":")
     make: Callable[..., World] = getattr(importlib.import_module(module), name)
     return functools.partial(make, parameters=parameters)

@@ -114,7 +114,7 @@ SPEC = RegressionSpec(
     title="Toy regression",
     description=(
         "A number x leads to one of three curves, plus noise; the variants take data away in a region, or add noise "
-        "there. What is uncertain, and why, is known exactly, so it can be seen whether a model knows it too."
+        "there. Each kind of uncertainty is known exactly, so it can be seen whether a model knows it too."
     ),
     variants=VARIANTS,
     require_variant=require_variant,

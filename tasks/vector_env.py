@@ -149,7 +149,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
     # --- at its own pace -----------------------------------------------------------------------------------------
 
     def send(self, actions: NDArray[np.int64] | Sequence[int], ids: Sequence[int] | None = None) -> None:
-        """Begin a macro-action in each of these lanes, or all; :meth:`recv` returns what became of it.
+        """Begin a macro-action in each of these lanes, or all; :meth:`recv` returns its result.
 
         Args:
             actions: One for each lane. Shape (n,).
@@ -172,7 +172,7 @@ class MacroVectorEnv(VectorEnv[Observed, NDArray[np.int64], NDArray[np.generic]]
             self._acting[lane] = _Acting(self._clock_s, step)
 
     def recv(self, n: int | None = None) -> Batch:
-        """What became of the ``n`` lanes, or all, that end first.
+        """The results of the ``n`` lanes, or all, that end first.
 
         First is first in simulated time, where lanes act side by side; it never depends on how fast anything runs.
         ``info["env_id"]`` says which they are, as every array of shape (n, ...) in this order.

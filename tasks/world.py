@@ -36,10 +36,10 @@ SLIP_FORCE_N = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """What a world shows."""
+    """The state of a world, as it is read."""
 
     macrostate: State  #: the nearest macrostate
-    problem: str | None  #: what keeps the scene from being a proper macrostate, in words, or None
+    problem: str | None  #: the reason why the scene is no proper macrostate, in words, or None
 
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -51,13 +51,13 @@ Sleep = Mapping[str, Ints | int]
 
 @dataclass(frozen=True, kw_only=True)
 class WorldState:
-    """A scene's dynamic state, MuJoCo's with what starts its solvers, its looks, and the planner's latest error."""
+    """A scene's dynamic state, MuJoCo's with the start of its solvers, its looks, and the planner's latest error."""
 
     physics: Floats
     looks: tuple[Floats, ...]
-    composite: Composite | None  #: where frames are patched, of what the latest is
+    composite: Composite | None  #: where frames are patched, the fragments of the latest
     sensing: Sensing
-    sleep: Sleep = field(default_factory=dict)  #: what sleeps, by the names in ``mjData``
+    sleep: Sleep = field(default_factory=dict)  #: the sleeping bodies, by the names in ``mjData``
 
 
 class World(abc.ABC):
@@ -108,7 +108,7 @@ class World(abc.ABC):
         self.update()
 
     def set_physics(self, settings: PhysicsSettings) -> None:
-        """Change what decides whether a grasp holds; once, before the first macro-action."""
+        """Change the physics of grasping; once, before the first macro-action."""
         self.sensing.settings = settings
         model = self.model
         built = PhysicsSettings()
@@ -120,7 +120,7 @@ class World(abc.ABC):
             mujoco.mj_setConst(model, mujoco.MjData(model))
 
     def set_slipping(self, slipping: bool) -> None:
-        """Let the fingers hold what they grip, or let it slip: with next to no friction and force."""
+        """Let the fingers hold a gripped object, or let it slip: with next to no friction and force."""
         settings = self.sensing.settings
         built = PhysicsSettings()
         friction = SLIP_FRICTION if slipping else settings.pad_friction / built.pad_friction * self._tip_friction
@@ -165,7 +165,9 @@ class World(abc.ABC):
                 setattr(self.data, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The attributes of a copy or a pickle, and what sleeps: a pickled ``mjData`` forgets a part of that."""
+        """The attributes of a copy or a pickle, and the sleeping bodies: a pickled ``mjData`` forgets a part of
+        that.
+        """
         return {**self.__dict__, "sleep": self._sleep()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -215,14 +217,14 @@ class World(abc.ABC):
         self.model.mat_rgba[self._people, 3] = 0.0 if hidden else 1.0
 
     def observed(self, macrostate: State) -> State:
-        """What cameras see of a macrostate: its gesture is -1 where it is hidden."""
+        """The view of cameras of a macrostate: its gesture is -1 where it is hidden."""
         return (*macrostate[:-1], HIDDEN) if self.model.mat_rgba[self._people[0], 3] == 0.0 else macrostate
 
     def vary(self, rng: np.random.Generator, *, move_objects: bool = True) -> None:
         """Draw this frame's light, colors, camera and hands as the appearance says, then its distractors.
 
-        Where frames are patched of fragments, a fragment's pose holds too unless objects must not move: what lies
-        where physics left it lies there.
+        Where frames are patched of fragments, a fragment's pose holds too unless objects must not move: an object that
+        physics moved stays there.
         """
         if self.level.pool is not None:
             self._patch(rng, move_objects=move_objects)
@@ -247,14 +249,14 @@ class World(abc.ABC):
         self._vary_hands(gesture, self._composite.hand.offset)
 
     def _vary_hands(self, gesture: int, offset: Sequence[float]) -> None:
-        """Put hands off their places by shares of what the appearance allows in x, y, z and yaw, if they may vary."""
+        """Put hands off their places by shares of the ranges of the appearance in x, y, z and yaw, if they may vary."""
         if self._hands_vary():
             *shift, turn = offset
             offset_m = [self.level.hand_offset_m * each for each in shift]
             self.set_gesture(gesture, offset_m, self.level.hand_yaw_rad * turn)
 
     def composite(self, frame: Frame) -> Frame:
-        """What the agent's camera makes of a rendered frame (H, W, 3): itself but where frames are photographs."""
+        """The agent's frame from a rendered one (H, W, 3): itself but where frames are photographs."""
         return frame if self._composite is None else self._composite.of(frame)
 
     @abc.abstractmethod
@@ -264,13 +266,13 @@ class World(abc.ABC):
     @property
     @abc.abstractmethod
     def executor(self) -> MacroExecutor:
-        """What carries macro-actions out in contact physics, made when it is first needed."""
+        """The executor of macro-actions in contact physics, made when it is first needed."""
 
     @abc.abstractmethod
     def execute(self, action: int, intended: State) -> MacroResult:
         """Physical execution: plan, simulate, and let people react.
 
-        ``intended`` says what people in the scene do, never what the robot achieves.
+        ``intended`` says how people in the scene act, never how far the robot succeeds.
 
         Raises:
             DivergedError: The simulation blew up.
@@ -278,22 +280,22 @@ class World(abc.ABC):
 
     @abc.abstractmethod
     def rest(self) -> None:
-        """Bring the scene to where macro-actions begin: the arm at its observation pose, with what it holds."""
+        """Bring the scene to where macro-actions begin: the arm at its observation pose, with a held object."""
 
     def read(self) -> Reading:
         """Read the macrostate back from where objects, gripper and hands are."""
         objects, problem = self._objects()
         return Reading(macrostate=(*objects, self._read_gesture()), problem=problem)
 
-    # --- what a task says ----------------------------------------------------------------------------------------
+    # --- for each task -------------------------------------------------------------------------------------------
 
     @abc.abstractmethod
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        """Put an object where ``value`` says, off by shares of what the appearance allows in x, y and yaw."""
+        """Put an object where ``value`` says, off by shares of the ranges of the appearance in x, y and yaw."""
 
     @abc.abstractmethod
     def read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
-        """The value nearest to an object's pose (7), and what is wrong with how it is there."""
+        """The value nearest to an object's pose (7), and the fault of that pose."""
 
     @abc.abstractmethod
     def value_in_hand(self, index: int, pose: list[float], value: int, *, gripped: bool) -> int:
@@ -312,15 +314,15 @@ class World(abc.ABC):
 
     @abc.abstractmethod
     def _read_gesture(self) -> int:
-        """What the hands say."""
+        """The gesture of the hands."""
 
     def _hands_vary(self) -> bool:
         return True
 
-    # --- what they all do ----------------------------------------------------------------------------------------
+    # --- for all tasks -------------------------------------------------------------------------------------------
 
     def _scaled(self, offset: Sequence[float]) -> tuple[float, float, float]:
-        """Shares of what the appearance allows, in x, y and yaw, as metres and radians."""
+        """Shares of the ranges of the appearance, in x, y and yaw, as metres and radians."""
         x, y, yaw = offset
         return self.level.object_offset_m * x, self.level.object_offset_m * y, self.level.object_yaw_rad * yaw
 
@@ -342,7 +344,7 @@ class World(abc.ABC):
         return np.asarray(self.data.qpos[self.object_qpos])
 
     def _objects(self) -> tuple[State, str | None]:
-        """The value of each object, and what is wrong with the first that is not as it should be."""
+        """The value of each object, and the fault of the first that is not as it should be."""
         place = self.data.qpos.tobytes(), self.data.mocap_pos.tobytes()
         if place != self._read_at:  # asked several times of one moment
             read = [self.read_object(index, pose) for index, pose in enumerate(self.object_poses().tolist())]

@@ -1,10 +1,10 @@
 """Factors and values found in the agent's own frames, told by interaction; no label, and no frame but its own.
 
-*Where*: pixels that change from one frame to the next, again and again, and hang together are one factor. *What*: two
+*Where*: pixels that change from one frame to the next, again and again, and hang together are one factor. *Values*: two
 crops of a factor are alike if the brightness gradients of one, shifted by a few pixels, are those of the other; values
 are groups of crops (average linkage) below the widest gap among the heights at which groups merge, or below the next
-one if that tells much better what follows an action. Tints, brightness and the jitter of a pose change neither. A crop
-that is like no exemplar of its factor has no known value.
+one if that predicts the outcome of an action much better. Tints, brightness and the jitter of a pose change neither. A
+crop that is like no exemplar of its factor has no known value.
 
 Where hardly a look is seen twice there is noise: of each pixel only colors that are usual or stay are seen, so that an
     object in front of noise is a factor as any.
@@ -37,12 +37,14 @@ _CHANGES = (2, 0.03)  # times, and share of the steps, that a pixel must change 
 _STARTS = (3, 0.2)  # the same of the starts of episodes: factors that no action changes may change there alone
 _ENOUGH = 500  # steps that a share is taken of at most: the more things there are, the more rarely each changes
 _LEAST_PX = 36  # pixels of a factor
-_LEAST_INNER_PX = 16  # the same of what is all in the inner of the image: at its border, slivers come into view
-_FLAT = 0.1  # of a crop's energy, as most have it: what a crop without contours counts as
+_LEAST_INNER_PX = (
+    16  # the same of a component that lies all in the inner of the image: at its border, slivers come into view
+)
+_FLAT = 0.1  # of a crop's energy, as most have it: the value of a crop without contours
 _SAME = 0.15  # distance that jitter makes; the least distance of two values
 _OTHER = 0.2
 _ROUND = 0.05  # added to heights where gaps are compared by their ratio
-_EVIDENCE = 10.0  # how much more likely, as a logarithm, finer values must make what follows
+_EVIDENCE = 10.0  # how much more likely, as a logarithm, finer values must make the next values
 _EXEMPLARS = 6  # most crops a value that are kept
 _COMPARED = 160  # most crops a factor that are grouped; the others take the value of the most alike
 _TOGETHER = 0.45  # share of the changes of either of two neighbouring pixels of a region that are changes of both
@@ -53,7 +55,7 @@ _FREQUENT = 0.25  # share of the frames in which a pixel shows a color that is n
 _COLORS = 8
 _RESTS = 0.1  # the same of a color that stays
 _STAYS = 0.2  # how much likelier such a color is where it was a step before: 0 as chance has it, 1 for sure
-_MEDIAN_COLOR = 1.0  # what a pixel shows in place of noise: the median color
+_MEDIAN_COLOR = 1.0  # the color of a pixel in place of noise: the median
 _SEEN = 3  # times that a value must have been seen to tell whether it varies freely
 _MOST = 0.7  # share of the pixels that hang together
 _EXPECTED = 5.0  # times that joint values that were never seen would have been seen by chance
@@ -79,7 +81,8 @@ class Part(NamedTuple):
     values: Ints  #: the content of each. Shape (E,).
     flat: float  #: energy that crops without contours count as
     reach: float  #: distance beyond which a crop is like no exemplar
-    rests: Images | None = None  #: where it is in front of noise, what :func:`quiet` needs. Shape (K, 64, 64, 3).
+    #: where it is in front of noise, the values that :func:`quiet` needs. Shape (K, 64, 64, 3).
+    rests: Images | None = None
 
     def read(self, shapes: Images) -> tuple[Ints, Mask]:
         """The value that each of N frames' contours shows, and whether it is known. Two arrays (N,)."""

@@ -87,7 +87,7 @@ class WorldModelSettings:
             raise InvalidValueError(
                 f"model.shared_hidden is {self.shared_hidden}, model.reward_hidden {self.reward_hidden} and "
                 f"model.termination_hidden {self.termination_hidden}: give either the first, for one network with both "
-                "outputs, or the other two, and set what is not used to []."
+                "outputs, or the other two, and set the unused ones to []."
             )
 
 

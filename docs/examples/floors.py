@@ -1,4 +1,4 @@
-"""Transitions until an agent solves 95 % of what can be solved, over the information floor: the ladder's worlds.
+"""Transitions until an agent solves 95 % of the solvable episodes, over the information floor: the ladder's worlds.
 
 python floors.py --agent factored --cubes 4 --out floors.json
 """

@@ -1,6 +1,6 @@
 """A world model of your own, judged against the exact truth of the rules. Run it: python own_world_model.py.
 
-The model remembers what followed each macro-action in each code of a frame, and draws from that. Of what it never saw
+The model remembers the outcomes of each macro-action in each code of a frame, and draws from them. Of unseen ones
 it says that nothing changes, and that it does not know.
 """
 

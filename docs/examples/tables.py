@@ -1,4 +1,5 @@
-"""How far what `factored:given` learned of actions is from the exact rules, after the floor's number of transitions.
+"""The distance of the actions' effects, as `factored:given` learned them, from the exact rules, after the floor's
+number of transitions.
 
 python tables.py slip=0.1 slip=0.2 fickle=0.2 --out tables.json
 """

@@ -73,7 +73,7 @@ PEERS = (
 )  # fmt: skip
 """Kept benches with the same tests after 100, 250 and 500 episodes; an agent of two is that of the first."""
 SETTINGS = {"replay_ratio": " tuned", "discount": " defaults"}
-"""What stands behind a name that has settings, by one that only those have."""
+"""The words behind a name that has settings, by one that only those have."""
 
 
 FAMILIES = {
@@ -224,7 +224,9 @@ def thesis_settings() -> None:
 
 
 def rungs() -> None:
-    """From the thesis' settings to those of quick: success of each seed, and what its model imagines rightly."""
+    """From the thesis' settings to those of quick: success of each seed, and the share that its model imagines
+    rightly.
+    """
     with (RESULTS / "arrow_puzzle-study-ladder" / "results.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["episodes"] == "1000"]
     names = list(dict.fromkeys(row["variant"] for row in rows))
@@ -259,7 +261,7 @@ def mild() -> None:
 
 
 def margins() -> None:
-    """Share of macro-actions as ruled against what decides whether a grasp holds, with Wilson's intervals."""
+    """Share of macro-actions as ruled against the physics of grasping, with Wilson's intervals."""
     labels = {
         "pad_friction": "friction of the fingertips",
         "finger_force_n": "most force of a finger (N)",

@@ -261,7 +261,7 @@ class New:
 
 @dataclass(frozen=True, kw_only=True)
 class Doctor:
-    """Describe this machine and installation, and say in words what is wrong with them."""
+    """Describe this machine and installation, and each fault of them in words."""
 
     def __call__(self) -> None:
         """Examine."""

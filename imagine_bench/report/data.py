@@ -85,7 +85,9 @@ class ReportData:
 
     result: BenchResult
     spec: TaskSpec  # the task
-    facts: RuleFacts | Certificate  # chance level and optimum of the tests; the certificate knows what frames hide
+    facts: (
+        RuleFacts | Certificate
+    )  # chance level and optimum of the tests; the certificate knows which coordinates frames hide
     learners: list[str]  # the agents that learn
     compared: list[str]  # those that are compared with DQN, where it was run
     thesis: dict[str, dict[int, tuple[float, float]]]  # its mean and standard deviation of success by agent and budget

@@ -97,7 +97,7 @@ _WORDS = {
     "without the macro-actions it knows least of (the best share, chosen with the truth), and without those that its "
     "own filter discards.",
     "Does it notice?": f"Random transitions until a detector of surprise says that every macro-action slips with "
-    f"probability {SLIP}, or that one also does what another does, at false alarms in {FALSE_ALARMS:.0%} of "
+    f"probability {SLIP}, or that one also has another's effect, at false alarms in {FALSE_ALARMS:.0%} of "
     f"unchanged streams of {LENGTH}; {LENGTH}: never. Counterfactuals: its imagination of two macro-actions with the "
     "same draws that cannot both be.",
     "What does it cost?": "CPU seconds are those of one core: of fitting, and of imagining 1,000 macro-actions. Frames "

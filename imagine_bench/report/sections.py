@@ -81,8 +81,8 @@ def causes(data: ReportData) -> Section | None:
     words = (
         "An episode that an optimal policy fails with the same draws of chance, too, was bad luck. Else truth is "
         "swapped in, one stage at a time, until the episode is solved: frames read right; then a perfect plan in the "
-        "agent's own model; then the truth about transitions that it never experienced; then all of the truth; then physics as the "
-        "rules say. The first stage that solves it names the cause."
+        "agent's own model; then the truth about transitions that it never experienced; then all of the truth; then "
+        "physics as the rules say. The first stage that solves it names the cause."
     )
     return Section("Why agents failed", [words], tables=[table]) if table.rows else None
 

@@ -54,7 +54,8 @@ class OptionRow:
     without: Changes = field(default_factory=dict)  #: The values of the bench that it is compared with
     world: str = ""  #: An option of the task's world, ``key=value``, in place of a field
     episodes: int = 2  #: Training episodes of either run
-    #: Whether it acts through what the agent is shown: an agent may learn the same from it, as it should of light.
+    #: Whether it acts through the part that the agent is shown: an agent may learn the same from it, as it should of
+    #: light.
     shown: bool = False
 
 

@@ -1,4 +1,4 @@
-"""The state of this machine and installation, and in words what is wrong with them."""
+"""The state of this machine and installation, and in words each fault of them."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class ArrowWorld(World):
 
     @functools.cached_property
     def executor(self) -> TurnExecutor:
-        """What carries macro-actions out in contact physics, made when it is first needed."""
+        """The executor of macro-actions in contact physics, made when it is first needed."""
         from ..motion.turn import TurnExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
         return TurnExecutor(self.model, self.data, self.layout.slots_xy_m, self.sensing)
@@ -101,7 +101,7 @@ class ArrowWorld(World):
         return {self._hand: self.layout.fingertips_m[gesture]}
 
     def read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
-        """The nearest direction of a cube's arrow, and what is wrong with how the cube stands."""
+        """The nearest direction of a cube's arrow, and the fault of the cube's pose."""
         turned_rad = orientation.yaw_rad(*pose[3:])
         quarters = round(turned_rad / _QUARTER_RAD)
         skew_rad = abs(turned_rad - quarters * _QUARTER_RAD)

@@ -39,7 +39,7 @@ _STATE = mujoco.mjtState
 _MOCAP = _STATE.mjSTATE_MOCAP_POS.value | _STATE.mjSTATE_MOCAP_QUAT.value
 _KEPT = _STATE.mjSTATE_QPOS.value | _MOCAP
 _INPUTS = _STATE.mjSTATE_CTRL.value | _MOCAP
-"""What a rollout is told at every step, controls first; mocap bodies left out would fall back to their defaults."""
+"""The input of a rollout at every step, controls first; mocap bodies left out would fall back to their defaults."""
 _BAD_STATE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
@@ -80,7 +80,7 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class MacroResult:
-    """What became of one macro-action."""
+    """The result of one macro-action."""
 
     sim_time_s: float = 0.0  #: simulated seconds
     ik_error_m: float = 0.0  #: largest distance between a solved waypoint and its target
@@ -88,7 +88,7 @@ class MacroResult:
     motion: Samples
 
     def then(self, later: MacroResult) -> MacroResult:
-        """Both as one macro-action; what went wrong first is its fault."""
+        """Both as one macro-action; the first fault is its fault."""
         shifted = later.motion._replace(time_s=later.motion.time_s + self.sim_time_s)
         return MacroResult(
             sim_time_s=self.sim_time_s + later.sim_time_s,
@@ -99,10 +99,10 @@ class MacroResult:
 
 
 class MacroExecutor:
-    """Executes trajectories on a compiled scene that holds the arm: the base of what plans macro-actions.
+    """Executes trajectories on a compiled scene that holds the arm: the base of planners of macro-actions.
 
     Before and after each macro-action the arm is set onto its observation pose; one that ended further off it than
-    0.02 rad is a fault. What plans for it measures true poses of objects, unless
+    0.02 rad is a fault. Its planner measures true poses of objects, unless
     :class:`.orientation.Sensing` says else.
     """
 
@@ -125,7 +125,7 @@ class MacroExecutor:
         """Bring ``data`` to the canonical start, in place: the arm at its observation pose, everything still.
 
         Only the positions of loose objects and of mocap bodies survive, and those of fingers that hold something;
-        velocities, warm start, sleep states, time and controls are as if new. Hence what follows depends on those
+        velocities, warm start, sleep states, time and controls are as if new. Hence the motion depends on those
         positions and on ``squeeze_m`` alone: the command to each finger that keeps an object held, or None, which opens
         the fingers to where they rest. Derived quantities are not updated.
         """
@@ -237,7 +237,7 @@ class MacroExecutor:
     def _capture(self, steps: int) -> Samples:
         """Samples of the latest run, of so many steps: ``capture_motion_hz`` a second.
 
-        Up to one a timestep they are steps of the simulation. Above, what lies between two steps is interpolated
+        Up to one a timestep they are steps of the simulation. Above, the motion between two steps is interpolated
         linearly, as the integrator moves positions; commands are held.
 
         Returns:

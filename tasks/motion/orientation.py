@@ -45,7 +45,7 @@ class ObjectPose:
 
 @dataclass
 class Sensing:
-    """What a world tells its executor of objects' poses."""
+    """The poses of objects, as a world tells them to its executor."""
 
     settings: PhysicsSettings = field(default_factory=PhysicsSettings)
     aside_m: tuple[float, float] = (0.0, 0.0)  #: error of this macro-action, in the world's x and y

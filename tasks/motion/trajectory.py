@@ -40,7 +40,7 @@ class Waypoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory:
-    """A motion sampled once a timestep; row k is what holds at the end of step k."""
+    """A motion sampled once a timestep; row k holds at the end of step k."""
 
     qpos_rad: Floats  #: planned arm joints. Shape (N, 7).
     arm_command_rad: Floats  #: commands to the arm's position servos. Shape (N, 7).
@@ -73,7 +73,7 @@ def plan(
 ) -> Trajectory:
     """Join the waypoints by minimum-jerk motions, each as short as the limits allow.
 
-    The command is q + (K_d q' + M q'') / K_p, which cancels what damping and inertia would make the servo lag
+    The command is q + (K_d q' + M q'') / K_p, which cancels the lag of the servo by damping and inertia
     (gravity is compensated in the model). M is taken halfway along each motion. The arm (7,) and each finger rest at
     their starts before; there is at least one waypoint.
     """

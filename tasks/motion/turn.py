@@ -25,7 +25,7 @@ _MAX_SKEW_RAD = math.radians(8)
 _FINGER_M = 0.011
 _FINGER_HALF_WIDTH_M = 0.014
 _CLEARANCE_M = 0.003
-"""How far a finger reaches beyond its opening, its back included, and what is left between it and other cubes."""
+"""How far a finger reaches beyond its opening, its back included, and the gap between it and other cubes."""
 _LEAST_OPENING_M = CUBE_EDGE_M / 2 + 0.002
 _LIFT_M = 0.06
 """The fingers come from and go to so far above the grip: the cube's top and 16 mm."""

@@ -54,7 +54,7 @@ def add_distractors(spec: mujoco.MjSpec, count: int) -> None:
 
 
 class Distraction:
-    """What the distractors of a model do; all their state is in ``mat_rgba`` of the model and ``mocap_pos`` of data.
+    """The motion of a model's distractors; all their state is in ``mat_rgba`` of the model and ``mocap_pos`` of data.
 
     Args:
         model: A scene with at least one distractor.

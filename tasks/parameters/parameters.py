@@ -1,6 +1,6 @@
-"""The parameters of a world: its name in one line, ``pick_place:slip=0.1``, what frames then show, and its rules.
+"""The parameters of a world: its name in one line, ``pick_place:slip=0.1``, the content of its frames, and its rules.
 
-Gesture and lag: frames may hide what the human says, and come some macro-actions late. The first observations of an
+Gesture and lag: frames may hide the human's gesture, and come some macro-actions late. The first observations of an
 episode repeat the start. Slip: the fingers open too early, so that a macro-action leaves all as it is. Goal change:
 after a macro-action that ends nothing, the human may want something else.
 """
@@ -48,7 +48,7 @@ class GestureObservation:
     always_shown: Callable[[State], bool]
 
     def seen(self, macrostate: State, step: int) -> tuple[tuple[float, State], ...]:
-        """What a frame taken after ``step`` macro-actions may show, as :meth:`.Sight.seen`."""
+        """The content of a frame taken after ``step`` macro-actions may show, as :meth:`.Sight.seen`."""
         shown = self.gesture
         if isinstance(shown, str):
             shown = float(shown == "always" or step == 0)
@@ -66,7 +66,7 @@ def hides(sight: Sight, macrostate: State, step: int, rng: np.random.Generator) 
 
 
 def delivered(under_way: tuple[_Seen, ...], newest: _Seen, lag: int) -> tuple[_Seen, ...]:
-    """What is under way once the newest observation is taken in; the first of it is due now."""
+    """The observations under way once the newest one is taken in; the first of it is due now."""
     return (*under_way, newest)[-1 - lag :]
 
 
@@ -173,12 +173,14 @@ class WorldParameters:
 
     @property
     def encoder_suffix(self) -> str:
-        """The end of an encoder's name: what parameters change in frames."""
+        """The end of an encoder's name: the changes of frames by parameters."""
         hidden = "" if self.gesture in ("always", 1.0) else "_hidden"
         return hidden + (f"_distractors{self.distractors}" if self.distractors else "")
 
     def observation_model(self, always_shown: Callable[[State], bool] = _never) -> GestureObservation | None:
-        """What frames show; None where that is all, at once. For macrostates ``always_shown`` nothing is hidden."""
+        """The content of frames; None where that is all, at once. For macrostates ``always_shown`` nothing is
+        hidden.
+        """
         if self.gesture in ("always", 1.0) and not self.lag:
             return None
         return GestureObservation(gesture=self.gesture, lag=self.lag, always_shown=always_shown)
@@ -195,7 +197,7 @@ class WorldRules(Rules):
 
     @abc.abstractmethod
     def asked_otherwise(self, outcome: Outcome) -> Sequence[Outcome]:
-        """What an outcome becomes where the human says something else instead, each equally likely."""
+        """The outcomes in place of one where the human says something else, each equally likely."""
 
     def varied(self, macrostate: State, outcomes: tuple[Outcome, ...]) -> tuple[Outcome, ...]:
         """Outcomes of a macro-action as they are with slips and a changing goal; equal ones are one."""

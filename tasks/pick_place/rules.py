@@ -1,8 +1,8 @@
 """The rules of pick-and-place with a human (thesis, chapter 3): no physics, no pixels, exact, and stochastic.
 
-A macrostate is ``(left, middle, right, gesture)``: where each object is, left to right in the agent's frame, and what
-the human's hands say. Twelve macrostates are play (thesis, table 3.1); seven more are ends: three with an object in the
-human's palm, four with the hands withdrawn, which is how the human answers whatever they did not ask for.
+A macrostate is ``(left, middle, right, gesture)``: where each object is, left to right in the agent's frame, and the
+gesture of the human's hands. Twelve macrostates are play (thesis, table 3.1); seven more are ends: three with an object
+in the human's palm, four with the hands withdrawn, which is how the human answers whatever they did not ask for.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class PickPlaceRules(WorldRules):
 
     @staticmethod
     def _wishes(held: int) -> State:
-        """What the human may say next when ``held`` has been picked as asked."""
+        """The possible next gestures when ``held`` has been picked as asked."""
         return (*(each for each in POINTING if each != held), OPEN_PALM)
 
     def is_legal(self, macrostate: State) -> bool:
@@ -92,7 +92,7 @@ class PickPlaceRules(WorldRules):
         return HANDED_OVER in macrostate[:N_OBJECTS] or not self.is_legal(macrostate)
 
     def is_asked_for(self, macrostate: State, action: int) -> bool:
-        """Whether ``action`` is what the human wants now, or the step toward it."""
+        """Whether ``action`` is the human's present wish, or the step toward it."""
         if self.is_terminal(macrostate):
             return False
         held = held_object(macrostate)
@@ -120,7 +120,7 @@ class PickPlaceRules(WorldRules):
         return _with(objects, held, PLACED) if action == held else objects
 
     def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
-        """One outcome a possible next gesture, and of what slips, which is not punished."""
+        """One outcome a possible next gesture, and one of an object that slips, which is not punished."""
         found = self._outcomes(macrostate, action)
         return found if self.is_terminal(macrostate) else self.varied(macrostate, found)
 

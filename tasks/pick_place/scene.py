@@ -17,7 +17,7 @@ from ..scenes.objects import add_objects
 from ..scenes.tabletop import add_tabletop
 
 TIMESTEP_S = 0.003
-"""Objects are carried here: contacts are as stiff as two steps, and in softer ones what is held creeps as the arm
+"""Objects are carried here: contacts are as stiff as two steps, and in softer ones a held object creeps as the arm
 accelerates, since the servos' damping is integrated implicitly and contacts are not."""
 
 CONTROL_TIMESTEP_S = 0.0025
@@ -34,7 +34,7 @@ IDLE_PALM_M = (1.00, -0.26, c.TABLE_HEIGHT_M + 0.04)
 
 _FOVY_DEG = 57.0
 _PITCH_RAD = math.radians(5.5)
-"""Wide, and tilted toward the tool: the frame shows the row, the hands, and at its bottom what the gripper holds."""
+"""Wide, and tilted toward the tool: the frame shows the row, the hands, and at its bottom the object in the gripper."""
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""Pick-and-place with a human (thesis, chapter 3): what the bench needs to know, and the environment.
+"""Pick-and-place with a human (thesis, chapter 3): the bench's description, and the environment.
 
 Importing this module is cheap: MuJoCo loads when an environment or a frame is made.
 """
@@ -55,7 +55,7 @@ SPEC = TaskSpec(
     title="Pick-and-place with a human",
     description=(
         "A human points at one of three objects, which the arm picks; they then point at another, so that it must be "
-        "put back first, or open their palm for a handover. What they want next is random, and a wrong action ends it."
+        "put back first, or open their palm for a handover. Their next wish is random, and a wrong action ends it."
     ),
     env_id="imagine_bench/PickPlace-v0",
     horizon=HORIZON,
@@ -115,9 +115,9 @@ def _spec(world: PickPlace) -> TaskSpec:
 def make_env(**options: Any) -> MacroEnv:
     """Pick-and-place with a human; ``options`` are its parameters and the keyword arguments of MacroEnv.
 
-    Actions 0, 1, 2 pick object i up, or put it back if it is held; action 3 hands over. What the robot is told it does
-    as far as that is possible, asked for or not; what is not possible it reaches out for in vain. The human answers
-    after having seen the result.
+    Actions 0, 1, 2 pick object i up, or put it back if it is held; action 3 hands over. The robot does as it is told as
+    far as that is possible, asked for or not; for impossible things it reaches out in vain. The human answers after
+    having seen the result.
 
     How the rules are read where the thesis is silent stands in ``docs/reference/environments.md``.
     """

@@ -32,15 +32,15 @@ MAX_OFF_GRIP_M = 0.015
 MAX_LIFT_OFF_M = 0.006
 """An object on the table or in the palm whose origin is higher or lower by so much lies on something else."""
 _IN_THE_AIR_M = 0.15
-"""What is held at the observation pose is at least so far above the table."""
+"""An object held at the observation pose is at least so far above the table."""
 _LIFTED_M = 0.05
-"""What the fingers hold so far above its place is picked."""
+"""An object that the fingers hold so far above its place is picked."""
 _FAR_M = 0.30
-"""What is held so far from where it shall be has made no progress."""
+"""A held object so far from its place has made no progress."""
 _HANDS_FORWARD_X_M = 0.90
 """Fingertip or palm nearer to the robot than this say something."""
 _VAIN_M = 0.09
-"""The gripper stops so far above what it reaches out for in vain, and its lift."""
+"""The gripper stops so far above a thing that it reaches out for in vain, and its lift."""
 _PLAIN = PickPlace()
 _GRIP_SHARE = 0.5
 """Share of the objects' pose variation that remains in the grip, which centres them."""
@@ -63,7 +63,7 @@ class PickWorld(World):
 
     @functools.cached_property
     def executor(self) -> CarryExecutor:
-        """What carries macro-actions out in contact physics, made when it is first needed."""
+        """The executor of macro-actions in contact physics, made when it is first needed."""
         from ..motion.carry import CarryExecutor  # noqa: PLC0415  (mink loads only where the arm really moves)
 
         return CarryExecutor(self.model, self.data, self.sensing)
@@ -107,7 +107,7 @@ class PickWorld(World):
     # --- acting --------------------------------------------------------------------------------------------------
 
     def set_outcome(self, action: int, intended: State) -> None:
-        """Kinematic execution: what moved is where a good macro-action leaves it."""
+        """Kinematic execution: a moved object is where a good macro-action leaves it."""
         del action
         for index, (now, then) in enumerate(zip(self._objects()[0], intended, strict=False)):
             if now != then:
@@ -120,8 +120,8 @@ class PickWorld(World):
     def execute(self, action: int, intended: State) -> MacroResult:
         """Physical execution: the arm acts in contact, everything comes to rest, and then the human answers.
 
-        The human answers as ``intended`` says if the objects are where that says, and stand as they should; whatever
-        else happened is not what they asked for, so they withdraw.
+        The human answers as ``intended`` says if the objects are where that says, and stand as they should; any other
+        result is not the one that they asked for, so they withdraw.
         """
         before = self._objects()[0]
         poses = self.object_poses()
@@ -130,7 +130,7 @@ class PickWorld(World):
         self.update()
         self.rest()
         after, problem = self._objects()
-        if HANDED_OVER not in after:  # a palm stays as it is under what lies in it
+        if HANDED_OVER not in after:  # a palm stays as it is under an object in it
             as_asked = problem is None and after == intended[:N_OBJECTS]
             self.set_gesture(intended[N_OBJECTS] if as_asked else WITHDRAWN)
             self.update()
@@ -138,12 +138,12 @@ class PickWorld(World):
         return replace(result, fault=result.fault or self._pushed(moving, poses, "by the way"))
 
     def rest(self) -> None:
-        """Bring the arm to its observation pose, and what it holds with it."""
+        """Bring the arm to its observation pose, and a held object with it."""
         self.executor.rest_holding(held_object(self._objects()[0]))
         self.update()
 
     def _act(self, action: int, objects: State, stays: bool) -> MacroResult:
-        """What the robot does, possible or not: what it cannot do, or slips, it reaches out for in vain."""
+        """The robot's motion, possible or not: for an impossible thing, or one that slips, it reaches out in vain."""
         held = held_object(objects)
         executor = self.executor
         if action == HAND_OVER:
@@ -164,7 +164,7 @@ class PickWorld(World):
     # --- reading -------------------------------------------------------------------------------------------------
 
     def read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
-        """Where an object is, by its pose (7), and what is wrong with how it is there."""
+        """Where an object is, by its pose (7), and the fault of its pose there."""
         spec = OBJECTS[index]
         name = self.object_names[index]
         position_m = pose[:3]

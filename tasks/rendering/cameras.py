@@ -1,4 +1,4 @@
-"""The views of every scene: what agents see, and what people do."""
+"""The views of every scene: those of agents, and those of people."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)
 
 
 def agent_camera_view(size_px: int = FRAME_PX) -> View:
-    """What agents see: no arm, hard edges, no shadows."""
+    """The view of agents: no arm, hard edges, no shadows."""
     return View(camera=AGENT_CAMERA, width=size_px, height=size_px, groups=(SCENE_GROUP, AGENT_GROUP))
 
 

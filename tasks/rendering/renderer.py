@@ -7,7 +7,7 @@
   The few that were used last are kept for the next renderer.
 - Any thread may draw, one at a time. The contexts of the main thread stay current there. Other threads share contexts
   that are released after each image; without EGL, which alone can release one, each thread has its own.
-- What is still open when the interpreter exits is closed before MuJoCo closes the display.
+- Contexts that are still open when the interpreter exits are closed before MuJoCo closes the display.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ _MISSING_GL = (
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """What an image shows and how well: a camera of the model, the size in pixels, and the geom groups to draw."""
+    """The content and the quality of an image: a camera of the model, the size in pixels, and the geom groups to
+    draw.
+    """
 
     camera: str
     width: int = 64
@@ -127,7 +129,7 @@ def _release(theirs: tuple[Any, ...] | None) -> None:
 
 
 def _drawing(model: mujoco.MjModel, view: View) -> tuple[mujoco.MjvOption, mujoco.MjvCamera, mujoco.MjvScene]:
-    """What a view draws, from where, and an empty scene to be filled with it."""
+    """The options and the camera of a view, and an empty scene to be filled."""
     option = mujoco.MjvOption()
     option.geomgroup[:] = np.isin(np.arange(mujoco.mjNGROUP), view.groups)
     option.sitegroup[:] = 0

@@ -91,7 +91,7 @@ _FIELDS = {
     "pose": ("object_offset_m", "object_yaw_rad"),
     "hand": ("hand_offset_m", "hand_yaw_rad"),
 }
-"""What each factor varies."""
+"""The variations of each factor."""
 
 
 def appearance(given: str | Mapping[str, float]) -> Appearance:
@@ -112,7 +112,7 @@ def between(name: str, factors: Mapping[str, float]) -> Appearance:
 
 
 def looks_of(model: mujoco.MjModel) -> tuple[Floats, ...]:
-    """What any appearance writes into a model: views of it."""
+    """The values that any appearance writes into a model: views of it."""
     headlight = model.vis.headlight
     return headlight.ambient, headlight.diffuse, model.light_diffuse, model.mat_rgba, model.cam_pos, model.cam_quat
 

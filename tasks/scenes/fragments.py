@@ -1,9 +1,9 @@
 """Frames as the thesis made them (5.2.1): a finite pool of fragments for each microstate, patched together.
 
-The microstates are the direction of one cube's arrow (in general: where one object is) and what the hand points at. A
-fragment fixes how its subject lies and the light of its photograph. A frame is a row of the hand's fragment above one
-column for each object, so that light changes at their seams; then the sensor's noise and gamma change the whole.
-Not the thesis': the seed, the widths in :data:`.appearance.LEVELS`, and fragments kept for tests.
+The microstates are the direction of one cube's arrow (in general: where one object is) and the place that the hand
+points at. A fragment fixes how its subject lies and the light of its photograph. A frame is a row of the hand's
+fragment above one column for each object, so that light changes at their seams; then the sensor's noise and gamma
+change the whole. Not the thesis': the seed, the widths in :data:`.appearance.LEVELS`, and fragments kept for tests.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The origin of the pointing hand is its index fingertip; it points along the body's -x, palm down, from the far side of
 the table, so that its thumb is on the frame's right. The origin of the open hand is the middle of its palm; its fingers
-point along -x. A plate and a rim of capsules carry what is laid into it; they are felt and not drawn. Hand and sleeve
-are one mesh each, since every drawn geom costs more than its vertices do.
+point along -x. A plate and a rim of capsules carry an object that is laid into it; they are felt and not drawn. Hand
+and sleeve are one mesh each, since every drawn geom costs more than its vertices do.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _PALM_CENTER_M = (0.118, 0.028, 0.037)
 _PALM_RADII_M = (0.052, 0.040, 0.019)
 
 PALM_REACH_M = 0.036
-"""What lies in the palm has its middle within so far of the palm's."""
+"""An object in the palm has its middle within so far of the palm's."""
 
 _OPEN_FINGERS: tuple[Limb, ...] = tuple(
     (
@@ -81,7 +81,7 @@ def _smooth(joints: Limb) -> Mesh:
 
 
 def fingertip_m(slot_xy_m: tuple[float, float]) -> c.Point:
-    """Nominal tip of the index finger that points at what stands on a slot, in the world."""
+    """Nominal tip of the index finger that points at an object on a slot, in the world."""
     dx_m, dy_m, dz_m = c.FINGERTIP_IN_SLOT_M
     return (slot_xy_m[0] + dx_m, slot_xy_m[1] + dy_m, c.CUBE_REST_Z_M + dz_m)
 

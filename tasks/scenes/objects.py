@@ -1,7 +1,7 @@
 """Three objects to pick: a blue ball, a red car, a green cup. Each is gripped from above across its y axis.
 
-Every body's origin is the middle of its grip. What is drawn is one mesh a color; what touches is a few primitives, and
-feet or wheels are spheres, which stand quietly on a table and in a palm.
+Every body's origin is the middle of its grip. The drawn shape is one mesh a color; the shape that touches is a few
+primitives, and feet or wheels are spheres, which stand quietly on a table and in a palm.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ObjectSpec:
     """One object as planning and reading see it."""
 
     name: str  #: of its body; ``<name>_joint`` is its free joint
-    grip_height_m: float  #: the body's origin above what it stands on
+    grip_height_m: float  #: the body's origin above the surface that it stands on
     grip_opening_m: float  #: each finger's distance from the grip's middle when its tips touch the object
     upright: bool = True  #: whether it has a right way up and a heading; a ball has neither
 

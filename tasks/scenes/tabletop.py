@@ -168,7 +168,7 @@ def add_tabletop(spec: mujoco.MjSpec, timestep_s: float = c.TIMESTEP_S) -> None:
         spec: The scene.
         timestep_s: Of the simulation; contacts get a time constant of two of them.
     """
-    option = spec.option  # solver settings in which friction alone holds what is lifted
+    option = spec.option  # solver settings in which friction alone holds a lifted object
     option.timestep = timestep_s
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON

@@ -22,7 +22,7 @@ from .agent import ReadState, TabularAgent, load_codes, read_codes, read_macrost
 from .settings import HYPERPARAMETERS, CountTableSettings
 
 _LEAST = 1e-3
-"""What ``1 - discount`` counts as, at least, so that the best return is finite without discount."""
+"""The least value that ``1 - discount`` counts as, so that the best return is finite without discount."""
 
 
 class CountTableAgent(TabularAgent):

@@ -16,7 +16,7 @@ _ACCURACY = 1e-6
 
 
 class CountTable:
-    """How often each action in each of the S states seen led where, with what reward and whether it ended there.
+    """How often each action in each of the S states seen led where, with which reward and whether it ended there.
 
     States are any integers; rows are kept in the order in which they were first seen, so equal rows give equal bits.
     """
