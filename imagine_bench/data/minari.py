@@ -1,7 +1,7 @@
 """Episodes as a Minari dataset; its own loader reads it from the folder that ``MINARI_DATASETS_PATH`` names.
 
 Observations are kept as they are: by default Minari would make JPEGs of them. Datasets of its own recorder, from an
-    environment of ours, are read too.
+environment of ours, are read too.
 """
 
 from __future__ import annotations

@@ -64,8 +64,7 @@ class MemoryReader(Protocol):
         Shape (M,).
 
         It is fitted on frames that the agent learned from: the value of each coordinate of the macrostate that a probe
-            saw last,
-        of so many values; -1 of one never seen. No agent acts on it.
+        saw last, of so many values; -1 of one never seen. No agent acts on it.
         """
 
 

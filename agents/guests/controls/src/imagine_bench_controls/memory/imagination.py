@@ -1,7 +1,7 @@
 """Imagination that remembers: a mixture density network on a recurrent state (MDN-RNN, Ha and Schmidhuber 2018).
 
 The memory of the recurrence is learned from the predictions of the world model: the next latents, reward and end. The
-    controller reads the latents and the memory, as in that paper, and learns nothing of the recurrence. Imagined
+controller reads the latents and the memory, as in that paper, and learns nothing of the recurrence. Imagined
 rollouts begin in real states and remember their imagined steps; filter and members are those of the imagining agents.
 """
 
