@@ -3,8 +3,8 @@
 A belief is the knowledge of an agent with memory before it acts: the distribution of the macrostate now, given every
 frame and every action of the episode and that it has not ended (Kaelbling, Littman and Cassandra 1998, section 3).
 Rewards are not shown. With a lag of k frames the belief is over the last k macrostates together, for the frames that
-are still to come belong to them. Beliefs are a macrostate machine of their own, enumerated from the starts within the horizon and
-solved as any other.
+are still to come belong to them. Beliefs are a macrostate machine of their own, enumerated from the starts within the
+horizon and solved as any other.
 """
 
 from __future__ import annotations
