@@ -56,7 +56,7 @@ def page() -> str:
         "Mohammad Thabet's thesis (*Imagination-Augmented Deep Reinforcement Learning for Robotic Applications*, "
         "Manchester, 2022) trains a DQN on transitions that a learned model imagines, and discards those of high "
         "epistemic uncertainty. Imagination saves real experience here too while it is scarce, [with other "
-        "settings](explanation/imagination.md); what the filter adds is not shown.",
+        "settings](explanation/imagination.md); a gain by the filter is not shown.",
         "",
         f"{len(rows)} elements: " + ", ".join(f"{counts[word]} {word}" for word in VERDICTS if counts[word]) + ".",
         "",
