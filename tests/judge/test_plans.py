@@ -215,6 +215,10 @@ def test_the_recording_shows_the_same_plans_and_the_arm_moves(
     steps = sum(plan.done for plan in right[:2])
     assert rows("/real/frame") == steps + 2, "the physical arm solves the same plans"
     assert rows("/scene/right_l3") > 20 * steps, "the arm must be seen moving"
+    said = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == "/real/text"]
+    texts = [str(text) for batch in said for (text,) in batch.column("TextDocument:text").to_pylist()]
+    done = [sum(line.endswith(" done") for line in text.splitlines()) for text in texts]
+    assert sorted(done) == sorted(number for plan in right[:2] for number in range(plan.done + 1))
 
 
 def test_plans_with_another_bound_or_number_lie_in_folders_of_their_own(tmp_path: Path) -> None:

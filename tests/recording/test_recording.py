@@ -265,6 +265,8 @@ def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
     assert (left.count("█"), right.count("█")) == (5, 11), "as long as their values are large: 1 to 2.5"
     assert left.index("│") == right.index("│"), "all bars begin at one zero"
     assert left.rindex("█") < left.index("│") < right.index("█")
+    rows = q_table(("a", "b"), np.array([-1.0, -4.0], dtype=np.float32), 0).splitlines()[1:3]
+    assert all(row[row.index("│") - 1] == "█" for row in rows), "a short bar begins at zero, too"
     assert "nan" not in q_table(("a", "b"), np.zeros(2, dtype=np.float32), 0)
 
 

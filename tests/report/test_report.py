@@ -154,6 +154,13 @@ def test_the_terminal_has_the_scores_and_the_verdict(many: BenchResult, page: Pa
     assert not any(line != line.rstrip() for line in lines)
 
 
+def test_each_part_of_a_wide_table_on_a_terminal_names_its_rows() -> None:
+    wide = Table("wide", ["agent", *(f"a long name of a column {place}" for place in range(5))], [["dqn", *"12345"]])
+    parts = wide.text.split("\n\n")
+    assert len(parts) > 1
+    assert {tuple(line.split()[0] for line in part.splitlines()[::2]) for part in parts} == {("agent", "dqn")}
+
+
 # The verdict -------------------------------------------------------------------------------------------------------
 
 

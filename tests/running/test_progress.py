@@ -9,7 +9,7 @@ from bench_fakes import FakeRunSpec
 from small_runs import small
 
 from imagine_bench.protocols.data import Phase, Progress
-from imagine_bench.running.bench import ProgressBar
+from imagine_bench.running.bench import Counted, ProgressBar
 
 WORK = 9 + 2 * 5
 """Of a learner: training episodes, and tests at two budgets."""
@@ -53,3 +53,12 @@ def test_a_minute_shows_each_run_and_its_curve(now_s: list[float], capsys: pytes
     line, curve = capsys.readouterr().err.splitlines()
     assert line.endswith("left · table seed 0: episode 6 of 9, last 50 solved 100 %")
     assert curve == "  █▅ table seed 0: training, each 50 episodes"
+
+
+def test_what_is_counted_says_the_time_gone_and_the_time_left(
+    now_s: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Counted("fits judged", total=4) as counted:
+        now_s[0] = 100.0
+        counted.step()
+    assert capsys.readouterr().err.splitlines() == ["fits judged: 1 of 4, 01:40 gone, 05:00 left"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import math
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +28,7 @@ from imagine_bench.protocols.data import digest
 from imagine_bench.report.page import write_page
 from imagine_bench.report.sweep import study_page
 from imagine_bench.rules import states_of
+from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import PolicyTable
 from imagine_bench.sweep.grid import BASE, STUDIES, Study, Variant, read_grid
 from imagine_bench.sweep.run import imagined_right, run_study
@@ -70,10 +72,21 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path, capsys: pytest.C
     rows = list(csv.DictReader((tmp_path / "out" / "seeds.csv").read_text().splitlines()))
     assert len(rows) == 3 * 2 * 2 and {row["seed"] for row in rows} == {"1000", "1001"}
     right = dataclasses.replace(lines[1], imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]))
+    right = dataclasses.replace(right, difference=(Estimate(0.1, *[math.nan] * 2), Estimate(-0.2, *[math.nan] * 2)))
     page = study_page(STUDY, [lines[0], right])
     assert [row[-2] for row in page.sections[0].tables[0].rows] == ["–", "–", "20.0", "30.0"], "means of seeds"
+    assert [row[-3] for row in page.sections[0].tables[0].rows] == ["–", "–", "+10.0", "−20.0"], "of each budget"
     rows = list(csv.DictReader(page.files["seeds.csv"].splitlines()))
     assert [row["imagined_right"] for row in rows][4:] == ["0.1000", "0.2000", "0.3000", "0.4000"]
+
+
+def test_a_difference_is_that_from_what_a_variant_is_compared_with(tmp_path: Path) -> None:
+    optimal = Variant(name="optimal", factor="agent", agent="oracle", against="table")
+    study = dataclasses.replace(STUDY, variants=(STUDY.variants[0], optimal))
+    table, line = run_study(study, "arrow_puzzle", root=tmp_path, launcher=Inline())
+    assert line.difference is not None and (line.success == 1.0).all()
+    assert [one.value for one in line.difference] == pytest.approx((1.0 - table.success.mean(axis=0)).tolist())
+    assert max(one.value for one in line.difference) > 0.0
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,12 @@ class _Drawn(_Wrong):
 def test_wrong_models_are_found(
     monkeypatch: pytest.MonkeyPatch, made: Callable[[Any], Any], holds: str, words: str
 ) -> None:
-    monkeypatch.setattr(registry, "made", lambda what, target, context: made(context))
+    others = registry.made  # the episodes are played by an agent
+
+    def make(what: str, *given: Any) -> Any:
+        return made(given[-1]) if what == "World model copy" else others(what, *given)
+
+    monkeypatch.setattr(registry, "made", make)
     found = checks(task="arrow_puzzle_easy", model="copy")
     for what, check in found.items():
         if what.startswith(holds):

@@ -1,7 +1,9 @@
 """``check --physics``: fidelity and margins of any task, and what is refused."""
 
+import dataclasses
 import json
 
+import gymnasium
 import pytest
 
 from imagine_bench import registry
@@ -44,6 +46,26 @@ def test_a_walk_ends_with_its_first_fault(monkeypatch):
     monkeypatch.setattr(physics, "make_env", lambda spec, **_: make(spec, physics=SLIPPERY))
     found = physics.walk(registry.task("pick_place"), "true")
     assert (found["lengths"], found["as_ruled"], len(found["faults"])) == ([1, 1], 0, 2)
+
+
+class Seeds(gymnasium.Env):
+    """Nothing fails, and every seed is noted."""
+
+    def __init__(self, physics, seen):
+        self.seen = seen
+
+    def reset(self, *, seed, options):
+        self.seen.append(seed)
+
+    def step(self, action):
+        return None, 0.0, False, False, {"fault": False}
+
+
+def test_each_trial_of_a_margin_begins_with_a_placement_of_its_own():
+    seen = []
+    gymnasium.register("Seeds-v0", Seeds, kwargs={"seen": seen})
+    spec = dataclasses.replace(registry.task("arrow_puzzle"), env_id="Seeds-v0")
+    assert physics.as_ruled(spec, SLIPPERY, 5) == 5 == len(set(seen))
 
 
 @pytest.mark.parametrize("name", physics.SWEEPS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -80,6 +81,12 @@ def test_missing_packages_are_complaints_and_missing_extras_notes() -> None:
     assert doctor.unmet_requirements(without) == [] and doctor.missing_extras() == []
     (note,) = doctor.missing_extras(without)
     assert note.endswith("pip install 'imagine-bench[agents,report]'.")
+
+
+def test_too_little_room_on_the_disk_is_a_complaint(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**29))
+    found, works = doctor.examine()
+    assert "Wrong: Only 0.5 GiB are free in" in found and not works
 
 
 def test_versions_that_are_not_the_locks_are_named(tmp_path: Path) -> None:

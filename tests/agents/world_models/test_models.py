@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 from imagine_bench.agents.world_models import convolutional, latent
-from imagine_bench.agents.world_models.patches import Patches
+from imagine_bench.agents.world_models.patches import Patch, Patches
 from imagine_bench.agents.world_models.structured import StructuredModel
 
 from imagine_bench import registry
@@ -130,11 +131,32 @@ def test_the_structured_model_knows_what_it_never_tried() -> None:
     assert found.aleatoric is None  # it has no such noise, and says so
 
 
+def test_every_future_of_a_question_begins_in_its_own_frame() -> None:
+    """How probable the likeliest step is depends on frame and macro-action alone, however many futures are drawn."""
+    model = made("structured")
+    model.fit(data().first(30), np.random.default_rng(1))
+    frames, actions = data().frames[:5, None], data().actions[:5, None]
+    one, many = (model.imagine(frames, actions, samples, np.random.default_rng(3)).modal for samples in (1, 4))
+    assert one is not None and many is not None and len(np.unique(one)) > 1
+    assert np.allclose(one, many)
+
+
 def test_patches_finds_the_cubes_and_the_hand_and_how_many_looks_each_has() -> None:
     model = made("patches")
     assert isinstance(model, Patches)
     model.fit(data(), np.random.default_rng(1))
     assert sorted(len(patch.gray) for patch in model.patches) == [3, 4, 4, 4], "the hand, and three arrows"
+
+
+def test_a_look_is_recognised_where_it_is_shifted_by_up_to_two_pixels() -> None:
+    """Shifted by more, a pattern is as far from itself as from any other, and gray is nearer."""
+    pattern = np.random.default_rng(0).normal(size=(64, 64))
+    pixels = np.arange(64 * 64).reshape(64, 64)[20:40, 20:40].ravel()
+    looks = np.stack([np.zeros(len(pixels)), pattern.ravel()[pixels]])
+    patch = Patch(pixels, looks, np.zeros((2, len(pixels), 3), dtype=np.uint8))
+    for shift in itertools.product(range(-3, 4), repeat=2):
+        (found,) = patch.looks(np.roll(pattern, shift, axis=(0, 1)).reshape(1, -1))
+        assert found == (max(map(abs, shift)) <= 2), shift
 
 
 def squares(states: Sequence[Sequence[int]]) -> np.ndarray:

@@ -96,6 +96,27 @@ def test_plans_lead_to_the_nearest_goal_at_whichever_step() -> None:
     assert moved(2, agent.act(seen(2), explore=False)) in {1, 3}, "the one that is one away, or on the way to the other"
 
 
+class Detour(torch.nn.Module):
+    """From 3 the first macro-action leads to 1; the last one leads to 1.5, and taken twice to the goal, at 0."""
+
+    def encode(self, pixels: torch.Tensor) -> torch.Tensor:
+        return 3.0 * pixels[:, :, 0, 0, :1]
+
+    def rollout(self, z: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        first, second = actions.argmax(dim=2).unbind(1)
+        one = torch.tensor([1.0, 3.0, 1.5])[first]
+        two = torch.where((first == 2) & (second == 2), 0.0, one)
+        return torch.stack([z[:, 0, 0], one, two], dim=1).unsqueeze(2)
+
+
+def test_a_plan_costs_the_squared_distances_of_all_its_steps_at_rest_after_its_arrival() -> None:
+    """To stay at 1 costs 1 + 1, the way over 1.5 costs 2.25."""
+    agent = learner(horizon=2, learning_starts=100)
+    agent._model = Detour()
+    agent._goals = [seen(GOAL).frame]
+    assert agent.act(seen(0), explore=False) == 0
+
+
 def test_updates_follow_the_ratio_and_the_global_generator_is_left_alone() -> None:
     before = torch.get_rng_state()
     agent = learner(replay_ratio=0.7)
