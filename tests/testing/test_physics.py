@@ -51,7 +51,7 @@ def test_a_walk_ends_with_its_first_fault(monkeypatch):
 class Seeds(gymnasium.Env):
     """Nothing fails, and every seed is noted."""
 
-    def __init__(self, physics, seen):
+    def __init__(self, seen):
         self.seen = seen
 
     def reset(self, *, seed, options):
@@ -61,9 +61,10 @@ class Seeds(gymnasium.Env):
         return None, 0.0, False, False, {"fault": False}
 
 
-def test_each_trial_of_a_margin_begins_with_a_placement_of_its_own():
+def test_each_trial_of_a_margin_begins_with_a_placement_of_its_own(monkeypatch):
     seen = []
-    gymnasium.register("Seeds-v0", Seeds, kwargs={"seen": seen})
+    known = gymnasium.envs.registration.EnvSpec("Seeds-v0", lambda physics: Seeds(seen))
+    monkeypatch.setitem(gymnasium.registry, "Seeds-v0", known)
     spec = dataclasses.replace(registry.task("arrow_puzzle"), env_id="Seeds-v0")
     assert physics.as_ruled(spec, SLIPPERY, 5) == 5 == len(set(seen))
 
