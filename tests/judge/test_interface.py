@@ -11,6 +11,7 @@ from fake_reader import BlindReader
 from imagine_bench.agents.world_models.limits import Exact
 from judged import JudgedWorld, judged_world, shown
 
+from imagine_bench import registry
 from imagine_bench.arrays import Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, State
@@ -75,6 +76,13 @@ class Records(Exact):
 
 
 TASK = "pick_place"
+
+
+def test_no_start_is_asked_about_twice_while_another_is_not_at_all() -> None:
+    rules = registry.task("arrow_puzzle").rules
+    for count in (len(rules.start_states) // 2, len(rules.start_states)):
+        found = questions.some_starts(rules, count, np.random.default_rng(0))
+        assert len(set(found)) == count and set(found) <= set(rules.start_states)
 
 
 def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:

@@ -64,6 +64,15 @@ def run_script(script: str, *before: str, **environment: str) -> subprocess.Comp
     )  # fmt: skip
 
 
+def test_the_table_stands_on_the_floor(world):
+    model = world.model
+    legs = [geom for geom in map(model.geom, range(model.ngeom)) if geom.name.startswith("table_leg")]
+    table = model.geom("table_wood")
+    heights = [world.data.geom(leg.name).xpos[2] + leg.size[2] * np.array([-1.0, 1.0]) for leg in legs]
+    underside = world.data.geom(table.name).xpos[2] - table.size[2]
+    np.testing.assert_allclose(heights, [[world.data.geom("floor").xpos[2], underside]] * 4)
+
+
 def test_renderers_of_one_scene_and_view_share_a_context(world, made):
     twin = ArrowWorld(appearance("clean"))
     twin.place((3, 3, 0, 2), np.random.default_rng(0))

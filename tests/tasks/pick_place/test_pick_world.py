@@ -104,6 +104,16 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
 
+def test_an_object_is_held_midway_between_the_fingers_and_anywhere_along_their_pads():
+    varied = PickWorld(appearance("strong"))
+    off_m = []
+    for seed in range(3):
+        varied.place((1, 0, 0, 1), np.random.default_rng(seed))
+        off_m.append(varied.object_poses()[0, :2] - varied.data.site("tcp").xpos[:2])
+    along_m, between_m = np.abs(off_m).T
+    assert along_m.max() > 1e-3 and between_m.max() < 1e-9
+
+
 def test_a_ball_is_picked_alike_however_it_has_rolled(world):
     """It has no heading, so that the commands are the same to the bit."""
     world.executor.capture_motion_hz = 20.0
