@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from guest_packages import Guests
 from packaging.requirements import Requirement
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
-from imagine_bench.registry.builtin import guests
+from imagine_bench.registry.builtin import guests as own_guests
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = sorted(file.parent for file in (ROOT / "agents" / "guests").glob("*/pyproject.toml"))
@@ -63,10 +64,17 @@ def test_the_extra_peers_names_the_guest_and_all_that_it_needs() -> None:
     assert named - {"imagine-bench-peers"} == needed - {"imagine-bench[agents]"}
 
 
+def test_a_package_is_known_by_all_of_its_modules(guests: Guests) -> None:
+    """Their code is in the version that results name."""
+    offers = {registry.AGENT_GROUP: {"one": "pair:ONE"}, registry.TASK_GROUP: {"two": "pair_more.deep:TWO"}}
+    guests.write("pair", "", offers)
+    assert registry.guest_packages()["pair"] == {"pair", "pair_more"}
+
+
 @pytest.fixture
 def without_guests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As where only imagine_bench is installed."""
-    packages = {guest.package for guest in guests()}
+    packages = {guest.package for guest in own_guests()}
 
     there = [point for each in distributions() if each.name not in packages for point in each.entry_points]
 

@@ -23,8 +23,28 @@ from imagine_bench.cli import observers
 from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.data import RunSpec
+from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts
+from imagine_bench.running.run_state import Counters
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
 from imagine_bench.store.run_folder import load_newest
+
+
+def test_figures_of_a_test_by_hand() -> None:
+    counts = EvaluationCounts()
+    for actions, total, faults, success in (([0, 1, 2], 7.0, 2, True), ([1], -1.0, 0, False)):
+        counts.add(EpisodeRecord([0], [0], 0, actions=actions, total=total, faults=faults, success=success))
+    assert counts.figures() == {
+        "test_episodes": 2, "successes": 1, "solved": "10", "mean_return": 3.0, "mean_length": 2.0, "faults": 2,
+    }  # fmt: skip
+
+
+def test_a_macro_action_that_is_tried_again_keeps_the_episode_of_its_first_time() -> None:
+    counters = Counters()
+    counters.try_out((0, 3), 1)
+    counters.add_episode(success=False, length=1)
+    counters.try_out((0, 3), 1)
+    counters.try_out((0, 3), 2)
+    assert counters.tried == {"0 3 1": 0, "0 3 2": 1}
 
 
 def test_tests_have_starts_and_looks_that_training_never_saw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
