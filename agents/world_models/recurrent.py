@@ -17,7 +17,7 @@ from imagine_bench.interfaces.motion import Motions
 from ..encoders.perception import prepare_torch
 from ..networks.mlp import initialise
 
-_STEPS = 2_500
+_STEPS = 4_000
 _BATCH = 32
 _RATE = 2e-3
 _EVERY = 2

@@ -49,6 +49,7 @@ from imagine_bench.running.launchers.jobs import at_a_time, launcher
 from imagine_bench.running.retraining import Retraining
 from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import newest_bench
+from imagine_bench.store.files import make_folder, table_text, write_bytes
 from imagine_bench.store.results import BenchResult
 from imagine_bench.sweep.grid import SUITE, SUITE_AGENTS, Study, Suite, grid_named
 from imagine_bench.sweep.run import run_study, run_suite
@@ -386,6 +387,10 @@ class Judge:
 
     def __call__(self) -> None:
         """Judge and report."""
+        motion = registry.task_of_motion(self.task)
+        if motion is not None:
+            self._judge_motions(motion)
+            return
         from imagine_bench.recording.judgement import record_judgement  # noqa: PLC0415 - as below
         from imagine_bench.report.judge import judged, judgement_page  # noqa: PLC0415 - as below
 
@@ -409,6 +414,22 @@ class Judge:
         print(f"Recording: {record_judgement(folder, judgement)}")
         if failed:
             raise RunFailedError("\n".join(failed))
+
+    def _judge_motions(self, task: str) -> None:
+        """Judge models of motions: what they say of the commands of a task's continuous control."""
+        from imagine_bench.judge.motion_scores import SIZES, judge_motions  # noqa: PLC0415 - MuJoCo loads slowly
+        from imagine_bench.report.motions import motion_rows, motion_table  # noqa: PLC0415 - as above
+
+        others = ("samples", "appearance", "policy", "order", "encoder", "workers")
+        given = [name for name in others if getattr(self, name) != getattr(type(self), name)]
+        if given:
+            raise InvalidValueError(f"Models of motions are judged without {', '.join(given)}; leave it out.")
+        sizes = SIZES if self.sizes == type(self).sizes else self.sizes
+        folder = make_folder(self.out / f"{file_name(self.task)}-motions")
+        rows = judge_motions(task, self.models or tuple(registry.MOTION_MODELS), sizes, self.seeds, folder)
+        write_bytes(folder / "motions.csv", table_text(motion_rows(rows)).encode())
+        table = motion_table(rows)
+        print(f"{table.text}\n\n{table.caption}\nEach row: {folder / 'motions.csv'}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,8 @@ from imagine_bench.judge.motions import AnsweredMotions, MotionSource
 from imagine_bench.judge.reading import ImageReader, reader_in
 from imagine_bench.seeding import SeedTree
 
+SIZES = (1200,)
+"""Motions that models learn from, by default."""
 PAIRS = 100
 CHAINS = 40
 DEPTH = 4

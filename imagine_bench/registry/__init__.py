@@ -290,6 +290,23 @@ def motion_id(env_id: str) -> str:
     return f"{name}Motion-v{version}"
 
 
+def motion_name(env_id: str) -> str:
+    """The name of an environment of continuous control on a command line: ``ArrowPuzzleMotion``."""
+    return env_id.rpartition("/")[2].partition("-v")[0]
+
+
+def task_of_motion(name: str) -> str | None:
+    """The task whose environment of continuous control has a name, such as ``ArrowPuzzleMotion``, or that id.
+
+    Options follow as a task's do: ``ArrowsMotion:cubes=1``. None for any other name.
+    """
+    base, colon, said = name.partition(":")
+    for task, entry in tasks().items():
+        if entry.motion and motion_name(motion_id(entry.env_id)) == motion_name(base):
+            return f"{task}{colon}{said}"
+    return None
+
+
 def vector_id(env_id: str) -> str:
     """The id of an environment's own vector environment; that of the single one keeps Gymnasium's default, sync."""
     name, _, version = env_id.rpartition("-v")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 
@@ -36,6 +37,17 @@ def motion_table(rows: Sequence[Row]) -> Table:
     chain = [f"after {depth + 1}" for depth in range(DEPTH)]
     header = ["model", "motions", "right", "nothing", "painted", "pairs", *chain, "CPU s"]
     return Table("motions", header, cells, _CAPTION)
+
+
+def motion_rows(rows: Sequence[Row]) -> list[dict[str, float | str]]:
+    """The rows as those of a CSV file, shares in [0, 1]."""
+    found: list[dict[str, float | str]] = []
+    for row in rows:
+        values: dict[str, float | str] = {"model": row.model, "motions": row.size, "seed": row.seed}
+        scores = asdict(row.scores)
+        by_depth = scores.pop("by_depth")
+        found.append(values | scores | {f"after_{depth + 1}": share for depth, share in enumerate(by_depth)})
+    return found
 
 
 def _mean(scores: Sequence[MotionScores], field: str) -> float:

@@ -153,7 +153,7 @@ class MotionEnv(SceneEnv):
         level = appearance_level(appearance)
         if level.pool is not None:
             raise InvalidValueError(
-                f"Appearance {level.name!r} patches images of macrostates; give clean, mild, strong or factors."
+                f"Appearance {appearance!r} patches images of macrostates; give clean, mild, strong or factors."
             )
         super().__init__(
             spec,
@@ -170,7 +170,9 @@ class MotionEnv(SceneEnv):
         self.reward = require_known("reward", reward, REWARDS)
         self._potential = Potential(self.world, spec.rules) if reward == "dense" else None
         self._slip = slip
-        self._told = told
+        if not isinstance(told, (bool, np.bool_)):
+            raise InvalidValueError(f"told is {brief(told)}; give True or False.")
+        self._told = bool(told)
         self._sight = spec.sight
         self._lag = spec.sight.lag if spec.sight else 0
         self._n_steps = steps_in_period(rate_hz, self.model.opt.timestep)
@@ -183,7 +185,11 @@ class MotionEnv(SceneEnv):
         self._referee = Referee(self.world, spec.rules)
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self.camera, control=True)
         self.observation_space = self._observer.space
-        self.time_limit_s = SECONDS_PER_MACRO_ACTION * spec.horizon if time_limit_s is None else time_limit_s
+        self.time_limit_s = SECONDS_PER_MACRO_ACTION * spec.horizon
+        if time_limit_s is not None:
+            if not isinstance(time_limit_s, Real) or isinstance(time_limit_s, bool) or not time_limit_s > 0:
+                raise InvalidValueError(f"time_limit_s is {brief(time_limit_s)}; give seconds above 0, or None.")
+            self.time_limit_s = float(time_limit_s)
         self._kind = (spec.id, "motion", control, self._n_steps, level.name, self.physics, slip, told)
         self.episode = Episode()
 
