@@ -134,10 +134,12 @@ def test_it_queries_what_is_uncertain_and_learns_no_dynamics() -> None:
     assert unknown() <= before
 
 
-def test_what_has_no_label_is_not_asked_again() -> None:
+def test_what_has_no_label_teaches_nothing_and_is_not_asked_again() -> None:
     learner = agent()
     live(learner, range(12), np.random.default_rng(0))
+    learner.learn()  # what was expected too
     seen, asked = Observation(frame=frame((0, 1, 1))), []
+    values = learner.q_values(seen)
     for _ in range(5):
         actions = learner.query(seen)
         assert actions is not None
@@ -146,6 +148,7 @@ def test_what_has_no_label_is_not_asked_again() -> None:
         assert not learner.replay[-1].has_reward
     assert len(set(asked)) == 5
     assert learner.diagnostics()["oracle/labels"] == 0
+    assert np.array_equal(learner.q_values(seen), values)
 
 
 def test_queries_lead_where_the_dynamics_do(experienced: FactoredAgent) -> None:

@@ -11,6 +11,7 @@ from machines import Wheels, spec_of
 from scipy import stats
 
 from imagine_bench import registry
+from imagine_bench.exact import learner
 from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.exact.factors import factor_graph, machine
 from imagine_bench.exact.learner import learn
@@ -97,6 +98,20 @@ def test_a_learner_that_is_done_has_seen_what_it_needs(dials):
     assert min(run.transitions for run in runs) >= 24 * 0.7
     again = learn(full, graph, 12, np.random.default_rng(0))
     assert again == runs[0]
+
+
+def test_a_learner_looks_no_further_than_its_episode_goes_on(monkeypatch):
+    full, left = machine(Wheels(n=2)), []
+    choose = learner._Learner.choose
+
+    def look(self, row, most, rng):
+        left.append(most)
+        return choose(self, row, most, rng)
+
+    monkeypatch.setattr(learner._Learner, "choose", look)
+    run = learner.learn(full, factor_graph(full), 3, np.random.default_rng(0))
+    assert len(left) == run.transitions and left.count(3) == run.episodes
+    assert all(later in {now - 1, 3} for now, later in zip(left, left[1:], strict=False)) and min(left) == 1
 
 
 def test_the_cost_of_learning_is_the_mean_of_learners_with_its_standard_error():
