@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -111,7 +112,7 @@ def test_a_learner_looks_no_further_than_its_episode_goes_on(monkeypatch):
     monkeypatch.setattr(learner._Learner, "choose", look)
     run = learner.learn(full, factor_graph(full), 3, np.random.default_rng(0))
     assert len(left) == run.transitions and left.count(3) == run.episodes
-    assert all(later in {now - 1, 3} for now, later in zip(left, left[1:], strict=False)) and min(left) == 1
+    assert all(later in {now - 1, 3} for now, later in pairwise(left)) and min(left) == 1
 
 
 def test_the_cost_of_learning_is_the_mean_of_learners_with_its_standard_error():
