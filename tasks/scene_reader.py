@@ -94,7 +94,7 @@ class FilmedScene:
         self.camera_for_people = HUMAN_CAMERA
         self.latest: MacroResult | None = None
         self._people = self._mocap()
-        self._replaying = False
+        self.draws_quickly = False  #: whether images for people have coarser shadows and edges
 
     @property
     def model(self) -> mujoco.MjModel:
@@ -177,9 +177,10 @@ class FilmedScene:
     def renderer_for_people(self, camera: str, width: int, height: int) -> Renderer:
         """The renderer of images for people from a camera, by name.
 
-        While a motion is replayed it draws coarser shadows and edges, so that a window on a processor does not stall.
+        While a motion is replayed, or with ``draws_quickly``, it draws coarser shadows and edges, so that a window on a
+        processor does not stall.
         """
-        return self.camera(human_camera_view(camera, width, height, quick=self._replaying))
+        return self.camera(human_camera_view(camera, width, height, quick=self.draws_quickly))
 
     def film(self, width: int = 640, height: int = 480) -> Frame:
         """Images for people of the latest macro-action, as captured. Shape (K, height, width, 3)."""
@@ -202,15 +203,16 @@ class FilmedScene:
             return
         standing = data.qpos.copy()
         people = self._mocap()
+        draws_quickly = self.draws_quickly
         try:
             data.mocap_pos[:], data.mocap_quat[:] = self._people
-            self._replaying = True
+            self.draws_quickly = True
             for time_s, qpos in zip(captured.time_s.tolist(), captured.qpos, strict=True):
                 data.qpos[:] = qpos
                 self.world.update()
                 yield time_s
         finally:
-            self._replaying = False
+            self.draws_quickly = draws_quickly
             data.qpos[:] = standing
             data.mocap_pos[:], data.mocap_quat[:] = people
             self.world.update()

@@ -35,7 +35,9 @@ from imagine_bench.cli.options import (
     require_with,
     shown,
 )
-from imagine_bench.errors import InvalidValueError, RunFailedError
+from imagine_bench.data.folder import CARD
+from imagine_bench.data.motion import read_demonstrations
+from imagine_bench.errors import ArtefactError, CheckFailedError, InvalidValueError, RunFailedError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.judge.judgement import Judgement, judge, kept
 from imagine_bench.judge.verify import cost
@@ -436,6 +438,8 @@ class Judge:
 class Verify(OfBench):
     """Play every episode of a bench again, and say in a line a run whether its tables follow from them.
 
+    Of a folder of demonstrations, play each from its seed and its commands, and say in one line whether they agree.
+
     With --train, runs are trained again, too. With --causes, every failed test episode gets the one cause that it has
     instead; the report then shows them.
     """
@@ -459,6 +463,9 @@ class Verify(OfBench):
 
         given, task = self.meant()
         self._require_fitting()
+        if given is not None and (given / CARD).exists():
+            self._verify_demonstrations(given)
+            return
         if self.causes:
             print(audits.why_report(given, root=self.out, task=task, encoder=self.encoder))
             return
@@ -479,6 +486,17 @@ class Verify(OfBench):
         print(cost(found, time.process_time() - begun_s))
         if error is not None:
             raise error
+
+    def _verify_demonstrations(self, folder: Path) -> None:
+        from imagine_bench.tools import demonstrations  # noqa: PLC0415 - likewise
+
+        require_with("a bench", self, "train", "causes", "encoder")
+        kept = read_demonstrations(folder)
+        try:
+            print(demonstrations.verify(kept))
+        except ArtefactError as error:
+            print(f"Does not hold. {error}")
+            raise CheckFailedError("Something in it is wrong; see above.") from error
 
     def _require_fitting(self) -> None:
         """Raise InvalidValueError for options that do not go together."""

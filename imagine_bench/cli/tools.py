@@ -25,14 +25,17 @@ from imagine_bench.cli.options import (
     require_with,
     shown,
 )
-from imagine_bench.data.folder import FORMATS, read_dataset, require_format, require_new, write_dataset
+from imagine_bench.data.folder import CARD, FORMATS, read_card, read_dataset, require_format, require_new, write_dataset
+from imagine_bench.data.motion import read_demonstrations
 from imagine_bench.errors import CheckFailedError, InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
+from imagine_bench.interfaces.episodes import FRAME_SHAPE
 from imagine_bench.registry.entries import file_name
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.collect import describe as describe_episodes
 from imagine_bench.store.bench_folder import newest_recording
 from imagine_bench.store.files import require_writable
+from imagine_bench.tools import demonstrations
 from imagine_bench.tools.describe import describe, names
 from imagine_bench.tools.doctor import examine
 from imagine_bench.tools.standard_data import standard_sets
@@ -40,13 +43,17 @@ from imagine_bench.tools.standard_data import standard_sets
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetCommand:
-    """Collect episodes of a task as a dataset, or say what one holds."""
+    """Collect episodes of a task as a dataset, or say what one holds.
+
+    TASK is a task of macro-actions, or one of continuous control, such as ArrowPuzzleMotion.
+    """
 
     task: MaybeTaskWord = None
     """Task that is played, also as --task TASK; none with --describe and --standard."""
     policy: str = "random"
     """The player: random; uniform (one random macro-action from any macrostate); oracle; mixed (random and oracle in
-    turn); or a run's folder, whose trained agent acts greedily."""
+    turn); or a run's folder, whose trained agent acts greedily. Of continuous control: expert; noisy (with errors, and
+    planned again after a failure); random; mixed (all three in turn)."""
     episodes: int = 200
     """Episodes."""
     format: Annotated[str, one_of(*FORMATS)] = "npz"
@@ -61,6 +68,10 @@ class DatasetCommand:
     """How much frames vary: clean, mild, strong, patched, or factors such as light=0.5,camera=0.2."""
     motion_hz: float = 0.0
     """Samples a second of the arm's motion and commands, kept in a file apart; 0 keeps none."""
+    size: Count = None
+    """Edge of images in pixels, of continuous control; by default 64."""
+    workers: Count = None
+    """Processes at a time, of continuous control; one a core by default. The episodes do not depend on it."""
     encoder: EncoderWord = None
     """The encoder the agent of a run saw through, where it is not bundled."""
     describe: File = None
@@ -73,9 +84,17 @@ class DatasetCommand:
         if [self.task is None, self.describe is None, not self.standard].count(False) != 1:
             raise InvalidValueError("Give exactly one of a task to collect episodes of, --describe and --standard.")
         if self.describe is not None:
-            print(describe_episodes(read_dataset(self.describe)))
+            if "control" in (read_card(self.describe) or {}):
+                print(demonstrations.describe(read_demonstrations(self.describe)))
+            else:
+                print(describe_episodes(read_dataset(self.describe)))
             return
         require_format(self.format)
+        motion = None if self.task is None else registry.task_of_motion(self.task)
+        if motion is not None:
+            self._demonstrate(motion)
+            return
+        require_with("a task of continuous control", self, "size", "workers")
         if self.task is None:
             for folder in standard_sets(self.out or Path("datasets"), self.format, self.episodes):
                 print(f"{folder}\n{describe_episodes(read_dataset(folder))}\n")
@@ -95,6 +114,24 @@ class DatasetCommand:
             motion_hz=self.motion_hz,
         )
         print(f"{folder}\n{describe_episodes(write_dataset(folder, episodes, files, card, self.format))}")
+
+    def _demonstrate(self, task: str) -> None:
+        require_with("a task of macro-actions", self, "execution", "motion_hz", "encoder")
+        folder = self.out or Path("datasets") / f"{file_name(str(self.task))}-{self.policy}"
+        require_new(folder)
+        require_writable(folder.parent)
+        made = demonstrations.collect(
+            task,
+            policy=self.policy,
+            episodes=self.episodes,
+            seed=self.seed,
+            appearance=self.appearance,
+            size=self.size or FRAME_SHAPE[0],
+            format=self.format,
+            folder=folder,
+            workers=self.workers,
+        )
+        print(f"{folder}\n{demonstrations.describe(made)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,13 +170,26 @@ class EncoderCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewCommand(OfBench):
-    """Open a recording in the Rerun viewer: the .rrd file of the first word, or the newest of a folder, task or all."""
+    """Open a recording in the Rerun viewer: the .rrd file of the first word, or the newest of a folder, task or all.
+
+    Of a folder of demonstrations, an episode is played again and recorded beside it.
+    """
+
+    episode: Count = None
+    """Of demonstrations: the number of the episode, from 0."""
 
     def __call__(self) -> None:
         """Find and open."""
         from imagine_bench.recording.stream import open_in_viewer  # noqa: PLC0415 - Rerun loads slowly
 
         path, task = self.meant()
+        if path is not None and (path / CARD).exists():
+            index = self.episode or 0
+            file = path.with_name(f"{path.name}-episode_{index}.rrd")
+            demonstrations.record(read_demonstrations(path), index, file)
+            path = file
+        else:
+            require_with("a folder of demonstrations", self, "episode")
         if path is not None and path.is_dir():
             of_run = path / "recording.rrd"
             path = of_run if of_run.is_file() else newest_recording(path)
@@ -163,7 +213,10 @@ class Describe:
 
 @dataclass(frozen=True, kw_only=True)
 class Play:
-    """Solve a task by keyboard; says at the end how often, beside chance and optimum. Or film the oracle."""
+    """Solve a task by keyboard; says at the end how often, beside chance and optimum. Or film the oracle.
+
+    Keys are macro-actions; of a task of continuous control, such as ArrowPuzzleMotion, they move the hand.
+    """
 
     task: MaybeTaskWord = None
     """Task to play, also as --task TASK; by default that of --model."""
@@ -190,6 +243,13 @@ class Play:
 
         if not self.film:
             require_with("--film", self, "out")
+            motion = None if self.task is None else registry.task_of_motion(self.task)
+            if motion is not None:
+                require_with("a task of macro-actions", self, "model", "execution", "encoder")
+                look = self.appearance or APPEARANCES[0]
+                play_motion = registry.load("imagine_bench.tools.play_motion:play_motion")
+                print(play_motion(motion, seed=self.seed, appearance=look, camera=self.camera))
+                return
             options = {"execution": self.execution, "appearance": self.appearance, "encoder": self.encoder}
             print(play.play(self.task, model=self.model, seed=self.seed, camera=self.camera, **options))
             return

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import secrets
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,8 @@ _MARKS = {
     "*/data/metadata.json": "minari",
 }
 """Files by which formats are known; their modules read from there."""
-_CARD = "card.json"
+CARD = "card.json"
+"""The facts of a dataset for programs, in its folder."""
 _README = "README.md"
 _SHOWN = ("task", "policy", "episodes", "transitions", "successes", "mean_return", "execution", "appearance", "seed")
 """Facts of the card that the page for readers shows, too."""
@@ -70,24 +72,39 @@ def write_dataset(folder: Path, episodes: Episodes, apart: Apart, card: Mapping[
         SetupError: The library that the format needs is not installed, or the folder cannot be written.
         InvalidValueError: The folder exists.
     """
+    with new_folder(folder, format) as partial:
+        registry.load(FORMATS[format]).write(partial, episodes, card)
+        whole = write_card(partial, {**card, "format": format, "content": episodes.hash}, apart)
+    return Dataset(folder=folder, format=format, episodes=episodes, card=whole)
+
+
+@contextmanager
+def new_folder(folder: Path, format: str) -> Iterator[Path]:
+    """A hidden folder, which gets the name of ``folder`` if the block ends well and vanishes if not.
+
+    Raises as :func:`write_dataset`.
+    """
     require_format(format)
     require_new(folder)
-    whole = {**card, "format": format, "content": episodes.hash}
-    whole["apart"] = {name: content_hash(arrays) for name, arrays in apart.items()}
     make_folder(folder.parent)
     partial = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")
     try:
         with writing(folder):
             partial.mkdir()  # a new folder, so that nothing a killed writer or anybody else left is in the dataset
-            registry.load(FORMATS[format]).write(partial, episodes, card)
-            for name, arrays in apart.items():
-                write_arrays(partial / f"{name}.npz", arrays)
-            write_json(partial / _CARD, sealed(whole))
-            write_bytes(partial / _README, _readme(whole).encode())
+            yield partial
             partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-    return Dataset(folder=folder, format=format, episodes=episodes, card=whole)
+
+
+def write_card(folder: Path, card: Mapping[str, Json], apart: Apart) -> dict[str, Json]:
+    """Write the files apart, the card with their digests, and the page for readers. Returns the card."""
+    whole = {**card, "apart": {name: content_hash(arrays) for name, arrays in apart.items()}}
+    for name, arrays in apart.items():
+        write_arrays(folder / f"{name}.npz", arrays)
+    write_json(folder / CARD, sealed(whole))
+    write_bytes(folder / _README, _readme(whole).encode())
+    return whole
 
 
 def _readme(card: Mapping[str, Json]) -> str:
@@ -114,7 +131,7 @@ def _readme(card: Mapping[str, Json]) -> str:
 |---|---|
 {facts}
 
-Made with imagine_bench: `{card.get("command", "")}`. `{_CARD}` has all facts and the digest of the episodes.
+Made with imagine_bench: `{card.get("command", "")}`. `{CARD}` has all facts and the digest of the episodes.
 `imagine_bench.data.folder.read_dataset(folder)` reads and checks them.
 """
 
@@ -137,16 +154,23 @@ def read_dataset(folder: Path) -> Dataset:
         ArtefactError: There is none, a file is damaged, or the content differs from the card.
         SetupError: The library that its format needs is not installed.
     """
+    card = read_card(folder)
+    if card is not None and "control" in card:
+        raise InvalidValueError(f"{folder} has hand commands, no macro-actions; give a dataset of these.")
     found = next(((name, path) for mark, name in _MARKS.items() for path in sorted(folder.glob(mark))), None)
     if found is None:
         marks = ", ".join(f"{mark} ({name})" for mark, name in _MARKS.items())
         raise ArtefactError(f"{folder} is no dataset; give a folder with {marks}.")
     format, path = found
-    card = read_sealed(folder / _CARD, "a dataset's card") if (folder / _CARD).exists() else None
     episodes = registry.load(FORMATS[format]).read(path)
     if card is not None and card.get("content") != episodes.hash:
         raise ArtefactError(f"{folder} is damaged: its episodes are not those of its card. It was left untouched.")
     return Dataset(folder=folder, format=format, episodes=episodes, card=card)
+
+
+def read_card(folder: Path) -> dict[str, Any] | None:
+    """The card of a folder, None where there is none. Raises ArtefactError: it is damaged."""
+    return read_sealed(folder / CARD, "a dataset's card") if (folder / CARD).exists() else None
 
 
 def read_apart(dataset: Dataset) -> dict[str, Arrays]:
@@ -154,9 +178,14 @@ def read_apart(dataset: Dataset) -> dict[str, Arrays]:
 
     Raises ArtefactError: a file is missing or damaged.
     """
+    return read_files(dataset.folder, dataset.card or {})
+
+
+def read_files(folder: Path, card: Mapping[str, Any]) -> dict[str, Arrays]:
+    """The files apart that a card names. Raises as :func:`read_apart`."""
     found = {}
-    for name, digest in (dataset.card or {}).get("apart", {}).items():
-        path = dataset.folder / f"{name}.npz"
+    for name, digest in card.get("apart", {}).items():
+        path = folder / f"{name}.npz"
         found[name] = read_arrays(path, "a part of a dataset")
         if content_hash(found[name]) != digest:
             raise ArtefactError(f"{path} differs from the card. It was left untouched.")

@@ -14,9 +14,11 @@ import io
 import itertools
 import json
 import operator
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import PIL.Image
@@ -24,6 +26,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from imagine_bench.arrays import Array, Arrays, Bools, Ints, content_hash
+from imagine_bench.data.motion import CAMERAS, PROPRIO_NAMES
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.episodes import FRAME_SHAPE, Episodes
@@ -52,6 +55,25 @@ _TYPES = {
     "index": "int64", "task_index": "int64",
 }  # fmt: skip
 """Columns of one number a row. LeRobot's own tools take actions to be real numbers; a second is a macro-action."""
+_STATE = "observation.state"
+_CAMERA = "observation.images."
+_MOTION_TYPES = {**_TYPES, _STATE: "float32", "macro_action": "int64"}
+"""Columns of demonstrations, of one number a row but for the action and the state."""
+_MOTION_NAMES = {
+    "action": "actions", _STATE: "proprio", "macro_action": "macro_action", "next.reward": "rewards",
+    "next.terminated": "terminated", "next.truncated": "truncated", "next.success": "success",
+}  # fmt: skip
+"""Columns of demonstrations, and the arrays that they are of."""
+_INDEX = "__index_level_0__"
+"""Where pandas keeps the index of a table."""
+
+
+class _Part(NamedTuple):
+    """The rows of one episode."""
+
+    columns: Arrays
+    images: Mapping[str, Frame]
+    tasks: list[str]
 
 
 def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
@@ -61,28 +83,116 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
     columns = _columns(episodes, firsts)
     frames = episodes.frames[before]
     masks = episodes.action_masks.astype(np.bool_)
-    table = _table({**columns, _MASK: masks[before]}, frames)
     digests = _digests(columns, masks[before], frames, episodes.lengths)
     text = [str(card["description"])]
-    places = [divmod(file, _FILES) for file in (firsts // _ROWS).tolist()]
+    table = {**columns, _MASK: masks[before]}
     spans = [slice(*span) for span in zip(firsts.tolist(), (firsts + episodes.lengths).tolist(), strict=True)]
-    for place, there in itertools.groupby(zip(places, spans, strict=True), key=operator.itemgetter(0)):
-        with pq.ParquetWriter(_file(folder / "data", *place), table.schema) as writer:
-            for _, span in there:
-                writer.write_table(table[span])
-    rows = []
-    for index, (span, (chunk, file)) in enumerate(zip(spans, places, strict=True)):
-        row = {_EPISODE: index, "tasks": text, "length": span.stop - span.start, "dataset_from_index": span.start}
-        row |= {"dataset_to_index": span.stop, "data/chunk_index": chunk, "data/file_index": file}
-        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-        stats = _statistics({name: column[span] for name, column in columns.items()}, frames[span])
-        rows.append(row | {f"stats/{name}/{each}": value for name, of in stats.items() for each, value in of.items()})
-    pq.write_table(pa.Table.from_pylist(rows), _file(folder / "meta/episodes", 0, 0))
+    parts = (_Part({name: each[span] for name, each in table.items()}, {_IMAGE: frames[span]}, text) for span in spans)
+    _write_rows(folder, parts)
     pq.write_table(_tasks(text), folder / "meta/tasks.parquet")
-    ends = _table({_EPISODE: np.arange(len(last)), _MASK: masks[last]}, episodes.frames[last])
+    ends = _table({_EPISODE: np.arange(len(last)), _MASK: masks[last]}, {_IMAGE: episodes.frames[last]})
     pq.write_table(ends.append_column(_DIGEST, pa.array(digests)), folder / _FINAL)
-    write_json(folder / "meta/stats.json", _statistics(columns, frames))
-    write_json(folder / _INFO, _info(episodes))
+    counts = {"total_episodes": len(episodes), "total_frames": len(episodes.actions), "total_tasks": 1}
+    write_json(folder / _INFO, _info(_features(episodes), counts, fps=1))
+
+
+def _write_rows(folder: Path, parts: Iterable[_Part]) -> None:
+    """Write the rows of episodes, one after another, the list of these, and the statistics of all."""
+    rows: list[dict[str, Json]] = []
+    columns = []
+    levels: dict[str, Ints] = {}
+    for (chunk, file), there in itertools.groupby(_placed(parts), key=operator.itemgetter(0)):
+        with ExitStack() as opened:
+            writer = None
+            for _, begin, part in there:
+                table = _table(part.columns, part.images)
+                if writer is None:
+                    writer = opened.enter_context(pq.ParquetWriter(_file(folder / "data", chunk, file), table.schema))
+                writer.write_table(table)
+                row: dict[str, Json] = {_EPISODE: len(rows)}
+                row |= {"tasks": part.tasks, "length": len(table), "dataset_from_index": begin}
+                row |= {"dataset_to_index": begin + len(table), "data/chunk_index": chunk, "data/file_index": file}
+                row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+                counts = {name: _levels(frames) for name, frames in part.images.items()}
+                stats = _statistics(part.columns, counts)
+                flat = {f"stats/{name}/{each}": value for name, of in stats.items() for each, value in of.items()}
+                rows.append(row | flat)
+                columns.append(part.columns)
+                levels = {name: levels.get(name, 0) + count for name, count in counts.items()}
+    whole = {name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
+    pq.write_table(pa.Table.from_pylist(rows), _file(folder / "meta/episodes", 0, 0))
+    write_json(folder / "meta/stats.json", _statistics(whole, levels))
+
+
+def _placed(parts: Iterable[_Part]) -> Iterator[tuple[tuple[int, int], int, _Part]]:
+    """Each part with its chunk and file, and with the number of rows before it."""
+    begin = 0
+    for part in parts:
+        yield divmod(begin // _ROWS, _FILES), begin, part
+        begin += len(part.columns[_EPISODE])
+
+
+def write_motion(folder: Path, episodes: Iterator[Arrays], card: Mapping[str, Any]) -> None:
+    """Write demonstrations, one after another. Each row has its own instruction as its task."""
+    tasks: dict[str, int] = {}
+    counts = Counter({"total_episodes": 0, "total_frames": 0})
+    fps = round(card["rate_hz"])
+    size = card["size"]
+
+    def parts() -> Iterator[_Part]:
+        for episode in episodes:
+            yield _motion_part(episode, counts, tasks, fps)
+            counts.update(total_episodes=1, total_frames=len(episode["rewards"]))
+
+    _write_rows(folder, parts())
+    pq.write_table(_tasks(list(tasks)), folder / "meta/tasks.parquet")
+    names = {"action": list(card["control_names"]), _STATE: list(PROPRIO_NAMES)}
+    features: dict[str, Json] = {}
+    for name, dtype in _MOTION_TYPES.items():
+        features[name] = {"dtype": dtype, "shape": [len(names.get(name, "1"))], "names": names.get(name)}
+    for name in CAMERAS:
+        shape = [size, size, 3]
+        features[_CAMERA + name] = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+    write_json(folder / _INFO, _info(features, {**counts, "total_tasks": len(tasks)}, fps=fps))
+
+
+def _motion_part(episode: Arrays, before: Mapping[str, int], tasks: dict[str, int], fps: float) -> _Part:
+    """The rows of a demonstration; ``before`` counts those before it, ``tasks`` numbers the instructions so far."""
+    said = episode["instruction"].tolist()
+    for text in said:
+        tasks.setdefault(text, len(tasks))
+    n_steps = len(said)
+    count = np.arange(n_steps)
+    made = {
+        "next.done": episode["terminated"] | episode["truncated"], "timestamp": count / fps, "frame_index": count,
+        _EPISODE: np.full(n_steps, before["total_episodes"]), "index": before["total_frames"] + count,
+        "task_index": np.array([tasks[text] for text in said]),
+    }  # fmt: skip
+    given = {theirs: episode[ours][:n_steps] for theirs, ours in _MOTION_NAMES.items()}
+    columns = {name: {**given, **made}[name].astype(dtype) for name, dtype in _MOTION_TYPES.items()}
+    return _Part(columns, {_CAMERA + name: episode[name][:n_steps] for name in CAMERAS}, list(dict.fromkeys(said)))
+
+
+def read_motion(folder: Path) -> Iterator[Arrays]:
+    """Read demonstrations, one at a time. Raises ArtefactError: damaged, not whole, or not of our columns."""
+    with reading(folder, f"a LeRobot dataset of demonstrations, version {_VERSION}"):
+        tasks = pq.read_table(folder / "meta/tasks.parquet")
+        said = np.array(tasks[_INDEX].to_pylist())[np.argsort(tasks["task_index"].to_numpy())]
+        for file in sorted(folder.glob("data/*/*.parquet")):
+            table = pq.read_table(file)
+            lengths = np.unique(table[_EPISODE].to_numpy(), return_counts=True)[1]
+            for begin, length in zip(np.cumsum(lengths) - lengths, lengths, strict=True):
+                yield _motion_arrays(table.slice(begin, length), said)
+
+
+def _motion_arrays(rows: pa.Table, said: Array) -> Arrays:
+    found: Arrays = {"instruction": np.array(said[rows["task_index"].to_numpy()].tolist())}
+    for theirs, ours in _MOTION_NAMES.items():
+        found[ours] = np.array(rows[theirs].to_pylist(), dtype=_MOTION_TYPES[theirs])
+    for name in CAMERAS:
+        images = _images(rows[_CAMERA + name].to_pylist())
+        found[name] = np.stack([np.asarray(image) for image in images])
+    return found
 
 
 def _columns(episodes: Episodes, firsts: Ints) -> Arrays:
@@ -98,10 +208,10 @@ def _columns(episodes: Episodes, firsts: Ints) -> Arrays:
     return {name: array.astype(dtype) for (name, dtype), array in zip(_TYPES.items(), columns, strict=True)}
 
 
-def _table(columns: Mapping[str, Array], frames: Frame) -> pa.Table:
-    """Columns and images, as the ``datasets`` library describes them."""
-    arrays: list[pa.Array] = [_pngs(frames)]
-    features: dict[str, dict[str, Json]] = {_IMAGE: {"_type": "Image"}}
+def _table(columns: Mapping[str, Array], images: Mapping[str, Frame]) -> pa.Table:
+    """Columns and images, with their types for the ``datasets`` library."""
+    arrays: list[pa.Array] = [_pngs(frames) for frames in images.values()]
+    features: dict[str, dict[str, Json]] = {name: {"_type": "Image"} for name in images}
     for name, column in columns.items():
         features[name] = {"dtype": str(column.dtype), "_type": "Value"}
         arrays.append(pa.array(column.ravel()))
@@ -127,51 +237,60 @@ def _file(folder: Path, chunk_index: int, file_index: int) -> Path:
     return path
 
 
-def _statistics(columns: Mapping[str, Array], frames: Frame) -> dict[str, dict[str, Json]]:
-    """Of every column, and of each color in [0, 1], whose arrays have the shape (3, 1, 1)."""
+def _levels(frames: Frame) -> Ints:
+    """How often each color has each of its 256 levels. Shape (3, 256)."""
+    return np.stack([np.bincount(frames[..., color].ravel(), minlength=256) for color in range(3)])
+
+
+def _statistics(columns: Mapping[str, Array], images: Mapping[str, Ints]) -> dict[str, dict[str, Json]]:
+    """Of every column but the mask; and, from their :func:`_levels`, of images, each color in [0, 1] as (3, 1, 1)."""
     levels = np.arange(256) / 255
-    counts = [np.bincount(frames[..., color].ravel(), minlength=256) for color in range(3)]
-    means = [np.average(levels, weights=count) for count in counts]
-    spreads = [
-        np.average((levels - mean) ** 2, weights=count) ** 0.5 for mean, count in zip(means, counts, strict=True)
-    ]
-    seen = [levels[count > 0] for count in counts]
-    colors = {"min": [s[0] for s in seen], "max": [s[-1] for s in seen], "mean": means, "std": spreads}
-    found: dict[str, dict[str, Json]] = {
-        _IMAGE: {which: [[[float(value)]] for value in values] for which, values in colors.items()}
-    }
+    found: dict[str, dict[str, Json]] = {}
+    for name, counts in images.items():
+        means = [np.average(levels, weights=count) for count in counts]
+        spreads = [
+            np.average((levels - mean) ** 2, weights=count) ** 0.5 for mean, count in zip(means, counts, strict=True)
+        ]
+        seen = [levels[count > 0] for count in counts]
+        colors = {"min": [s[0] for s in seen], "max": [s[-1] for s in seen], "mean": means, "std": spreads}
+        found[name] = {which: [[[float(value)]] for value in values] for which, values in colors.items()}
     for name, column in columns.items():
-        found[name] = {which: [float(getattr(column, which)())] for which in colors}
-    return {name: {**of, "count": [len(frames)]} for name, of in found.items()}
+        if name != _MASK:
+            whichs = ("min", "max", "mean", "std")
+            found[name] = {which: np.ravel(getattr(column, which)(axis=0)).astype(float).tolist() for which in whichs}
+    rows = len(columns[_EPISODE])
+    return {name: {**of, "count": [rows]} for name, of in found.items()}
 
 
 def _tasks(text: list[str]) -> pa.Table:
-    """The metadata that pandas writes for a table whose index is the description and whose one column is
-    ``task_index``.
-    """
-    index = "__index_level_0__"
+    """The table of pandas whose index is the descriptions and whose one column is ``task_index``."""
+    index = _INDEX
     column = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
     columns = [
         {**column, "name": "task_index", "field_name": "task_index"},
         {**column, "name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object"},
     ]
     told = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
-    table = pa.table({"task_index": pa.array([0], pa.int64()), index: text})
+    table = pa.table({"task_index": pa.array(range(len(text)), pa.int64()), index: text})
     return table.replace_schema_metadata({"pandas": json.dumps(told)})
 
 
-def _info(episodes: Episodes) -> dict[str, Json]:
+def _features(episodes: Episodes) -> dict[str, Json]:
     features: dict[str, Json] = {}
     for name, dtype in _TYPES.items():
         names = ["macro_action"] if name == "action" else None
         features[name] = {"dtype": dtype, "shape": [1], "names": names}
     features[_MASK] = {"dtype": "bool", "shape": [episodes.n_actions], "names": None}
     features[_IMAGE] = {"dtype": "image", "shape": list(FRAME_SHAPE), "names": ["height", "width", "channels"]}
+    return features
+
+
+def _info(features: Mapping[str, Json], counts: Mapping[str, int], fps: float) -> dict[str, Json]:
     return {
-        "codebase_version": _VERSION, "robot_type": None, "total_episodes": len(episodes),
-        "total_frames": len(episodes.actions), "total_tasks": 1, "chunks_size": _FILES, "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200, "fps": 1, "splits": {"train": f"0:{len(episodes)}"},
-        "data_path": f"data/{_PATH}", "video_path": None, "features": features,
+        "codebase_version": _VERSION, "robot_type": None, **counts, "chunks_size": _FILES,
+        "data_files_size_in_mb": 100, "video_files_size_in_mb": 200, "fps": fps,
+        "splits": {"train": f"0:{counts['total_episodes']}"}, "data_path": f"data/{_PATH}", "video_path": None,
+        "features": features,
     }  # fmt: skip
 
 
@@ -281,8 +400,12 @@ def _ends(folder: Path, digests: list[str]) -> pa.Table:
 
 def _decoded(table: pa.Table) -> tuple[Frame, Bools]:
     """The images of a table, and its masks."""
-    images = [PIL.Image.open(io.BytesIO(image["bytes"]), formats=["PNG"]) for image in table[_IMAGE].to_pylist()]
+    images = _images(table[_IMAGE].to_pylist())
     for image in images:
         if (image.mode, image.size) != ("RGB", FRAME_SHAPE[:2]):
             raise InvalidValueError(f"an image is {image.mode} of {image.size} pixels")
     return np.stack([np.asarray(image) for image in images]), np.array(table[_MASK].to_pylist(), dtype=np.bool_)
+
+
+def _images(column: Iterable[Mapping[str, bytes]]) -> list[PIL.Image.Image]:
+    return [PIL.Image.open(io.BytesIO(image["bytes"]), formats=["PNG"]) for image in column]

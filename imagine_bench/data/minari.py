@@ -6,10 +6,11 @@ environment of ours, are read too.
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -21,24 +22,65 @@ import numpy as np
 from minari.data_collector import EpisodeBuffer
 
 from imagine_bench import registry
+from imagine_bench.arrays import Arrays
+from imagine_bench.data.motion import OBSERVATIONS
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.store.files import reading
 
+_NAMED = {
+    "rewards": "rewards",
+    "terminations": "terminated",
+    "truncations": "truncated",
+    "actions": "actions",
+}
+"""Arrays of an episode in Minari's words, and in ours."""
+_INFOS = {"macro_action": -1, "instruction": "", "success": False}
+"""Parts of a demonstration that are infos, and each after the last command."""
+
 
 def write(folder: Path, episodes: Episodes, card: Mapping[str, Any]) -> None:
     """Write the dataset ``<task>-<policy>-v0``; the card says which environment it is of."""
-    name = re.sub(r"[^\w-]+", "_", f"{card['task']}-{card['policy']}")
     env_id = registry.task_entry(card["task"]).env_id
     made = {name: card[name] for name in ("execution", "appearance")}
+    _create(folder, [_buffer(episodes, index) for index in range(len(episodes))], card, env_id, made)
+
+
+def _create(
+    folder: Path, buffers: Iterable[EpisodeBuffer], card: Mapping[str, Any], env_id: str, made: dict[str, Any]
+) -> None:
+    name = re.sub(r"[^\w-]+", "_", f"{card['task']}-{card['policy']}")
     written_below = mock.patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder.resolve()))
     with written_below, warnings.catch_warnings(), closing(gymnasium.make(env_id, **made)) as env:
         warnings.simplefilter("ignore")  # about facts that we do not know, such as an address for questions
         minari.create_dataset_from_buffers(
-            f"{name}-v0", [_buffer(episodes, index) for index in range(len(episodes))], env=env,
-            algorithm_name=str(card["policy"]), description=str(card["description"]), data_format="parquet",
-            jpeg_encoding=False,
+            f"{name}-v0", buffers, env=env, algorithm_name=str(card["policy"]), description=str(card["description"]),
+            data_format="parquet", jpeg_encoding=False,
         )  # fmt: skip
+
+
+def write_motion(folder: Path, episodes: Iterator[Arrays], card: Mapping[str, Any]) -> None:
+    """Write demonstrations, one after another, likewise."""
+    made = {name: card[name] for name in ("appearance", "size")}
+    _create(folder, map(_motion_buffer, itertools.count(), episodes), card, card["env_id"], made)
+
+
+def _motion_buffer(index: int, episode: Arrays) -> EpisodeBuffer:
+    infos = {name: [*episode[name].tolist(), after] for name, after in _INFOS.items()}
+    seen = {name: episode[name] for name in OBSERVATIONS}
+    steps = {theirs: episode[ours] for theirs, ours in _NAMED.items()}
+    return EpisodeBuffer(id=index, observations=seen, infos=infos, **steps)
+
+
+def read_motion(folder: Path) -> Iterator[Arrays]:
+    """Read demonstrations, one at a time. Raises ArtefactError: one is damaged."""
+    with reading(folder, "a Minari dataset of demonstrations"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        (path,) = folder.glob("*/data/metadata.json")
+        for episode in minari.MinariDataset(path.parent).iterate_episodes():
+            steps = {ours: getattr(episode, theirs) for theirs, ours in _NAMED.items()}
+            infos = {name: np.asarray(episode.infos[name][:-1]) for name in _INFOS}
+            yield {**episode.observations, **steps, **infos}
 
 
 def _buffer(episodes: Episodes, index: int) -> EpisodeBuffer:

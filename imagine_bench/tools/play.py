@@ -9,7 +9,7 @@ import io
 import string
 import textwrap
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any, SupportsFloat
@@ -234,15 +234,21 @@ def play(
     if appearance is not None:
         chosen["appearance"] = appearance_name(appearance)
     require_integer("seed", seed, 0)
-    registry.load("imagine_bench.tasks.rendering.window:open_display")(seen=True)
-    with warnings.catch_warnings(), mock.patch("matplotlib.use"):  # it would let matplotlib open windows, too
-        warnings.simplefilter("ignore")
-        from gymnasium.utils.play import play as keyboard  # noqa: PLC0415 - an extra
+    keyboard = keyboard_player()
     env = gymnasium.make(spec.env_id, disable_env_checker=True, **chosen)
     keys: dict[str, Action] = dict(zip(KEYS, range(spec.n_actions), strict=False))
     with closing(KeyboardGame(env, spec, imaginer, seed)) as game:
         keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)
     return game.summary()
+
+
+def keyboard_player() -> Callable[..., None]:
+    """Gymnasium's loop of keys and windows. Raises SetupError: neither pygame nor desktop."""
+    registry.load("imagine_bench.tasks.rendering.window:open_display")(seen=True)
+    with warnings.catch_warnings(), mock.patch("matplotlib.use"):  # it would let matplotlib open windows, too
+        warnings.simplefilter("ignore")
+        from gymnasium.utils.play import play as keyboard  # noqa: PLC0415 - an extra
+    return keyboard
 
 
 def _view(camera: str) -> dict[str, Any]:

@@ -166,6 +166,7 @@ class MotionEnv(SceneEnv):
             cameras=(HUMAN_CAMERA, FAR_CAMERA),
         )
         self._make_world = make_world
+        self.draws_quickly = self.render_mode == "human"
         self._instruct = instruct
         self.reward = require_known("reward", reward, REWARDS)
         self._potential = Potential(self.world, spec.rules) if reward == "dense" else None
@@ -265,6 +266,15 @@ class MotionEnv(SceneEnv):
     def instruction(self) -> str:
         """The goal in words, as the pointing hand says it now."""
         return self._instruct(self.episode.macrostate)
+
+    def hand_target_m(self) -> Floats:
+        """Where the servos are told to bring the point between the fingers, in the world. Shape (3,)."""
+        return self.controls.hand_pose(self.data.ctrl[self._columns.ctrl[: len(ARM_JOINTS)]])[0]
+
+    def servo_forces(self) -> Floats:
+        """What the servos exert now: torques of the seven joints (N m), forces of both fingers (N). Shape (9,)."""
+        forces: Floats = self.data.actuator_force[self._columns.ctrl].copy()
+        return forces
 
     def get_state(self) -> MotionState:
         """All that decides how the episode goes on, copied; of a wrapper it knows nothing."""

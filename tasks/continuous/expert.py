@@ -50,8 +50,11 @@ class Expert:
         self.macro_action = -1  #: the macro-action under way
         self.refused: str | None = None  #: why the planner knows no motion for it, or None
 
-    def begin(self, macro_action: int) -> None:
-        """Plan a macro-action from where the scene stands."""
+    def begin(self, macro_action: int, *, fails: bool = False) -> None:
+        """Plan a macro-action from where the scene stands.
+
+        One that ``fails`` changes nothing: the fingers let go of a cube before they turn it, or reach out in vain.
+        """
         env = self._env
         self.macro_action = macro_action
         planner = self._planner
@@ -65,7 +68,7 @@ class Expert:
         planner.rest()
         planner.update()
         before = env.episode.macrostate
-        intended = env.task.rules.outcomes(before, macro_action)[0].macrostate
+        intended = before if fails else env.task.rules.outcomes(before, macro_action)[0].macrostate
         executor = planner.executor
         executor.trajectory = None
         result = planner.execute(macro_action, intended)

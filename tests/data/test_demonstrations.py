@@ -1,0 +1,208 @@
+"""Demonstrations of continuous control: what happened, in each format the same, and only that replays."""
+
+from __future__ import annotations
+
+import functools
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from imagine_bench import registry
+from imagine_bench.arrays import Arrays, content_hash
+from imagine_bench.cli import exit_code as main
+from imagine_bench.data.folder import FORMATS, new_folder, read_card, read_dataset, write_card
+from imagine_bench.data.motion import CAMERAS, Demonstrations, Digest, read_demonstrations
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.tools import demonstrations
+from imagine_bench.tools.demonstrations import DemonstrationSettings, demonstration, verify
+
+ENV_ID = "imagine_bench/ArrowPuzzleEasyMotion-v0"  # one cube, at most two macro-actions
+
+
+@functools.cache
+def episode(policy: str = "expert", index: int = 0, env_id: str = ENV_ID) -> Arrays:
+    return demonstration(
+        DemonstrationSettings(env_id=env_id, policy=policy, seed=0, appearance="clean", size=32), index
+    )
+
+
+def written(folder: Path, format: str = "npz", **changes: np.ndarray[Any, Any]) -> Demonstrations:
+    """One episode as a folder whose card agrees with it, whatever was changed in it."""
+    told = {**episode(), **changes}
+    shown = {name: array for name, array in told.items() if name not in ("seed", "macrostates")}
+    digest = Digest()
+    digest.add(shown)
+    card = {
+        "task": "ArrowPuzzleEasyMotion", "env_id": ENV_ID, "policy": "expert", "control": "twist", "rate_hz": 25.0,
+        "appearance": "clean", "size": 32, "control_names": list("xyzabcg"), "description": "", "format": format,
+        "content": str(digest),
+    }  # fmt: skip
+    with new_folder(folder, format) as partial:
+        (partial / "episodes").mkdir()
+        registry.load(FORMATS[format]).write_motion(partial, iter([shown]), card)
+        hidden = {"seeds": told["seed"][None], "macrostates": told["macrostates"]}
+        whole = write_card(partial, card, {"privileged": hidden})
+    return Demonstrations(folder=folder, card=whole)
+
+
+def test_the_expert_solves_its_episodes_and_says_which_macro_action_is_under_way() -> None:
+    told = episode()
+    n_steps = len(told["rewards"])
+    assert told["success"][-1] and told["terminated"][-1] and not told["success"][:-1].any()
+    assert told["actions"].dtype == np.float32 and told["actions"].shape == (n_steps, 7)
+    assert told["hand"].shape == told["front"].shape == (n_steps + 1, 32, 32, 3)
+    changes = np.flatnonzero((np.diff(told["macrostates"], axis=0) != 0).any(axis=1))
+    rules = registry.task("arrow_puzzle_easy").rules
+    for row in changes:
+        before = tuple(told["macrostates"][row].tolist())
+        after = rules.outcomes(before, int(told["macro_action"][row]))[0].macrostate
+        assert after == tuple(told["macrostates"][row + 1].tolist())
+    assert told["instruction"][0].startswith("Turn the")
+
+
+def test_a_noisy_expert_fails_plans_again_and_still_succeeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first try of each macro-action lets go too early: it takes twice as long, and no event is a fault."""
+    module = registry.load("imagine_bench.tasks.continuous.demonstrator")
+    begun = []
+    begin = module.Expert.begin
+
+    def noted(self: Any, macro_action: int, *, fails: bool = False) -> None:
+        begun.append(fails := len(begun) % 2 == 0)
+        begin(self, macro_action, fails=fails)
+
+    monkeypatch.setattr(module.Expert, "begin", noted)
+    told = episode("noisy", 1)
+    assert told["success"][-1] and begun == [True, False] * (len(begun) // 2)
+    assert not np.array_equal(told["actions"], episode("expert", 1)["actions"][: len(told["actions"])])
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_each_format_gives_the_episode_back(tmp_path: Path, format: str) -> None:
+    kept = written(tmp_path / "set", format)
+    (found,) = read_demonstrations(tmp_path / "set")
+    n_steps = len(found["rewards"])
+    held = {name: array[:n_steps] for name, array in episode().items() if name in found}
+    assert content_hash({name: array[:n_steps] for name, array in found.items()}) == content_hash(held)
+    assert set(episode()) - set(found) == {"seed", "macrostates"}, "no learner is given them"
+    assert verify(kept).startswith("1 of 1 episodes replay")
+    with pytest.raises(InvalidValueError, match="has hand commands, no macro-actions"):
+        read_dataset(tmp_path / "set")
+
+
+def test_lerobot_is_told_of_both_cameras_the_state_and_the_task_of_each_row(tmp_path: Path) -> None:
+    said = episode()["instruction"].copy()
+    said[40:] = "Stop."
+    written(tmp_path / "set", "lerobot", instruction=said.astype("<U40"))
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    table = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
+    assert set(table.schema.names) == set(info["features"])
+    assert info["fps"] == 25 and info["total_tasks"] == 2
+    assert {name: info["features"][f"observation.images.{name}"]["shape"] for name in CAMERAS} == {
+        name: [32, 32, 3] for name in CAMERAS
+    }
+    assert info["features"]["action"]["shape"] == [7] and info["features"]["observation.state"]["shape"] == [16]
+    assert table["task_index"].to_pylist() == [0] * 40 + [1] * (len(table) - 40)
+    np.testing.assert_allclose(table["timestamp"].to_numpy(), np.arange(len(table)) / 25, atol=1e-5)
+    (row,) = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert row["tasks"] == [said[0], "Stop."]
+    stats = json.loads((tmp_path / "set/meta/stats.json").read_text())
+    np.testing.assert_allclose(stats["action"]["mean"], episode()["actions"].mean(axis=0), rtol=1e-5)
+    hand = episode()["hand"][:-1].reshape(-1, 3) / 255
+    np.testing.assert_allclose(np.ravel(stats["observation.images.hand"]["mean"]), hand.mean(axis=0), rtol=1e-9)
+
+
+def changed(name: str, change: Callable[[np.ndarray[Any, Any]], None]) -> dict[str, np.ndarray[Any, Any]]:
+    array = episode()[name].copy()
+    change(array)
+    return {name: array}
+
+
+FORGERIES: dict[str, Callable[[], dict[str, np.ndarray[Any, Any]]]] = {
+    "a command": lambda: changed("actions", lambda array: array[20].__setitem__(0, 0.9)),
+    "a reward": lambda: changed("rewards", lambda array: array.__setitem__(3, 1.0)),
+    "a macrostate": lambda: changed("macrostates", lambda array: array[5].__setitem__(0, (array[5, 0] + 1) % 4)),
+    "an instruction": lambda: changed("instruction", lambda array: array.__setitem__(7, "Stop.")),
+    "the arm's sense": lambda: changed("proprio", lambda array: array[9].__setitem__(2, array[9, 2] + 0.01)),
+    "another start": lambda: {"seed": episode()["seed"] + 1},
+    "the end is missing": lambda: {name: array[: len(array) - 30] for name, array in episode().items() if array.ndim},
+}
+
+
+@pytest.mark.parametrize("forgery", FORGERIES)
+def test_what_does_not_follow_from_the_commands_is_found(tmp_path: Path, forgery: str) -> None:
+    """The forger wrote a card that agrees."""
+    kept = written(tmp_path / "set", **FORGERIES[forgery]())
+    with pytest.raises(ArtefactError, match="episode 0: "):
+        verify(kept)
+
+
+def test_an_image_that_was_changed_is_not_that_of_the_card(tmp_path: Path) -> None:
+    written(tmp_path / "honest")
+    images = changed("hand", lambda array: array.__setitem__((3, 0, 0), 7))
+    written(tmp_path / "other", **images)
+    shutil.copy(tmp_path / "other/episodes/000000.npz", tmp_path / "honest/episodes/000000.npz")
+    with pytest.raises(ArtefactError, match="its episodes are not those of its card"):
+        verify(read_demonstrations(tmp_path / "honest"))
+
+
+def test_the_command_says_whether_a_folder_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    written(tmp_path / "honest")
+    written(tmp_path / "forged", **FORGERIES["a reward"]())
+    assert main(["verify", str(tmp_path / "honest")]) == 0
+    said = capsys.readouterr().out
+    assert said == "1 of 1 episodes replay from seed and commands: equal rewards, macrostates and instructions.\n"
+    assert main(["verify", str(tmp_path / "forged")]) == 1
+    assert "rewards 3 is 0.0, and 1.0 was kept" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--policy", "oracle"], "No policy 'oracle'. Known: expert, noisy, random, mixed."),
+        (["--motion-hz", "5"], "--motion-hz goes with a task of macro-actions"),
+        (["--episodes", "0"], "episodes is 0"),
+        (["--size", "8"], "must be an integer from 32 to 256 pixels"),
+    ],
+)
+def test_a_wrong_command_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
+) -> None:
+    command = ["dataset", "ArrowPuzzleMotion", "--policy", "expert", "--out", str(tmp_path / "set"), *words]
+    assert main(command) == 2
+    said = capsys.readouterr().err
+    assert sentence in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["ArrowPuzzleMotion", "imagine_bench/ArrowPuzzleMotion-v0"])
+def test_names_of_continuous_control_are_those_of_its_environments(name: str) -> None:
+    assert registry.task_of_motion(name) == "arrow_puzzle"
+    assert registry.task_of_motion(f"{name}:cubes=2") == "arrow_puzzle:cubes=2"
+    assert registry.task_of_motion("arrow_puzzle") is None
+
+
+@pytest.mark.slow
+def test_fifty_episodes_replay_and_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+    words = ["dataset", "ArrowPuzzleMotion", "--policy", "mixed", "--size", "32", "--episodes"]
+    assert main([*words, "50", "--format", "lerobot", "--out", str(tmp_path / "two"), "--workers", "2"]) == 0
+    assert main([*words, "4", "--out", str(tmp_path / "one"), "--workers", "1"]) == 0
+    assert main(["verify", str(tmp_path / "two")]) == main(["verify", str(tmp_path / "one")]) == 0
+    first = [dict(each) for each, _ in zip(read_demonstrations(tmp_path / "two"), range(4), strict=False)]
+    for wide, narrow in zip(first, read_demonstrations(tmp_path / "one"), strict=True):
+        np.testing.assert_array_equal(wide["actions"], narrow["actions"])
+        np.testing.assert_array_equal(wide["front"], narrow["front"][:-1])
+    assert (read_card(tmp_path / "two") or {})["episodes"] == 50
+
+
+def test_a_collection_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(function: object, items: list[Any], *, on_end: Callable[[Any, str], None], **_: object) -> None:
+        on_end(items[0], "the power went out.")
+
+    monkeypatch.setattr(demonstrations, "work_through", fails)
+    assert main(["dataset", "ArrowPuzzleMotion", "--policy", "expert", "--out", str(tmp_path / "set")]) == 1
+    assert not list(tmp_path.iterdir())
