@@ -74,11 +74,6 @@ def known_task(name: str) -> TaskSpec:
         )
 
 
-def agent_title(agent: str) -> str:
-    """The agent's name, as it is typed."""
-    return agent
-
-
 @dataclass(frozen=True)
 class ReportData:
     """The numbers of a bench."""

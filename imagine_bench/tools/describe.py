@@ -20,7 +20,7 @@ from imagine_bench.running.bench import task_types
 from imagine_bench.running.launchers.jobs import LAUNCHERS
 from imagine_bench.store.encoders import bundled
 from imagine_bench.sweep.grid import Study, all_grids
-from imagine_bench.tools.settings import OF_AGENTS, Cases, settings_in_words
+from imagine_bench.tools.settings import OF_AGENTS, settings_in_words
 
 _EXECUTIONS = (
     "The arm moves in contact physics: the default.",
@@ -58,41 +58,34 @@ def describe(name: str) -> str:
     """
     is_task = registry.has_task(name) or name in registry.regressions()
     pages = [describe_task(name)] if is_task else []
-    learners = (
-        (registry.agents(), OF_AGENTS),
-        (registry.regressors(), {"": ("fast", name), "preset thesis": ("published", name)}),
-        (registry.world_models(), OF_AGENTS),
-    )
-    for known, cases in learners:
+    learners: dict[str, AgentEntry | RegressorEntry | WorldModelEntry] = {}
+    for known in (registry.world_models(), registry.regressors(), registry.agents()):
         if name in known:
-            pages.append(_learner(name, known[name], cases))
+            pages.append(_learner(name, known[name]))
+        learners |= known
     if not pages:
-        for guest in registry.absent_guests():
-            if name in guest.names.get(registry.AGENT_GROUP, ()):
-                registry.agent_entry(name)
-        known_names = [*registry.tasks(), *registry.regressions(), *(each for known, _ in learners for each in known)]
-        raise UnknownNameError("task, agent or world model", name, dict.fromkeys(known_names))
+        if any(name in guest.names.get(registry.AGENT_GROUP, ()) for guest in registry.absent_guests()):
+            registry.agent_entry(name)
+        raise UnknownNameError(
+            "task, agent or world model", name, [*registry.tasks(), *registry.regressions(), *learners]
+        )
     return "\n\n".join(pages)
 
 
-def _learner(name: str, entry: AgentEntry | RegressorEntry | WorldModelEntry, cases: Cases) -> str:
-    """An agent, a regressor or a world model: its name in commands, its observation, and its settings."""
-    rows: dict[str, str] = {}
-    target = _REGRESSOR_SETTINGS if isinstance(entry, RegressorEntry) else entry.settings
-    command = f"judge TASK --models {name}" if isinstance(entry, WorldModelEntry) else f"bench TASK --agents {name}"
-    rows["command"] = f"imagine-bench {command}"
-    if isinstance(entry, AgentEntry):
-        seen = f"the {entry.encoder_kind} that the task's encoder gives of a frame" if entry.needs_encoder else "frames"
-        rows["observes"] = ", ".join(entry.observes) or seen
-        rows["learns"] = "yes" if entry.learns else "no"
-    if not isinstance(entry, RegressorEntry) and entry.privileged:
-        rows["privileged"] = "yes: it is shown the true state, or the rules"
-    page = _page(entry.title or name, entry.description, rows)
+def _learner(name: str, entry: AgentEntry | RegressorEntry | WorldModelEntry) -> str:
+    """An agent, a regressor or a world model: its description, its name in commands, and its settings."""
+    command = "judge TASK --models" if isinstance(entry, WorldModelEntry) else "bench TASK --agents"
+    page = _page(entry.title or name, entry.description, {"command": f"imagine-bench {command} {name}"})
+    cases = OF_AGENTS
+    if isinstance(entry, RegressorEntry):
+        target = _REGRESSOR_SETTINGS
+        cases = {"": ("fast", name), "preset thesis": ("published", name)}
+    else:
+        target = entry.settings
     if not target:
         return f"{page}\n\nIt has no settings."
-    option = "" if isinstance(entry, WorldModelEntry) else "with --set NAME=VALUE, or "
     colon = "," if ":" in name else ":"
-    head = f"Settings of the preset quick, in brackets of others; changed {option}as {name}{colon}NAME=VALUE"
+    head = f"Settings of the preset quick, in brackets of others; changed in a command as {name}{colon}NAME=VALUE"
     return f"{page}\n\n{head}\n{settings_in_words(target, cases)}"
 
 
