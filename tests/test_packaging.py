@@ -55,7 +55,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 def test_the_wheel_holds_only_imagine_bench(wheel: list[str]) -> None:
     tops = {name.split("/")[0] for name in wheel}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"imagine_bench"}
-    of_guests = [f"imagine_bench/agents/guests/{guest}/pyproject.toml" for guest in ("controls", "peers")]
+    of_guests = [f"imagine_bench/agents/guests/{guest}/pyproject.toml" for guest in ("controls", "motion", "peers")]
     assert sorted(name for name in wheel if "guest" in name) == of_guests
 
 

@@ -1,0 +1,175 @@
+"""Commands: ``python -m imagine_bench_motion demonstrate | clone | try | flat | level``, each with ``--help``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from .cloning import Clone, Training, train
+from .demonstrations import Demonstrations, collect
+from .skills import FAMILIES
+from .trials import summary, tries
+
+APPEARANCES = ["clean", "mild"]
+
+
+def main() -> None:
+    """Run the command that was given."""
+    parser = argparse.ArgumentParser(prog="python -m imagine_bench_motion", description=__doc__)
+    commands = parser.add_subparsers(required=True)
+    _add_demonstrate(commands.add_parser("demonstrate", help="let the expert demonstrate single macro-actions"))
+    _add_clone(commands.add_parser("clone", help="train a policy on demonstrations"))
+    _add_try(commands.add_parser("try", help="count how often a policy carries out single macro-actions"))
+    _add_flat(commands.add_parser("flat", help="train SAC of Stable-Baselines3 on one cube, without macro-actions"))
+    _add_level(commands.add_parser("level", help="train an agent of macro-actions that planner or clone carry out"))
+    given = parser.parse_args()
+    given.run(given)
+
+
+def _add_demonstrate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, help="the .npz file to write")
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=1000)
+    parser.add_argument("--observation", default="hand,front,proprio", help="parts, as the environment takes them")
+    parser.add_argument("--appearances", nargs="+", default=APPEARANCES)
+    parser.add_argument("--family", choices=list(FAMILIES), default="arrows")
+    parser.set_defaults(run=_demonstrate)
+
+
+def _demonstrate(given: argparse.Namespace) -> None:
+    began_s = time.process_time()
+    data = collect(
+        given.count,
+        seed=given.seed,
+        observation=given.observation,
+        appearances=given.appearances,
+        family=given.family,
+    )
+    data.save(given.file)
+    cpu_s = time.process_time() - began_s
+    print(f"{data.count} demonstrations, {len(data.episode)} control periods, {cpu_s:.0f} CPU s: {given.file}")
+
+
+def _add_clone(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("demonstrations", type=Path, help="a file of 'demonstrate'")
+    parser.add_argument("file", type=Path, help="the file of the policy to write")
+    parser.add_argument("--observation", default="hand,front,proprio", help="the parts that the demonstrations show")
+    parser.add_argument("--first", type=int, help="take only so many demonstrations")
+    parser.add_argument("--updates", type=int, default=Training.updates, help="gradient steps")
+    parser.add_argument("--chunk", type=int, default=16, help="commands that are predicted at once")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.set_defaults(run=_clone)
+
+
+def _clone(given: argparse.Namespace) -> None:
+    data = Demonstrations.load(given.demonstrations)
+    if given.first is not None:
+        data = data.first(given.first)
+    clone = train(
+        data,
+        seed=given.seed,
+        observation=given.observation,
+        settings=Training(updates=given.updates),
+        layout={"chunk": given.chunk},
+        told=lambda update, loss: print(f"{update} updates, loss {loss:.4f}", flush=True),
+    )
+    clone.save(given.file)
+    print(f"{clone.parameters} parameters, {clone.about['cpu_s']:.0f} CPU s: {given.file}")
+
+
+def _add_try(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, help="a file of 'clone'")
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=77)
+    parser.add_argument("--appearances", nargs="+", default=APPEARANCES)
+    parser.add_argument("--family", choices=list(FAMILIES), default="arrows")
+    parser.add_argument("--out", type=Path, help="a .json file for every try")
+    parser.set_defaults(run=_try)
+
+
+def _try(given: argparse.Namespace) -> None:
+    clone = Clone.load(given.file)
+    began_s = time.process_time()
+    found = tries(clone, given.count, seed=given.seed, appearances=given.appearances, family=given.family)
+    cpu_s = time.process_time() - began_s
+    kept = summary(found)
+    print(f"{kept['done']} of {kept['count']} done, {cpu_s:.0f} CPU s")
+    for name in ("by_appearance", "by_macro_action"):
+        print(*(f"  {key}: {done} of {count}" for key, (done, count) in kept[name].items()), sep="\n")
+    print(*(f"  failed: {each}" for each in kept["failed"]), sep="\n")
+    if given.out is not None:
+        given.out.write_text(json.dumps({"about": clone.about, "seed": given.seed, **kept}, indent=1) + "\n")
+
+
+def _add_flat(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("out", type=Path, help="the .json file of the curve")
+    parser.add_argument("--steps", type=int, default=50_000)
+    parser.add_argument("--reward", choices=["sparse", "dense"], default="sparse")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.set_defaults(run=_flat)
+
+
+def _flat(given: argparse.Namespace) -> None:
+    from .flat import Point, learn  # noqa: PLC0415 - needs the library
+
+    def told(point: Point) -> None:
+        print(point, flush=True)
+        curve.append(asdict(point))
+        kept = {"seed": given.seed, "reward": given.reward, "curve": curve}
+        given.out.write_text(json.dumps(kept, indent=1) + "\n")
+
+    curve: list[dict[str, float]] = []
+    learn(given.steps, seed=given.seed, told=told, reward=given.reward)
+
+
+def _add_level(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("out", type=Path, help="the .json file of the curve")
+    parser.add_argument("--agent", required=True, help="of macro-actions, by its registered name; or oracle")
+    parser.add_argument("--execution", choices=["planner", "clone"], required=True)
+    parser.add_argument("--clone", type=Path, help="another file of a clone than the bundled one")
+    parser.add_argument("--cubes", type=int, default=3)
+    parser.add_argument("--slip", type=float, default=0.0, help="probability that a grip slips, which no rule declares")
+    parser.add_argument("--budgets", type=int, nargs="+", default=[50, 100, 200])
+    parser.add_argument("--tests", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.set_defaults(run=_level)
+
+
+def _level(given: argparse.Namespace) -> None:
+    from .levels import Level, environment, learn, make_agent, oracle_success  # noqa: PLC0415 - needs MuJoCo
+
+    def told(point: Level) -> None:
+        print(point, flush=True)
+        kept["curve"].append(asdict(point))
+        given.out.write_text(json.dumps(kept, indent=1) + "\n")
+
+    world = {"cubes": given.cubes, "slip": given.slip, "clone": given.clone}
+    env, test_env = (environment(given.execution, **world) for _ in range(2))
+    asked = {name: value for name, value in vars(given).items() if name not in ("run", "out", "clone")}
+    kept: dict[str, Any] = {**asked, "curve": []}
+    rules, horizon = env.rules, env.horizon
+    if given.agent == "oracle":
+        successes, mean_s = oracle_success(test_env.env, rules, tests=given.tests, horizon=horizon)
+        kept |= {"successes": successes, "macro_action_s": round(mean_s, 3)}
+        given.out.write_text(json.dumps(kept, indent=1) + "\n")
+        print(f"{successes} of {given.tests}, {mean_s:.2f} s a macro-action")
+        return
+    agent = make_agent(given.agent, env.spec, given.seed)
+    learn(
+        env.env,
+        test_env.env,
+        agent,
+        budgets=given.budgets,
+        tests=given.tests,
+        horizon=horizon,
+        seed=given.seed,
+        told=told,
+    )
+
+
+if __name__ == "__main__":
+    main()

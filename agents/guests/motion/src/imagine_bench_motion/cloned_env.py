@@ -1,0 +1,176 @@
+"""Macro-actions that a cloned skill carries out, not the planner: options (Sutton et al. 1999) with learned policies.
+
+Agents of macro-actions, their rules and their frames stay as they are; only the execution is another one, and it fails
+now and then.
+"""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from imagine_bench.tasks.rendering.cameras import agent_camera_view
+
+from imagine_bench.errors import InvalidValueError, brief
+from imagine_bench.interfaces import Frame
+
+from .cloning import Clone
+from .instruction import GO_BACK
+from .skills import HOME_COMMAND, Command, skill_env
+from .trials import MOST_PERIODS
+
+Info = dict[str, Any]
+BUNDLED = Path(str(files(__package__) / "skills_3_cubes.pt"))
+"""The clone that comes with this package: three arrow cubes."""
+_BACK_PERIODS = 12
+"""Control periods in which the skill lifts the hand, before the arm goes home along its joints."""
+_HOME_PERIODS = 25
+"""The most control periods of the way home."""
+_AT_HOME_RAD = 2e-3
+"""An arm nearer to its observation pose, at each joint, is there."""
+
+
+class _Event(NamedTuple):
+    """A change of the macrostate under way."""
+
+    reward: float
+    terminated: bool
+    success: bool
+    macro_action: int  #: that it amounts to, or -1
+    fault: str
+
+
+class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
+    """The arrow puzzle by macro-actions, each carried out by a clone at 25 Hz.
+
+    Action Space: ``Discrete(6)``, the macro-actions of the arrow puzzle.
+
+    Observation Space: ``Box(0, 255, (64, 64, 3), uint8)``: the frame of the arrow puzzle, with the arm back at its
+    observation pose.
+
+    Rewards: those of the rules for the macrostate that was read back. A macro-action after which no arrow has turned
+    counts as a turn that slipped; a change that is no macro-action ends the episode with -5.
+
+    Starting State: one of the rules' start states, or ``reset(options={"macrostate": ...})``.
+
+    Episode End: where the rules say so, or at a fault; truncated by the registered time limit, or where the simulation
+    blew up.
+
+    Info: ``macrostate``, ``is_success``, ``legal``, ``fault``, ``fault_reason``, ``sim_time_s`` (of the latest
+    macro-action, the way back included), ``done`` (whether the latest macro-action was the one that was asked for).
+
+    Args:
+        execution: ``"physics"``; there is no other.
+        appearance: How much the scene varies.
+        clone: The skill, or a file of one; None is the one of this package.
+        **options: Options of :func:`imagine_bench.tasks.continuous.spec.make_arrows`, such as ``slip``.
+
+    Raises:
+        ArtefactError: No such file.
+        InvalidValueError: Another execution.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own declaration
+
+    def __init__(
+        self,
+        execution: str = "physics",
+        appearance: str = "clean",
+        clone: Clone | str | Path | None = None,
+        **options: Any,
+    ) -> None:
+        if execution != "physics":
+            raise InvalidValueError(f"A clone executes macro-actions in physics; execution={brief(execution)} is none.")
+        self.clone = clone if isinstance(clone, Clone) else Clone.load(Path(clone or BUNDLED))
+        self.motion = skill_env(self.clone.observation, appearance, time_limit_s=1e9, **options)
+        self.action_names = self.motion.task.action_names
+        self.action_space = gymnasium.spaces.Discrete(len(self.action_names))
+        view = agent_camera_view()
+        self.observation_space = gymnasium.spaces.Box(0, 255, (view.height, view.width, 3), np.uint8)
+        self._camera = self.motion.camera(view)
+        self._seen: Any = None
+        self._latest: Info = {}
+        self._periods = 0
+        self._events: list[_Event] = []
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Frame, Info]:
+        """Start an episode; see :meth:`imagine_bench.tasks.continuous.env.MotionEnv.reset`."""
+        super().reset(seed=seed)
+        self._seen, self._latest = self.motion.reset(seed=seed, options=options)
+        self._periods = 0
+        self._events = []
+        return self._frame(), self._info(self._latest)
+
+    def step(self, action: np.int64 | int) -> tuple[Frame, float, bool, bool, Info]:
+        """Let the clone carry out one macro-action, and bring the arm back."""
+        chosen = int(action)
+        if not self.action_space.contains(chosen):
+            raise InvalidValueError(
+                f"Action {brief(action)} does not exist; give an integer from 0 to {len(self.action_names) - 1}."
+            )
+        rules = self.motion.task.rules
+        before = self.motion.episode.macrostate
+        self._periods = 0
+        self._events = []
+        blew_up = self._carry_out(self.action_names[chosen])
+        if not self._events:  # the fingers turned nothing, as where a turn slips
+            outcome = rules.judge(before, chosen, before)
+            self._events = [_Event(outcome.reward, outcome.terminated, outcome.success, -1, "")]
+        first, last = self._events[0], self._events[-1]
+        info = {
+            **self._info({**self._latest, "is_success": np.bool_(last.success)}),
+            "legal": np.bool_(last.success or not last.terminated),
+            "fault": np.bool_(bool(last.fault)),
+            "fault_reason": last.fault,
+            "done": np.bool_(len(self._events) == 1 and first.macro_action == chosen),
+        }
+        return self._frame(), sum(each.reward for each in self._events), last.terminated, blew_up, info
+
+    def close(self) -> None:
+        """Free the environment of continuous control."""
+        self.motion.close()
+
+    # --- details -------------------------------------------------------------------------------------------------
+
+    def _carry_out(self, instruction: str) -> bool:
+        """Let the clone do what the words ask for, then go back and home. Returns whether the simulation blew up."""
+        self.clone.begin(instruction)
+        for _ in range(MOST_PERIODS):
+            if self._period(self.clone.act(self._seen)):
+                return True
+            if self._events:
+                break
+        self.clone.begin(GO_BACK)
+        for _ in range(_BACK_PERIODS):
+            if self._period(self.clone.act(self._seen)):
+                return True
+        for _ in range(_HOME_PERIODS):
+            if self._period(HOME_COMMAND):
+                return True
+            if np.abs(self._seen["proprio"][: len(HOME_COMMAND) - 1] - HOME_COMMAND[:-1]).max() < _AT_HOME_RAD:
+                break
+        return False
+
+    def _period(self, command: Command) -> bool:
+        """One control period; keeps its event unless the episode is over. Returns whether the simulation blew up."""
+        self._seen, reward, terminated, blew_up, info = self.motion.step(command)
+        self._periods += 1
+        self._latest = info
+        over = bool(self._events) and self._events[-1].terminated
+        if (info["event"] or blew_up) and not over:
+            event = _Event(
+                float(reward), terminated, bool(info["is_success"]), int(info["macro_action"]), info["fault_reason"]
+            )
+            self._events.append(event)
+        return blew_up
+
+    def _frame(self) -> Frame:
+        return self.motion.world.composite(self._camera.frame(self.motion.data))
+
+    def _info(self, info: Info) -> Info:
+        names = ("macrostate", "is_success", "legal", "fault", "fault_reason")
+        sim_time_s = np.float64(self._periods * self.motion.period_s)
+        return {**{name: info[name] for name in names}, "sim_time_s": sim_time_s, "done": np.bool_(False)}

@@ -1,0 +1,240 @@
+"""Behaviour cloning with action chunks: training on demonstrations, and acting with temporal ensembling."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from imagine_bench.agents.encoders.perception import prepare_torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from imagine_bench.errors import ArtefactError
+
+from .demonstrations import Demonstrations
+from .instruction import words_vector
+from .network import ChunkPolicy, Layout, new_network
+from .skills import Command, images_of, numbers_of
+
+_SMALLEST_DEVIATION = 1e-2
+"""Of an input or a command that hardly varies: it is divided by this instead."""
+_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """Settings of training."""
+
+    updates: int = 6_000  #: gradient steps
+    batch: int = 64  #: periods a gradient step
+    learning_rate: float = 1e-3  #: at the start; it falls to 0 along a half cosine
+    weight_decay: float = 1e-4
+    number_noise: float = 0.05  #: standard deviation added to standardised inputs
+    shift_px: int = 2  #: images are moved by up to so many pixels along both axes; 0 leaves them
+    brightness: float = 0.1  #: images are made brighter or darker by up to this share
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """Means and standard deviations of a vector."""
+
+    mean: NDArray[np.float32]
+    deviation: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, rows: NDArray[np.float32]) -> Scale:
+        """Of the columns of an array (T, P)."""
+        return cls(mean=rows.mean(axis=0), deviation=np.maximum(rows.std(axis=0), _SMALLEST_DEVIATION))
+
+    def standardised(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Rows (..., P) with mean 0 and deviation 1."""
+        return ((rows - self.mean) / self.deviation).astype(np.float32)
+
+    def restored(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The inverse of :meth:`standardised`."""
+        return (rows * self.deviation + self.mean).astype(np.float32)
+
+
+class Clone:
+    """A policy that is told in words which macro-action to carry out, and gives a command each control period.
+
+    Each period it predicts the next ``chunk`` commands. What is done is the mean of all predictions for this period,
+    weighted by exp(-0.01 age) with the oldest first, as in ACT (Zhao et al. 2023).
+
+    Args:
+        network: The network.
+        inputs: The scale of the inputs that are no images.
+        commands: The scale of commands.
+        about: How it was made; kept with it.
+    """
+
+    def __init__(self, network: ChunkPolicy, inputs: Scale, commands: Scale, about: Mapping[str, Any]) -> None:
+        prepare_torch("cpu")
+        self.network = network.eval()
+        self._inputs = inputs
+        self._commands = commands
+        self.about = dict(about)
+        self._instruction: str | None = None
+        self._words = torch.empty(0)
+        self._due: list[NDArray[np.float32]] = []
+
+    @property
+    def observation(self) -> str:
+        """The parts that it sees, as an environment takes them."""
+        return str(self.about["observation"])
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers the network has."""
+        return sum(each.numel() for each in self.network.parameters())
+
+    def begin(self, instruction: str) -> None:
+        """Forget what was predicted, and follow this instruction from now on."""
+        self._instruction = instruction
+        self._words = torch.from_numpy(words_vector(instruction))[None]
+        self._due = []
+
+    def act(self, observation: Mapping[str, Any]) -> Command:
+        """The command for this period. Shape (8,)."""
+        with torch.inference_mode():
+            images = {camera: _as_input(image[None]) for camera, image in images_of(observation).items()}
+            numbers = torch.from_numpy(self._inputs.standardised(numbers_of(observation)))[None]
+            predicted = self.network(images, numbers, self._words)[0].numpy()
+        self._due = [rest[1:] for rest in self._due if len(rest) > 1]
+        self._due.append(self._commands.restored(predicted))
+        weights = np.exp(-0.01 * np.arange(len(self._due)))
+        now = np.stack([rest[0] for rest in self._due])
+        return (weights @ now / weights.sum()).astype(np.float32)
+
+    def save(self, path: Path) -> None:
+        """Write one file of numbers and plain values."""
+        scales = {name: vars(scale) for name, scale in (("inputs", self._inputs), ("commands", self._commands))}
+        content = {
+            "version": _VERSION,
+            "about": self.about,
+            "layout": asdict(self.network.layout),
+            "weights": self.network.state_dict(),
+            "scales": {name: {key: torch.from_numpy(each) for key, each in of.items()} for name, of in scales.items()},
+        }
+        torch.save(content, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Clone:
+        """Read a file that :meth:`save` has written.
+
+        Raises:
+            ArtefactError: There is none, or it is another file.
+        """
+        try:
+            content = torch.load(path, weights_only=True)
+            if content["version"] != _VERSION:
+                raise KeyError(content["version"])
+        except Exception as error:
+            raise ArtefactError(f"{path} is no saved clone ({error}); train one first.") from error
+        layout = Layout(**{**content["layout"], "cameras": tuple(content["layout"]["cameras"])})
+        with torch.device("meta"):
+            network = ChunkPolicy(layout, content["about"]["size_px"])
+        network.load_state_dict(content["weights"], assign=True)
+        scales = {name: Scale(**{k: v.numpy() for k, v in of.items()}) for name, of in content["scales"].items()}
+        return cls(network, scales["inputs"], scales["commands"], content["about"])
+
+
+def train(
+    data: Demonstrations,
+    *,
+    seed: int,
+    observation: str,
+    settings: Training | None = None,
+    layout: Mapping[str, int] | None = None,
+    told: Callable[[int, float], None] | None = None,
+) -> Clone:
+    """Clone the expert.
+
+    Args:
+        data: Demonstrations.
+        seed: Of the weights, the batches and what is added to inputs.
+        observation: The parts that the demonstrations show.
+        settings: Of training.
+        layout: Fields of :class:`.network.Layout` that differ from their defaults.
+        told: Called every 100 gradient steps with their number and the mean loss since.
+    """
+    prepare_torch("cpu")
+    settings = settings or Training()
+    generator = torch.Generator().manual_seed(seed)
+    inputs, commands = Scale.of(data.numbers), Scale.of(data.commands)
+    shape = Layout(
+        cameras=tuple(sorted(data.images)),
+        numbers=data.numbers.shape[1],
+        commands=data.commands.shape[1],
+        **dict(layout or {}),
+    )
+    size_px = next((image.shape[1] for image in data.images.values()), 64)
+    network = new_network(shape, size_px, generator)
+    began_s = time.process_time()
+    _fit(network, data, inputs, commands, settings, generator, told)
+    about = {
+        "observation": observation,
+        "size_px": size_px,
+        "demonstrations": data.count,
+        "periods": len(data.episode),
+        "seed": seed,
+        "training": asdict(settings),
+        "cpu_s": round(time.process_time() - began_s, 1),
+    }
+    return Clone(network, inputs, commands, about)
+
+
+def _fit(
+    network: ChunkPolicy,
+    data: Demonstrations,
+    inputs: Scale,
+    commands: Scale,
+    settings: Training,
+    generator: torch.Generator,
+    told: Callable[[int, float], None] | None,
+) -> None:
+    numbers = torch.from_numpy(inputs.standardised(data.numbers))
+    targets = torch.from_numpy(commands.standardised(data.commands))
+    chunks = torch.from_numpy(data.chunks(network.layout.chunk))
+    known, which = np.unique(data.instructions, return_inverse=True)
+    words = torch.from_numpy(np.stack([words_vector(str(each)) for each in known]))[torch.from_numpy(which)]
+    optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.updates)
+    network.train()
+    losses = []
+    for update in range(1, settings.updates + 1):
+        rows = torch.randint(len(numbers), (settings.batch,), generator=generator)
+        noise = settings.number_noise * torch.randn(settings.batch, numbers.shape[1], generator=generator)
+        images = {camera: _varied(image[rows.numpy()], settings, generator) for camera, image in data.images.items()}
+        predicted = network(images, numbers[rows] + noise, words[rows])
+        loss = (predicted - targets[chunks[rows]]).abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+        if told is not None and update % 100 == 0:
+            told(update, float(np.mean(losses)))
+            losses = []
+
+
+def _as_input(images: NDArray[np.uint8]) -> Tensor:
+    """Images (B, S, S, 3) as (B, 3, S, S) in [0, 1]."""
+    return torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float() / 255.0
+
+
+def _varied(images: NDArray[np.uint8], settings: Training, generator: torch.Generator) -> Tensor:
+    """The images of a batch as inputs, moved as a whole and each made brighter or darker, so that fewer suffice."""
+    seen = _as_input(images)
+    most = settings.shift_px
+    if most:
+        across, along = torch.randint(2 * most + 1, (2,), generator=generator).tolist()
+        padded = torch.nn.functional.pad(seen, [most] * 4, mode="replicate")
+        seen = padded[:, :, along : along + images.shape[1], across : across + images.shape[2]]
+    light = 1.0 + settings.brightness * (2.0 * torch.rand(len(seen), 1, 1, 1, generator=generator) - 1.0)
+    return seen * light

@@ -1,0 +1,158 @@
+"""Demonstrations of single macro-actions by the scripted expert, as arrays to learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from imagine_bench.tasks.continuous.expert import Expert
+from numpy.typing import NDArray
+
+from imagine_bench.errors import InvalidValueError
+
+from .instruction import GO_BACK
+from .skills import begin, images_of, numbers_of, skill_env
+
+NOISE_RAD = 0.012
+"""Standard deviation of what is added to a joint command each period, in every second demonstration."""
+NOISE_KEPT = 0.8
+"""Share of a period's noise that goes on in the next one."""
+
+MOST_TRIES = 5
+"""Tries of the expert for each demonstration that is kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demonstrations:
+    """Control periods of N demonstrations, one after the other; T of them."""
+
+    images: dict[str, NDArray[np.uint8]]  #: by camera: (T, S, S, 3)
+    numbers: NDArray[np.float32]  #: the other inputs: (T, P)
+    instructions: NDArray[np.str_]  #: in words: (T,)
+    commands: NDArray[np.float32]  #: the expert's, without noise: (T, C)
+    episode: NDArray[np.int64]  #: which demonstration: (T,)
+
+    @property
+    def count(self) -> int:
+        """How many demonstrations."""
+        return int(self.episode.max()) + 1
+
+    def first(self, count: int) -> Demonstrations:
+        """The first demonstrations alone."""
+        kept = self.episode < count
+        return Demonstrations(
+            images={camera: image[kept] for camera, image in self.images.items()},
+            numbers=self.numbers[kept],
+            instructions=self.instructions[kept],
+            commands=self.commands[kept],
+            episode=self.episode[kept],
+        )
+
+    def chunks(self, length: int) -> NDArray[np.int64]:
+        """For each period, the rows of the next commands; the last one of a demonstration stays. Shape (T, length)."""
+        rows = np.arange(len(self.episode))
+        last = np.searchsorted(self.episode, self.episode, side="right") - 1
+        return np.minimum(rows[:, None] + np.arange(length), last[:, None])
+
+    def save(self, path: Path) -> None:
+        """Write one ``.npz`` file."""
+        arrays: dict[str, Any] = {f"image.{camera}": image for camera, image in self.images.items()}
+        named = {name: getattr(self, name) for name in ("numbers", "instructions", "commands", "episode")}
+        np.savez(path, **arrays, **named)
+
+    @classmethod
+    def load(cls, path: Path) -> Demonstrations:
+        """Read a file that :meth:`save` has written."""
+        with np.load(path) as file:
+            images = {name.removeprefix("image."): file[name] for name in file.files if name.startswith("image.")}
+            named = {name: file[name] for name in ("numbers", "instructions", "commands", "episode")}
+        return cls(images=images, **named)
+
+
+def collect(
+    count: int, *, seed: int, observation: str, appearances: Sequence[str] = ("clean", "mild"), **options: Any
+) -> Demonstrations:
+    """Let the expert demonstrate each macro-action in turn, the same number of times.
+
+    Arms start off their observation pose. In every second demonstration the commands are disturbed, and the expert's
+    own ones are what is to be learned: so there are ways back from small errors (Laskey et al. 2017). A demonstration
+    without the event that was wanted is not kept.
+
+    Args:
+        count: How many are kept.
+        seed: Of everything random.
+        observation: What is kept of each moment, as the environment takes it.
+        appearances: Levels, in turn.
+        **options: Of the world, and its ``family``.
+
+    Raises:
+        InvalidValueError: The expert fails too often in this world.
+    """
+    rng = np.random.default_rng(seed)
+    stages = [_Stage(observation, appearance, options) for appearance in appearances]
+    kept: list[_Episode] = []
+    for _ in range(MOST_TRIES * count):
+        if len(kept) == count:
+            break
+        stage = stages[len(kept) % len(stages)]
+        macro_action = len(kept) // len(stages) % stage.env.task.n_actions
+        found = stage.demonstrate(macro_action, rng, disturbed=len(kept) // 2 % 2 == 1)
+        if found is not None:
+            kept.append(found)
+    if len(kept) < count:
+        raise InvalidValueError(
+            f"Of {MOST_TRIES * count} tries of the expert only {len(kept)} did what they should; give another world."
+        )
+    cameras = kept[0].images[0]
+    return Demonstrations(
+        images={camera: np.stack([image[camera] for each in kept for image in each.images]) for camera in cameras},
+        numbers=np.stack([row for each in kept for row in each.numbers]),
+        instructions=np.array([words for each in kept for words in each.instructions]),
+        commands=np.stack([row for each in kept for row in each.commands]),
+        episode=np.repeat(np.arange(len(kept)), [len(each.commands) for each in kept]),
+    )
+
+
+class _Episode:
+    """One demonstration as it grows."""
+
+    def __init__(self) -> None:
+        self.images: list[dict[str, NDArray[np.uint8]]] = []
+        self.numbers: list[NDArray[np.float32]] = []
+        self.instructions: list[str] = []
+        self.commands: list[NDArray[np.float32]] = []
+
+
+class _Stage:
+    """An environment at one appearance, and its expert, which plans in a scene of its own."""
+
+    def __init__(self, observation: str, appearance: str, options: dict[str, Any]) -> None:
+        self.env = skill_env(observation, appearance, **options)
+        self._expert = Expert(self.env, self.env.another_world())
+
+    def demonstrate(self, macro_action: int, rng: np.random.Generator, *, disturbed: bool) -> _Episode | None:
+        env = self.env
+        observation = begin(env, macro_action, rng)
+        self._expert.begin(macro_action)
+        instruction = env.task.action_names[macro_action]
+        found = _Episode()
+        off_rad = np.zeros(env.action_space.shape[0] - 1)
+        done = False
+        while not self._expert.is_done:
+            command = np.asarray(self._expert.act(), dtype=np.float32)
+            found.images.append(images_of(observation))
+            found.numbers.append(numbers_of(observation))
+            found.instructions.append(GO_BACK if done else instruction)
+            found.commands.append(command)
+            told = command.copy()
+            if disturbed:
+                off_rad = NOISE_KEPT * off_rad + rng.normal(0.0, NOISE_RAD, len(off_rad))
+                told[:-1] += off_rad.astype(np.float32)
+            observation, _, _, truncated, info = env.step(told)
+            if truncated or info["fault"]:
+                return None
+            done |= int(info["macro_action"]) == macro_action
+        return found if done else None

@@ -1,0 +1,209 @@
+"""One loop for agents of macro-actions, whoever carries these out: success against seconds of robot time.
+
+It also asks an agent's world model how often a macro-action changes nothing, and counts how often that is true.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from imagine_bench.interfaces import AgentContext, Observation, TaskSpec, Transition
+from imagine_bench.interfaces.capabilities import FrameReader, OutcomePredictor
+from imagine_bench.registry import agent_entry, task
+from imagine_bench.rules import Rules
+from imagine_bench.seeding import SeedTree
+
+from .cloned_env import CloneExecutedEnv
+
+Env = gymnasium.Env[Any, Any]
+PUZZLE_CUBES = 3
+_TEST_SEED = 10**9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """One point of a learning curve of an agent of macro-actions."""
+
+    episodes: int  #: real training episodes so far
+    macro_actions: int  #: of training
+    robot_s: float  #: simulated seconds of training
+    nothing: int  #: macro-actions of training that changed no object
+    faults: int  #: macro-actions of training that ended in a fault
+    successes: int  #: of test episodes
+    tests: int
+    #: mean probability that the agent's model gives to "nothing changes", at the starts of tests; None: it has none
+    expects_nothing: float | None
+    cpu_s: float  #: of training and tests so far
+
+
+class Stage(NamedTuple):
+    """An environment of macro-actions, and what is known of its task."""
+
+    env: Env
+    spec: TaskSpec
+    rules: Rules
+    horizon: int
+
+
+def environment(execution: str, *, cubes: int, slip: float, clone: Path | None = None) -> Stage:
+    """The arrow world whose macro-actions planner or clone carry out, with the rules of a world without slips.
+
+    Args:
+        execution: ``"planner"`` or ``"clone"``.
+        cubes: How many.
+        slip: Probability that a grip slips. Rules and agents do not know of it.
+        clone: A file; None is the bundled one.
+    """
+    spec = task("arrow_puzzle" if cubes == PUZZLE_CUBES else f"arrows:cubes={cubes},horizon=10")
+    env: Env
+    if execution == "clone":
+        env = CloneExecutedEnv(clone=clone, cubes=cubes, slip=slip)
+    else:
+        env = gymnasium.make("imagine_bench/Arrows-v0", cubes=cubes, horizon=spec.horizon, slip=slip)
+    return Stage(env, spec, spec.rules, spec.horizon)
+
+
+def make_agent(name: str, spec: TaskSpec, seed: int, appearance: str = "clean") -> Any:
+    """An agent of macro-actions by its registered name, with the bundled encoder if it needs one."""
+    entry = agent_entry(name)
+    module, _, attribute = str(entry.make).partition(":")
+    suffix = "" if entry.encoder_kind == "latents" else f"-{entry.encoder_kind}"
+    bundled = files("imagine_bench.assets") / "encoders" / f"{spec.encoder}-{appearance}{suffix}.safetensors"
+    context = AgentContext(
+        n_actions=spec.n_actions,
+        preprocessing=spec.preprocessing,
+        encoder=Path(str(bundled)) if entry.needs_encoder else None,
+        seeds=SeedTree(seed).child("agent"),
+        config_group=spec.config_group,
+    )
+    return getattr(importlib.import_module(module), attribute)(context)
+
+
+def learn(
+    env: Env,
+    test_env: Env,
+    agent: Any,
+    *,
+    budgets: Sequence[int],
+    tests: int,
+    horizon: int,
+    seed: int,
+    told: Callable[[Level], None],
+) -> list[Level]:
+    """Train an agent, and test it after so many episodes.
+
+    Args:
+        env: An environment of macro-actions for training; ``info["sim_time_s"]`` is the time of the latest one.
+        test_env: Another one, for tests.
+        agent: The learner.
+        budgets: Training episodes before each test, ascending.
+        tests: Test episodes.
+        horizon: Macro-actions before truncation.
+        seed: Of the training episodes.
+        told: Called with each point of the curve.
+    """
+    began_s = time.process_time()
+    count = _Count()
+    curve = []
+    for episode in range(1, max(budgets) + 1):
+        _train_episode(env, agent, episode, horizon, seed * 10**5 + episode, count)
+        if episode in budgets:
+            successes = sum(test_episode(test_env, agent, horizon, _TEST_SEED + each) for each in range(tests))
+            point = Level(
+                episodes=episode,
+                macro_actions=count.macro_actions,
+                robot_s=round(count.robot_s, 2),
+                nothing=count.nothing,
+                faults=count.faults,
+                successes=successes,
+                tests=tests,
+                expects_nothing=expects_nothing(test_env, agent, 20),
+                cpu_s=round(time.process_time() - began_s, 1),
+            )
+            told(point)
+            curve.append(point)
+    return curve
+
+
+@dataclass
+class _Count:
+    macro_actions: int = 0
+    robot_s: float = 0.0
+    nothing: int = 0
+    faults: int = 0
+
+
+def _train_episode(env: Env, agent: Any, episode: int, horizon: int, seed: int, count: _Count) -> None:
+    frame, info = env.reset(seed=seed)
+    seen = Observation(frame=frame)
+    for step in range(1, horizon + 1):
+        action = agent.act(seen, explore=True)
+        before = info["macrostate"]
+        frame, reward, terminated, blew_up, info = env.step(action)
+        following = Observation(frame=frame)
+        truncated = blew_up or step == horizon
+        transition = Transition(
+            observation=seen,
+            action=action,
+            reward=float(reward),
+            next_observation=following,
+            terminated=bool(terminated),
+            truncated=truncated,
+        )
+        agent.observe(transition, episode=episode)
+        count.macro_actions += 1
+        count.robot_s += float(info["sim_time_s"])
+        count.faults += bool(info["fault"])
+        count.nothing += bool(np.array_equal(info["macrostate"], before)) and not info["fault"]
+        seen = following
+        if terminated or truncated:
+            return
+
+
+def test_episode(env: Env, agent: Any, horizon: int, seed: int) -> bool:
+    """Whether a test episode without exploration succeeds."""
+    frame, _ = env.reset(seed=seed)
+    for _ in range(horizon):
+        frame, _, terminated, blew_up, info = env.step(agent.act(Observation(frame=frame), explore=False))
+        if terminated or blew_up:
+            return bool(info["is_success"])
+    return False
+
+
+def expects_nothing(env: Env, agent: Any, starts: int) -> float | None:
+    """Mean probability, over all macro-actions at some starts, that the agent's model gives to no change at all.
+
+    The agent's own probe reads the macrostates of the frames, as it reads those of the model's outcomes. None: its
+    model cannot be asked.
+    """
+    if not isinstance(agent, OutcomePredictor) or not isinstance(agent, FrameReader):
+        return None
+    frames = np.stack([env.reset(seed=_TEST_SEED + each)[0] for each in range(starts)])
+    expected = agent.predict_outcomes(frames, np.random.default_rng(0))
+    same = (expected.macrostates == agent.read_frames(frames)[:, None, None, :]).all(axis=-1)  # [N, A, B]
+    return float((expected.p_continues * same).sum(axis=-1).mean())
+
+
+def oracle_success(env: Env, rules: Rules, *, tests: int, horizon: int) -> tuple[int, float]:
+    """Successes of the rules' optimal policy, and mean seconds of its macro-actions."""
+    successes = 0
+    times_s = []
+    for episode in range(tests):
+        _, info = env.reset(seed=_TEST_SEED + episode)
+        for _ in range(horizon):
+            action = rules.optimal_action(tuple(info["macrostate"].tolist()))
+            _, _, terminated, blew_up, info = env.step(action)
+            times_s.append(float(info["sim_time_s"]))
+            if terminated or blew_up:
+                break
+        successes += bool(info["is_success"])
+    return successes, float(np.mean(times_s))

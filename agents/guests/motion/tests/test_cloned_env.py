@@ -1,0 +1,104 @@
+"""Macro-actions that a clone carries out: the rules judge them, and any agent of macro-actions can act."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from imagine_bench_motion.cloned_env import BUNDLED, CloneExecutedEnv
+from imagine_bench_motion.cloning import Clone
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.registry import task, task_entry
+
+START = (1, 2, 3, 0)
+
+
+class Still(Clone):
+    """Never moves the arm."""
+
+    def __init__(self) -> None:
+        self.about = {"observation": "proprio,objects"}
+
+    def begin(self, instruction: str) -> None:
+        del instruction
+
+    def act(self, observation: Any) -> Any:
+        return np.append(observation["proprio"][:7], np.float32(1.0))
+
+
+@functools.cache
+def environment() -> CloneExecutedEnv:
+    return CloneExecutedEnv()
+
+
+def test_the_bundled_clone_sees_no_macrostate_and_is_small() -> None:
+    clone = Clone.load(BUNDLED)
+    assert set(clone.observation.split(",")) <= {"hand", "front", "proprio"}
+    assert clone.parameters <= 2_000_000
+
+
+def test_the_clone_turns_the_cube_that_it_is_asked_to_and_the_rules_judge_it() -> None:
+    env = environment()
+    rules = task("arrow_puzzle").rules
+    done = 0
+    for action in range(6):
+        env.reset(seed=action, options={"macrostate": START})
+        frame, reward, terminated, truncated, info = env.step(action)
+        assert frame.shape == (64, 64, 3) and not truncated
+        if info["done"]:
+            (expected,) = rules.outcomes(START, action)
+            done += 1
+            assert tuple(info["macrostate"]) == expected.macrostate
+            assert (reward, terminated, info["is_success"]) == (expected.reward, expected.terminated, expected.success)
+            assert 1.0 < info["sim_time_s"] < 4.5
+    assert done >= 4
+
+
+def test_a_macro_action_begins_and_ends_at_the_observation_pose() -> None:
+    env = environment()
+    env.reset(seed=0, options={"macrostate": (3, 2, 1, 0)})
+    joints_rad = env.motion.data.qpos[:7].copy()
+    env.step(5)
+    np.testing.assert_allclose(env.motion.data.qpos[:7], joints_rad, atol=5e-3)
+
+
+def test_a_macro_action_that_turns_nothing_counts_as_one_that_slipped() -> None:
+    env = CloneExecutedEnv(clone=Still())
+    env.reset(seed=0, options={"macrostate": START})
+    _, reward, terminated, truncated, info = env.step(2)
+    assert (reward, terminated, truncated) == (-1.0, False, False)
+    assert tuple(info["macrostate"]) == START and not info["done"] and not info["fault"]
+
+
+def test_equal_seeds_give_equal_episodes() -> None:
+    env = environment()
+    found = []
+    for _ in range(2):
+        first, _ = env.reset(seed=9)
+        second, reward, *_, info = env.step(1)
+        found.append((first.tobytes(), second.tobytes(), reward, info["macrostate"].tobytes()))
+    assert found[0] == found[1]
+
+
+@pytest.mark.slow
+def test_gymnasiums_checker_passes() -> None:
+    check_env(CloneExecutedEnv(clone=Still()), skip_render_check=True)
+
+
+@pytest.mark.parametrize(("name", "value"), [("execution", "kinematic"), ("execution", 3)])
+def test_another_execution_is_refused(name: str, value: Any) -> None:
+    with pytest.raises(InvalidValueError, match="in physics"):
+        CloneExecutedEnv(**{name: value})
+
+
+def test_the_bench_knows_the_task_with_the_rules_of_the_arrow_puzzle() -> None:
+    entry = task_entry("arrow_puzzle_cloned")
+    cloned, puzzle = task("arrow_puzzle_cloned"), task("arrow_puzzle")
+    assert entry.env_id == cloned.env_id
+    assert cloned.rules is puzzle.rules and cloned.encoder == puzzle.encoder
+    with pytest.raises(InvalidValueError, match="from 0 to 5"):
+        environment().step(6)

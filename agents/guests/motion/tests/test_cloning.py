@@ -1,0 +1,142 @@
+"""Behaviour cloning: instructions, demonstrations, and what a policy does with its predictions."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from imagine_bench_motion.cloning import Clone, Scale, Training, train
+from imagine_bench_motion.demonstrations import Demonstrations, collect
+from imagine_bench_motion.instruction import GO_BACK, words_vector
+from imagine_bench_motion.network import ChunkPolicy, Layout
+from imagine_bench_motion.trials import share_done, tries
+
+from imagine_bench.errors import ArtefactError
+from imagine_bench.registry import task
+
+VECTORS = "proprio,objects"
+
+
+@functools.cache
+def demonstrations() -> Demonstrations:
+    return collect(4, seed=5, observation=VECTORS)
+
+
+@functools.cache
+def clone() -> Clone:
+    return train(demonstrations(), seed=0, observation=VECTORS, settings=Training(updates=50))
+
+
+@pytest.mark.parametrize("cubes", [1, 2, 3, 4, 5, 6])
+def test_each_macro_action_has_words_of_its_own(cubes: int) -> None:
+    names = (*task(f"arrows:cubes={cubes}").action_names, GO_BACK)
+    assert len({words_vector(name).tobytes() for name in names}) == len(names)
+
+
+def test_order_and_capitals_of_words_do_not_matter() -> None:
+    np.testing.assert_array_equal(words_vector("Turn the left cube."), words_vector("cube left the turn"))
+
+
+def test_a_demonstration_asks_for_a_turn_and_after_it_to_go_back() -> None:
+    data = demonstrations()
+    for episode in range(data.count):
+        words = data.instructions[data.episode == episode].tolist()
+        turn = words[0]
+        assert turn in task("arrow_puzzle").action_names
+        n_turn = words.count(turn)
+        assert words == [turn] * n_turn + [GO_BACK] * (len(words) - n_turn)
+        assert 20 < n_turn < len(words)
+
+
+def test_demonstrations_depend_on_the_seed_alone() -> None:
+    again = collect(4, seed=5, observation=VECTORS)
+    np.testing.assert_array_equal(again.numbers, demonstrations().numbers)
+    np.testing.assert_array_equal(again.commands, demonstrations().commands)
+    other = collect(1, seed=6, observation=VECTORS)
+    assert not np.array_equal(other.numbers[0], again.numbers[0])
+
+
+def test_demonstrations_start_at_different_poses_of_the_arm() -> None:
+    data = demonstrations()
+    starts = data.numbers[np.unique(data.episode, return_index=True)[1]]
+    assert (starts[:, -16:-9].std(axis=0) > 0.01).all()  # joints
+
+
+def test_a_chunk_stays_within_its_demonstration() -> None:
+    data = demonstrations()
+    chunks = data.chunks(16)
+    assert (data.episode[chunks] == data.episode[:, None]).all()
+    assert (chunks[:, 0] == np.arange(len(chunks))).all()
+    ends = np.flatnonzero(np.diff(data.episode))
+    assert (chunks[ends] == ends[:, None]).all()
+
+
+def test_demonstrations_come_back_from_their_file(tmp_path: Path) -> None:
+    data = demonstrations()
+    data.save(tmp_path / "some.npz")
+    again = Demonstrations.load(tmp_path / "some.npz")
+    np.testing.assert_array_equal(again.commands, data.commands)
+    assert again.instructions.tolist() == data.instructions.tolist()
+    assert again.first(2).count == 2
+
+
+class Counting(ChunkPolicy):
+    """Predicts 10 n, 10 n + 1, ... at its n-th call."""
+
+    def __init__(self) -> None:
+        super().__init__(Layout(cameras=(), numbers=1, commands=1, chunk=3))
+        self.calls = 0
+
+    def forward(self, images: object, numbers: object, words: object) -> torch.Tensor:
+        self.calls += 1
+        return 10.0 * self.calls + torch.arange(3.0).reshape(1, 3, 1)
+
+
+def test_a_command_is_the_mean_of_all_predictions_for_its_period_the_oldest_first() -> None:
+    unit = Scale(mean=np.zeros(1, dtype=np.float32), deviation=np.ones(1, dtype=np.float32))
+    policy = Clone(Counting(), unit, unit, {})
+    policy.begin(GO_BACK)
+    seen = {"proprio": np.zeros(1, dtype=np.float32)}
+    found = [policy.act(seen).item() for _ in range(4)]
+    weights = np.exp([0.0, -0.01, -0.02])
+    expected = [
+        10.0,
+        np.average([11.0, 20.0], weights=weights[:2]),
+        np.average([12.0, 21.0, 30.0], weights=weights),
+        np.average([22.0, 31.0, 40.0], weights=weights),
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    policy.begin(GO_BACK)
+    assert policy.act(seen).item() == 50.0
+
+
+def test_training_follows_its_seed_and_comes_nearer_to_the_expert() -> None:
+    losses: list[float] = []
+    settings = Training(updates=200, batch=32)
+    train(demonstrations(), seed=0, observation=VECTORS, settings=settings, told=lambda _, loss: losses.append(loss))
+    assert losses[1] < 0.7 * losses[0]
+    again = train(demonstrations(), seed=0, observation=VECTORS, settings=Training(updates=50))
+    for mine, other in zip(clone().network.parameters(), again.network.parameters(), strict=True):
+        assert torch.equal(mine, other)
+
+
+def test_a_saved_clone_acts_as_before(tmp_path: Path) -> None:
+    clone().save(tmp_path / "skill.pt")
+    again = Clone.load(tmp_path / "skill.pt")
+    seen = {"proprio": np.zeros(16, dtype=np.float32), "objects": np.zeros((3, 7), dtype=np.float32)}
+    for each in (clone(), again):
+        each.begin("turn the left cube clockwise")
+    np.testing.assert_array_equal(clone().act(seen), again.act(seen))
+    (tmp_path / "other.pt").write_bytes(b"no clone")
+    with pytest.raises(ArtefactError, match="train one first"):
+        Clone.load(tmp_path / "other.pt")
+
+
+@pytest.mark.slow
+def test_a_clone_of_sixty_demonstrations_turns_cubes() -> None:
+    data = collect(60, seed=11, observation=VECTORS)
+    policy = train(data, seed=0, observation=VECTORS, settings=Training(updates=2_000))
+    assert share_done(tries(policy, 60, seed=12)) > 0.7

@@ -1,0 +1,65 @@
+"""Agents of macro-actions learn through the same loop, whoever carries their macro-actions out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from imagine_bench_motion.flat import flat_env
+from imagine_bench_motion.levels import Level, environment, expects_nothing, learn, make_agent, oracle_success
+
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes
+
+KEPT = Path(__file__).parents[4] / "docs" / "results" / "motion"
+
+
+class Sticky:
+    """A model that expects nothing of three macro-actions in four, and success of the others."""
+
+    def read_frames(self, frames: Any) -> Any:
+        return np.zeros((len(frames), 4), dtype=np.int64)
+
+    def predict_outcomes(self, frames: Any, rng: Any) -> Any:
+        del rng
+        macrostates = np.zeros((len(frames), 4, 2, 4), dtype=np.int64)
+        macrostates[:, :, 1] = 1
+        p_continues = np.tile([0.75, 0.25], (len(frames), 4, 1))
+        return ExpectedOutcomes(macrostates=macrostates, p_continues=p_continues, reward=np.zeros((len(frames), 4)))
+
+
+def test_what_a_model_expects_not_to_change_is_weighted_by_its_probability() -> None:
+    stage = environment("planner", cubes=3, slip=0.0)
+    assert expects_nothing(stage.env, Sticky(), 2) == pytest.approx(0.75)
+    assert expects_nothing(stage.env, object(), 2) is None
+
+
+def test_the_planner_solves_what_the_rules_say_and_robot_time_adds_up() -> None:
+    stage = environment("planner", cubes=1, slip=0.0)
+    successes, macro_action_s = oracle_success(stage.env, stage.rules, tests=5, horizon=stage.horizon)
+    assert successes == 5
+    assert 1.5 < macro_action_s < 3.0
+    told: list[Level] = []
+    agent = make_agent("random", stage.spec, 0)
+    (point,) = learn(stage.env, stage.env, agent, budgets=[4], tests=2, horizon=stage.horizon, seed=0, told=told.append)
+    assert told == [point]
+    assert 4 <= point.macro_actions <= 4 * stage.horizon
+    assert point.robot_s == pytest.approx(point.macro_actions * macro_action_s, rel=0.2)
+
+
+def test_the_flat_environment_is_one_vector_of_all_that_there_is_to_see() -> None:
+    env = flat_env()
+    seen, _ = env.reset(seed=0)
+    assert seen.shape == (16 + 7 + 4 + 1,) and env.action_space.shape == (7,)
+
+
+def test_kept_numbers_of_the_page_are_those_of_the_kept_files() -> None:
+    page = (KEPT.parents[1] / "how_to" / "clone.md").read_text()
+    for file in sorted(KEPT.glob("tries_*.json")):
+        kept = json.loads(file.read_text())
+        assert f"{kept['done']} of {kept['count']}" in page, file.name
+    for file in sorted(KEPT.glob("level_*_oracle.json")):
+        kept = json.loads(file.read_text())
+        assert f"{kept['successes']} of {kept['tests']}" in page, file.name
