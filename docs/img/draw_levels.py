@@ -21,7 +21,7 @@ AGENTS = {
 }
 """Color and marker of an agent of macro-actions."""
 LINES = {"planner": ("-", "planned"), "clone": ("--", "cloned")}
-"""Line and word of what carries macro-actions out."""
+"""Line of planner and clone, and the word for macro-actions that they carry out."""
 FLAT = ("#9a9a9a", "^")
 
 

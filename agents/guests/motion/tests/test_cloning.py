@@ -1,4 +1,4 @@
-"""Behaviour cloning: instructions, demonstrations, and what a policy does with its predictions."""
+"""Behaviour cloning: instructions, demonstrations, and the commands of a policy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Agents of macro-actions learn through the same loop, whoever carries their macro-actions out."""
+"""Agents of macro-actions learn through the same loop, by planner or by clone."""
 
 from __future__ import annotations
 

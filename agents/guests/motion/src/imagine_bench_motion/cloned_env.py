@@ -136,7 +136,7 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
     # --- details -------------------------------------------------------------------------------------------------
 
     def _carry_out(self, instruction: str) -> bool:
-        """Let the clone do what the words ask for, then go back and home. Returns whether the simulation blew up."""
+        """Let the clone follow an instruction, then go back and home. Returns whether the simulation blew up."""
         self.clone.begin(instruction)
         for _ in range(MOST_PERIODS):
             if self._period(self.clone.act(self._seen)):

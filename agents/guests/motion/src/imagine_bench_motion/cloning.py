@@ -19,7 +19,7 @@ from imagine_bench.errors import ArtefactError
 from .demonstrations import Demonstrations
 from .instruction import words_vector
 from .network import ChunkPolicy, Layout, new_network
-from .skills import Command, images_of, numbers_of
+from .skills import Command, Observed, images_of, numbers_of
 
 _SMALLEST_DEVIATION = 1e-2
 """Of an input or a command that hardly varies: it is divided by this instead."""
@@ -63,7 +63,7 @@ class Scale:
 class Clone:
     """A policy that is told in words which macro-action to carry out, and gives a command each control period.
 
-    Each period it predicts the next ``chunk`` commands. What is done is the mean of all predictions for this period,
+    Each period it predicts the next ``chunk`` commands. It carries out the mean of all predictions for this period,
     weighted by exp(-0.01 age) with the oldest first, as in ACT (Zhao et al. 2023).
 
     Args:
@@ -94,12 +94,12 @@ class Clone:
         return sum(each.numel() for each in self.network.parameters())
 
     def begin(self, instruction: str) -> None:
-        """Forget what was predicted, and follow this instruction from now on."""
+        """Forget all predictions, and follow this instruction from now on."""
         self._instruction = instruction
         self._words = torch.from_numpy(words_vector(instruction))[None]
         self._due = []
 
-    def act(self, observation: Mapping[str, Any]) -> Command:
+    def act(self, observation: Observed) -> Command:
         """The command for this period. Shape (8,)."""
         with torch.inference_mode():
             images = {camera: _as_input(image[None]) for camera, image in images_of(observation).items()}
@@ -157,7 +157,7 @@ def train(
 
     Args:
         data: Demonstrations.
-        seed: Of the weights, the batches and what is added to inputs.
+        seed: Of the weights, the batches and the noise of the inputs.
         observation: The parts that the demonstrations show.
         settings: Of training.
         layout: Fields of :class:`.network.Layout` that differ from their defaults.

@@ -17,7 +17,7 @@ from .instruction import GO_BACK
 from .skills import begin, images_of, numbers_of, skill_env
 
 NOISE_RAD = 0.012
-"""Standard deviation of what is added to a joint command each period, in every second demonstration."""
+"""Standard deviation of the noise that a joint command gets each period, in every second demonstration."""
 NOISE_KEPT = 0.8
 """Share of a period's noise that goes on in the next one."""
 
@@ -78,13 +78,13 @@ def collect(
     """Let the expert demonstrate each macro-action in turn, the same number of times.
 
     Arms start off their observation pose. In every second demonstration the commands are disturbed, and the expert's
-    own ones are what is to be learned: so there are ways back from small errors (Laskey et al. 2017). A demonstration
+    own ones are kept: so there are ways back from small errors (Laskey et al. 2017). A demonstration
     without the event that was wanted is not kept.
 
     Args:
         count: How many are kept.
         seed: Of everything random.
-        observation: What is kept of each moment, as the environment takes it.
+        observation: The parts that are kept of each moment, as the environment takes them.
         appearances: Levels, in turn.
         **options: Of the world, and its ``family``.
 
@@ -104,7 +104,7 @@ def collect(
             kept.append(found)
     if len(kept) < count:
         raise InvalidValueError(
-            f"Of {MOST_TRIES * count} tries of the expert only {len(kept)} did what they should; give another world."
+            f"Of {MOST_TRIES * count} tries of the expert only {len(kept)} succeeded; give another world."
         )
     cameras = kept[0].images[0]
     return Demonstrations(

@@ -13,7 +13,7 @@ from imagine_bench.tasks.continuous.spec import make_arrows
 from stable_baselines3 import SAC
 
 OBSERVATION = "proprio,objects,state"
-"""What it sees: more than any other agent here, the true poses and the macrostate."""
+"""It sees more than any other agent here: the true poses and the macrostate."""
 _SEEDS = 2**31
 
 

@@ -1,4 +1,4 @@
-"""One loop for agents of macro-actions, whoever carries these out: success against seconds of robot time.
+"""One loop for agents of macro-actions, by planner or by clone: success against seconds of robot time.
 
 It also asks an agent's world model how often a macro-action changes nothing, and counts how often that is true.
 """
@@ -46,7 +46,7 @@ class Level:
 
 
 class Stage(NamedTuple):
-    """An environment of macro-actions, and what is known of its task."""
+    """An environment of macro-actions, and its task."""
 
     env: Env
     spec: TaskSpec

@@ -14,7 +14,7 @@ from .instruction import WIDTH
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What goes in and comes out."""
+    """Sizes of inputs and outputs."""
 
     cameras: tuple[str, ...]  #: names of the images
     numbers: int  #: of the vector of other inputs
@@ -44,7 +44,7 @@ class ChunkPolicy(nn.Module):
     """A convolutional network a camera, and a multilayer perceptron over everything.
 
     Args:
-        layout: What goes in and comes out.
+        layout: Sizes of inputs and outputs.
         size_px: Edge of the images; a multiple of 8.
     """
 

@@ -28,6 +28,8 @@ HOME_COMMAND = np.array([*OBSERVATION_QPOS_RAD, 1.0], dtype=np.float32)
 """The command that keeps the arm at its observation pose, with open fingers."""
 HELD_GRIP = 0.5
 """Fingers that are told to be nearer together than this at a start hold something."""
+Observed = Mapping[str, NDArray[Any]] | NDArray[Any]
+"""Several parts by name, or one."""
 Command = NDArray[np.float32]
 """Joints (rad) and grip. Shape (8,)."""
 
@@ -36,7 +38,7 @@ def skill_env(observation: str, appearance: str = "clean", *, family: str = "arr
     """A world for single macro-actions.
 
     Args:
-        observation: What a policy sees, as the environment takes it; several parts.
+        observation: The parts that a policy sees, as the environment takes them.
         appearance: How much the scene varies.
         family: ``"arrows"``: three arrow cubes; or ``"pick_place"``.
         **options: Other options of the family's world and of the environment.
@@ -75,16 +77,20 @@ def _starts(rules: Rules, macro_action: int) -> list[State]:
 
 
 def told_grip(env: MotionEnv) -> float:
-    """What the fingers are told now, as a grip from -1 (closed) to 1 (open)."""
+    """The fingers' command now, as a grip from -1 (closed) to 1 (open)."""
     return 2.0 * float(env.data.ctrl[-1]) / MOST_OPEN_M - 1.0
 
 
-def numbers_of(observation: Mapping[str, Any]) -> NDArray[np.float32]:
+def numbers_of(observation: Observed) -> NDArray[np.float32]:
     """The parts of an observation that are no images, one after the other."""
-    parts = [part.ravel() for name, part in sorted(observation.items()) if part.ndim < 3]
-    return np.concatenate(parts, dtype=np.float32)
+    return np.concatenate([part.ravel() for _, part in _parts(observation) if part.ndim < 3], dtype=np.float32)
 
 
-def images_of(observation: Mapping[str, Any]) -> dict[str, NDArray[np.uint8]]:
+def images_of(observation: Observed) -> dict[str, NDArray[np.uint8]]:
     """The images of an observation by camera."""
-    return {name: part for name, part in sorted(observation.items()) if part.ndim == 3}
+    return {name: part for name, part in _parts(observation) if part.ndim == 3}
+
+
+def _parts(observation: Observed) -> list[tuple[str, NDArray[Any]]]:
+    """Each part by name, in alphabetical order; one alone has none."""
+    return sorted(observation.items()) if isinstance(observation, Mapping) else [("", observation)]

@@ -23,7 +23,7 @@ class Try:
     appearance: str
     done: bool  #: whether the first event was the macro-action that was asked for
     periods: int
-    fault: str  #: what happened instead, or empty
+    fault: str  #: the fault, or another event, or no event; empty where it was done
 
 
 def one_try(env: Any, clone: Clone, macro_action: int, rng: np.random.Generator) -> Try:
