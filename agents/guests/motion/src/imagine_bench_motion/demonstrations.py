@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from imagine_bench.errors import InvalidValueError
 
 from .instruction import GO_BACK
-from .skills import begin, images_of, numbers_of, skill_env
+from .skills import HOME_COMMAND, begin, images_of, numbers_of, skill_env
 
 NOISE_RAD = 0.012
 """Standard deviation of the noise that a joint command gets each period, in every second demonstration."""
@@ -139,7 +139,7 @@ class _Stage:
         self._expert.begin(macro_action)
         instruction = env.task.action_names[macro_action]
         found = _Episode()
-        off_rad = np.zeros(env.action_space.shape[0] - 1)
+        off_rad = np.zeros(len(HOME_COMMAND) - 1)
         done = False
         while not self._expert.is_done:
             command = np.asarray(self._expert.act(), dtype=np.float32)

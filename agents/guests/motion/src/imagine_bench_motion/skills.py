@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.errors import require_known
 from imagine_bench.interfaces import State
-from imagine_bench.rules import Rules
+from imagine_bench.rules import Rules, states_of
 
 CONTROL = "joint"
 """The control of all commands here: joints (rad) and the grip, absolute, as in ACT. Errors do not add up."""
@@ -23,7 +23,10 @@ START_JOINTS_RAD = 0.08
 """The largest distance of each joint from the observation pose at a varied start: some 4 cm of the hand."""
 START_PERIODS = 8
 """Control periods in which the arm goes from the observation pose to a varied start."""
-FAMILIES = {"arrows": functools.partial(make_arrows, horizon=10), "pick_place": make_pick_place}
+FAMILIES: Mapping[str, Callable[..., MotionEnv]] = {
+    "arrows": functools.partial(make_arrows, horizon=10),
+    "pick_place": make_pick_place,
+}
 HOME_COMMAND = np.array([*OBSERVATION_QPOS_RAD, 1.0], dtype=np.float32)
 """The command that keeps the arm at its observation pose, with open fingers."""
 HELD_GRIP = 0.5
@@ -70,9 +73,10 @@ def begin(env: MotionEnv, macro_action: int, rng: np.random.Generator) -> Any:
     return observation
 
 
-@functools.cache
 def _starts(rules: Rules, macro_action: int) -> list[State]:
-    moves = ((state, outcome.macrostate) for state in rules.states for outcome in rules.outcomes(state, macro_action))
+    moves = (
+        (state, outcome.macrostate) for state in states_of(rules) for outcome in rules.outcomes(state, macro_action)
+    )
     return list(dict.fromkeys(state for state, reached in moves if state[:-1] != reached[:-1]))
 
 
