@@ -108,7 +108,7 @@ class CpuLimit:
             if used > 2.0 * limit:
                 pytest.fail(
                     f"The test used {used:.1f} CPU s, more than twice the limit of {limit:.1f} CPU s. "
-                    "Make it cheaper, share what it trains in a module's fixture, or mark it slow.",
+                    "Make it cheaper, share a trained model in a module's fixture, or mark it slow.",
                     pytrace=False,
                 )
         return result

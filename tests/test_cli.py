@@ -1,4 +1,4 @@
-"""The command line: what it says to wrong words, and that a bench ends in a table, a report and an honest exit code."""
+"""The command line: its answers to wrong words, and that a bench ends in a table, a report and an honest exit code."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def test_a_failing_seed_fails_the_command_and_names_its_log(
     assert len(inline.order) == 2
     assert (folder / "failing/seed_0/DONE").exists() and not (folder / "failing/seed_1/DONE").exists()
     assert main(["report", str(folder)]) == 0
-    assert "Missing are failing seed 1: 0 of 5" in capsys.readouterr().out, "what is missing is never left out"
+    assert "Missing are failing seed 1: 0 of 5" in capsys.readouterr().out, "a missing run is never left out"
 
 
 def test_a_bench_ends_with_a_table_a_report_and_recordings(
@@ -361,6 +361,6 @@ FAMILY = [value for value in vars(errors).values() if isinstance(value, type) an
 @pytest.mark.parametrize("kind", FAMILY)
 def test_every_error_comes_back_from_a_worker_process(kind: type[ImagineBenchError]) -> None:
     """One that cannot be unpickled breaks a whole pool of processes."""
-    error = UnknownNameError("task", "arow", ["arrow"]) if kind is UnknownNameError else kind("what went wrong")
+    error = UnknownNameError("task", "arow", ["arrow"]) if kind is UnknownNameError else kind("the fault")
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is kind and str(again) == str(error) and vars(again) == vars(error)

@@ -25,7 +25,9 @@ _TOP = Path(__file__).parent.parent
 LOOSE = "loose modules"
 """The modules that lie in ``imagine_bench/`` itself count as one folder."""
 PACKAGE = "the package itself"
-"""``__init__.py``, ``api.py`` and ``__main__.py`` of ``imagine_bench``: what its import and ``python -m`` offer."""
+"""``__init__.py``, ``api.py`` and ``__main__.py`` of ``imagine_bench``: the names that its import and ``python -m``
+offer.
+"""
 FOLDERS = (
     LOOSE,
     "imagine_bench/reference",

@@ -1,4 +1,6 @@
-"""What an ordinary user installs: a wheel that holds only ``imagine_bench``, with everything it needs at run time."""
+"""The installation of an ordinary user: a wheel that holds only ``imagine_bench``, with everything it needs at run
+time.
+"""
 
 from __future__ import annotations
 
@@ -99,7 +101,7 @@ def test_the_lock_meets_every_requirement(python: str) -> None:
 
 
 def test_every_python_gets_the_versions_of_the_others() -> None:
-    """What bits depend on differs between no two Pythons."""
+    """The packages that bits depend on differ between no two Pythons."""
     shared = set.intersection(*({*locked(python).items()} for python in _PYTHONS))
     assert {"daqp", "gymnasium", "mink", "mujoco", "numpy", "safetensors", "scipy"} <= {name for name, _ in shared}
     assert "dm-control" in locked("3.12") and "dm-control" not in locked("3.13"), "labmaze has no wheel for it"
@@ -129,7 +131,7 @@ def test_torch_is_pinned_alike_and_its_needs_are_locked() -> None:
 
 
 def test_environments_alone_need_no_torch_rerun_or_matplotlib() -> None:
-    """In a process that finds no module of an extra: an episode, the lists, the rules; and what a bench says."""
+    """In a process that finds no module of an extra: an episode, the lists, the rules; and the answer of a bench."""
     code = f"""
 import sys
 from importlib.machinery import PathFinder
@@ -186,7 +188,7 @@ def test_the_development_container_is_that_image_and_sets_up_its_own_checkout() 
     assert (folder / said["build"]["context"]).resolve() == _TOP
     assert said["postCreateCommand"] == "make setup"
     left_out = (_TOP / ".dockerignore").read_text().split()
-    assert {".venv/", "runs/", "datasets/"} <= set(left_out), "what a checkout has made stays out of the image"
+    assert {".venv/", "runs/", "datasets/"} <= set(left_out), "files that a checkout has made stay out of the image"
     interpreter = said["customizations"]["vscode"]["settings"]["python.defaultInterpreterPath"]
     assert interpreter == "${containerWorkspaceFolder}/.venv/bin/python"
 

@@ -1,4 +1,4 @@
-"""``.ci/setup.sh`` run for real, with interpreters that only pretend, and what the Makefile makes of its variables."""
+"""``.ci/setup.sh`` run for real, with interpreters that only pretend, and the Makefile's use of its variables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 TOOLS = "awk bash cat chmod cksum cp dirname grep head id mkdir mktemp rm tail uname".split()
 GUESTS = ("controls", "motion", "peers")
 LOCK = "--no-deps --require-hashes -r .ci/requirements.lock"
-# An interpreter that pretends: it makes an environment of itself and notes what it should install.
+# An interpreter that pretends: it makes an environment of itself and notes the packages to install.
 PRETENDER = r"""
 case "$*" in
     "-c "*) answer ;;
@@ -33,7 +33,7 @@ FAILS = "echo no network >&2; exit 1"
 
 
 class Checkout:
-    """A folder with what setup reads, and a PATH of interpreters that pretend."""
+    """A folder with the files that setup reads, and a PATH of interpreters that pretend."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -47,7 +47,7 @@ class Checkout:
             (self.path / tool).symlink_to(shutil.which(tool) or pytest.fail(f"no {tool} here"))
 
     def python(self, name: str, version: str = "3.12.1", install: str = ":", venv: str = ":") -> None:
-        """Put an interpreter on the PATH; a version that is no number is what it complains of."""
+        """Put an interpreter on the PATH; it complains of a version that is no number."""
         answer = f"echo {version}" if version[0].isdigit() else f"echo '{version}' >&2; exit 127"
         parts = {"answer": answer, "install": install, "venv": venv}
         functions = [f"{part}() {{ {does}; }}" for part, does in parts.items()]
@@ -69,7 +69,7 @@ class Checkout:
         return done.returncode, done.stdout
 
     def log(self) -> list[str]:
-        """What interpreters were asked to make and install."""
+        """The calls of interpreters to make and install."""
         return (self.folder / "log").read_text().splitlines() if (self.folder / "log").exists() else []
 
 
@@ -126,7 +126,7 @@ def test_an_interpreter_that_was_named_is_the_only_one(ready: Checkout) -> None:
     ready.python("python3.11", "3.11.7")
     code, out = ready.setup(PYTHON="python3.10")
     assert (code, out.splitlines()[-2:]) == (1, ["setup: PYTHON=python3.10 cannot be used:", "  python3.10: not found"])
-    assert (ready.folder / ".venv/bin/python").exists(), "what was there is left"
+    assert (ready.folder / ".venv/bin/python").exists(), "earlier files are left"
     assert ready.setup(PYTHON="python3") == (0, ""), "the same version"
     code, out = ready.setup(PYTHON=str(ready.path / "python3.11"))  # a path with a space
     assert code == 0 and "making .venv anew: PYTHON asks for another Python than its 3.12.1" in out

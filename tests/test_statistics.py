@@ -1,4 +1,4 @@
-"""Statistics against answers worked out by hand, against scipy's, and against what defines them."""
+"""Statistics against answers worked out by hand, against scipy's, and against their definitions."""
 
 from __future__ import annotations
 
@@ -249,7 +249,9 @@ def test_auroc_and_the_probability_of_improvement_count_pairs() -> None:
 
 
 def test_so_many_more_runs_would_show_a_difference_in_four_of_five() -> None:
-    """Of normal runs 20 points apart, with a standard deviation of 15: what more_seeds says of 6 is what they need."""
+    """Of normal runs 20 points apart, with a standard deviation of 15: the answer of more_seeds for 6 is their true
+    need.
+    """
     rng = np.random.default_rng(0)
     pairs = rng.normal([[0.6], [0.4]], 0.15, (200, 2, 6))
     counts = [6 + statistics.more_seeds(a, b, cells=2) for a, b in pairs if statistics.difference(a, b).p > 0.025]

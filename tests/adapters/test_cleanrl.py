@@ -1,4 +1,4 @@
-"""A loop like CleanRL's on our vector environment: what it reads at the end of an episode is what happened."""
+"""A loop like CleanRL's on our vector environment: it reads the end of an episode as it was."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LANES = 3
 
 
 def collected(envs, total_timesteps, seed=1):
-    """The acting half of ``cleanrl/dqn.py``: what its buffer would hold, by column, and the episodes it would print."""
+    """The acting half of ``cleanrl/dqn.py``: the contents of its buffer, by column, and the episodes it would print."""
     rng = np.random.default_rng(seed)
     stored = []
     printed = []

@@ -1,4 +1,4 @@
-"""Our tasks in stable-worldmodel's ``World``: a policy scores what it deserves, and episodes are ours to the bit.
+"""Our tasks in stable-worldmodel's ``World``: a policy gets its exact score, and episodes are ours to the bit.
 
 The tests of the real library are skipped without it (``pip install stable-worldmodel imageio opencv-python-headless``).
 """

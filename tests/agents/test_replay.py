@@ -1,4 +1,4 @@
-"""The two memories: what goes in comes out, in pairs, and each by itself."""
+"""The two memories: stored rows come out again, in pairs, and each by itself."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_memory_is_restored_exactly_and_independently(count: int) -> None:
     assert torch.equal(first.z, second.z)
     assert torch.equal(first.reward, second.reward)
     fill(memory, 8, sigma=0.5)
-    assert (arrays["sigma"] < 0.2).all(), "what was stored does not follow later writes"
+    assert (arrays["sigma"] < 0.2).all(), "stored rows do not follow later writes"
 
 
 def test_sampling_an_empty_memory_is_an_error() -> None:

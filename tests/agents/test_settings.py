@@ -66,7 +66,7 @@ def test_the_defaults_are_the_published_numbers_of_chapter_5() -> None:
         "memory.imagined": 3_000,
     }
     assert {name: flat[name] for name in printed} == printed
-    of_the_suite = {  # what algorithm 1 has not, at rest
+    of_the_suite = {  # settings beyond algorithm 1, at rest
         "model.members": 1,
         "model.shared_hidden": (),
         "model.head_input": "next_state",

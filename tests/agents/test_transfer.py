@@ -1,4 +1,4 @@
-"""What learners keep from one task to the next of the same world, what they forget, and what they ask about."""
+"""The knowledge that learners keep from one task to the next of the same world, that they forget, and their queries."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_it_queries_what_is_uncertain_and_learns_no_dynamics() -> None:
     known, real, before = [evidence.copy() for evidence in dynamics_of(learner)], len(learner.replay), unknown()
     asked = ask(learner, 200)
     assert 0 < len(asked) < 200
-    assert max(map(len, asked)) > 1, "what is not one action away can be asked about too"
+    assert max(map(len, asked)) > 1, "states that are not one action away can be asked about too"
     assert all(np.array_equal(*pair) for pair in zip(known, dynamics_of(learner), strict=True))
     counted = learner.diagnostics()
     assert (counted["real_transitions"], counted["oracle/labels"]) == (real, len(asked))

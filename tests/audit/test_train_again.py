@@ -1,4 +1,6 @@
-"""Runs trained again: what a replay cannot show is found, and what was not compared is said first, with exit code 3."""
+"""Runs trained again: forgeries that a replay cannot show are found, and parts that were not compared are said first,
+with exit code 3.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results are verified by playing the test episodes again: what holds is said to hold, and every forgery is found."""
+"""Results are verified by playing the test episodes again: true claims are said to hold, and every forgery is found."""
 
 from __future__ import annotations
 
@@ -351,7 +351,7 @@ def test_a_policy_cannot_shift_the_starts_of_tests(env_id: str, execution: str, 
 
 
 def test_an_episode_cut_off_before_its_end_is_found(finished: Path) -> None:
-    """Everything that is claimed of it is true of what was played, which is not all of it."""
+    """Everything that is claimed of it is true of the played part, which is not all of it."""
     row, counts = load_bench(finished).runs[0].checkpoints[0], EvaluationCounts()
     assert row.kept is not None
     cut_off = int(np.flatnonzero(row.kept.lengths > 1)[0])

@@ -143,7 +143,7 @@ def best_sets(rules: Rules, horizon: int) -> list[dict[State, set[int]]]:
 def test_unlucky_is_what_an_optimal_policy_fails_with_the_same_draws(task: str, tmp_path: Path) -> None:
     """An optimal policy lives each test again in the real environment, whose generator draws the same.
 
-    Among equals it does what the agent does, as 'unlucky' says.
+    Among equals it takes the agent's action, as 'unlucky' says.
     """
     row, found = asked(tmp_path, "bad", task, evaluation_episodes=70, budgets=(1,))
     assert row.kept is not None and row.beliefs is not None

@@ -1,4 +1,4 @@
-"""What packages of others do wrong is one sentence, and costs nobody else's results."""
+"""A fault of another package is one sentence, and costs nobody else's results."""
 
 from __future__ import annotations
 

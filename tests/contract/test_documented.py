@@ -1,4 +1,5 @@
-"""What was documented on November 27 still works: paths can be imported, commands and make targets name the line.
+"""Everything that was documented on November 27 still works: paths can be imported, commands and make targets name the
+line.
 
 A line of ``frozen/documented.txt`` is a module, ``module:name`` or ``module:Class.member``. An old one warns once.
 """

@@ -1,4 +1,4 @@
-"""What every registered environment targets, in both executions."""
+"""The targets of every registered environment, in both executions."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def env(request):
 
 @pytest.mark.parametrize("task", WORLDS)
 def test_the_contracts_checks_and_stable_baselines_are_content(task):
-    """Every macrostate is begun in and told, and what follows is what the rules say, among others."""
+    """Every macrostate is begun in and told, and the next one is one of those of the rules."""
     assert report(checks(task)) == 0
     env = make(task, render_mode="rgb_array", width=64, height=48, **KINEMATIC)
     with warnings.catch_warnings():
@@ -82,7 +82,7 @@ def check_info(info, spec, *, after_step):
 
 
 def reached(spec, before, action, info):
-    """The rules' outcome that the environment reports; what the human does next may be one of several."""
+    """The rules' outcome that the environment reports; the next gesture of the human may be one of several."""
     after = tuple(info["macrostate"].tolist())
     (outcome,) = [each for each in spec.rules.outcomes(before, action) if each.macrostate == after]
     return outcome

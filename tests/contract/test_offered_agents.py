@@ -81,7 +81,7 @@ def test_a_packages_agent_is_compared_like_one_of_ours(
     row = dict(zip(metrics[0].split(","), metrics[-1].split(","), strict=True))
     assert float(row["diagnostics/real_transitions"]) == float(row["env_steps"]) > 0
     guests.offer(site, {})
-    assert main(["report", str(folder)]) == 0, "what was measured can be read without the package"
+    assert main(["report", str(folder)]) == 0, "results can be read without the package"
     said = capsys.readouterr().out
     assert "Not installed here: agent their_agent. Numbers that need missing code are not shown." in said
     assert re.search(r"^their_agent +\d", said, re.MULTILINE)
@@ -116,7 +116,7 @@ def test_an_offer_that_is_no_agent_costs_nobody_anything(
 ) -> None:
     (site / "their_broken.py").write_text("1 / 0")
     guests.offer(site, {registry.AGENT_GROUP: {point: target, "fine": "their_package:ENTRY"}})
-    assert versions()["their_package"].startswith("1.2+"), "what is broken can still be named"
+    assert versions()["their_package"].startswith("1.2+"), "a broken agent can still be named"
     assert registry.agent_entry("dqn") is registry.AGENTS["dqn"] and registry.agent_entry("fine").title == "Theirs"
     with pytest.raises(SetupError, match=r"^The package their_package offers ") as caught:
         registry.agent_entry(asked)

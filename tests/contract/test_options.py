@@ -65,7 +65,7 @@ def test_every_option_of_the_world_has_an_effect_or_is_refused(agent: str) -> No
     refused = refusals(agent, [name for name, row in OPTION_ROWS.items() if row.shown])
     if registry.agent_entry(agent).privileged:  # one that renders its world needs an encoder of that very world
         refused -= {"gesture", "lag"}
-    assert not refused & {"split", "physics", "appearance", "gesture", "lag"}, "what the world is like is for all"
+    assert not refused & {"split", "physics", "appearance", "gesture", "lag"}, "the world is the same for all"
 
 
 @pytest.mark.parametrize("agent", AGENTS)

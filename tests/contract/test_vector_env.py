@@ -41,7 +41,7 @@ def make_sync(mode, **options):
 
 
 def walk_both(one, other, steps, n_actions, *, mask):
-    """Step two vector environments alike and compare what they return: how many episodes ended by rule and limit."""
+    """Step two vector environments alike and compare their results: how many episodes ended by rule and limit."""
     for each in zip(one.reset(seed=3), other.reset(seed=3), strict=True):
         assert_same(*each)
     rng, ended = np.random.default_rng(0), np.zeros(2, dtype=int)

@@ -1,4 +1,4 @@
-"""A collected dataset is what happened: it can be replayed, its policies are what they say, one seed is one content."""
+"""A collected dataset is true: it can be replayed, its policies are as named, one seed is one content."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_the_command_collects_and_describes(tmp_path: Path, capsys: pytest.Captu
     assert main([*words, "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert main(["dataset", "--describe", str(out)]) == 0
-    assert capsys.readouterr().out == said.partition("\n")[2], "what is read is what was written"
+    assert capsys.readouterr().out == said.partition("\n")[2], "the read dataset is the written one"
     for part in ("oracle (optimal macro-actions by the rules), seed 0", "100.0% of episodes [34.2%", "chance 4.6%"):
         assert part in said
     assert describe(read_dataset(out)) in said and read_dataset(out).episodes.hash in said

@@ -209,7 +209,7 @@ def test_writers_of_one_name_do_not_mix(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_no_value_changes_with_its_type() -> None:
-    """Others may keep actions as floats and rewards as integers; what is no action is refused."""
+    """Others may keep actions as floats and rewards as integers; a number that is no action is refused."""
     episodes = collected()[0]
     steps, frames = episodes.steps(0)
     part = {name: getattr(episodes, name)[steps] for name in ("actions", "rewards", "terminated", "truncated")}

@@ -153,7 +153,7 @@ def test_a_set_of_others_is_read_without_a_card(tmp_path: Path, monkeypatch: pyt
 
 
 def test_the_layout_is_lerobots(tmp_path: Path) -> None:
-    """What LeRobot's own reader needs; those of 0.4.4 and 0.6.1 were run on such a set, but install only apart."""
+    """The needs of LeRobot's own reader; those of 0.4.4 and 0.6.1 were run on such a set, but install only apart."""
     written(tmp_path / "set", "lerobot")
     episodes, folder = collected()[0], tmp_path / "set"
     info = json.loads((folder / "meta/info.json").read_text())

@@ -185,7 +185,7 @@ def reached(where: str, level: str) -> np.ndarray:
 
 
 def price(budget: str, where: str, what: str) -> str:
-    """What one run has had until a budget, mean over seeds: a column, or frames its encoder saw before."""
+    """The experience of one run until a budget, mean over seeds: a column, or frames its encoder saw before."""
     folder, _, agent = where.rpartition("/")
     if what == "frames":
         entry = registry.agent_entry(agent)
@@ -268,13 +268,13 @@ def study(budget: str, folder: str, *variants: str) -> str:
 
 
 def study_right(budget: str, folder: str, variant: str) -> str:
-    """What a variant's models hold rightly of one macro-action, %: mean."""
+    """The share that a variant's models know rightly of one macro-action, %: mean."""
     right = [float(row["imagined_right"]) for row in _study(folder, variant, budget) if row["imagined_right"]]
     return percent(float(np.mean(right))) if right else "–"
 
 
 def study_difference(budget: str, folder: str, *variants: str) -> list[Compared]:
-    """Against what each is compared with, points [95 %]."""
+    """Against the variant that each is compared with, points [95 %]."""
     found, tests = [], STUDIES["factors"].evaluation_episodes
     for variant in variants:
         against = _study(folder, variant, budget)[0]["against"]
@@ -334,7 +334,7 @@ def plans(folder: str, agent: str, key: str, episodes: str = "") -> str:
 
 
 def thesis_plans(key: str) -> str:
-    """The same of the thesis; an en dash for what it does not say."""
+    """The same of the thesis; an en dash for a number that it lacks."""
     found = reference.load("arrow_puzzle")["plans"]
     if key == "solved":
         return f"*{found['solved']} of {found['attempted']}*"

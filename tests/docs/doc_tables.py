@@ -5,8 +5,8 @@ A comment before a table names its folders and says what its cells are, in the w
     <!-- table: A=arrow_puzzle-quick; iqm(@,A/dqn)|average(@,A/random) -->
 
 ``@`` is the number in the row's first cell or, where the comment has ``rows: ...|...;``, the row's own arguments.
-``text`` is a column of words. Below a table that compares stands what its bold cells mean and the smallest difference
-that it could have shown. ``python tests/docs/doc_tables.py`` writes all that anew.
+``text`` is a column of words. Below a table that compares stand the meaning of its bold cells and the smallest
+difference that it could have shown. ``python tests/docs/doc_tables.py`` writes all that anew.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MARKED = re.compile(
 
 @dataclass(frozen=True)
 class Table:
-    """A marked table: where its text lies in the page, its lines, and what it should say."""
+    """A marked table: where its text lies in the page, its lines, and the right text."""
 
     start: int
     end: int

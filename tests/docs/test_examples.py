@@ -122,7 +122,7 @@ def test_what_the_page_says_of_elsewhere_was_kept() -> None:
 def test_what_an_agent_needs_over_the_floor(
     example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing, for who knows the way; blind choice is never good enough."""
+    """No gap for a player who knows the way; blind choice is never good enough."""
     assert len(list(example.worlds(3))) == 27
     monkeypatch.setattr(example, "BUDGETS", (4, 8))
     monkeypatch.setattr(example, "worlds", lambda cubes: [("arrow_puzzle_easy", "clean")])

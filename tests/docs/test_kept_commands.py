@@ -30,7 +30,7 @@ NOT_OPTIONS = (
     *("encoder", "codes", "sampled_futures", "settings_digest", "agent_names", "dataset"),
     *("headlines", "open_loop_starts", "recorded_episodes"),
 )
-"""Fields of a protocol that no option sets: what they were is compared, and a difference is named in the file."""
+"""Fields of a protocol that no option sets: their values are compared, and a difference is named in the file."""
 
 
 def name(folder: Path) -> str:
@@ -82,7 +82,7 @@ def test_each_kept_bench_has_one_command() -> None:
 def test_the_command_asks_for_the_kept_comparison(folder: Path) -> None:
     differs = differing(folder, planned(words(folder)))
     assert differs == COMMANDS[name(folder)]["differs"].split()
-    assert set(differs) <= set(NOT_OPTIONS), "an option of the command does not give what was kept"
+    assert set(differs) <= set(NOT_OPTIONS), "an option of the command does not give the kept value"
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ def test_the_command_leaves_a_bench_of_the_same_shape(folder: Path, tmp_path: Pa
 
 
 def fixed_columns(rows: list[dict[str, str]]) -> list[str]:
-    """The columns that every bench of the type has; those after them depend on what its agents measured.
+    """The columns that every bench of the type has; those after them depend on its agents' measurements.
 
     Benches of regressors before 2026-11-28 also had CRPS, transforms and pooled weight samples.
     """

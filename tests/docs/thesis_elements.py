@@ -1,4 +1,4 @@
-"""The page docs/thesis.md, made from docs/thesis.csv: every element of the thesis, where it is and what came of it.
+"""The page docs/thesis.md, made from docs/thesis.csv: every element of the thesis, its place and its result.
 
 ``python tests/docs/thesis_elements.py`` writes it anew. In a cell, ``{iqm(500,arrow_puzzle-quick/dqn)}`` is what
 :mod:`doc_cells` computes from the kept results.
@@ -77,7 +77,7 @@ def page() -> str:
 
 
 def missing(row: dict[str, str]) -> list[str]:
-    """What an element names and is not there."""
+    """Names of an element that are not there."""
     lacks = [] if not row["code"] or (ROOT / row["code"]).is_file() else [row["code"]]
     if row["page"] and not (ROOT / "docs" / row["page"]).is_file():
         lacks.append(row["page"])

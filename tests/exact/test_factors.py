@@ -19,7 +19,7 @@ from imagine_bench.exact.learner import learn
 
 
 def test_the_thesis_puzzle_has_39_facts():
-    """24 of what a turn does, 12 forbidden pairs, 3 goals: counted by hand."""
+    """24 effects of a turn, 12 forbidden pairs, 3 goals: counted by hand."""
     found = certificate(registry.task("arrow_puzzle"))
     assert (found.facts, found.width, found.macrostates, found.starts) == (39, 2, 165, 54)
     assert found.plan_lengths == ((1, 12), (2, 12), (3, 12), (4, 12), (5, 6))

@@ -27,7 +27,7 @@ ALL = pytest.mark.parametrize(("rules", "sight", "horizon"), WORLDS.values(), id
 
 
 def _best_over_histories(rules, sight, horizon):
-    """Expectimax over what was shown: whole trajectories of macrostates are kept, nothing is merged."""
+    """Expectimax over observations: whole trajectories of macrostates are kept, nothing is merged."""
 
     def best(trajectories, step):
         if step == horizon:

@@ -1,4 +1,4 @@
-"""Splits of starts: what training must never show, and that they are data with a hash."""
+"""Splits of starts: the starts that training must never show, and that they are data with a hash."""
 
 from __future__ import annotations
 

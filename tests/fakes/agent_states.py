@@ -35,5 +35,5 @@ def goes_on(agent: Any, other: Any, live: Callable[[Any, int, int], object], ste
     for each in (agent, other):
         live(each, steps, 3)
     assert same(agent.state(), other.state())
-    assert not same(agent.state(), saved), "what was learned since changed no snapshot"
+    assert not same(agent.state(), saved), "later learning changed no snapshot"
     return saved

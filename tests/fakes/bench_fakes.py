@@ -70,7 +70,7 @@ class TableAgent:
 
 
 class RulesImaginer(TableAgent):
-    """Imagines what it is told to: ``wrong_from`` is the first depth (from 1) it gets wrong, and the filter knows."""
+    """Imagines as it is told: ``wrong_from`` is the first depth (from 1) it gets wrong, and the filter knows."""
 
     wrong_from = 4
 
@@ -110,7 +110,7 @@ class FailingAgent(TableAgent):
 
 
 class Pupil(TableAgent):
-    """Notes all that it is shown, asks about random plans whenever it may, and counts what it carries over."""
+    """Notes all that it is shown, asks about random plans whenever it may, and counts its transfers."""
 
     made: list[Pupil] = []  # noqa: RUF012 - how a test finds it
 

@@ -28,7 +28,7 @@ class CountingModel:
     """An identifiable world model: latent (i, c) goes to (i, c + 1), and uncertainty and end come at chosen counts.
 
     The first latent dimension tells the rollouts apart by the action taken first. ``change`` gets the mixtures of
-    latents, and these, and returns what is predicted instead.
+    latents, and these, and returns the prediction instead.
     """
 
     members = 1
@@ -92,7 +92,7 @@ def make(*, filtered: bool, model: CountingModel, **changes: object) -> tuple[Im
 def imagined(
     model: CountingModel, *, filtered: bool = False, epsilon: float = 0.5, states: int = 1, **changes: object
 ) -> tuple[Imagination, Counts]:
-    """What such a model imagined from (0, 0), with so many real states remembered."""
+    """The imagination of such a model from (0, 0), with so many real states remembered."""
     imagination, controller = make(filtered=filtered, model=model, **changes)
     counts = imagination.rollouts(controller, torch.zeros(2), remembering(states), epsilon)
     return imagination, counts

@@ -1,4 +1,6 @@
-"""Agents for tests of what surrounds agents: they act at random from a seed, and imagine what a test can recognise."""
+"""Agents for tests of the code around agents: they act at random from a seed, and imagine frames that a test can
+recognise.
+"""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from imagine_bench import registry
 from imagine_bench.tools.new import new_package
 
 Offers = Mapping[str, Mapping[str, str]]
-"""What a package offers, as its pyproject.toml says it: targets by name, by group."""
+"""The offers of a package, as in its pyproject.toml: targets by name, by group."""
 
 
 class Guests:

@@ -79,7 +79,7 @@ class Hostile:
         return {"large": np.ones(2**28)}
 
     def sends_a_pickle(self, path: str) -> Arrays:
-        """Behind the back of who serves it."""
+        """Behind the back of its server."""
         for number in map(int, os.listdir("/proc/self/fd")):
             end = Path(f"/proc/self/fd/{number}")
             if end.exists() and str(end.readlink()).startswith("socket"):

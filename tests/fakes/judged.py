@@ -1,4 +1,4 @@
-"""Worlds that are judged without a renderer: their frames hold what they show as numbers."""
+"""Worlds that are judged without a renderer: their frames hold their content as numbers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def labelled(task: str) -> TaskSpec:
 
 
 def shown(frame: Frame, spec: TaskSpec) -> NDArray[np.int64]:
-    """What a labelled frame shows; -1 for what it hides."""
+    """The content of a labelled frame; -1 for a hidden coordinate."""
     return frame[0, : len(spec.macrostate_names), 0].astype(np.int64) - 1
 
 

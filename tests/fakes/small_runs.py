@@ -1,4 +1,4 @@
-"""Small runs, benches and datasets, made in this process, and what their results are compared by."""
+"""Small runs, benches and datasets, made in this process, and the comparison of their results."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def oracle() -> Agent:
 
 
 class Hand:
-    """Who plays in a learner's stead: the optimal macro-action with probability ``skill``, else any."""
+    """The player in a learner's stead: the optimal macro-action with probability ``skill``, else any."""
 
     def __init__(self, skill: float, rng: np.random.Generator) -> None:
         self._oracle = oracle()

@@ -46,7 +46,7 @@ def does(choice: dict[State, int], model: ExpectedOutcomes | None, states: tuple
 
 
 def episode(start: State, actions: list[int], **changes: Any) -> FailedEpisode:
-    """What comes of macro-actions by the rules, which leave nothing to chance here."""
+    """The outcomes of macro-actions by the rules, which leave nothing to chance here."""
     states, terminated = [start], False
     for action in actions:
         (outcome,) = RULES.outcomes(states[-1], action)
@@ -63,7 +63,7 @@ def cause(agent: PolicyTable, tried: NDArray[np.int64], happened: FailedEpisode,
 
 @pytest.mark.parametrize("start", FAR[::24])
 def test_the_best_stands_for_what_an_agent_does_where_it_reads_nothing(start: State) -> None:
-    """What its model says there, from frames that it misreads, is not held against the model."""
+    """The answers of its model there, from frames that it misreads, is not held against the model."""
     readable = np.array([state != start for state in STATES])
     there = model_of(SPEC, lambda state, action: state == start)
     failed = episode(start, [ILLEGAL[start]])

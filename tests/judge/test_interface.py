@@ -1,4 +1,4 @@
-"""What a model hands in is checked, and what is wrong with it is one sentence that names model and method."""
+"""The answers of a model are checked, and a fault is one sentence that names model and method."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:
             assert np.array_equal(answers.weights, each[name].weights)
             assert all(np.array_equal(array, each[name].offered[key]) for key, array in answers.offered.items())
     over = [world.spec.rules.is_terminal(state) for state in shuffled[0]]
-    assert any(over) and not all(over), "a batch does not tell that it is about what comes after an end"
+    assert any(over) and not all(over), "a batch does not tell that it is about frames after an end"
 
 
 def test_the_first_transitions_are_the_same_ones() -> None:

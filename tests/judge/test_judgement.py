@@ -1,4 +1,4 @@
-"""Models of other packages, and trained agents, are judged without a change here; what is kept is not done again."""
+"""Models of other packages, and trained agents, are judged without a change here; kept fits are not done again."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ _MODELS = ("nearest", "spy", "cheat", "raises", "late", "unmade", "exits", "dies
 
 
 class Said(NamedTuple):
-    """A judgement by the command: where it is kept, its exit status and what it printed."""
+    """A judgement by the command: its folder, its exit status and its output."""
 
     folder: Path
     status: int
@@ -382,7 +382,7 @@ def _judged(root: Path, *models: str, seeds: tuple[int, ...]) -> tuple[Path, Jud
 
 @pytest.mark.usefixtures("_few")
 def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tmp_path: Path) -> None:
-    """What an agent says its own images show counts for nothing."""
+    """An agent's own reading of its images counts for nothing."""
     run = str(runs["imaginer"])
     folder, one = _judged(tmp_path, run, "copy", seeds=(1000, 1001))
     (cell,) = (cell for cell in kept(folder, one) if cell["model"] == run)
@@ -399,7 +399,7 @@ def test_the_folder_of_an_agent_stands_for_all_its_runs(runs: dict[str, Path], t
     agent = str(runs["imaginer"].parent)
     folder, one = _judged(tmp_path, agent, seeds=(1000,))
     assert [(cell["model"], cell["seed"]) for cell in kept(folder, one)] == [(agent, 0), (agent, 1)]
-    assert not list(folder.glob("data-*")), "nothing is collected for what does not learn"
+    assert not list(folder.glob("data-*")), "nothing is collected for a model that does not learn"
     assert list(shown(folder, one)) == [agent]
 
 
@@ -420,7 +420,7 @@ def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Pat
     with _open(runs["imaginer"], "arrow_puzzle", tmp_path) as judged:
         visited = judged.visited
     assert visited is not None
-    assert 0 < len(visited) <= 2 * 20, "what it experienced is what the bench counted"
+    assert 0 < len(visited) <= 2 * 20, "its experience is the one that the bench counted"
     assert all(len(state) == 4 and 0 <= action < 6 for state, action in visited)
     twice = (str(runs["imaginer"]), str(runs["imaginer"] / ".." / "seed_0"))
     with pytest.raises(InvalidValueError, match="give each world model or run once"):

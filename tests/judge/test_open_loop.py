@@ -113,13 +113,13 @@ def test_uncertainty_is_held_to_the_errors_it_should_find(puzzle: EvalSet) -> No
     wrong = np.zeros((40, 10), dtype=np.bool_)
     wrong[1::2, 2] = True  # every other rollout, at depth 3
     loop = open_loop(Told(puzzle, wrong), puzzle, SeedTree(0))
-    assert loop.judged.tolist() == [40] * 3 + [20] + [40] * 6  # what begins wrong is not judged
+    assert loop.judged.tolist() == [40] * 3 + [20] + [40] * 6  # a transition that begins wrong is not judged
     assert (loop.auroc_epistemic[2], loop.auroc_modal[2], loop.auroc_aleatoric[2]) == (1.0, 0.0, 0.5)
     assert np.isnan(loop.auroc_epistemic[[0, 1, 3, 9]]).all()  # nothing is wrong there
 
 
 class Perfect(bench_fakes.RulesImaginer):
-    """Imagines what the environment itself shows, from a start that its first frame cannot tell from the real one."""
+    """Imagines the environment's own frames, from a start that its first frame cannot tell from the real one."""
 
     fresh = False
 

@@ -1,4 +1,4 @@
-"""The two ends of the scale score what enumeration says they must, and a planted mistake is charged exactly."""
+"""The two ends of the scale have the scores of enumeration, and a planted mistake is charged exactly."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def test_the_mean_squared_distance_of_all_samples_is_that_of_the_model(model: di
 
 
 class Toss:
-    """From state 0, one in four wins and ends; what was won stays, and would pay again."""
+    """From state 0, one in four wins and ends; a won state stays, and would pay again."""
 
     def outcomes(self, state: State, action: int) -> tuple[Outcome, ...]:
         if state == (1,):

@@ -78,7 +78,7 @@ def test_the_scene_stands_as_every_frame_shows_it(imagined: Path) -> None:
 
 
 def by_step(path: Path, entity: str, column: str) -> list[tuple[int, object]]:
-    """What was logged for an entity, each with its real step, in their order."""
+    """The values that were logged for an entity, each with its real step, in their order."""
     batches = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity]
     found = [
         pair
@@ -181,7 +181,7 @@ def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, 
 
 
 def logged(path: Path) -> dict[tuple[str, str], list[str]]:
-    """What was logged, by entity and column; how rows are cut into chunks depends on the clock and does not count."""
+    """The logged values, by entity and column; how rows are cut into chunks depends on the clock and does not count."""
     found: dict[tuple[str, str], list[str]] = {}
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()
@@ -328,7 +328,7 @@ def test_bodies_that_stand_still_get_no_new_poses(tmp_path: Path) -> None:
 
 
 def labelled(states: NDArray[np.int64], appearance: str, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Frames that say their macrostates in numbers; 255 for what is hidden."""
+    """Frames that say their macrostates in numbers; 255 for a hidden coordinate."""
     frames = np.zeros((len(states), 64, 64, 3), np.uint8)
     frames[:, 0, : states.shape[1], 0] = states % 256
     return frames

@@ -1,4 +1,4 @@
-"""Filmstrips show real frames as they are, mark what the rules forbid and where the filter cuts, and clip no words."""
+"""Filmstrips show real frames as they are, mark forbidden steps and the cut of the filter, and clip no words."""
 
 from __future__ import annotations
 

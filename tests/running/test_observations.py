@@ -1,4 +1,6 @@
-"""What agents see is a choice of the protocol: shown as named, refused where an agent cannot take it, reported."""
+"""The observation of agents is a choice of the protocol: shown as named, refused where an agent cannot take it,
+reported.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ _FEW: dict[str, Any] = {"budgets": (3,), "evaluation_episodes": 2, "execution": 
 
 
 class Witness(FakeAgent):
-    """Notes what it is shown."""
+    """Notes its observations."""
 
     seen: list[Observation]
     contexts: list[AgentContext]

@@ -1,4 +1,4 @@
-"""What a bench shows of its progress: what is done, the time left, and what was last heard of a run."""
+"""The progress of a bench on the screen: the finished part, the time left, and the latest news of a run."""
 
 from __future__ import annotations
 

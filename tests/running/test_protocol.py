@@ -1,4 +1,4 @@
-"""Protocols: complete, hashed, and strict about what they are given."""
+"""Protocols: complete, hashed, and strict about their values."""
 
 import dataclasses
 

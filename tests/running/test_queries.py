@@ -1,4 +1,4 @@
-"""What learners are taught and not shown: demonstrations, answers, and earlier tasks of the same world."""
+"""The teaching of learners: demonstrations, answers, and earlier tasks of the same world."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_no_more_queries_than_allowed_and_no_macrostate(tmp_path: Path) -> None:
     do(tmp_path / "run", queries=3, demonstrations=2)
     (pupil,) = Pupil.made
     last = load_newest(tmp_path / "run" / "checkpoints")
-    assert last is not None and last.values["queries"] == [0, 0, 3, 3, 3, 3], "who watches does not ask"
+    assert last is not None and last.values["queries"] == [0, 0, 3, 3, 3, 3], "a watching learner does not ask"
     assert len(pupil.answers) == 12
     assert all(answer is not None for _, answer in pupil.answers), "this puzzle leaves nothing to chance"
     assert len({answer for _, answer in pupil.answers}) > 1

@@ -1,4 +1,4 @@
-"""One run: what agents are shown, what is counted, and that a killed and resumed run ends in the same bits."""
+"""One run: the observations of agents, the counts, and that a killed and resumed run ends in the same bits."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_macro_action_that_is_tried_again_keeps_the_episode_of_its_first_time(
 
 
 def test_tests_have_starts_and_looks_that_training_never_saw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a tuning run, which is shown tuning starts alone, and what observers ask with is shown as tests are."""
+    """Of a tuning run, which is shown tuning starts alone, and the frames of observers look as tests do."""
     reset, seen, shown = MacroEnv.reset, set(), set()
 
     def noted(env: MacroEnv, *, seed: int, options: Any = None) -> Any:

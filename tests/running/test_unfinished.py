@@ -1,4 +1,4 @@
-"""A bench is run seed by seed, and what is there of an unfinished one can be read."""
+"""A bench is run seed by seed, and the finished part of an unfinished one can be read."""
 
 from __future__ import annotations
 

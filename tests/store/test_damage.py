@@ -1,4 +1,4 @@
-"""What was changed behind our back is refused in one sentence that names the file; what others left is no hindrance."""
+"""A file that was changed behind our back is refused in one sentence that names it; foreign files are no hindrance."""
 
 from __future__ import annotations
 

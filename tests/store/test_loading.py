@@ -45,7 +45,7 @@ def do(root: Path, *agents: str, **changes: Any) -> Path:
 
 
 def kept_from(folder: Path, kept: Path) -> Path:
-    """What is kept of a bench for good."""
+    """The part of a bench that is kept for good."""
     assert main(["report", str(folder)]) == 0
     kept.mkdir()
     for name in ("bench.json", "results.csv"):

@@ -1,4 +1,4 @@
-"""Encoders of worlds that none is bundled for: trained once for what the worlds look like, whatever their rules."""
+"""Encoders of worlds that none is bundled for: trained once for the looks of the worlds, whatever their rules."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LOOK_ALIKE = ("arrows:cubes=2", "arrows:cubes=2,slip=0.2", "arrows:cubes=2,goal=
 
 @pytest.fixture
 def trained(tmp_path, monkeypatch):
-    """What was trained, in order, by something that only leaves a file."""
+    """The trained encoders, in order, by something that only leaves a file."""
     made = []
 
     def retrain(spec, *, recipe, appearance, seed, out):
@@ -54,7 +54,10 @@ def test_what_looks_otherwise_is_trained_for_itself(trained):
     places = {encoders.own(registry.task(name), appearance, kind) for name, appearance, kind in wanted}
     assert len(places) == len(wanted) == len(trained)
     spec = registry.task("arrows:cubes=2")
-    for settings in ({"config_group": "chapter_3"}, {"preprocessing": "small_rgb"}):  # and what is trained otherwise
+    for settings in (
+        {"config_group": "chapter_3"},
+        {"preprocessing": "small_rgb"},
+    ):  # and encoders that are trained otherwise
         assert encoders.cached(dataclasses.replace(spec, **settings), "clean", "codes") not in places
 
 

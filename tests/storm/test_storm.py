@@ -1,6 +1,6 @@
 """A storm: deaths, damages and hostile inputs by the thousand; nothing is silent, nothing raw. ``make storm`` runs it.
 
-Each test prints what it counted. What is drawn is drawn from a generator with a fixed seed.
+Each test prints its counts. Random numbers come from a generator with a fixed seed.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def test_every_region_of_every_file_may_be_damaged(  # noqa: C901, PLR0912
                 counts["the same"] += 1
             finally:
                 path.write_bytes(content)
-    if not finished:  # and what goes on from there
+    if not finished:  # and the runs that go on from there
         for path in sorted(path for path in run.rglob("*") if path.is_file() and not path.name.startswith(".lock")):
             content = path.read_bytes()
             for damaged in list(damages(content, rng))[::7]:
@@ -115,7 +115,7 @@ def test_every_region_of_every_file_may_be_damaged(  # noqa: C901, PLR0912
 
 
 _BEGINS = 77
-"""The exit code of a command that would begin a bench: what it was given has been accepted."""
+"""The exit code of a command that would begin a bench: its options have been accepted."""
 
 
 def command(rng: np.random.Generator, root: Path) -> str:

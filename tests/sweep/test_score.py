@@ -18,7 +18,7 @@ SCALES = (Scale(chance=0.1, optimum=0.9), Scale(chance=0.5, optimum=1.0))
 
 
 def _row(share):
-    """What an agent reaches that is so far on its way in every level."""
+    """The results of an agent that is so far on its way in every level."""
     return [scale.chance + share * (scale.optimum - scale.chance) for scale in SCALES]
 
 

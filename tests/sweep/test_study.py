@@ -62,7 +62,7 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path, capsys: pytest.C
         expected = line.success.mean(axis=0) - base.success.mean(axis=0)
         assert [one.value for one in line.difference] == pytest.approx(expected.tolist())
     again = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
-    assert len(launcher.jobs) == 6, "what is done is not run again"
+    assert len(launcher.jobs) == 6, "finished runs are not run again"
     assert all(np.array_equal(one.success, other.success) for one, other in zip(lines, again, strict=True))
     write_page(tmp_path / "out", study_page(STUDY, lines))
     assert "also holds" not in capsys.readouterr().out
@@ -186,7 +186,7 @@ DIGESTS = {
     "factors": "783723911a58", "deviations": "9448576e1c0c", "ladder": "16c2e21e0136", "controller": "a461c222ed4c",
     "curiosity": "f24530419bb3", "uncertainty": "286a80f9b84c", "remarks": "234d3c347058", "smoke": "4d5a5ddbd8cc",
 }  # fmt: skip
-"""Of every study that kept results may name: what it compared when they were made."""
+"""Of every study that kept results may name: its variants when they were made."""
 
 
 @pytest.mark.parametrize("name", STUDIES)

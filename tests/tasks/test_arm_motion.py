@@ -1,4 +1,4 @@
-"""What can be read of the arm's motion during a macro-action, and that reading it changes nothing."""
+"""The readings of the arm's motion during a macro-action, and that reading it changes nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an environment can be asked to show: parts of one moment, of any size, and macrostates that nobody visits."""
+"""The observations of an environment: parts of one moment, of any size, and macrostates that nobody visits."""
 
 from __future__ import annotations
 

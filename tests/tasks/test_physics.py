@@ -1,4 +1,4 @@
-"""What decides whether a grasp holds: settings, their margins, blind moves, and what the arm may run into."""
+"""The physics of grasping: settings, their margins, blind moves, and collisions of the arm."""
 
 import copy
 

@@ -134,10 +134,10 @@ def test_frames_survive_a_foreign_renderer_in_the_same_process(world, foreign):
 def test_a_context_that_other_code_damaged_is_not_shared(world, foreign):
     first, second = Renderer(world.model, agent_camera_view()), Renderer(world.model, agent_camera_view())
     before = first.frame(world.data)
-    foreign._mjr_context.free()  # while ours is current: OpenGL deletes what has the same numbers in ours
+    foreign._mjr_context.free()  # while ours is current: OpenGL deletes objects of the same numbers in ours
     assert not np.array_equal(first.frame(world.data), before), "nothing was damaged"
     assert np.array_equal(second.frame(world.data), before)
-    assert np.array_equal(first.frame(world.data), before), "who shared it takes another one, too"
+    assert np.array_equal(first.frame(world.data), before), "an environment that shared it takes another one, too"
     first.close()
     second.close()
     assert np.array_equal(first.frame(world.data), before)

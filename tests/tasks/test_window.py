@@ -30,7 +30,7 @@ def make(**options):
 
 @pytest.fixture
 def shown(monkeypatch):
-    """What windows show, image by image, without waiting between them."""
+    """The images of windows, one by one, without waiting between them."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     images, flip = [], pygame.display.flip
 

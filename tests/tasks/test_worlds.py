@@ -1,4 +1,4 @@
-"""Worlds: what is put into a scene is read back from it, however it looks."""
+"""Worlds: a macrostate that is put into a scene is read back from it, however it looks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_macrostates_are_read_back_at_every_level(name, level):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_people_see_all_that_is_acted_on_and_larger_than_from_afar(name):
-    """Objects, fingers, and what points or is held out lie within an image of four to three."""
+    """Objects, fingers, and hands lie within an image of four to three."""
     world, rules = world_of(name, FIXED), registry.task(name).rules
     model, data = world.model, world.data
     parts = [model.body(index).name for index in range(model.nbody)]
@@ -67,7 +67,7 @@ def test_people_see_all_that_is_acted_on_and_larger_than_from_afar(name):
     ],
 )
 def test_the_gripper_passes_the_pointing_hand(name, state, action):
-    """With what it holds."""
+    """With a held object."""
     world = world_of(name, FIXED)
     world.place(state, np.random.default_rng(0))
     people = world.data.mocap_pos.copy()

@@ -1,4 +1,4 @@
-"""``check --physics``: fidelity and margins of any task, and what is refused."""
+"""``check --physics``: fidelity and margins of any task, and refusals."""
 
 import dataclasses
 import json

@@ -2,9 +2,9 @@
 
 cosmic-ray says what can be changed in the files below. Of all the places a sample is drawn, as many a room, and at
 each place one of its changes. Each is made in a copy of the checkout, where the tests of its file run until one fails.
-What was tried is kept as it comes in ``build/mutants.jsonl``: the same command goes on there, and tries again what
-no test noticed. In the end ``build/mutants.json`` holds the counts and ``build/mutants.csv`` all that was tried, with
-the reason why a survivor may live, as far as ``mutants_that_may_live.json`` gives one.
+Tried mutants are kept as they come in ``build/mutants.jsonl``: the same command goes on there, and tries again those
+that no test noticed. In the end ``build/mutants.json`` holds the counts and ``build/mutants.csv`` all that was tried,
+with the reason why a survivor may live, as far as ``mutants_that_may_live.json`` gives one.
 """
 
 from __future__ import annotations
@@ -83,7 +83,9 @@ _SLOWEST = 5.0
 
 
 def bare(code: str) -> str | None:
-    """A program without what the type checker watches and not the tests: annotations and guards; None if it is none."""
+    """A program without the parts that the type checker watches and not the tests: annotations and guards; None if it
+    is none.
+    """
     try:
         tree = ast.parse(code)
     except SyntaxError:
@@ -105,7 +107,7 @@ def bare(code: str) -> str | None:
 
 
 def places(file: str) -> dict[tuple[Any, Any], list[tuple[str, int]]]:
-    """Where a file can be changed, and what each place can be changed by: operators and their occurrences."""
+    """Where a file can be changed, and the changes for each place: operators and their occurrences."""
     found: dict[tuple[Any, Any], list[tuple[str, int]]] = {}
     nodes = list(ast_nodes(get_ast((ROOT / file).read_text())))
     for name in operator_names():

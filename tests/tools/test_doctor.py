@@ -1,4 +1,4 @@
-"""The doctor and the facts it reads: what is wrong is said in words, what is right is left alone."""
+"""The doctor and the facts it reads: a fault is said in words, sound parts are left alone."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_the_broken_pair_is_named() -> None:
 
 
 def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each edit, and a new file that nobody added, has a name of its own; what is no code has none."""
+    """Each edit, and a new file that nobody added, has a name of its own; a file that is no code has none."""
 
     def git(*words: str) -> None:
         identity = ("-c", "user.name=x", "-c", "user.email=x@example.org")

@@ -106,7 +106,7 @@ def test_the_model_imagines_from_the_first_frame_by_the_same_keys(monkeypatch):
     sees, imagines = game.render()[:, -568:-284], game.render()[:, -284:]
     np.testing.assert_allclose(panel(imagines)[..., 0], 0.9 * frame.mean(axis=2), atol=1)
     np.testing.assert_array_equal(panel(sees), seen[-1][0])
-    assert not np.array_equal(imagines[240:], blank[240:]), "words about what it predicts"
+    assert not np.array_equal(imagines[240:], blank[240:]), "words about its predictions"
     assert game.summary().endswith("\nThe model foresaw 1 of 2 macrostates.")
     game.close()
 
@@ -157,7 +157,7 @@ def test_keyboard_events_play_the_task(keyboard, capsys):
 
 
 class Bare(gymnasium.Wrapper):
-    """What the contract asks of a task, and no more: no scene to look at."""
+    """A task by the contract alone, and no more: no scene to look at."""
 
     unwrapped = property(lambda self: self)
 
@@ -206,7 +206,7 @@ def test_a_film_reaches_the_goal_and_is_never_overwritten(tmp_path):
     assert len(pictures) > 20 and pictures.shape[1:] == (568, 924)
     assert np.abs(np.diff(pictures[:, :, :640], axis=0)).max() > 50, "the arm is seen moving"
     frames = pictures[:, 36 : 36 + 192, 648 : 648 + 192]
-    assert np.abs(frames[-1] - frames[0]).max() > 50, "what the agent sees at the end is not what it saw at first"
+    assert np.abs(frames[-1] - frames[0]).max() > 50, "the agent's last frame is not its first one"
     before = out.read_bytes()
     with pytest.raises(SetupError, match="exists and is not overwritten"):
         film("arrow_puzzle", out, seed=1)

@@ -1,4 +1,4 @@
-"""The encoders that come with the package: what they read on fresh frames, and how fast."""
+"""The encoders that come with the package: their reading of fresh frames, and their speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command that trains an encoder anew: what it leaves, and what it refuses."""
+"""The command that trains an encoder anew: its files, and its refusals."""
 
 from __future__ import annotations
 

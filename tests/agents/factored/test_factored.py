@@ -23,7 +23,7 @@ from imagine_bench.interfaces import AgentState, Observation
 
 @pytest.mark.parametrize("sizes", [(3, 4, 4, 4), (7, 7), (3, 3, 2)])
 def test_what_an_untried_action_does_is_imagined_as_expected(sizes: tuple[int, ...]) -> None:
-    """Whether a tie between what was seen and the prior is rounded up or down must not decide it."""
+    """Whether a tie between experience and the prior is rounded up or down must not decide it."""
     model, rng = FactoredModel(sizes, 2, FactoredSettings()), np.random.default_rng(0)
     code = (0,) * len(sizes)
     for _ in range(3):
@@ -210,7 +210,7 @@ def test_what_draws_it_can_be_read_and_changes_nothing() -> None:
 @pytest.mark.parametrize("place", range(4))
 def test_optimism_values_the_unknown_at_the_best_reward(place: int) -> None:
     class Untried(_Chain):
-        """Only the end brings a reward; what the others do is half unknown."""
+        """Only the end brings a reward; the effect of the others is half unknown."""
 
         def results(self, codes: NDArray[np.int64], moves: Moves) -> Results:
             found = super().results(codes, moves)

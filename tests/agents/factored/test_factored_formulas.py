@@ -62,9 +62,9 @@ PARENTS = {0: ((0,), (0, 1)), 1: ((1,), (0, 1))}
 def structures(
     factor: int, code: Code, rows: list[CodeTransition], pooled: list[CodeTransition], fails: float
 ) -> list[tuple[Floats, Floats, float]]:
-    """What each would expect of an action after ``rows`` of it, and others that were pooled.
+    """The expectation of each for an action after ``rows`` of it, and others that were pooled.
 
-    It stays; changes by itself; tables; tables whose rows are alike. Each is what is expected, what was seen, and the
+    It stays; changes by itself; tables; tables whose rows are alike. Each is the expected value, the seen one, and the
     weight of the prior.
     """
     values, own, pseudo = SIZES[factor], code[factor], DYNAMICS.concentration * SIZES[factor]
@@ -95,7 +95,8 @@ def structures(
 def learned_by_hand() -> tuple[Floats, list[float], int]:
     """How probable each structure of each factor and action is, (2, A, 6), and how often any action fails to change it.
 
-    Priors, and how well each told what came next; what actions teach together is pooled whenever a tenth more was seen.
+    Priors, and how well each told the next value; the joint knowledge of actions is pooled whenever a tenth more was
+    seen.
     """
     by_size = np.array([1 / 1.25, 0.25 / 1.25])
     prior = np.array([0.4, 0.6 * 0.2, *0.6 * 0.8 * 0.7 * by_size, *0.6 * 0.8 * 0.3 * by_size])
@@ -122,7 +123,7 @@ def learned_by_hand() -> tuple[Floats, list[float], int]:
 
 
 def predicted(factor: int, code: Code, action: int) -> tuple[FactorPrediction, Floats]:
-    """What is predicted, and what was seen: averages over the structures."""
+    """Predictions, and experience: averages over the structures."""
     weight, fails, pooled_at = learned_by_hand()
     rows = [row for row in lived() if row.action == action]
     every = structures(factor, code, rows, lived()[:pooled_at], fails[factor])
@@ -161,7 +162,7 @@ def test_each_conjunction_has_a_number_of_its_own() -> None:
 
 
 def brought(model: FactoredModel, code: Code, action: int, following: Code) -> tuple[dict[int, float], float]:
-    """Probability of each outcome, and that something untested decides: by causes, and by what was seen."""
+    """Probability of each outcome, and that something untested decides: by causes, and by experience."""
     chance, untested = by_noisy_or(model, code, action, following)
     pseudo, same = SETTINGS.outcomes.pseudo_seen, [row for row in lived() if row[:3] == (code, action, following)]
     seen = Counter(model.outcomes.outcomes.index((row.reward, row.terminated)) for row in same)
@@ -276,7 +277,7 @@ def test_causes_are_found_by_expectation_maximisation() -> None:
         likelihood = chance[brought, np.arange(len(rows))] / chance.sum(axis=0)
         return strengths, tests, rate, float(np.log(likelihood).sum()) + cost
 
-    assert causes.default == int(np.argmax([explain(default)[3] for default in range(3)])), "what explains it best"
+    assert causes.default == int(np.argmax([explain(default)[3] for default in range(3)])), "the best explanation"
     strengths, tests, rate, posterior = explain(causes.default)
     for outcome, strength in strengths.items():
         assert causes.strength[outcome, met] == pytest.approx(strength)

@@ -1,4 +1,4 @@
-"""Perception learned while acting: what is found in pictures of a tiny world, and an agent that begins with nothing."""
+"""Perception learned while acting: factors in images of a tiny world, and an agent that begins with nothing."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_pieces_that_hardly_part_are_one_factor() -> None:
 
 @pytest.mark.parametrize(("top", "found"), [(30, 1), (0, 0), (59, 0)])
 def test_a_small_thing_is_a_factor_unless_the_border_cuts_it(top: int, found: int) -> None:
-    """Five by five pixels; what comes into view at the border is as small, and no thing."""
+    """Five by five pixels; a sliver that comes into view at the border is as small, and no thing."""
     frames = gray(60)
     frames[np.random.default_rng(0).random(60) < 0.5, top : top + 5, 30:35] = 220
     assert len(appearance.find(frames)) == found
@@ -157,7 +157,7 @@ def test_the_widest_gap_parts_the_groups() -> None:
 
 
 def test_what_changed_often_enough_is_a_factor_however_long_nothing_changed() -> None:
-    """In 2.5 % of the steps, the share of one of many things; what changed half as often is none yet."""
+    """In 2.5 % of the steps, the share of one of many things; a thing that changed half as often is none yet."""
     frames = gray(800)
     frames[40::80, 20:32, 20:32] += (100 * shape(0))[..., None].astype(np.uint8)
     frames[80::160, 40:52, 40:52] += (100 * shape(1))[..., None].astype(np.uint8)
@@ -166,7 +166,7 @@ def test_what_changed_often_enough_is_a_factor_however_long_nothing_changed() ->
 
 
 def test_a_faint_edge_in_an_empty_place_is_no_value() -> None:
-    """A sliver of what lies beside it has contours, but hardly any beside those of what may lie there."""
+    """A sliver of a neighbour has contours, but hardly any beside those of objects that may lie there."""
     value = np.arange(90) % 3  # nothing, or one of two marks
     frames = gray(90)
     for kind in (0, 1):
@@ -263,7 +263,7 @@ def test_with_as_many_frames_as_it_may_remember_it_sees_as_before() -> None:
 
 
 def test_it_can_show_how_it_learned_to_see(trained: Trained) -> None:
-    """As often as what it saw changed; pictures show each factor where it is, and change nothing in the agent."""
+    """As often as its perception changed; images show each factor where it is, and change nothing in the agent."""
     learner, _ = trained
     before = learner.state()
     shown = list(learner.perceived())
@@ -297,6 +297,6 @@ def test_what_was_done_is_remembered_with_its_frames_and_how_long_episodes_are(t
         assert actions[actions >= 0].tolist() == taken
         assert begins.sum() == EPISODES
         assert np.array_equal(actions < 0, np.roll(begins, -1)), "nothing was done in an episode's last frame"
-        assert eyes.first(8)[2][-1] < 0, "what leads to a later frame is none of the first"
+        assert eyes.first(8)[2][-1] < 0, "a transition to a later frame is none of the first"
     np.testing.assert_array_equal(late(resumed), late(learner))
     assert np.abs(np.subtract(*late(learner))).max() > 1.0, "with one macro-action left, other things are worth doing"

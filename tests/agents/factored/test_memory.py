@@ -1,4 +1,4 @@
-"""What ``factored`` remembers of an episode: chosen by evidence alone, and worth what it should be."""
+"""What ``factored`` remembers of an episode: chosen by evidence alone, and worth as much as it should be."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_the_last_value_that_told_something_is_remembered_for_an_episode() -> No
         (2, 1),
         (0, 0),
     ]
-    assert [row.code[:2] for row in found] == [row.code for row in rows], "what is seen stays as it is"
+    assert [row.code[:2] for row in found] == [row.code for row in rows], "a seen value stays as it is"
     assert remembering(rows, begins, None) == rows
 
 
@@ -112,7 +112,7 @@ def test_chance_alone_is_no_reason_to_remember() -> None:
 
 
 def watched(learner: LearnedPerceptionAgent, episodes: range, *, covered: bool = False, worth: float = 1.0) -> None:
-    """Let it learn from episodes of drawn macro-actions, whose rewards are multiplied by what they are worth."""
+    """Let it learn from episodes of drawn macro-actions, whose rewards are multiplied by their worth."""
     for episode in episodes:
         for transition in played(None, np.random.default_rng(episode), covered=covered):
             learner.observe(replace(transition, reward=worth * transition.reward), episode=episode)

@@ -1,4 +1,4 @@
-"""Algorithm 1 as a whole: its order, what act may change, exact resumption, learning above chance."""
+"""Algorithm 1 as a whole: its order, the changes by act, exact resumption, learning above chance."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_one_seed_acts_alike_until_imagination_begins() -> None:
 
 
 class Calls(list[tuple[str, tuple[Any, ...], dict[str, Any]]]):
-    """The calls of methods that are watched, with their arguments; they still do what they did."""
+    """The calls of methods that are watched, with their arguments; they still do the same."""
 
     def watch(self, owner: object, of: str, *names: str) -> None:
         for name in names:

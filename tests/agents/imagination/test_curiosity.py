@@ -1,4 +1,4 @@
-"""Curiosity: real transitions pay for what the model does not know of them, and never for noise (thesis 6)."""
+"""Curiosity: real transitions pay for the model's uncertainty about them, and never for noise (thesis 6)."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def test_an_ensemble_predicts_with_all_its_members_components() -> None:
 
 @pytest.mark.parametrize(("components", "least", "most"), [(6, 0.0, 0.25), (1, 0.5, 1.0)])
 def test_a_mixture_holds_several_outcomes_and_one_gaussian_does_not(components: int, least: float, most: float) -> None:
-    """A coin of three sides, at -2, 0 and 3: what is fitted by its likelihood is off by this total variation."""
+    """A coin of three sides, at -2, 0 and 3: a fit by its likelihood is off by this total variation."""
     sides = torch.tensor([-2.0, 0.0, 3.0])
     shares = torch.tensor([0.5, 0.3, 0.2])
     draws = torch.Generator().manual_seed(0)

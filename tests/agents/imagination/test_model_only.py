@@ -1,4 +1,4 @@
-"""Model-only training: what is tested was trained in the model alone, and training resumes to the bit."""
+"""Model-only training: the tested controller was trained in the model alone, and training resumes to the bit."""
 
 from __future__ import annotations
 

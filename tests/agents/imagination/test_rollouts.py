@@ -1,4 +1,4 @@
-"""Imagined rollouts: where they end, what the filter discards, where they are stored."""
+"""Imagined rollouts: their ends, the filter, their storage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Uses of uncertainty beside the thesis' filter: weights by confidence, and what a rollout has gathered so far."""
+"""Uses of uncertainty beside the thesis' filter: weights by confidence, and the sum over a rollout so far."""
 
 from __future__ import annotations
 

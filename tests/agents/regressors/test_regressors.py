@@ -1,4 +1,4 @@
-"""Networks among others and alone, weight samples against a loop, and what is predicted."""
+"""Networks among others and alone, weight samples against a loop, and predictions."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_network_among_others_is_the_network_alone(precision: str) -> None:
 
 
 def test_hidden_layers_decay_and_the_output_layer_does_not() -> None:
-    """Without a gradient, Adam moves what decays and leaves the rest."""
+    """Without a gradient, Adam moves decaying weights and leaves the rest."""
     model = among([0])
     before = [parameter.detach().clone() for parameter in model.network.parameters()]
     for parameter in model.network.parameters():

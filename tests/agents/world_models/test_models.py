@@ -1,4 +1,4 @@
-"""Every registered world model keeps the contract, and learns and draws from what it is given alone."""
+"""Every registered world model keeps the contract, and learns and draws from the given data alone."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_each_keeps_the_contract(name: str, quick: Callable[[str], WorldModel]) 
     assert np.array_equal(imagined(model).pictures, first.pictures), "it was changed by imagining"
     assert imagined(model, history=2, depth=1).pictures.shape[2] == 1
     if first.p_ended is not None:
-        assert (np.diff(first.p_ended, axis=2) >= -1e-6).all(), "what is over begins again"
+        assert (np.diff(first.p_ended, axis=2) >= -1e-6).all(), "an ended episode begins again"
     assert isinstance(model.parameters(), int)
 
 

@@ -1,4 +1,4 @@
-"""The reader takes fog, noise and blends for what they are, and keeps what it learned."""
+"""The reader recognises fog, noise and blends, and keeps its knowledge."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def transition(
 
 
 def built(maker: Callable[[AgentContext], Made], overrides: dict[str, Any] | None = None, **changes: Any) -> Made:
-    """What a maker makes of a context whose encoder is the fake one and whose networks are tiny."""
+    """The agent that a maker makes from a context whose encoder is the fake one and whose networks are tiny."""
     context = AgentContext(
         n_actions=ACTIONS,
         preprocessing="gray_strips",

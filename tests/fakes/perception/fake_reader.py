@@ -1,4 +1,4 @@
-"""A reader that reads nothing: what the judge rendered itself is known to the pixel anyway."""
+"""A reader that reads nothing: frames that the judge rendered itself are known to the pixel anyway."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def another(name: str, values: int) -> Forge:
 
 
 def exchange(name: str) -> Forge:
-    """Two episodes exchange what they have in an array."""
+    """Two episodes exchange their values in an array."""
 
     def change(arrays: Arrays, rng: np.random.Generator) -> None:
         one, other = rng.integers(len(arrays[name]), size=2)

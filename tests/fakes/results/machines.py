@@ -1,4 +1,4 @@
-"""Macrostate machines without a scene, for what is computed from rules alone."""
+"""Macrostate machines without a scene, for computations from rules alone."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Glimpse:
 
 
 def spec_of(rules, horizon, sight=None):
-    """A task of such a machine, for what needs no scene."""
+    """A task of such a machine, for tests without a scene."""
     wheels = [f"wheel {i}" for i in range(rules.n)]
     return TaskSpec(
         id="wheels",

@@ -1,4 +1,4 @@
-"""What a recording holds, read from its file."""
+"""The contents of a recording, read from its file."""
 
 from __future__ import annotations
 

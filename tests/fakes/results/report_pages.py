@@ -1,4 +1,4 @@
-"""What every report must be, whatever it is about: readable at 1200 pixels and without ``nan``."""
+"""The requirements of every report: readable at 1200 pixels and without ``nan``."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def narrowest_px(table: list[list[str]]) -> float:
 
 
 def check_dashes(page: str) -> None:
-    """A table with a dash says below it what the dash means, or its section does."""
+    """A table with a dash explains the dash below it, or its section does."""
     for section in page.split("<h2>"):
         if re.search(r"<td[^>]*>–</td>", section):
             assert "–: " in section, section[:80]

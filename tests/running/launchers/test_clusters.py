@@ -44,7 +44,7 @@ def jobs(root: Path, seeds: tuple[int, ...], episodes: int) -> list[Job]:
 
 
 def results(root: Path, seeds: tuple[int, ...]) -> list[Any]:
-    """What the runs found, but for CPU times."""
+    """The results of the runs, but for CPU times."""
     found: list[Any] = []
     for seed in seeds:
         run = load_run(root / f"seed_{seed}")

@@ -1,4 +1,4 @@
-"""What says a world: names, values, and worlds that there are not."""
+"""The description of a world: names, values, and worlds that there are not."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ KEPT = {
     ("PickPlace", "clean"): ("b816c3c8a7639696", "737594c1acba46cd"),
     ("PickPlace", "strong"): ("90d7888150abf724", "90ebcab3548f2414"),
 }
-"""Of each task as it was before there was a family (commit d67df46): what a walk did and drew, and its frames."""
+"""Of each task as it was before there was a family (commit d67df46): the steps and draws of a walk, and its frames."""
 
 
 def walked(name, appearance):

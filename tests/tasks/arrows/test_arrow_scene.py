@@ -1,4 +1,4 @@
-"""The compiled scene, its parts, its looks, and what the agent's camera sees of them."""
+"""The compiled scene, its parts, its looks, and the agent's view of them."""
 
 from __future__ import annotations
 

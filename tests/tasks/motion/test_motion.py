@@ -1,4 +1,4 @@
-"""Macro-actions in contact: turns do what the rules say, by contact, within the robot's limits, bit for bit."""
+"""Macro-actions in contact: turns obey the rules, by contact, within the robot's limits, bit for bit."""
 
 import math
 import os

@@ -22,7 +22,7 @@ def make(id_, **options):
 
 
 def on_the_screen(env):
-    """Which pixels look at the screen or what rolls on it: by the pinhole camera, not by drawing. Shape (64, 64)."""
+    """Which pixels look at the screen or at a ball on it: by the pinhole camera, not by drawing. Shape (64, 64)."""
     camera = env.model.camera("wrist").id
     place_m, turn = env.data.cam_xpos[camera], env.data.cam_xmat[camera].reshape(3, 3)
     across = (np.arange(64) + 0.5) / 32 - 1

@@ -1,4 +1,4 @@
-"""What the world parameters gesture and lag leave to be seen: of every world, alone, in lanes, and as macrostates."""
+"""The observations under the world parameters gesture and lag: of every world, alone, in lanes, and as macrostates."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_what_was_moved_stands_as_if_it_never_was(id_, parameters, execution):
 
 
 def offsets(env):
-    """How far objects stand off their places, as shares of what the appearance allows: x, y, yaw. Shape (N, 3)."""
+    """How far objects stand off their places, as shares of the ranges of the appearance: x, y, yaw. Shape (N, 3)."""
     poses, level = env.world.object_poses(), env.world.level
     if hasattr(env.world, "layout"):
         places_m = np.array(env.world.layout.slots_xy_m)

@@ -1,4 +1,4 @@
-"""World parameters: what the rules say of them by hand, and that environments do as often as they say."""
+"""World parameters: the rules worked out by hand, and that environments agree with their frequencies."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ def test_parameters_of_pick_and_place_by_hand():
 
 
 def walk(name, execution, steps):
-    """Probability that the rules gave to what came, and to slips and to a human elsewhere, and how often these came."""
+    """Probability that the rules gave to the outcomes, and to slips and to a human elsewhere, and how often these
+    came.
+    """
     spec = registry.task(name)
     env = gymnasium.make(spec.env_id, execution=execution, observation="state", disable_env_checker=True)
     rng, found = np.random.default_rng(0), []

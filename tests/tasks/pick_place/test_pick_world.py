@@ -152,7 +152,7 @@ def slippery_tips(model):
     ],
 )
 def test_only_friction_holds_and_what_slips_is_a_fault_and_ends_the_episode(macrostate, action, reason):
-    """No weld, no teleport; wherever it lies then, the human does not take it for what they asked for."""
+    """No weld, no teleport; wherever it lies then, the human does not take it for the wanted object."""
     env = gymnasium.make(SPEC.env_id).unwrapped
     env.reset(seed=0, options={"macrostate": macrostate})
     slippery_tips(env.world.model)
@@ -165,7 +165,9 @@ def test_only_friction_holds_and_what_slips_is_a_fault_and_ends_the_episode(macr
 
 
 def test_what_was_reached_against_the_draw_is_judged_from_where_the_action_began(monkeypatch):
-    """The handover should have slipped, and the car came into the palm all the same: a fault, and what was asked."""
+    """The handover should have slipped, and the car came into the palm all the same: a fault, and the wish is
+    fulfilled.
+    """
     env = gymnasium.make("imagine_bench/PickPlace-v0", slip=0.99).unwrapped
     env.reset(seed=0, options={"macrostate": (0, 1, 0, OPEN_PALM)})
     executor = env.world.executor
@@ -215,7 +217,7 @@ def test_the_palm_stays_under_what_was_laid_into_it(seed: int) -> None:
     assert np.array_equal(data.mocap_pos, before_m)
     lies = data.qpos.copy()
     *_, info = env.step(0)
-    assert not info["fault"] and np.abs(data.qpos - lies).max() < 1e-5, "what is done then changes nothing"
+    assert not info["fault"] and np.abs(data.qpos - lies).max() < 1e-5, "a later action changes nothing"
     env.close()
 
 

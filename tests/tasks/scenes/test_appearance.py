@@ -1,4 +1,4 @@
-"""Appearance by factors: names, the levels as their points, and that a factor varies what it says and nothing else."""
+"""Appearance by factors: names, the levels as their points, and that a factor varies its own part and nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Q-learning and Dyna-Q: the update by hand, convergence to value iteration, chance, snapshots, what may be seen."""
+"""Q-learning and Dyna-Q: the update by hand, convergence to value iteration, chance, snapshots, observations."""
 
 from __future__ import annotations
 

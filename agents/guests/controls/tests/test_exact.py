@@ -1,4 +1,4 @@
-"""Imagination that knows: rollouts of the rules alone, a filter that keeps what is right, snapshots, who may."""
+"""Imagination that knows: rollouts of the rules alone, a filter that keeps right transitions, snapshots, privileges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Agents with memory, on a stand-in for an encoder: what is remembered, replayed and imagined."""
+"""Agents with memory, on a stand-in for an encoder: memory, replay and imagination."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def make(name: str, **overrides: Any) -> RememberingAgent:
 
 
 def recall(agent: RememberingAgent, episodes: range, rng: np.random.Generator) -> None:
-    """Training in a world where the second macro-action is to be what the first frame said."""
+    """Training in a world where the second macro-action is to be as the first frame said."""
     for number in episodes:
         agent.begin_episode()
         cue = int(rng.integers(ACTIONS))
@@ -43,7 +43,7 @@ def recall(agent: RememberingAgent, episodes: range, rng: np.random.Generator) -
 
 
 def second(agent: RememberingAgent, cue: int) -> int:
-    """What is done greedily after the cue was shown and something was done."""
+    """The greedy action after the cue was shown and something was done."""
     agent.begin_episode()
     agent.act(Observation(frame=frame(1 + cue)), explore=False)
     return agent.act(Observation(frame=frame(0)), explore=False)
@@ -150,7 +150,7 @@ def test_a_full_ring_replays_whole_pieces_only() -> None:
     assert kept == {(2, 2), (2, 3), *((3, t) for t in range(5))}
     for z, reward in zip(batch.z, batch.reward, strict=True):
         number, t = divmod(int(reward), 100)
-        assert torch.allclose(z, truth[number - 1][t], atol=1e-6), "what was overwritten is stood in for by the stored"
+        assert torch.allclose(z, truth[number - 1][t], atol=1e-6), "the stored memory stands in for overwritten steps"
 
 
 def test_no_gradient_goes_through_the_burn_in() -> None:

@@ -35,7 +35,7 @@ def agent(seed: int = 0, **overrides: Any) -> SwappingDQN:
 
 
 def live(learner: SwappingDQN, steps: int, seed: int = 1) -> list[tuple[tuple[int, ...], int]]:
-    """Train on the tiny world of wheels by chance; what was tried."""
+    """Train on the tiny world of wheels by chance; the pairs that were tried."""
     rng = np.random.default_rng(seed)
     code = fake_codes.starts()[0]
     tried = []

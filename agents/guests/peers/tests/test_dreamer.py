@@ -1,4 +1,4 @@
-"""DreamerV3 of sheeprl, an episode at a time: what it remembers, whose random numbers it takes, what it learns."""
+"""DreamerV3 of sheeprl, an episode at a time: its memory, its random numbers, its learning."""
 
 from __future__ import annotations
 

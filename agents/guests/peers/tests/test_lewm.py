@@ -1,4 +1,4 @@
-"""LeWM of torch-world: where it plans to, what it remembers, whose random numbers it takes, what it learns."""
+"""LeWM of torch-world: where it plans to, its memory, its random numbers, its learning."""
 
 from __future__ import annotations
 

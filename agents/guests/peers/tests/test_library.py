@@ -101,7 +101,7 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(runner, "play_test_episode", killed)
         do(tmp_path / "run", agent)
-    assert not (tmp_path / "run/metrics.csv").exists(), "what the attempt before left is not this one's"
+    assert not (tmp_path / "run/metrics.csv").exists(), "leftovers of the attempt before are not this one's"
     again = do(tmp_path / "run", agent)
     assert measured(whole) == measured(again)
     assert whole.training_length.tolist() == again.training_length.tolist()

@@ -22,7 +22,7 @@ TASK = registry.task("arrow_puzzle")
 
 
 def puzzle(horizon: int = 10, uncertain: tuple[tuple[State, int], ...] = ()) -> ImaginedEnv:
-    """The arrow puzzle as imagined by a model that is right, but for what it is uncertain of."""
+    """The arrow puzzle as imagined by a model that is right, except where it is uncertain."""
     starts = RuledModel(TASK).encode(TASK.rules.start_states).numpy()
     return ImaginedEnv(ImaginedVectorEnv(ruled(TASK, uncertain=uncertain), starts, horizon=horizon))
 
