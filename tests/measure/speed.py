@@ -18,6 +18,7 @@ from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
 
+import control_speed
 import gymnasium
 import mujoco
 import numpy as np
@@ -76,6 +77,7 @@ def measure() -> Iterator[Figure]:
         yield from drawing(registry.task(task))
         yield from physics(registry.task(task))
         yield from vector(registry.task(task))
+    yield from control_steps(3)
 
 
 def fresh_interpreters(task: str) -> Iterator[Figure]:
@@ -198,6 +200,16 @@ def vector(spec: TaskSpec) -> Iterator[Figure]:
         else:
             more = f" ({curve}; threads {threads_gain:.2f})"
             yield figure_of(f"{what}, share of two threads' gain", gain / threads_gain, ".2f", ">=", 0.6, more)
+
+
+def control_steps(rounds: int) -> Iterator[Figure]:
+    """A step of continuous control beside MuJoCo alone for the same physics steps and images."""
+    processes = control_speed.Processes(Path.cwd(), core=0)
+    for key in control_speed.OURS:
+        suite = control_speed.SUITES[key]
+        for images in suite.images():
+            measured = [{key: processes.beside_mujoco(suite, images, 0.5)} for _ in range(rounds)]
+            yield control_speed.beside_mujoco(measured, key, images)
 
 
 def lanes_gain(spec: TaskSpec, execution: str, lanes: int, turns: int, *, blocks: int) -> tuple[float, float]:

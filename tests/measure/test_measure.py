@@ -6,6 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import control_speed
 import decisions
 import interval_coverage
 import numpy as np
@@ -111,6 +112,44 @@ def test_a_frame_costs_little_more_than_mujocos_drawing_alone() -> None:
     frame, step = speed.drawing(registry.task("arrow_puzzle"))
     assert frame.met and step.met
     assert " against " in frame.measured and frame.measured.endswith("CPU ms)")
+
+
+def test_a_busy_machine_changes_no_ratio_between_suites() -> None:
+    """Rounds in which everything takes longer, each by its own factor, give the same figures."""
+    rng = np.random.default_rng(0)
+    quiet = [{key: measured(suite, rng) for key, suite in control_speed.SUITES.items()}] * 3
+    busy = [
+        {key: {what: load * value for what, value in row.items()} for key, row in each.items()}
+        for each, load in zip(quiet, (1.0, 2.5, 7.0), strict=True)
+    ]
+    ratios = [[each.measured.split(" (")[0] for each in control_speed.figures(rounds)] for rounds in (quiet, busy)]
+    assert ratios[0] == ratios[1] and len(ratios[0]) == 14
+
+
+def test_ours_is_compared_with_the_fastest_peer_as_it_draws_fastest() -> None:
+    rng = np.random.default_rng(0)
+    round_ = {key: measured(suite, rng) for key, suite in control_speed.SUITES.items()}
+    for peer in set(round_) - set(control_speed.OURS):
+        one = control_speed.SUITES[peer].one_image
+        for kind in (one, one.removesuffix("-plain")):
+            faster = {**round_[peer], f"step_s {kind}": 0.02 * round_["ours"][f"step_s {one}"]}
+            _, figure, _ = control_speed.beside_peers([{**round_, peer: faster}], "ours")
+            assert figure.measured == f"0.0 ({control_speed.SUITES[peer].name})" and not figure.met
+
+
+def measured(suite: control_speed.Suite, rng: np.random.Generator) -> dict[str, float]:
+    """Seconds of steps of a suite, drawn."""
+    parts = ("step_s", "own step_s", "own mj_step_s", "own mjr_s")
+    return {f"{part} {images}": rng.uniform(1, 2) for part in parts for images in suite.images()}
+
+
+@pytest.mark.slow
+def test_a_control_step_costs_little_more_than_mujoco_alone(tmp_path: Path) -> None:
+    kept = tmp_path / "speed.json"
+    control_speed.main([str(tmp_path), "--rounds", "1", "--seconds", "0.5", "--only", "ours", "--out", str(kept)])
+    found = json.loads(kept.read_text())
+    assert found["figures"] and all(figure["met"] for figure in found["figures"])
+    assert found["memory"]["ours"]["more_mib"] < 20.0
 
 
 @pytest.mark.slow
