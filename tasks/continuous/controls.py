@@ -76,6 +76,8 @@ class HandControl:
         self._most_rad = arm.speed_limit_rad_s * period_s
         self._most_m = FINGER_SPEED_M_S * period_s
         self._per_unit = np.array([HAND_SPEED_M_S] * 3 + [HAND_TURN_RAD_S] * 3) * period_s
+        self._lowest_m = np.array(WORKSPACE_LOW_M)
+        self._highest_m = np.array(WORKSPACE_HIGH_M)
         self.space = self._space()
 
     def _space(self) -> gymnasium.spaces.Box[Any]:
@@ -102,7 +104,7 @@ class HandControl:
             raise InvalidValueError(f"Action {brief(action)} has another shape or a value that is not finite; {words}.")
         if self.control == "pose" and not given[3:7].any():
             raise InvalidValueError("The quaternion of the action is all zeros; give (1, 0, 0, 0) for no rotation.")
-        return np.clip(given, self.space.low, self.space.high)
+        return np.minimum(np.maximum(given, self.space.low), self.space.high)
 
     def command(self, action: Floats, joints_rad: Floats, opening_m: float) -> Command:
         """The command for a checked action, from the command before: joints (7,) and the opening of each finger."""
@@ -124,9 +126,9 @@ class HandControl:
     def _by_twist(self, motion: Floats, joints_rad: Floats) -> tuple[Floats, str]:
         place_m, _ = self._ik.hand_pose(joints_rad)
         target_m = place_m + motion[:3]
-        inside_m = np.clip(target_m, WORKSPACE_LOW_M, WORKSPACE_HIGH_M)
+        inside_m = np.minimum(np.maximum(target_m, self._lowest_m), self._highest_m)
         step_rad, missed = self._ik.step(np.concatenate([inside_m - place_m, motion[3:]]), self._most_rad)
-        outside = not np.array_equal(inside_m, target_m)
+        outside = bool((inside_m != target_m).any())
         return joints_rad + step_rad, "workspace" if outside else "reach" if missed else ""
 
     def _by_pose(self, target_m: Floats, quat: Floats, joints_rad: Floats) -> tuple[Floats, str]:

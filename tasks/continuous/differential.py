@@ -41,6 +41,7 @@ class DifferentialIK:
         self.upper_rad: Floats = arm.model.jnt_range[:, 1].copy()
         self._posture_rad = np.array(OBSERVATION_QPOS_RAD)
         self._weights = np.array([1.0, 1.0, 1.0, *[_ROTATION_WEIGHT] * 3])
+        self._pull = _POSTURE_GAIN * _POSTURE_WEIGHT**2
         self._jacobian = np.empty((6, arm.model.nv))
         self._regular = _POSTURE_WEIGHT**2 * np.eye(arm.model.nv)
         self._no_rows = np.empty((0, arm.model.nv))
@@ -71,12 +72,12 @@ class DifferentialIK:
         weighted = self._weights[:, None] * jacobian
         wanted = self._weights * motion
         hessian = weighted.T @ weighted + self._regular
-        pull = _POSTURE_GAIN * _POSTURE_WEIGHT**2 * (self._posture_rad - qpos_rad)
+        pull = self._pull * (self._posture_rad - qpos_rad)
         upper = np.minimum(most_rad, self.upper_rad - qpos_rad)
         lower = np.maximum(-most_rad, self.lower_rad - qpos_rad)
         solved, _, status, _ = daqp.solve(
             hessian, -(wanted @ weighted + pull), self._no_rows, upper, lower, self._kinds
         )
-        step_rad: Floats = np.clip(solved, lower, upper) if status > 0 else np.zeros(len(upper))
+        step_rad: Floats = np.minimum(np.maximum(solved, lower), upper) if status > 0 else np.zeros(len(upper))
         missed = weighted @ step_rad - wanted
         return step_rad, bool(missed @ missed > _MAX_RESIDUAL**2)

@@ -306,16 +306,18 @@ class MotionEnv(SceneEnv):
 
     def _simulate(self, action: Floats) -> None:
         """Move the servos' commands to where the action says, in equal steps, and simulate the period."""
+        model = self.model
         data = self.data
+        servos = data.ctrl
         columns = self._columns.ctrl
-        before = data.ctrl[columns]
+        before = servos[columns]
         n_arm = len(ARM_JOINTS)
         command = self.controls.command(action, before[:n_arm], float(before[-1]))
         after = np.array([*command.joints_rad, command.opening_m, command.opening_m])
         self.episode.limited = command.limited
         for ctrl in before + self._ramp * (after - before):
-            data.ctrl[columns] = ctrl
-            mujoco.mj_step(self.model, data)
+            servos[columns] = ctrl
+            mujoco.mj_step(model, data)
 
     def _judge(self) -> Event | None:
         """The event of the period that is over, with all that it changes in the scene."""
