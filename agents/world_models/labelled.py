@@ -1,6 +1,6 @@
 """A world model of macro-actions as a model of motions: it is told what a motion was planned for, and sees no command.
 
-Where a motion fails it still imagines the macro-action: what a model at the coarser level cannot know.
+Where a motion fails it still imagines the macro-action: a model at the coarser level cannot know the failure.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A small recurrent predictor of motions: a frame and all commands of a motion to the frame at its end, in plain torch.
 
-A convolutional network sees the scene, a gated recurrent unit reads the commands, and what both say is painted over the
-frame, as in :mod:`.convolutional`.
+A convolutional network sees the scene, a gated recurrent unit reads the commands, and the output of both is painted
+over the frame, as in :mod:`.convolutional`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class MotionNetwork(nn.Module):
         seen = self.down(frames)
         hidden = self.middle(torch.cat([seen.flatten(1), last], dim=1))
         drawn, mask = self.up(torch.cat([seen, hidden.view_as(seen)], dim=1)).chunk(2, dim=1)
-        mask = (mask - 3.0).sigmoid()  # where it paints over what was there: at first almost nowhere
+        mask = (mask - 3.0).sigmoid()  # where it paints over the former image: at first almost nowhere
         return (1.0 - mask) * frames + mask * drawn.sigmoid()
 
 

@@ -418,7 +418,7 @@ class Judge:
             raise RunFailedError("\n".join(failed))
 
     def _judge_motions(self, task: str) -> None:
-        """Judge models of motions: what they say of the commands of a task's continuous control."""
+        """Judge models of motions: their predictions for the commands of a task's continuous control."""
         from imagine_bench.judge.motion_scores import SIZES, judge_motions  # noqa: PLC0415 - MuJoCo loads slowly
         from imagine_bench.report.motions import motion_rows, motion_table  # noqa: PLC0415 - as above
 

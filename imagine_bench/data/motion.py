@@ -39,7 +39,7 @@ PROPRIO_NAMES = (
     *(f"hand {axis}, m" for axis in "xyz"),
     *(f"hand quaternion {part}" for part in "wxyz"),
 )
-"""What each number of ``proprio`` is."""
+"""The meaning of each number of ``proprio`` is."""
 OUTCOMES = ("rewards", "terminated", "truncated", "success", "instruction")
 """The arrays that follow from the commands."""
 

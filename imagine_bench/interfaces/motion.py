@@ -49,7 +49,7 @@ class MotionModel(Protocol):
 
 
 def require_frames(frames: object, *, name: str, rows: int) -> Frame:
-    """What a model of motions handed in, if it is N frames. Raises InvalidValueError: another type or shape."""
+    """The answer of a model of motions, checked to be N frames. Raises InvalidValueError: another type or shape."""
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != (rows, 64, 64, 3):
         given = f"{frames.dtype} {frames.shape}" if isinstance(frames, np.ndarray) else type(frames).__name__
         raise InvalidValueError(

@@ -34,7 +34,7 @@ DEPTH = 4
 
 @dataclass(frozen=True, kw_only=True)
 class MotionQuestions:
-    """What every model of motions is asked, the same for all."""
+    """The questions to every model of motions, the same for all."""
 
     planned: AnsweredMotions
     raised: AnsweredMotions  #: the same motions, 60 mm higher
@@ -123,7 +123,7 @@ def judge_motions(
 
     Raises:
         UnknownNameError: No such task or model.
-        InvalidValueError: A task without continuous control, sizes below 1, or what a model hands in is no frames.
+        InvalidValueError: A task without continuous control, sizes below 1, or the answer of a model is no frames.
     """
     entry = registry.task_entry(task)
     if not entry.motion or min(sizes) < 1:
@@ -150,7 +150,7 @@ def judge_motions(
 
 
 class Simulator(Untaught):
-    """Hands in the true final frames of what is asked: what the reader makes of them bounds every model."""
+    """Hands in the true final frames of the questions: the reader's reading of them bounds every model."""
 
     def __init__(self, asked: MotionQuestions) -> None:
         every = (asked.planned, asked.raised, *asked.chains)

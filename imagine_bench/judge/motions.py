@@ -1,4 +1,4 @@
-"""Motions at the level of commands, with what became of them: what models of motion learn from and are asked.
+"""Motions at the level of commands, with their results: the data and the questions of models of motion.
 
 A question is a frame of the scene at rest and all commands of a motion; the answer is the macrostate that the simulator
 ends in. Shapes: ``N`` motions, ``T`` control periods of the longest, ``A`` numbers of an action.
@@ -32,7 +32,7 @@ _CALM = 8
 
 @dataclass(frozen=True, kw_only=True)
 class AnsweredMotions(Motions):
-    """N motions, and what became of them."""
+    """N motions, and their results."""
 
     variants: Ints  #: which of :data:`VARIANTS` it is. Shape (N,).
     states: Ints  #: macrostate before. Shape (N, M).

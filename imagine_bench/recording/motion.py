@@ -1,4 +1,4 @@
-"""Rerun recordings of continuous control: where the hand shall be, forces, events, and what its cameras see.
+"""Rerun recordings of continuous control: the hand's target, forces, events, and the images of its cameras.
 
 Timelines: ``sim_time`` and ``env_step``, one a control period. Entities: ``/scene/...``, ``/motion/...``.
 """
@@ -25,10 +25,10 @@ _YELLOW = (240, 180, 0)
 
 @contextmanager
 def motion_recording(path: Path, env: MotionEnv) -> Iterator[Callable[[Any, Observed, float, Info], None]]:
-    """A recording of an environment, made of what is handed to it.
+    """A recording of an environment, made of the values that are handed to it.
 
     Yields:
-        What is to be called after each period with the command, the observation, the reward and ``info``; and at the
+        The call after each period with the command, the observation, the reward and ``info``; and at the
         start of an episode with None, the observation, 0 and ``info``.
 
     Raises:
@@ -84,7 +84,7 @@ class _MotionRecorder:
 
 
 def _layout(recording: Recording) -> rrb.Vertical:
-    """The scene and what the cameras see above, curves below."""
+    """The scene and the images of the cameras above, curves below."""
     cameras = recording.shown(
         rrb.Spatial2DView(origin="/motion/hand", name="Hand camera"),
         rrb.Spatial2DView(origin="/motion/front", name="Front camera"),

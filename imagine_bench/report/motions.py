@@ -14,7 +14,7 @@ _CAPTION = (
     "Percent of questions, means over seeds. Right: motions as planned, whose imagined final frame shows the "
     "macrostate that the simulator ends in. Nothing: the same motions 60 mm higher, which grip nothing, and the model "
     "says so. Painted: of these, the model paints the change all the same. Pairs: both motions are right. After n: so "
-    "many motions, each imagined from the frame imagined before. The simulator's own frames show what is misread."
+    "many motions, each imagined from the frame imagined before. The simulator's own frames show the reader's errors."
 )
 
 

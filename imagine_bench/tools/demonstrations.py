@@ -63,9 +63,11 @@ class DemonstrationSettings:
 
 
 Watch = Callable[[Any, Observed, float, Info], None]
-"""Is shown each period: the command, and what the step returned; at the start None, the observation, 0 and ``info``."""
+"""Is shown each period: the command, and the results of the step; at the start None, the observation, 0 and
+``info``.
+"""
 _Item = tuple[DemonstrationSettings, int, Path]
-"""What is played, the number of the episode, and the file that it is written to."""
+"""The played task, the number of the episode, and the file that it is written to."""
 
 
 def collect(
@@ -185,7 +187,7 @@ def lived(env: MotionEnv, seed: int, actor_of: Callable[[], Actor], watch: Watch
 
 
 class _Tally:
-    """Counts what goes through it on its way into a format, and keeps what is apart."""
+    """Counts the episodes that go through it on their way into a format, and keeps the arrays apart."""
 
     def __init__(self) -> None:
         self._digest = Digest()
@@ -195,7 +197,7 @@ class _Tally:
         self._hidden: list[tuple[Any, Any]] = []
 
     def through(self, files: Sequence[Path]) -> Iterator[Arrays]:
-        """The episodes of files, without what is apart."""
+        """The episodes of files, without the arrays apart."""
         for file in files:
             episode = read_arrays(file)
             self._hidden.append((episode.pop("seed"), episode.pop("macrostates")))

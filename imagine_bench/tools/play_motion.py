@@ -1,4 +1,6 @@
-"""``imagine-bench play`` of continuous control: keys move the hand, and a window shows what it and its cameras see."""
+"""``imagine-bench play`` of continuous control: keys move the hand, and a window shows the scene and the images of its
+cameras.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +111,7 @@ class HandGame(gymnasium.Wrapper[Arrays, Command, Arrays, Command]):
         return self._seen, 0.0, False, False, self._info
 
     def _words(self, reward: float) -> str:
-        """The event of this period, or what limits the hand, or how the fingers are."""
+        """The event of this period, or the limit of the hand, or how the fingers are."""
         info = self._info
         if info["event"]:
             action = int(info["macro_action"])
@@ -129,7 +131,7 @@ class HandGame(gymnasium.Wrapper[Arrays, Command, Arrays, Command]):
         return f"Solved {self.solved} of {self.episodes} episodes ({share}); {optimum}."
 
     def render(self) -> Frame:
-        """The window: the scene, both cameras, what the person wants, and the keys. Shape (H, W, 3)."""
+        """The window: the scene, both cameras, the person's wish, and the keys. Shape (H, W, 3)."""
         canvas = Image.new("RGB", (_WIDTH + _PANEL, _HEIGHT + _BAND), "white")
         canvas.paste(Image.fromarray(self._scene.human_view(_WIDTH, _HEIGHT)))
         draw = ImageDraw.Draw(canvas)

@@ -1,4 +1,4 @@
-"""What an action of a control period says: a hand twist, a hand pose, or joints; and the servos' commands for it.
+"""The meaning of an action of a control period: a hand twist, a hand pose, or joints; and the servos' commands for it.
 
 Commands go on from the commands before, not from where the arm is: the hand does not drift while it is asked for
 nothing. Speeds, joint ranges and the workspace hold for every action; the servos' forces are limited in the model.
@@ -41,7 +41,7 @@ CONTROL_NAMES = {
     "joint_delta": (*(f"{name} velocity" for name in _JOINTS), "grip"),
     "joint": (*_JOINTS, "grip"),
 }
-"""What each number of an action says, by the name of the control."""
+"""The meaning of each number of an action, by the name of the control."""
 Motion = NDArray[np.floating[Any] | np.integer[Any]]
 """An action of continuous control."""
 
@@ -51,7 +51,8 @@ class Command(NamedTuple):
 
     joints_rad: Floats  #: shape (7,)
     opening_m: float  #: of each finger
-    limited: str  #: what kept it from the action: "workspace", "reach" (a joint's range, speed, a singularity), or ""
+    #: the reason that kept it from the action: "workspace", "reach" (a joint's range, speed, a singularity), or ""
+    limited: str
 
 
 class HandControl:

@@ -82,8 +82,8 @@ class MotionEnv(SceneEnv):
 
     Info: ``macrostate`` (int64, (M,)), ``event`` (whether the macrostate changed in this period), ``macro_action`` (the
     macro-action that the event amounts to, or -1), ``is_success``, ``success``, ``legal``, ``fault``, ``fault_reason``,
-    ``limited`` (what kept the command from the action, or empty), ``sim_time_s`` (of this period), ``elapsed_s`` (since
-    the start), ``instruction`` (empty unless ``told``).
+    ``limited`` (the reason that kept the command from the action, or empty), ``sim_time_s`` (of this period),
+    ``elapsed_s`` (since the start), ``instruction`` (empty unless ``told``).
 
     Args:
         spec: The task.
@@ -94,7 +94,7 @@ class MotionEnv(SceneEnv):
         rate_hz: Commands a second; a period is a whole number of the simulation's steps.
         appearance: A name, or factors; drawn at the start and anew after each event.
         reward: ``"sparse"``, the rules' alone; or ``"dense"``, with the growth of :class:`.dense.Potential` added.
-        observation: What is observed: some of ``hand``, ``front``, ``proprio``, ``objects``, ``state``.
+        observation: The observation: some of ``hand``, ``front``, ``proprio``, ``objects``, ``state``.
         size: Edge of observed images in pixels, 32 to 256.
         told: Whether ``info["instruction"]`` says the goal in words, and no image shows the pointing hand.
         time_limit_s: Seconds before truncation; None is 3 s for each macro-action of the horizon.
@@ -102,7 +102,7 @@ class MotionEnv(SceneEnv):
         width: Pixels of :meth:`render`.
         height: Pixels of :meth:`render`.
         camera: Camera of :meth:`render`: ``"human"`` or ``"far"``.
-        physics: What decides whether a grasp holds: settings, or a mapping of some of their names to values.
+        physics: The physics of grasping: settings, or a mapping of some of their names to values.
 
     Raises:
         UnknownNameError: An unknown control, appearance, render mode, camera, physics setting or observation.
@@ -238,7 +238,9 @@ class MotionEnv(SceneEnv):
         return reward, terminated, truncated, self._info(success=success, fault=fault)
 
     def observe(self, envs: Sequence[MotionEnv]) -> list[Observed]:
-        """What :meth:`reset` and :meth:`step` return of environments like this, by its cameras; once a moment."""
+        """The observations of :meth:`reset` and :meth:`step` for environments like this, by its cameras; once a
+        moment.
+        """
         now = self._observer.observe([(env._observer, env.world.observed(env.episode.macrostate)) for env in envs])
         for env, seen in zip(envs, now, strict=True):
             episode = env.episode
@@ -272,7 +274,9 @@ class MotionEnv(SceneEnv):
         return self.controls.hand_pose(self.data.ctrl[self._columns.ctrl[: len(ARM_JOINTS)]])[0]
 
     def servo_forces(self) -> Floats:
-        """What the servos exert now: torques of the seven joints (N m), forces of both fingers (N). Shape (9,)."""
+        """The present efforts of the servos: torques of the seven joints (N m), forces of both fingers (N). Shape
+        (9,).
+        """
         forces: Floats = self.data.actuator_force[self._columns.ctrl].copy()
         return forces
 

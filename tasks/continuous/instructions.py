@@ -1,4 +1,4 @@
-"""The goal of a macrostate in words: what the pointing hand says without words."""
+"""The goal of a macrostate in words: the pointing hand says it without words."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..scenes.objects import OBJECTS
 
 
 def instruction(task: TaskSpec, macrostate: State) -> str:
-    """What the person wants in a macrostate, such as "Turn the left arrow toward the human."."""
+    """The wish of the person in a macrostate, such as "Turn the left arrow toward the human."."""
     if isinstance(task.rules, ArrowRules):
         return _turn(task, task.rules.goal, macrostate)
     return _pick(macrostate)

@@ -18,7 +18,7 @@ FAULT_REWARD = -5.0
 """Of an end that no macro-action leads to: as much as the rules of both tasks take for a wrong macro-action."""
 _LEFT, _RIGHT, _OTHER = 1, 2, 4
 GRIPPED = _LEFT | _RIGHT
-"""Bits of what touches an object: either finger, and the rest of the arm."""
+"""Bits of the parts that touch an object: either finger, and the rest of the arm."""
 _STILL_M_S = 0.01
 _STILL_RAD_S = 0.2
 """An object that moves and turns more slowly is at rest."""
@@ -26,7 +26,7 @@ _FALLEN_M = TABLE_HEIGHT_M - 0.05
 
 
 class Touch:
-    """What of the robot touches each object of a world."""
+    """The parts of the robot that touch each object of a world."""
 
     def __init__(self, world: World) -> None:
         model = world.model
@@ -125,7 +125,7 @@ class Referee:
         return (speeds[:, :3].max(axis=1) > _STILL_M_S) | (speeds[:, 3:].max(axis=1) > _STILL_RAD_S)
 
     def _at_once(self, changed: Sequence[int], touched: Ints, moving: NDArray[np.bool_]) -> list[str]:
-        """What else moved while one object changed, in words."""
+        """The other objects that moved while one changed, in words."""
         also = [index for index in range(len(moving)) if index in changed or (moving[index] and not touched[index])]
         if len(also) == 1:
             return []

@@ -21,7 +21,7 @@ def agent_camera_view(size_px: int = FRAME_PX) -> View:
 
 
 def control_view(camera: str, size_px: int = FRAME_PX) -> View:
-    """What agents see in continuous control: objects, table, hands and a coarse arm; hard edges, no shadows.
+    """The view of agents in continuous control: objects, table, hands and a coarse arm; hard edges, no shadows.
 
     Args:
         camera: One of :data:`.constants.CONTROL_CAMERAS`, in a scene with :func:`.control_views.add_control_views`.

@@ -102,7 +102,7 @@ _PARTS = (
 
 
 def add_control_views(spec: mujoco.MjSpec) -> None:
-    """Add what agents see in continuous control to a scene that holds the arm, a table and objects.
+    """Add the parts that agents see in continuous control to a scene that holds the arm, a table and objects.
 
     The cameras are ``hand`` and ``front``; geoms ``control_*`` of :data:`.constants.CONTROL_GROUP` draw the arm.
     """
