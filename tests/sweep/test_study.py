@@ -73,10 +73,13 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path, capsys: pytest.C
     assert len(rows) == 3 * 2 * 2 and {row["seed"] for row in rows} == {"1000", "1001"}
     right = dataclasses.replace(lines[1], imagined_right=np.array([[0.1, 0.2], [0.3, 0.4]]))
     right = dataclasses.replace(right, difference=(Estimate(0.1, *[math.nan] * 2), Estimate(-0.2, *[math.nan] * 2)))
-    page = study_page(STUDY, [lines[0], right])
+    first = dataclasses.replace(lines[0], success=np.array([[0.1, 0.2], [0.3, 0.4]]))
+    page = study_page(STUDY, [first, right])
+    assert [row[-4] for row in page.sections[0].tables[0].rows][:2] == ["20.0", "30.0"], "means of seeds"
     assert [row[-2] for row in page.sections[0].tables[0].rows] == ["–", "–", "20.0", "30.0"], "means of seeds"
     assert [row[-3] for row in page.sections[0].tables[0].rows] == ["–", "–", "+10.0", "−20.0"], "of each budget"
     rows = list(csv.DictReader(page.files["seeds.csv"].splitlines()))
+    assert [row["success"] for row in rows][:4] == ["0.1", "0.2", "0.3", "0.4"]
     assert [row["imagined_right"] for row in rows][4:] == ["0.1000", "0.2000", "0.3000", "0.4000"]
 
 

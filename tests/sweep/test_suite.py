@@ -106,6 +106,13 @@ def test_the_page_shows_every_score_and_the_hash(result):
     shown = [f"{float(row['score']):.2f}".replace("-", "\u2212") if row["score"] else "–" for row in scores]
     assert [cell.split()[0] for row in cells for cell in row] == shown
     assert TINY.hash in texts(page)["index.html"]
+    priced = {
+        key: tuple(dataclasses.replace(each, train_cpu_s=10.0) for each in levels)
+        for key, levels in result.levels.items()
+    }
+    prices = suite_page(dataclasses.replace(result, levels=priced)).table.rows[-1]
+    runs = len(TINY.seeds) * sum(len(each.levels) for each in TINY.experiments)
+    assert prices[1:] == [f"{10.0 * runs:.1f}"] * 3
 
 
 def test_the_suite_is_that_of_all_kept_scores():
