@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,8 @@ def test_this_installation_works(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     for word in ("mujoco", "torch", "GL renderer", "processor", "Everything works."):
         assert word in out
+    memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    assert environment.machine()["memory_gib"] == pytest.approx(memory_bytes / 1024**3, abs=0.06)
 
 
 def with_version(**changed: str) -> Callable[[str], str]:
