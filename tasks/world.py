@@ -30,8 +30,8 @@ MAX_SKEW_RAD = math.radians(20.0)
 """An object that is tipped, or turned off where it may stand, by more is a problem."""
 MAX_OTHER_SHIFT_M = 0.005
 SLIP_FRICTION = 0.02
-SLIP_FORCE_N = 1.0
-"""Friction and force (N) of fingertips whose grip slips, in continuous control."""
+SLIP_FORCE_N = 2.0
+"""Friction of fingertips whose grip slips, and the force (N) by which such fingers open, in continuous control."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,24 +113,25 @@ class World(abc.ABC):
         model = self.model
         built = PhysicsSettings()
         model.geom_friction[self._tips, :2] *= settings.pad_friction / built.pad_friction
-        self._set_finger_force(settings.finger_force_n)
+        self._set_finger_force(-settings.finger_force_n, settings.finger_force_n)
         if settings.object_mass != built.object_mass:
             model.body_mass[self.object_bodies] *= settings.object_mass
             model.body_inertia[self.object_bodies] *= settings.object_mass
             mujoco.mj_setConst(model, mujoco.MjData(model))
 
     def set_slipping(self, slipping: bool) -> None:
-        """Let the fingers hold a gripped object, or let it slip: with next to no friction and force."""
+        """Let the fingers hold a gripped object, or let it slip: without friction, they open whatever they are told."""
         settings = self.sensing.settings
         built = PhysicsSettings()
         friction = SLIP_FRICTION if slipping else settings.pad_friction / built.pad_friction * self._tip_friction
         self.model.geom_friction[self._tips, :1] = friction
-        self._set_finger_force(SLIP_FORCE_N if slipping else settings.finger_force_n)
+        force_n = settings.finger_force_n
+        self._set_finger_force(*((SLIP_FORCE_N, SLIP_FORCE_N) if slipping else (-force_n, force_n)))
 
-    def _set_finger_force(self, force_n: float) -> None:
+    def _set_finger_force(self, least_n: float, most_n: float) -> None:
         for name in FINGER_JOINTS:
             servo = self.model.actuator(name.replace("_slide", "_servo")).id
-            self.model.actuator_forcerange[servo] = (-force_n, force_n)
+            self.model.actuator_forcerange[servo] = (least_n, most_n)
 
     def get_state(self) -> WorldState:
         """Everything in the scene that may change, copied."""

@@ -16,6 +16,8 @@ _ROTATION_WEIGHT = 0.3
 """Metres that a radian of the hand's rotation weighs."""
 _POSTURE_WEIGHT = 0.005
 """Metres that a radian off the posture weighs: it decides where the hand leaves a choice, and nowhere else."""
+_WRIST_SHARE = 0.01
+"""Of that, the last joint, which turns freely: so a turn of the hand about its own axis leaves the elbow still."""
 _POSTURE_GAIN = 0.15
 """Share of the way back to the posture that a step takes where the hand leaves a choice."""
 _MAX_RESIDUAL = 2e-3
@@ -41,9 +43,11 @@ class DifferentialIK:
         self.upper_rad: Floats = arm.model.jnt_range[:, 1].copy()
         self._posture_rad = np.array(OBSERVATION_QPOS_RAD)
         self._weights = np.array([1.0, 1.0, 1.0, *[_ROTATION_WEIGHT] * 3])
-        self._pull = _POSTURE_GAIN * _POSTURE_WEIGHT**2
         self._jacobian = np.empty((6, arm.model.nv))
-        self._regular = _POSTURE_WEIGHT**2 * np.eye(arm.model.nv)
+        posture = np.full(arm.model.nv, _POSTURE_WEIGHT**2)
+        posture[-1] *= _WRIST_SHARE
+        self._regular = np.diag(posture)
+        self._pull = _POSTURE_GAIN * posture
         self._no_rows = np.empty((0, arm.model.nv))
         self._kinds = np.zeros(arm.model.nv, dtype=np.intc)
 

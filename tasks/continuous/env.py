@@ -34,6 +34,8 @@ RATE_HZ = 25.0
 REWARDS = ("sparse", "dense")
 SECONDS_PER_MACRO_ACTION = 3.0
 """An episode is truncated after so many seconds for each macro-action of the task's horizon; planned, one takes 2.2."""
+_LET_GO_M = 0.003
+"""A grip is over when each finger is told to be so much further apart than before, and touches nothing."""
 
 
 @dataclass
@@ -43,7 +45,7 @@ class Episode:
     macrostate: State = ()
     periods: int = 0  #: control periods so far
     events: int = 0  #: changes of the macrostate so far
-    gripping: bool = False  #: whether the fingers have gripped something since they last opened
+    gripped_m: float | None = None  #: the closest that the fingers of this grip were told to be; None without a grip
     slipping: bool = False  #: whether this grip slips
     latest: Event | None = None  #: the event of the latest period
     potential: float = 0.0  #: with the dense reward, of the latest moment
@@ -89,7 +91,8 @@ class MotionEnv(SceneEnv):
         spec: The task.
         make_world: Its world, at an appearance level, made for continuous control.
         instruct: The goal of a macrostate in words.
-        slip: Probability that a grip slips: its friction and force fall until the fingers open.
+        slip: Probability that a grip slips: the fingers lose their friction and open by themselves, until they are told
+            to open. What is held at the start of an episode does not slip.
         control: ``"twist"``, ``"pose"``, ``"joint_delta"`` or ``"joint"``.
         rate_hz: Commands a second; a period is a whole number of the simulation's steps.
         appearance: A name, or factors; drawn at the start and anew after each event.
@@ -342,20 +345,20 @@ class MotionEnv(SceneEnv):
         return event
 
     def _slip_or_hold(self, touched: Ints) -> None:
-        """Draw at the beginning of a grip whether it slips; it is over when the fingers open and touch nothing."""
+        """Draw at the beginning of a grip whether it slips; it is over when the fingers are told to open."""
         episode = self.episode
-        if not episode.gripping and bool((touched & GRIPPED == GRIPPED).any()):
-            episode.gripping = True
-            episode.slipping = bool(self.np_random.random() < self._slip)
+        told_m = float(self.data.ctrl[self._columns.ctrl[-1]])
+        if episode.gripped_m is None and bool((touched & GRIPPED == GRIPPED).any()):
+            episode.gripped_m = told_m
+            held_at_start = episode.periods == 1
+            episode.slipping = not held_at_start and bool(self.np_random.random() < self._slip)
             self.world.set_slipping(episode.slipping)
-        elif episode.gripping and not (touched & GRIPPED).any() and self._fingers_open():
-            episode.gripping = False
+        elif episode.gripped_m is not None and told_m > episode.gripped_m + _LET_GO_M and not (touched & GRIPPED).any():
+            episode.gripped_m = None
             episode.slipping = False
             self.world.set_slipping(False)
-
-    def _fingers_open(self) -> bool:
-        """Whether the fingers are told to be wider apart than they are."""
-        return bool(self.data.ctrl[self._columns.ctrl[-1]] > self.data.qpos[self._columns.qpos[-1]])
+        elif episode.gripped_m is not None:
+            episode.gripped_m = min(episode.gripped_m, told_m)
 
     def _vary(self, *, move_objects: bool = True) -> None:
         """Draw how the scene looks, and where that is hidden by chance, whether the gesture is seen."""

@@ -227,3 +227,36 @@ def test_a_goal_is_reached_by_the_optimal_macro_actions_alone(family: str, start
 def test_goals_of_images_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="vectors"):
         GoalEnv(make_arrows(observation="hand,proprio"))
+
+
+@pytest.mark.parametrize("family", ["arrows", "pick_place"])
+def test_a_grip_that_slips_leaves_the_object_where_it_is(family: str) -> None:
+    """Of 14 grips each slips or not, as drawn; what slips is no event and no fault, what holds is its macro-action."""
+    env, expert = environment(family, slip=0.5, **(FREE if family == "arrows" else {}))
+    slipped = 0
+    for seed in range(14):
+        state = (1, 2, 3, 0) if family == "arrows" else (0, 0, 0, seed % 3)
+        action = seed % 6 if family == "arrows" else seed % 3
+        env.reset(seed=seed, options={"macrostate": state})
+        expert.begin(action)
+        slips = False
+        while not expert.is_done:
+            *_, info = env.step(expert.act())
+            slips |= env.episode.slipping
+        assert not info["fault"]
+        expected = state if slips else env.task.rules.outcomes(state, action)[0].macrostate
+        assert tuple(info["macrostate"])[:-1] == expected[:-1]
+        slipped += slips
+    assert 2 <= slipped <= 12  # 99.8 % of binomial draws
+
+
+def test_a_turn_about_the_hand_leaves_its_place() -> None:
+    """By hand twist, half a turn a second: what is gripped is not dragged aside."""
+    env, _ = environment("arrows")
+    env.reset(seed=0)
+    before_m = env.data.site_xpos[env.world.model.site("tcp").id].copy()
+    for step in range(60):
+        twist = [0, 0, 0, 0, 0, (1 if step < 30 else -1) * math.pi / 6, 0]
+        env.step(np.array(twist, dtype=np.float32))
+        off_m = env.data.site_xpos[env.world.model.site("tcp").id] - before_m
+        assert np.linalg.norm(off_m) < 0.002
