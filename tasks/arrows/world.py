@@ -25,6 +25,8 @@ _QUARTER_RAD = math.pi / 2
 _THESIS = Arrows()
 """The puzzle of three cubes."""
 MAX_OFF_SLOT_M = 0.015
+MAX_LIFT_OFF_M = 0.010
+"""A cube whose middle is higher than that above where it stands is held, or lies on something."""
 
 
 class ArrowWorld(World):
@@ -105,10 +107,7 @@ class ArrowWorld(World):
         turned_rad = orientation.yaw_rad(*pose[3:])
         quarters = round(turned_rad / _QUARTER_RAD)
         skew_rad = abs(turned_rad - quarters * _QUARTER_RAD)
-        off_m = math.dist(pose[:2], self.layout.slots_xy_m[index])
-        problem = self._tipped(index, pose)
-        if problem is None and off_m > MAX_OFF_SLOT_M:
-            problem = f"{self.object_names[index]} stands {1e3 * off_m:.0f} mm off its slot"
+        problem = self._misplaced(index, pose)
         if problem is None and skew_rad > MAX_SKEW_RAD:
             problem = f"{self.object_names[index]} stands {math.degrees(skew_rad):.0f} degrees off a right angle"
         return -quarters % 4, problem
@@ -124,9 +123,20 @@ class ArrowWorld(World):
         """How far a cube is turned clockwise, as seen in the frame, from a direction. In (-pi, pi]."""
         return math.remainder(-orientation.yaw_rad(*pose[3:]) - value * _QUARTER_RAD, 2 * math.pi)
 
+    def _misplaced(self, index: int, pose: list[float]) -> str | None:
+        """In what a cube's pose differs from one on its slot, however it is turned."""
+        name = self.object_names[index]
+        tipped = self._tipped(index, pose)
+        off_m = math.dist(pose[:2], self.layout.slots_xy_m[index])
+        if tipped is not None or off_m > MAX_OFF_SLOT_M:
+            return tipped or f"{name} stands {1e3 * off_m:.0f} mm off its slot"
+        return f"{name} is not on the table" if abs(pose[2] - c.CUBE_REST_Z_M) > MAX_LIFT_OFF_M else None
+
     def value_in_hand(self, index: int, pose: list[float], value: int, *, gripped: bool) -> int:
-        """The direction that a cube has been turned past by more than 20 degrees: one quarter further, or its own."""
-        del index, gripped
+        """The direction that a cube on its slot has been turned past by more than 20 degrees, or ``value``."""
+        del gripped
+        if self._misplaced(index, pose):
+            return value
         turned_rad = self._turned_rad(pose, value)
         if abs(turned_rad) <= _QUARTER_RAD + MAX_SKEW_RAD:
             return value

@@ -31,6 +31,8 @@ from .dense import Potential
 from .referee import GRIPPED, Event, Referee
 
 RATE_HZ = 25.0
+SLOWEST_HZ = 5.0
+"""In a longer period the wrist could turn a cube past a quarter and on to the next one unseen."""
 REWARDS = ("sparse", "dense")
 SECONDS_PER_MACRO_ACTION = 3.0
 """An episode is truncated after so many seconds for each macro-action of the task's horizon; planned, one takes 2.2."""
@@ -186,7 +188,7 @@ class MotionEnv(SceneEnv):
         self.action_space = self.controls.space
         self._columns = arm_columns(self.model)
         self._ramp = (np.arange(1, self._n_steps + 1) / self._n_steps)[:, None]
-        self._referee = Referee(self.world, spec.rules)
+        self._referee = Referee(self.world, spec.rules, spec.macrostate_values)
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self.camera, control=True)
         self.observation_space = self._observer.space
         self.time_limit_s = SECONDS_PER_MACRO_ACTION * spec.horizon
@@ -393,7 +395,9 @@ class MotionEnv(SceneEnv):
 
 def steps_in_period(rate_hz: float, timestep_s: float) -> int:
     """Steps of a simulation in a control period. Raises InvalidValueError: they are no whole number."""
-    if isinstance(rate_hz, Real) and not isinstance(rate_hz, bool) and 0 < rate_hz <= 1 / timestep_s + 1e-6:
+    most_hz = 1.0 / timestep_s
+    is_number = isinstance(rate_hz, Real) and not isinstance(rate_hz, bool)
+    if is_number and SLOWEST_HZ <= rate_hz <= most_hz + 1e-6:
         steps = 1.0 / (float(rate_hz) * timestep_s)
         if abs(steps - round(steps)) < 1e-6:
             return round(steps)
@@ -402,4 +406,4 @@ def steps_in_period(rate_hz: float, timestep_s: float) -> int:
         raise InvalidValueError(
             f"At {rate_hz:g} Hz a period is no whole number of steps of {1e3 * timestep_s:g} ms; give {named} Hz."
         )
-    raise InvalidValueError(f"Rate {brief(rate_hz)} must be a number of Hz, up to {1 / timestep_s:g}.")
+    raise InvalidValueError(f"Rate {brief(rate_hz)} must be a number of Hz from {SLOWEST_HZ:g} to {most_hz:g}.")

@@ -63,17 +63,21 @@ class Referee:
     """Watches the objects of a world, and says when and how the macrostate has changed.
 
     An object at rest that no part of the robot touches has the value that is read of its pose. One that is touched or
-    moves has its value of before, until it has passed another one: a cube that is turned by more than a quarter and
-    20 degrees, an object that is gripped and lifted. So one grasp cannot skip a macrostate.
+    moves has its value of before, until it has passed another one: a cube that is turned on its place by more than a
+    quarter and 20 degrees, an object that is gripped and lifted. So one grasp cannot skip a macrostate: what it skips
+    beside its place is a fault when the object comes to rest. Where one object changes, all others must stand, or be
+    held, as the macrostate says.
 
     Args:
         world: The scene.
         rules: Its task's.
+        values: Names of the values of each coordinate of a macrostate.
     """
 
-    def __init__(self, world: World, rules: Rules) -> None:
+    def __init__(self, world: World, rules: Rules, values: Sequence[Sequence[str]]) -> None:
         self._world = world
         self._rules = rules
+        self._values = values
         self._touch = Touch(world)
         self._speeds = world.object_qvel
         self._asleep: bytes = b""
@@ -99,6 +103,7 @@ class Referee:
         objects = list(macrostate[:-1])
         changed = []
         problems = []
+        disturbed = []
         for index, pose in enumerate(poses.tolist()):
             problem = None
             if pose[2] < _FALLEN_M:
@@ -107,6 +112,8 @@ class Referee:
             elif touched[index] or moving[index]:
                 gripped = bool(touched[index] & GRIPPED == GRIPPED)
                 value = self._world.value_in_hand(index, pose, objects[index], gripped=gripped)
+                if not touched[index] or self._world.read_object(index, pose) != (value, None):
+                    disturbed.append(index)
             else:
                 value, problem = self._world.read_object(index, pose)
             if problem is not None:
@@ -116,21 +123,14 @@ class Referee:
                 objects[index] = value
         if not changed and not problems:
             return None
-        if not problems:
-            problems = self._at_once(changed, touched, moving)
+        at_once = [self._world.object_names[index] for index in sorted({*changed, *disturbed})]
+        if not problems and len(at_once) > 1:
+            problems.append(f"{' and '.join(at_once)} moved at once")
         return self._judged(macrostate, tuple(objects), problems, rng)
 
     def _moving(self) -> NDArray[np.bool_]:
         speeds: Floats = np.abs(self._world.data.qvel[self._speeds])
         return (speeds[:, :3].max(axis=1) > _STILL_M_S) | (speeds[:, 3:].max(axis=1) > _STILL_RAD_S)
-
-    def _at_once(self, changed: Sequence[int], touched: Ints, moving: NDArray[np.bool_]) -> list[str]:
-        """The other objects that moved while one changed, in words."""
-        also = [index for index in range(len(moving)) if index in changed or (moving[index] and not touched[index])]
-        if len(also) == 1:
-            return []
-        names = " and ".join(self._world.object_names[index] for index in also)
-        return [f"{names} moved at once"]
 
     def _judged(self, before: State, objects: State, problems: Sequence[str], rng: np.random.Generator) -> Event:
         if not problems:
@@ -138,9 +138,16 @@ class Referee:
                 fitting = [each for each in self._rules.outcomes(before, action) if each.macrostate[:-1] == objects]
                 if fitting:
                     return Event(action=action, outcome=_drawn(fitting, rng), fault=None)
-            problems = [f"the objects went from {before[:-1]} to {objects}, which no macro-action does"]
+            problems = [self._impossible(index, before[index], then) for index, then in enumerate(objects)]
         reached = Outcome(1.0, (*objects, before[-1]), FAULT_REWARD, terminated=True, success=False)
-        return Event(action=-1, outcome=reached, fault=problems[0])
+        return Event(action=-1, outcome=reached, fault="; ".join(filter(None, problems)))
+
+    def _impossible(self, index: int, before: int, then: int) -> str:
+        """How an object changed that no macro-action changes so; empty for one that did not change."""
+        if before == then:
+            return ""
+        values = self._values[index]
+        return f"{self._world.object_names[index]} went from {values[before]} to {values[then]} in one motion"
 
 
 def _drawn(outcomes: Sequence[Outcome], rng: np.random.Generator) -> Outcome:
