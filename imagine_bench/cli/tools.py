@@ -274,13 +274,16 @@ class CheckCommand:
     """World model to check."""
     physics: bool = False
     """Measure the task's contact physics instead: fidelity to the rules at random, then how far friction, force, mass
-    and the planner's errors may go before macro-actions fail."""
+    and the planner's errors may go before macro-actions fail. Of continuous control, such as ArrowPuzzleMotion: how
+    many planned macro-actions (--trials) and whole episodes (of --turns macro-actions) succeed by hand twists."""
     turns: int = 2_000
     """With --physics: macro-actions of the fidelity measurement; 0 for none."""
     trials: int = 200
     """With --physics: macro-actions of each value of each setting; 0 for none."""
     appearances: tuple[str, ...] = APPEARANCES[:1]
     """With --physics: appearance levels at which fidelity is measured."""
+    random: int = 100
+    """With --physics, of continuous control: episodes of random hand twists."""
     out: Path = Path("runs/margins.json")
     """With --physics: the file in which the figures are kept, with the machine's description."""
 
@@ -289,10 +292,13 @@ class CheckCommand:
         from imagine_bench.testing import contract, physics  # noqa: PLC0415 - nothing else needs them
 
         if not self.physics:
-            require_with("--physics", self, "turns", "trials", "appearances", "out")
+            require_with("--physics", self, "turns", "trials", "random", "appearances", "out")
             failed = contract.report(contract.checks(self.task, self.agent, self.model)) > 0
         elif self.task is None or self.agent or self.model:
             raise InvalidValueError("Physics is measured of a task; give one, and no --agent or --model.")
+        elif registry.task_of_motion(self.task):
+            numbers = {"turns": self.turns, "trials": self.trials, "random_episodes": self.random}
+            failed = not physics.check_motion(self.task, self.out, **numbers, appearances=self.appearances)
         else:
             failed = not physics.check_physics(
                 self.task, self.out, turns=self.turns, trials=self.trials, appearances=self.appearances

@@ -20,6 +20,7 @@ from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Bools, Floats, State
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.exact import motion
 from imagine_bench.interfaces import APPEARANCES, SENSES, PhysicsSettings, TaskSpec
 from imagine_bench.registry.machine import describe_environment, gl_renderer
 from imagine_bench.rules import states_of_play
@@ -37,6 +38,7 @@ SWEEPS: dict[str, tuple[float, ...]] = {
 HEAD = "| what | required | measured | |\n|---|---|---|---|"
 """Head of a table of figures."""
 _CLEAN = APPEARANCES[0]
+_RIGHT = 0.99  # of planned macro-actions in continuous control
 _ACTIONS_A_WALK = 200  # between two resets: errors may accumulate
 _ACTIONS_A_VARIED_WALK = 5  # where poses vary, a turn undoes the draw of the reset
 _WALKS = 5  # without a reset, of each way to sense poses
@@ -125,6 +127,50 @@ def check_physics(
         kept |= measure_margins(spec, trials)
     write_json(out, {**kept, "environment": describe_environment()})
     return all(figure.met for figure in figures)
+
+
+def check_motion(
+    name: str, out: Path, *, turns: int, trials: int, random_episodes: int, appearances: Sequence[str]
+) -> bool:
+    """Measure how far a task of continuous control can be solved, print it, and keep it.
+
+    Args:
+        name: The task as commands name it, such as ``"ArrowPuzzleMotion"``.
+        out: The JSON file to write.
+        turns: Macro-actions of whole episodes of planned motions.
+        trials: Segments: single planned macro-actions.
+        random_episodes: Episodes of random hand twists, at the first appearance alone.
+        appearances: Appearance levels.
+
+    Returns:
+        Whether at least 99 % of the segments were as ruled.
+
+    Raises:
+        InvalidValueError: No segments, or a folder to write to.
+        UnknownNameError: An unknown task or appearance.
+        SetupError: The file cannot be written.
+    """
+    if trials < 1 or out.is_dir():
+        raise InvalidValueError(f"trials is {trials} and the file {out}; give at least 1 and a JSON file to write.")
+    task = registry.task_of_motion(name) or name
+    entry = registry.task_entry(task)
+    spec = registry.task(task)
+    require_writable(out.parent)
+    measure = registry.load("imagine_bench.tasks.continuous.segments:measure")
+    kept = {}
+    right = True
+    for number, level in enumerate(map(appearance_name, appearances)):
+        env = registry.load(entry.motion)(**entry.options, appearance=level, observation="proprio")
+        found = measure(env, tries=trials, turns=turns, random_episodes=0 if number else random_episodes)
+        kept[level] = asdict(found)
+        both = motion.certificate(spec, kept[level])
+        right &= both.as_ruled >= _RIGHT * both.segments
+        print(f"{level}: shown reachable {both.shown:.2%}; {motion.evidence(both)}")
+        for reason, count in found.faults.items():
+            print(f"  {count} times: {reason}")
+        env.close()
+    write_json(out, {"task": spec.id, "seed": 0, "appearances": kept, "environment": describe_environment()})
+    return right
 
 
 def make_env(spec: TaskSpec, **options: Any) -> Any:

@@ -11,6 +11,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
+from imagine_bench.exact import motion
 from imagine_bench.exact.certificate import certificate, certificate_rows
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS, TaskSpec, bundled_name
 from imagine_bench.protocols.data import ProtocolData, TaskType
@@ -56,7 +57,7 @@ def describe(name: str) -> str:
         UnknownNameError: There is none of this name.
         SetupError: It is in a package that is not installed.
     """
-    is_task = registry.has_task(name) or name in registry.regressions()
+    is_task = registry.has_task(registry.task_of_motion(name) or name) or name in registry.regressions()
     pages = [describe_task(name)] if is_task else []
     learners: dict[str, AgentEntry | RegressorEntry | WorldModelEntry] = {}
     for known in (registry.world_models(), registry.regressors(), registry.agents()):
@@ -66,9 +67,10 @@ def describe(name: str) -> str:
     if not pages:
         if any(name in guest.names.get(registry.AGENT_GROUP, ()) for guest in registry.absent_guests()):
             registry.agent_entry(name)
-        raise UnknownNameError(
-            "task, agent or world model", name, [*registry.tasks(), *registry.regressions(), *learners]
-        )
+        moving = [each.env_id for each in registry.tasks().values() if each.motion]
+        hands = [registry.motion_name(registry.motion_id(each)) for each in moving]
+        known_names = [*registry.tasks(), *hands, *registry.regressions(), *learners]
+        raise UnknownNameError("task, agent or world model", name, known_names)
     return "\n\n".join(pages)
 
 
@@ -95,7 +97,7 @@ def describe_task(name: str) -> str:
         data = registry.regression(name)
         rows = {"learned from": f"data, in the variants {', '.join(data.variants)}", "error": data.error_name}
         return _page(data.title, data.description, rows)
-    spec = registry.task(name)
+    spec = registry.task(registry.task_of_motion(name) or name)
     facts = spec.facts()
     exact = certificate(spec)
     factors = (f"{n} ({', '.join(v)})" for n, v in zip(spec.macrostate_names, spec.macrostate_values, strict=True))
@@ -119,7 +121,24 @@ def describe_task(name: str) -> str:
         **certificate_rows(exact),
         "encoders": _encoders(spec),
     }
-    return _page(spec.title, spec.description, rows)
+    hand = _by_hand(spec)
+    if registry.task_of_motion(name):
+        return _page(spec.title, spec.description, hand | {"rules": "those of its macro-actions:"} | rows)
+    return _page(spec.title, spec.description, rows | dict(list(hand.items())[1:2]))
+
+
+def _by_hand(spec: TaskSpec) -> dict[str, str]:
+    """What a task is in continuous control, and how far it can be solved; nothing where it has none."""
+    base, colon, options = spec.id.partition(":")
+    if not registry.has_task(base) or not registry.task_entry(base).motion:
+        return {}
+    made_by = registry.motion_id(registry.task_entry(base).env_id)
+    name = registry.motion_name(made_by)
+    made_by += f", with {options.replace(',', ', ')}" if options else ""
+    return {
+        "continuous": f"{made_by}: commands to the hand or the joints at 25 Hz, judged by the same rules",
+        **motion.rows(spec, name + colon + options),
+    }
 
 
 def names() -> str:

@@ -1,0 +1,180 @@
+"""Measures what planned motions achieve, macro-action by macro-action, for the certificate of continuous control.
+
+A segment is one macro-action of :class:`.expert.Expert`, by hand twists. It is as ruled if its only event is this
+macro-action, without a fault, and if the hand is back near its observation pose at the end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from imagine_bench.arrays import Floats, State
+from imagine_bench.rules import states_of_play
+
+from ..scenes.arm import ARM_JOINTS, arm_columns
+from ..scenes.constants import OBSERVATION_QPOS_RAD
+from .controls import HAND_SPEED_M_S, HAND_TURN_RAD_S, MOST_OPEN_M
+from .env import MotionEnv
+from .expert import Expert
+
+START_M = 0.04
+START_RAD = math.radians(15.0)
+"""A segment starts with the hand off its observation pose by up to so much along each axis, and about the vertical."""
+_MOVE_PERIODS = 10
+"""Periods in which the hand is moved there."""
+
+
+@dataclass(kw_only=True)
+class Measured:
+    """All segments at one appearance, whole episodes, and a random policy; can be written as JSON."""
+
+    #: Of each pair: objects, macro-action, tries, those as ruled, mean and longest duration (s), and whether the
+    #: episode ends there, so that the duration is without the way back to the observation pose.
+    segments: list[tuple[State, int, int, int, float, float, bool]]
+    pairs: int  #: (arrangement of objects, macro-action) pairs that there are
+    faults: dict[str, int]  #: the most frequent reasons of those not as ruled, with their counts
+    furthest_m: float  #: that a hand was off its observation pose after a segment
+    furthest_rad: float
+    episodes: int  #: of the optimal macro-actions, one after another
+    solved: int
+    random_episodes: int  #: with a uniformly random hand twist each period
+    random_solved: int
+    time_limit_s: float  #: of the environment
+
+
+def measure(env: MotionEnv, *, tries: int, turns: int, random_episodes: int, seed: int = 0) -> Measured:
+    """Measure everything that a certificate needs.
+
+    Args:
+        env: An environment of the task, by hand twists.
+        tries: Segments, spread evenly over the pairs, each pair once at least; of more pairs, a sample of so many.
+        turns: Macro-actions of whole episodes of the optimal policy; the last episode is played to its end.
+        random_episodes: Episodes of random hand twists.
+        seed: Of everything random.
+    """
+    rng = np.random.default_rng(seed)
+    pairs = _pairs(env)
+    chosen = pairs if len(pairs) <= tries else [pairs[each] for each in sorted(rng.permutation(len(pairs))[:tries])]
+    expert = Expert(env, env.another_world())
+    faults: Counter[str] = Counter()
+    furthest = np.zeros(2)
+    segments = []
+    for number, (state, action) in enumerate(chosen):
+        seconds = []
+        as_ruled = 0
+        for attempt in range(math.ceil(tries / len(chosen))):
+            env.reset(seed=seed + 10_000 * number + attempt, options={"macrostate": state})
+            if attempt:
+                _move(env, rng)
+            fault, taken_s, off = _segment(env, expert, action)
+            furthest = np.maximum(furthest, off)
+            seconds.append(taken_s)
+            as_ruled += fault is None
+            faults.update([fault] if fault else [])
+        mean_s = round(float(np.mean(seconds)), 3)
+        longest_s = round(max(seconds), 3)
+        ends = env.task.rules.outcomes(state, action)[0].terminated
+        segments.append((state[:-1], action, len(seconds), as_ruled, mean_s, longest_s, ends))
+    solved = _episodes(env, expert, turns)
+    return Measured(
+        segments=segments,
+        pairs=len(pairs),
+        faults=dict(faults.most_common(10)),
+        furthest_m=float(furthest[0]),
+        furthest_rad=float(furthest[1]),
+        episodes=len(solved),
+        solved=sum(solved),
+        random_episodes=random_episodes,
+        random_solved=sum(_random_episode(env, each) for each in range(random_episodes)),
+        time_limit_s=env.time_limit_s,
+    )
+
+
+def _pairs(env: MotionEnv) -> list[tuple[State, int]]:
+    """For each arrangement of objects and macro-action that changes it, a macrostate; one that goes on, if any does."""
+    rules = env.task.rules
+    found: dict[tuple[State, int], tuple[bool, State]] = {}
+    for state in states_of_play(rules):
+        for action in range(rules.n_actions):
+            outcomes = rules.outcomes(state, action)
+            goes_on = not outcomes[0].terminated
+            if all(each.macrostate[:-1] == state[:-1] for each in outcomes):
+                continue
+            best, _ = found.get((state[:-1], action), (False, state))
+            if goes_on or not best:
+                found[state[:-1], action] = (goes_on, state)
+    return [(state, action) for (_, action), (_, state) in found.items()]
+
+
+def _move(env: MotionEnv, rng: np.random.Generator) -> None:
+    """Move the hand off its observation pose, as far as starts may be."""
+    offset = np.append(START_M * rng.uniform(-1, 1, 3), START_RAD * rng.uniform(-1, 1))
+    twist = offset / np.array([HAND_SPEED_M_S] * 3 + [HAND_TURN_RAD_S]) / (_MOVE_PERIODS * env.period_s)
+    grip = 2.0 * env.data.ctrl[arm_columns(env.model).ctrl[-1]] / MOST_OPEN_M - 1.0
+    for _ in range(_MOVE_PERIODS):
+        env.step(np.array([*twist[:3], 0.0, 0.0, twist[3], grip], dtype=np.float32))
+
+
+def _segment(env: MotionEnv, expert: Expert, action: int) -> tuple[str | None, float, Floats]:
+    """Why a macro-action was not as ruled, or None; its seconds; how far (m, rad) the hand ended off."""
+    before = env.episode.macrostate
+    began_s = env.elapsed_s
+    expert.begin(action)
+    events = []
+    over = False
+    while not (expert.is_done or over):
+        _, _, terminated, truncated, info = env.step(expert.act())
+        over = bool(terminated or truncated)
+        if info["event"]:
+            events.append(info)
+    seconds = env.elapsed_s - began_s
+    off = np.zeros(2) if over else _off_observation_pose(env)
+    if expert.refused or len(events) != 1:
+        return expert.refused or f"{len(events)} events", seconds, off
+    (event,) = events
+    reached = tuple(event["macrostate"].tolist())
+    if event["fault"] or reached not in [each.macrostate for each in env.task.rules.outcomes(before, action)]:
+        return str(event["fault_reason"]) or "another macro-action", seconds, off
+    too_far = off[0] > START_M or off[1] > START_RAD
+    return "the hand ended further off than segments start" if too_far else None, seconds, off
+
+
+def _off_observation_pose(env: MotionEnv) -> Floats:
+    """How far the hand is off the observation pose, in m and rad."""
+    columns = arm_columns(env.model).qpos[: len(ARM_JOINTS)]
+    now_m, now = env.controls.hand_pose(env.data.qpos[columns])
+    rest_m, rest = env.controls.hand_pose(np.array(OBSERVATION_QPOS_RAD))
+    turned = math.acos(float(np.clip((np.trace(now.T @ rest) - 1.0) / 2.0, -1.0, 1.0)))
+    return np.array([float(np.linalg.norm(now_m - rest_m)), turned])
+
+
+def _episodes(env: MotionEnv, expert: Expert, turns: int) -> list[bool]:
+    """Of each whole episode of optimal macro-actions, one after another, whether it is solved."""
+    solved: list[bool] = []
+    done = 0
+    while done < turns:
+        env.reset(seed=len(solved))
+        over = False
+        while not over:
+            expert.begin(env.task.rules.optimal_action(env.episode.macrostate))
+            done += 1
+            while not (expert.is_done or over):
+                _, _, terminated, truncated, info = env.step(expert.act())
+                over = bool(terminated or truncated)
+        solved.append(bool(info["is_success"]))
+    return solved
+
+
+def _random_episode(env: MotionEnv, seed: int) -> bool:
+    """Whether uniformly random hand twists, a new one each period, solve an episode."""
+    rng = np.random.default_rng(seed)
+    env.reset(seed=seed)
+    while True:
+        action = rng.uniform(env.action_space.low, env.action_space.high)
+        _, _, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            return bool(info["is_success"])
