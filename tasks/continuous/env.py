@@ -75,7 +75,8 @@ class MotionEnv(SceneEnv):
     turning about x, y, z, and the grip (-1 closed, 1 open).
 
     Observation Space: by ``observation``, a dict of the parts that :class:`.observations.Observer` explains, or one
-    part as it is.
+    part as it is. With ``lag``, all parts, proprioception too, are those of the moment of an earlier event, so many
+    events ago, or of the start; they stay the same until the next event.
 
     Rewards: those of the rules, charged at each event: a change of the macrostate that is read of the scene. A change
     that is no macro-action is a fault, which ends the episode with -5. With ``reward="dense"`` a shaping term is added.

@@ -21,7 +21,7 @@ from imagine_bench.tasks.pick_place.rules import PickPlace
 from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.specs import world_maker
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, UnknownKeywordError
 
 FREE = {"goal": "000", "forbid": "none"}
 """Arrow puzzle in which nothing but the goal ends an episode."""
@@ -167,10 +167,63 @@ def test_ids_are_known_to_gymnasium(name: str) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("option", [{"shuffle": 3}, {"coupling": "neighbour"}])
-def test_parameters_without_meaning_for_a_hand_are_refused(option: dict[str, Any]) -> None:
-    with pytest.raises(InvalidValueError, match="leave it out"):
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"shuffle": 3}, "leave it out"),
+    ({"coupling": "neighbour"}, "leave it out"),
+    ({"appearance": "patched"}, "'patched' patches images"),
+    ({"split": "plan_length=2"}, "unexpected keyword argument 'split'"),
+    ({"execution": "kinematic"}, "unexpected keyword argument 'execution'"),
+    ({"cubes": 7}, "give an integer from 1 to 6"),
+    ({"goal": "all", "forbid": "equal"}, "no start"),
+    ({"rate_hz": 2}, "from 5 to 125"),
+]
+
+
+@pytest.mark.parametrize(("option", "words"), REFUSED)
+def test_options_without_meaning_for_a_hand_are_refused(option: dict[str, Any], words: str) -> None:
+    with pytest.raises((InvalidValueError, UnknownKeywordError), match=words):
         make_arrows(**option)
+
+
+@pytest.mark.parametrize("name", ["arrows", "pick_place"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"goal_change": 1.0},
+        {"gesture": "first"},
+        {"gesture": 0.0},
+        {"distractors": 2},
+        {"lag": 1},
+        {"appearance": "strong"},
+        {"slip": 0.5},
+        {"told": True},
+    ],
+)
+def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(name: str, option: dict[str, Any]) -> None:
+    make = make_arrows if name == "arrows" else make_pick_place
+    env = make(observation="state,objects", **option, **(FREE if name == "arrows" else {}))
+    start = (1, 2, 3, 0) if name == "arrows" else (0, 0, 0, 0)
+    first, info = env.reset(seed=0, options={"macrostate": start})
+    assert bool(info["instruction"]) == bool(option.get("told"))
+    expert = Expert(env, env.another_world())
+    event = next(each for _ in range(9) for each in carry_out(env, expert, 0))
+    after = tuple(event["macrostate"])
+    assert not event["fault"]
+    if option.get("goal_change") and name == "arrows":
+        assert after[-1] != start[-1]
+    hidden = "gesture" in option or option.get("told")
+    assert (env.world.observed(after)[-1] == -1) == bool(hidden and not (name == "pick_place" and after[-1] == 4))
+    seen = env.step(np.zeros(7, dtype=np.float32))[0]
+    assert np.array_equal(seen["state"], first["state"]) == ("lag" in option)
+
+
+@pytest.mark.parametrize("cubes", range(1, 7))
+def test_any_number_of_cubes_is_turned_by_hand(cubes: int) -> None:
+    env = make_arrows(observation="proprio", cubes=cubes, goal="0" * cubes, forbid="none")
+    env.reset(seed=0, options={"macrostate": (*(1, 2, 3, 1, 2, 3)[:cubes], 0)})
+    expert = Expert(env, env.another_world())
+    for action in (1, 2 * cubes - 2):
+        assert [each["macro_action"] for each in carry_out(env, expert, action)] == [action]
 
 
 @pytest.mark.parametrize("family", ["arrows", "pick_place"])

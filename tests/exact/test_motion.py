@@ -1,0 +1,103 @@
+"""The certificate of continuous control: what segments prove, by hand-made measurements."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from imagine_bench import registry
+from imagine_bench.cli import exit_code as main
+from imagine_bench.exact.motion import certificate, measured
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.rules import shortest_plans, states_of_play, tabulate
+from imagine_bench.statistics import wilson
+
+MANY = 10**9
+
+
+def measurement(
+    spec: TaskSpec, *, of: int = MANY, right: int = MANY, longest_s: float = 2.0, limit_s: float = 20.0
+) -> dict[str, Any]:
+    """As if every pair of a task had been tried so often, and been right so often."""
+    states = states_of_play(spec.rules)
+    pairs = sorted({(state[:-1], action) for state in states for action in range(spec.n_actions)})
+    segments = [[list(objects), action, of, right, longest_s, longest_s, False] for objects, action in pairs]
+    counts = {"episodes": 0, "solved": 0, "random_episodes": 0, "random_solved": 0}
+    return {"segments": segments, "pairs": len(pairs), "time_limit_s": limit_s, **counts}
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "arrow_puzzle_hard", "pick_place", "arrows:cubes=2,goal_change=0.2"])
+def test_segments_that_never_fail_show_the_optimum(task: str) -> None:
+    spec = registry.task(task)
+    found = certificate(spec, measurement(spec, limit_s=2000.0))
+    assert found.shown == pytest.approx(found.optimum, abs=1e-6)
+
+
+def test_what_is_shown_is_the_product_of_the_segments_lower_bounds() -> None:
+    """One cube: two starts are a turn from the goal, and one is two turns."""
+    spec = registry.task("arrow_puzzle_easy")
+    measure = measurement(spec, of=100, right=100)
+    share, _ = wilson(600, 600)
+    assert certificate(spec, measure).shown == pytest.approx((2 * share + share**2) / 3)
+    measure = measurement(spec, of=100, right=80)
+    share, _ = wilson(480, 600)
+    assert certificate(spec, measure).shown == pytest.approx((2 * share + share**2) / 3)
+
+
+def test_a_time_limit_without_room_for_two_shows_what_one_macro_action_solves() -> None:
+    spec = registry.task("arrow_puzzle_easy")
+    found = certificate(spec, measurement(spec, longest_s=2.0, limit_s=3.9))
+    assert found.macro_actions == 1
+    assert found.shown == pytest.approx(2 / 3, abs=1e-6)
+
+
+def test_pairs_that_were_not_tried_show_nothing_unless_pairs_were_sampled() -> None:
+    spec = registry.task("arrow_puzzle_easy")
+    measure = measurement(spec, limit_s=5.0)
+    measure["segments"] = [each for each in measure["segments"] if each[:2] != [[1], 1]]
+    assert certificate(spec, measure).shown == pytest.approx(1.0, abs=1e-6)  # taken for a sample
+    measure["pairs"] -= 1
+    assert certificate(spec, measure).shown == pytest.approx((0 + 1 + 1) / 3, abs=1e-6)
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "arrow_puzzle_hard", "pick_place"])
+@pytest.mark.parametrize("appearance", ["clean", "strong"])
+def test_what_was_measured_leaves_less_than_a_point(task: str, appearance: str) -> None:
+    """Both bounds of success within 1 point, mean time within 10 %, and room within the time limit for every plan."""
+    spec = registry.task(task)
+    found = certificate(spec, measured(task)["appearances"][appearance])
+    assert found.optimum - found.shown <= 0.01
+    assert (found.mean_high_s - found.mean_low_s) / found.mean_s <= 0.1
+    assert found.measured_pairs == found.pairs
+    assert found.solved >= 0.99 * found.episodes
+    assert found.random_solved <= 0.01 * found.random_episodes
+    assert found.macro_actions >= int(shortest_plans(tabulate(spec.rules)).max())
+
+
+@pytest.mark.parametrize("name", ["ArrowPuzzleEasyMotion", "PickPlaceMotion"])
+def test_the_command_measures_and_keeps_a_certificate(name: str, tmp_path: Any, capsys: Any) -> None:
+    out = tmp_path / "kept.json"
+    words = ["check", name, "--physics", "--trials", "2", "--turns", "2", "--random", "1", "--out", str(out)]
+    assert main(words) == 0
+    kept = json.loads(out.read_text())
+    found = certificate(registry.task(kept["task"]), kept["appearances"]["clean"])
+    assert found.as_ruled == found.segments >= 2
+    assert found.solved == found.episodes >= 1
+    assert kept["environment"]["commit"]
+    assert "shown reachable" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["ArrowPuzzleMotion", "arrow_puzzle", "ArrowsMotion:cubes=1"])
+def test_describe_knows_continuous_control(name: str, capsys: Any) -> None:
+    assert main(["describe", name]) == 0
+    assert "by hand" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"), [("ArowPuzzleMotion", "ArrowPuzzleMotion"), ("PickMotion", "PickPlaceMotion")]
+)
+def test_a_misspelt_name_of_continuous_control_is_answered_by_the_nearest(name: str, nearest: str, capsys: Any) -> None:
+    assert main(["describe", name]) == 2
+    assert f"Did you mean '{nearest}'?" in capsys.readouterr().err
