@@ -112,7 +112,7 @@ def _pairs(env: MotionEnv) -> list[tuple[State, int]]:
 
 def _move(env: MotionEnv, rng: np.random.Generator) -> None:
     """Move the hand off its observation pose, as far as starts may be."""
-    offset = np.append(START_M * rng.uniform(-1, 1, 3), START_RAD * rng.uniform(-1, 1))
+    offset: Floats = np.append(START_M * rng.uniform(-1, 1, 3), START_RAD * rng.uniform(-1, 1))
     twist = offset / np.array([HAND_SPEED_M_S] * 3 + [HAND_TURN_RAD_S]) / (_MOVE_PERIODS * env.period_s)
     grip = 2.0 * env.data.ctrl[arm_columns(env.model).ctrl[-1]] / MOST_OPEN_M - 1.0
     for _ in range(_MOVE_PERIODS):
