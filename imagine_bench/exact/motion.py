@@ -49,13 +49,13 @@ class MotionCertificate:
 
 
 def measured(task: str) -> dict[str, Any]:
-    """What was measured of a task: by appearance, with the command, commit, machine and seed; empty if nothing was."""
+    """The measurements of a task: by appearance, with the command, commit, machine and seed; empty if nothing was."""
     file = resources.files(__package__).joinpath("measured", f"{task}.json")
     return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
 
 
 def certificate(spec: TaskSpec, found: dict[str, Any]) -> MotionCertificate:
-    """Both bounds, from the rules and from what was measured at one appearance (``Measured`` of continuous control)."""
+    """Both bounds, from the rules and from the measurements at one appearance (``Measured`` of continuous control)."""
     tables = tabulate(spec.rules)
     tries, as_ruled, mean_s, longest_s, ends = np.array([each[2:] for each in found["segments"]]).T
     whole_s = mean_s[ends == ends.min()]
@@ -102,7 +102,7 @@ def _as_measured(tables: RuleTables, found: dict[str, Any]) -> RuleTables:
 
 
 def evidence(found: MotionCertificate) -> str:
-    """What the lower bound rests on, in words."""
+    """The measurements behind the lower bound, in words."""
     sampled = "" if found.measured_pairs == found.pairs else f" ({found.measured_pairs:,} of {found.pairs:,} pairs)"
     return (
         f"{found.as_ruled:,} of {found.segments:,} macro-actions{sampled} as ruled, {found.solved:,} of "

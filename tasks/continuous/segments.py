@@ -1,4 +1,4 @@
-"""Measures what planned motions achieve, macro-action by macro-action, for the certificate of continuous control.
+"""Measures how often planned motions succeed, macro-action by macro-action, for the certificate of continuous control.
 
 A segment is one macro-action of :class:`.expert.Expert`, by hand twists. It is as ruled if its only event is this
 macro-action, without a fault, and if the hand is back near its observation pose at the end.
@@ -47,7 +47,7 @@ class Measured:
 
 
 def measure(env: MotionEnv, *, tries: int, turns: int, random_episodes: int, seed: int = 0) -> Measured:
-    """Measure everything that a certificate needs.
+    """Measure all that a certificate needs.
 
     Args:
         env: An environment of the task, by hand twists.
@@ -64,6 +64,7 @@ def measure(env: MotionEnv, *, tries: int, turns: int, random_episodes: int, see
     furthest = np.zeros(2)
     segments = []
     for number, (state, action) in enumerate(chosen):
+        rng = np.random.default_rng([seed, number])
         seconds = []
         as_ruled = 0
         for attempt in range(math.ceil(tries / len(chosen))):

@@ -1,4 +1,4 @@
-"""Tricks of a hand: the referee says what became of each, and no motion earns more than the rules' best policy."""
+"""Tricks of a hand: the referee judges each, and no motion earns more than the rules' best policy."""
 
 from __future__ import annotations
 
@@ -284,7 +284,7 @@ def a_script(rng: np.random.Generator) -> dict[str, float]:
 
 
 def played(hand: Hand, script: dict[str, float]) -> None:
-    """Do what a script says."""
+    """Carry out a script."""
     cube = int(script["cube"])
     x_m, y_m = hand.env.world.layout.slots_xy_m[cube]
     if script["push"]:
