@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import re
 from collections.abc import Callable
 from typing import Any, cast
@@ -228,15 +229,76 @@ def test_a_trick_with_objects_is_seen(name: str) -> None:
     assert_fault(hand, fault)
 
 
-def test_a_change_that_no_macro_action_makes_is_told_in_words() -> None:
+def moves(env: MotionEnv) -> None:
+    """The second cube slides slowly."""
+    env.data.qvel[env.world.object_qvel[1, 0]] = 0.02
+
+
+def stands_off(env: MotionEnv) -> None:
+    """The second cube is 3 cm off its slot."""
+    env.data.qpos[env.world.object_qpos[1, 0]] += 0.03
+
+
+def falls(env: MotionEnv) -> None:
+    """The second cube is below the table."""
+    env.data.qpos[env.world.object_qpos[1, 2]] -= 0.2
+
+
+def floats(env: MotionEnv) -> None:
+    """The second cube is at rest above its slot."""
+    env.data.qpos[env.world.object_qpos[1, 2]] += 0.02
+
+
+def stands(env: MotionEnv) -> None:
+    del env
+
+
+@pytest.mark.parametrize(
+    ("before", "touched", "prepare", "fault"),
+    [
+        ((0, 2, 3, 0), (0, 0, 0), stands, None),
+        ((0, 2, 3, 0), (0, 1, 0), stands, None),
+        ((3, 2, 3, 0), (0, 0, 0), stands, "cube 0 went from left to right in one motion"),
+        ((0, 2, 0, 0), (0, 0, 0), stands, "cube 0 and cube 2 moved at once"),
+        ((0, 2, 3, 0), (0, 0, 0), moves, "cube 0 and cube 1 moved at once"),
+        ((0, 2, 3, 0), (0, 1, 0), stands_off, "cube 0 and cube 1 moved at once"),
+        ((1, 2, 3, 0), (0, 0, 0), stands_off, "cube 1 stands 28 mm off its slot"),
+        ((1, 2, 3, 0), (0, 1, 0), falls, "cube 1 fell off the table"),
+        ((1, 2, 3, 0), (0, 0, 0), floats, "cube 1 is not on the table"),
+    ],
+)
+def test_an_event_is_a_macro_action_or_says_what_else_it_is(
+    before: State, touched: tuple[int, ...], prepare: Callable[[MotionEnv], None], fault: str | None
+) -> None:
+    """The scene stands as the start says; the macrostate before says what it came from."""
     env = free()
     env.reset(seed=0, options={"macrostate": START})
-    nothing = np.zeros(3, dtype=np.int64)
+    prepare(env)
     referee = Referee(env.world, env.task.rules, env.task.macrostate_values)
-    event = referee.event((3, 2, 3, 0), nothing, np.random.default_rng(0))
+    event = referee.event(before, np.array(touched), np.random.default_rng(0))
     assert event is not None
-    assert event.fault == "cube 0 went from left to right in one motion"
+    assert event.fault == fault
+    assert event.outcome.terminated == (fault is not None)
     assert event.outcome.macrostate == START
+
+
+@pytest.mark.parametrize(
+    ("off_m", "quat", "value"),
+    [
+        ((0.0, 0.0, 0.0), (math.cos(1.0), 0.0, 0.0, -math.sin(1.0)), 1),  # turned by 115 degrees on its place
+        ((0.0, 0.0, 0.0), (math.cos(0.9), 0.0, 0.0, -math.sin(0.9)), 0),  # by 103
+        ((0.03, 0.0, 0.0), (math.cos(1.0), 0.0, 0.0, -math.sin(1.0)), 0),  # beside its place
+        ((0.0, 0.0, 0.1), (math.cos(1.0), 0.0, 0.0, -math.sin(1.0)), 0),  # in the air
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), 0),  # upside down
+    ],
+)
+def test_a_quarter_is_passed_only_upright_on_the_slot(
+    off_m: tuple[float, ...], quat: tuple[float, ...], value: int
+) -> None:
+    world = free().world
+    x_m, y_m = world.layout.slots_xy_m[0]
+    place_m = np.array([x_m, y_m, TABLE_HEIGHT_M + STANDING_M]) + off_m
+    assert world.value_in_hand(0, [*place_m, *quat], 0, gripped=True) == value
 
 
 class AnyChange(ArrowRules):
