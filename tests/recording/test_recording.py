@@ -259,6 +259,12 @@ def test_a_module_in_the_current_folder_is_no_viewer(tmp_path: Path, monkeypatch
     assert (tmp_path / "ran").read_text() == "path"
 
 
+def test_each_episode_has_a_start_of_its_own(imagined: Path) -> None:
+    texts = [str(text) for _, (text,) in by_step(imagined, "/real/text", "TextDocument:text")]
+    starts = [text.partition("a new start")[2].partition("**")[0] for text in texts if "a new start" in text]
+    assert len(set(starts)) == len(starts) == 2
+
+
 def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
     _, left, right, *_ = q_table(("left", "right turn"), np.array([-1.0, 2.5], dtype=np.float32), 1).splitlines()
     assert left.startswith("  left") and right.startswith("> right turn   +2.50 ")

@@ -40,12 +40,20 @@ def test_fidelity_and_margins_are_measured_and_kept(tmp_path, monkeypatch, capsy
     assert "| pad_friction | 0.01 | 0 of 4 | 0.000 to " in capsys.readouterr().out
 
 
-def test_a_walk_ends_with_its_first_fault(monkeypatch):
+def test_a_walk_has_a_start_of_its_own_and_ends_with_its_first_fault(monkeypatch):
     monkeypatch.setattr(physics, "_WALKS", 2)
-    make = physics.make_env
-    monkeypatch.setattr(physics, "make_env", lambda spec, **_: make(spec, physics=SLIPPERY))
+    make, seeds = physics.make_env, []
+
+    def slippery(spec, **_):
+        env = make(spec, physics=SLIPPERY)
+        reset = env.reset
+        monkeypatch.setattr(env, "reset", lambda seed: (seeds.append(seed), reset(seed=seed))[1])
+        return env
+
+    monkeypatch.setattr(physics, "make_env", slippery)
     found = physics.walk(registry.task("pick_place"), "true")
     assert (found["lengths"], found["as_ruled"], len(found["faults"])) == ([1, 1], 0, 2)
+    assert len(set(seeds)) == 2
 
 
 class Seeds(gymnasium.Env):
