@@ -6,6 +6,8 @@ Training, evaluation and tuning can never share an environment seed: the purpose
 from __future__ import annotations
 
 import hashlib
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -68,6 +70,27 @@ class SeedTree:
     def integer(self) -> int:
         """A seed in [0, 2**63) for libraries that take one integer, such as ``torch.Generator.manual_seed``."""
         return int(self.sequence().generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def seed_range(word: str) -> range:
+    """The seeds of a word: ``7``, or ``0-21`` for 0, 1 and so on to 21. Raises InvalidValueError: it is neither."""
+    first, dash, last = word.partition("-")
+    last = last if dash else first
+    seeds = range(int(first), int(last) + 1) if first.isdecimal() and last.isdecimal() else range(0)
+    if not 1 <= len(seeds) <= TUNING_SEEDS:
+        raise InvalidValueError(
+            f"Seeds {word!r} are neither a number nor a range such as 0-21, of at most {TUNING_SEEDS:,} seeds."
+        )
+    return seeds
+
+
+def seeds_text(seeds: Sequence[int]) -> str:
+    """Ascending seeds as the command line takes them, three or more that follow each other as a range: ``0-5 9``."""
+    words: list[str] = []
+    for _, group in itertools.groupby(enumerate(seeds), key=lambda placed: placed[1] - placed[0]):
+        some = [seed for _, seed in group]
+        words += [f"{some[0]}-{some[-1]}"] if len(some) > 2 else map(str, some)
+    return " ".join(words)
 
 
 def is_tuning_seed(seed: int) -> bool:

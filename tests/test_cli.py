@@ -60,6 +60,7 @@ def bench_words(out: Path, *more: str) -> list[str]:
         ("--variants base", "arrow_puzzle takes no --variants; leave it out."),
         ("--set controller.discnt=0.9", "No setting 'controller.discnt'. Did you mean 'controller.discount'? Known: "),
         ("--workers 0", "0 workers cannot run anything; give at least 1."),
+        ("--seeds 5-3", "Seeds '5-3' are neither a number nor a range such as 0-21"),
     ],
 )
 def test_wrong_words_get_one_line_and_exit_code_2(
@@ -146,6 +147,14 @@ def test_a_task_is_the_first_word_or_an_option(capsys: pytest.CaptureFixture[str
             assert main([command[0], *task, *command[1:]]) == 2
             said.add(capsys.readouterr().err)
         assert re.search("No task(, agent or world model)? 'nowhere'", said.pop()) and not said
+
+
+@pytest.mark.parametrize("words", ["--seeds 0-2 7 --out 2026-11", "--seeds=0-2 --out=2026-11"])
+def test_a_range_stands_for_its_seeds_and_for_nothing_else(words: str) -> None:
+    command = cli.parsed(["bench", "arrow_puzzle", *words.split()])
+    assert isinstance(command, cli.Bench)
+    assert command.budget.seeds is not None and command.budget.seeds[:3] == (0, 1, 2)
+    assert command.launch.out == Path("2026-11")
 
 
 def test_a_command_called_from_python_leaves_the_process_as_it_was(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError
-from imagine_bench.seeding import Purpose, SeedTree, episode_seed
+from imagine_bench.seeding import Purpose, SeedTree, episode_seed, seed_range, seeds_text
 
 
 def test_children_differ_and_do_not_depend_on_order():
@@ -39,6 +39,21 @@ def test_episode_seeds_never_meet():
     seeds = [episode_seed(p, s, e) for p, s, e in itertools.product(purposes, *edges)]
     assert len(set(seeds)) == len(purposes) * 12
     assert max(seeds) < 2**63
+
+
+def test_seeds_as_text_are_read_back_and_neighbours_are_one_word():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        seeds = np.flatnonzero(rng.random(30) < 0.7).tolist()
+        words = seeds_text(seeds).split()
+        assert list(itertools.chain.from_iterable(map(seed_range, words))) == seeds
+    assert seeds_text(range(53)) == "0-52"
+
+
+@pytest.mark.parametrize("word", ["5-3", "1-", "-1", "1-2-3", "a", "0-9999999"])
+def test_a_word_that_is_no_range_of_seeds_is_refused(word: str):
+    with pytest.raises(InvalidValueError, match="are neither a number nor a range such as 0-21"):
+        seed_range(word)
 
 
 def test_bad_values_say_what_is_allowed():

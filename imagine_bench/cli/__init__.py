@@ -8,7 +8,7 @@ import re
 import shlex
 import sys
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import Annotated, TextIO, get_args
@@ -40,6 +40,7 @@ from imagine_bench.errors import (
     reason,
     require_known,
 )
+from imagine_bench.seeding import seed_range
 from imagine_bench.store.files import expanded
 from imagine_bench.version import __version__
 
@@ -70,6 +71,7 @@ COMMANDS = tuple(
 _PROGRAM = "imagine-bench"
 _CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 _LONGEST_WORD = 1000
+_RANGE = re.compile(r"\d+-")
 _SETS_UP_TORCH = "imagine_bench.agents.encoders.perception"
 FORMER = {
     "film": ("play", "--film"),
@@ -155,7 +157,7 @@ def understood(words: Sequence[str]) -> list[str]:
         InvalidValueError: A word that no terminal could show, a task given twice, or a former command that is no
             command any more.
     """
-    given = [_readable(word) for word in words]
+    given = [*_with_seeds_listed(map(_readable, words))]
     command = given[0] if given else ""
     given[:1] = [ALSO.get(command, command)] if given else []
     if command in ELSEWHERE:
@@ -169,6 +171,23 @@ def understood(words: Sequence[str]) -> list[str]:
     if given and not given[0].startswith("-"):
         require_known("command", given[0], [*COMMANDS, *ALSO])
     return _with_task_first(given) if given and given[0] in _TASK_FIRST else given
+
+
+def _with_seeds_listed(words: Iterable[str]) -> Iterator[str]:
+    """The words, with all seeds in place of a range behind ``--seeds``, such as ``0-21``."""
+    option = ""
+    for word in words:
+        name, equals, value = word.partition("=")
+        if word.startswith("--"):
+            option = name
+        elif option == "--seeds":
+            value = word
+        if option != "--seeds" or not _RANGE.match(value):
+            yield word
+            continue
+        if equals:
+            yield option
+        yield from map(str, seed_range(value))
 
 
 def _readable(word: str) -> str:

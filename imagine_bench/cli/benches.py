@@ -117,7 +117,7 @@ class Budget:
     """Options of how much is run."""
 
     seeds: Counts = None
-    """Seeds, by default the preset's; each agent has one run a seed."""
+    """Seeds, by default the preset's, such as 0 1 2 or 0-21; each agent has one run a seed."""
     budgets: Counts = None
     """Real training episodes at which agents are tested, ascending; by default the preset's."""
     variants: ManyWords = ()

@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ from imagine_bench.running.bench import certificate_of, counted
 from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts, replay
 from imagine_bench.running.retraining import Verdict, judged, part_digest
 from imagine_bench.running.run_state import Counters, CountVisits, environments
-from imagine_bench.seeding import TUNING_SEEDS, Purpose, episode_seed, evaluation_split, is_tuning_seed
+from imagine_bench.seeding import TUNING_SEEDS, Purpose, episode_seed, evaluation_split, is_tuning_seed, seed_range
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, read_control
 from imagine_bench.store.results import Checkpoint, KeptEpisodes, RunResult
@@ -53,7 +54,7 @@ _SAME_TIME = 0.05
 """Share by which simulated times may differ: kinds of CPU differ by a step of physics."""
 _OF_DATASET = re.compile("-([0-9]+)@")
 """The number of its episodes in a dataset's identity."""
-_SEEDS_OF_COMMAND = re.compile(" bench .*--seeds[ =]([0-9]+(?: [0-9]+)*)")
+_SEEDS_OF_COMMAND = re.compile(" bench .*--seeds[ =]([0-9]+(?:[ -][0-9]+)*)")
 
 UNSHOWN = (
     "that an agent chose the macro-actions that are kept as its own (another's, or an oracle's, play again as well)",
@@ -293,7 +294,7 @@ def _seeds(protocol: Protocol, sessions: Sequence[Mapping[str, str]]) -> list[st
     seeds = protocol.seeds
     for session in sessions:
         said = _SEEDS_OF_COMMAND.search(session["command"])
-        planned = seeds if said is None else tuple(sorted(map(int, said[1].split())))
+        planned = seeds if said is None else tuple(sorted(chain.from_iterable(map(seed_range, said[1].split()))))
         require(planned == seeds, f"it has the seeds {brief(seeds)}, and {brief(session['command'])} ran others.")
     task = registry.task(protocol.task)
     preset = {**PRESETS.get(protocol.preset, {}), **task.presets.get(protocol.preset, {})}

@@ -51,13 +51,14 @@ from imagine_bench.report.page import (
     signed_percent,
 )
 from imagine_bench.running.headlines import Headline
+from imagine_bench.seeding import seeds_text
 from imagine_bench.statistics import LEVEL, Estimate, first_lasting, more_seeds
 from imagine_bench.store import encoders
 from imagine_bench.store.loading import archive_files
 from imagine_bench.store.results import BenchResult
 
 _EQUAL_UPDATES = "dqn_more_updates"
-_SEEDS_OPTION = re.compile(r" --seeds(?: \d+)+")
+_SEEDS_OPTION = re.compile(r" --seeds(?: [\d-]+)+")
 _AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
     "against dqn": lambda record: record["agent"],
     "real episodes": lambda record: f"{record['episodes']:,}",
@@ -162,7 +163,7 @@ def _undecided(data: ReportData, agent: str, more: int) -> str:
     if not more:
         return words
     words += f"; about {more} more would decide"
-    every = " ".join(map(str, (*seeds, *range(seeds[-1] + 1, seeds[-1] + 1 + more))))
+    every = seeds_text((*seeds, *range(seeds[-1] + 1, seeds[-1] + 1 + more)))
     command = str(data.result.environment.get("command", ""))
     if not command.startswith("imagine-bench bench ") or ";" in command:
         return words

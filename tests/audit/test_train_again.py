@@ -186,6 +186,13 @@ def test_on_another_processor_all_that_is_the_same_to_the_bit_holds(pair: Path, 
             1,
             "Does not hold. 1 of 3 verdicts",
         ),
+        (
+            lambda folder: change_sessions(
+                folder, lambda found: found["sessions"][0].update(command="imagine-bench bench x --seeds 0-1 --out y")
+            ),
+            0,
+            "Holds.",
+        ),
     ],
 )
 def test_the_first_line_and_the_exit_code_say_what_was_found(
