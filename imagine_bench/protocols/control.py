@@ -275,7 +275,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {
         "agents": ("random", "dqn", "dqn_more_updates", *_THESIS_AGENTS[1:], "factored:given", "oracle"),
-        "seeds": tuple(range(6)), "few_seeds": {"imagination_uncertainty": 3}, "budgets": (100, 250, 450),
+        "seeds": tuple(range(11)), "budgets": (100, 250, 450),
+        "few_seeds": {
+            "imagination": 5, "dqn": 5,
+            "imagination_uncertainty": 2, "factored:given": 2, "random": 2, "oracle": 2,
+        },
         "open_loop_starts": 20, "recorded_seeds": 1,
         "headlines": (("imagination", "dqn"), ("imagination", "dqn_more_updates")),
     },
