@@ -275,9 +275,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {
         "agents": ("random", "dqn", "dqn_more_updates", *_THESIS_AGENTS[1:], "factored:given", "oracle"),
-        "seeds": tuple(range(11)), "budgets": (100, 250, 450),
+        "seeds": tuple(range(6)), "budgets": (100, 250, 450),
         "few_seeds": {
-            "imagination": 5, "dqn": 5,
+            "dqn_more_updates": 11, "imagination": 5, "dqn": 5,
             "imagination_uncertainty": 2, "factored:given": 2, "random": 2, "oracle": 2,
         },
         "open_loop_starts": 20, "recorded_seeds": 1,
@@ -316,11 +316,15 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     """
     require_known("preset", preset, PRESETS)
     spec = task(task_name)
-    values = {"config_group": spec.config_group, **PRESETS[preset], **spec.presets.get(preset, {}), **changes}
+    own = spec.presets.get(preset, {})
+    values: dict[str, Any] = {"config_group": spec.config_group}
+    for part in (PRESETS[preset], own, changes):
+        if "agents" in part:  # headlines and numbers of seeds are of the agents that stand beside them
+            values |= {"headlines": (), "few_seeds": {}}
+        values |= part
     few = values.pop("few_seeds", {})
-    if "agents" in changes:  # a preset speaks of its own agents
-        few = {}
-        values["headlines"] = changes.get("headlines", ())
+    if few and not {"seeds"} & {*own, *changes}:
+        values["seeds"] = tuple(range(max(few.values())))
     values["execution"] = spec.execution(values.get("execution"))
     values["after"] = tuple(map(canonical, values.get("after", ())))
     if values.get("split") is not None:
@@ -330,7 +334,11 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     wanted = dataclasses.replace(
         wanted,
         headlines=tuple(pair for pair in wanted.headlines if agents.issuperset(pair)),
-        few_seeds=tuple((agent, wanted.seeds[:most][-1]) for agent, most in few.items() if agent in agents),
+        few_seeds=tuple(
+            (agent, wanted.seeds[most - 1])
+            for agent, most in few.items()
+            if agent in agents and most < len(wanted.seeds)
+        ),
     )
     wanted = dataclasses.replace(wanted, code=registered_code(wanted.agents))
     for agent in wanted.agents:  # a protocol that is only read may be of a package that is not here

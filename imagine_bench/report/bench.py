@@ -58,6 +58,7 @@ from imagine_bench.store.loading import archive_files
 from imagine_bench.store.results import BenchResult
 
 _EQUAL_UPDATES = "dqn_more_updates"
+_UNTIL = " --until-decided"
 _SEEDS_OPTION = re.compile(r" --seeds(?: [\d-]+)+")
 _AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
     "against dqn": lambda record: record["agent"],
@@ -131,9 +132,10 @@ def _of_headline(data: ReportData, headline: Headline) -> str:
     if headline.decided:
         word = "better" if found.value > 0.0 else "worse"
         return f"{word} than {base}, {size} ({p_level(found.p)})"
+    undecided = _undecided(data, headline.agent, headline.base, headline.more)
     if math.isnan(found.p):
-        return f"{size} against {base}, {_undecided(data, headline.agent, headline.more)}"
-    return f"no gain over {base} is shown, {size}, {_undecided(data, headline.agent, headline.more)}"
+        return f"{size} against {base}, {undecided}"
+    return f"no gain over {base} is shown, {size}, {undecided}"
 
 
 def _against_dqn(data: ReportData, agent: str) -> str:
@@ -152,28 +154,34 @@ def _against_dqn(data: ReportData, agent: str) -> str:
     shares, base = (data.result.success_rates(name)[:, -1] for name in (agent, BASE_AGENT))
     more = more_seeds(shares, base, cells=data.cells, trials=data.result.protocol.evaluation_episodes)
     points = signed_percent(last["difference_to_dqn"])
-    return f"{points} points against {BASE_AGENT} at {last['episodes']:,}, {_undecided(data, agent, more)}"
+    return f"{points} points against {BASE_AGENT} at {last['episodes']:,}, {_undecided(data, agent, BASE_AGENT, more)}"
 
 
-def _undecided(data: ReportData, agent: str, more: int) -> str:
-    """How many seeds an agent has, and the command with so many more that they would about decide."""
+def _undecided(data: ReportData, agent: str, base: str, more: int) -> str:
+    """How many seeds two agents have, and the command that would about decide, of a headline that adds seeds itself."""
     protocol = data.result.protocol
-    seeds = protocol.seeds_of(agent)
+    fewer, other = sorted((agent, base), key=lambda name: len(protocol.seeds_of(name)))
+    seeds = protocol.seeds_of(fewer)
+    others = len(protocol.seeds_of(other))
     words = f"undecided with {len(seeds)} seed{'s' if len(seeds) > 1 else ''}"
+    if others > len(seeds):
+        words += f" of {fewer} and {others} of {other}"
     if not more:
         return words
     words += f"; about {more} more would decide"
-    every = seeds_text((*seeds, *range(seeds[-1] + 1, seeds[-1] + 1 + more)))
     command = str(data.result.environment.get("command", ""))
     if not command.startswith("imagine-bench bench ") or ";" in command:
         return words
-    alone = f" --agents {BASE_AGENT} {agent}" if agent in dict(protocol.few_seeds) else ""
-    command = _SEEDS_OPTION.sub("", command) + alone
+    if (agent, base) in protocol.headlines and " --agents " not in command:
+        return f"{words}: {command.removesuffix(_UNTIL)}{_UNTIL}"
+    command = _SEEDS_OPTION.sub("", command)
+    if fewer in dict(protocol.few_seeds):
+        command += f" --agents {base} {agent}"
     for name, now in PRESETS.get(protocol.preset, {}).items():  # an earlier version's preset may have been another
         was = getattr(protocol, name)
         if name in ("agents", "budgets") and f" --{name} " not in command and set(was) != set(now):
             command += f" --{name} {' '.join(map(str, was))}"
-    return f"{words}: {command} --seeds {every}"
+    return f"{words}: {command} --seeds {seeds_text((*seeds, *range(seeds[-1] + 1, seeds[-1] + 1 + more)))}"
 
 
 def shown(record: Record) -> int:

@@ -79,7 +79,8 @@ def until_decided(
     """Run seeds in stages until every headline is decided, or ``most`` seeds are done.
 
     Each stage is a bench of its own, so whatever was run before is only read: an interrupted call, made again, goes on
-    and ends in the same results. From the second stage on the agents of headlines alone are run.
+    and ends in the same results. The agents of headlines have all seeds, and from the second stage on they alone are
+    run.
 
     Args:
         plan: Runs a bench with changes to fields of ``first``, or reads it where it is finished.
@@ -99,8 +100,9 @@ def until_decided(
             "has two if --agents is left out."
         )
     counts = stages(len(first.seeds), most)
-    begun = plan(most_looks=len(counts))
     agents = tuple(dict.fromkeys(agent for pair in first.headlines for agent in reversed(pair)))
+    few = {agent: len(first.seeds_of(agent)) for agent, _ in first.few_seeds if agent not in agents}
+    begun = plan(seeds=first.seeds, most_looks=len(counts), few_seeds=few)
     parts: list[BenchResult] = []
     whole = begun
     for before, count in itertools.pairwise(counts):

@@ -1,14 +1,15 @@
-"""``python tests/measure/decisions.py [BENCH] [DRAWS]``: how often would the default bench have decided its headlines?
+"""``python tests/measure/decisions.py [BENCH ...] [DRAWS]``: how often would the default bench decide its headlines?
 
-BENCH is a kept bench with many seeds of the agents of the headlines, by default the one of this repository. Groups of
-six of its seeds are repetitions of the default bench: first disjoint ones, then random draws. Printed first is how
-often looking again and again, with more seeds each time, claims a headline though all agents have one law.
+The benches are kept ones of the agents of the headlines, by default those of this repository; their seeds are put
+together. A group with as many seeds of each agent as the default bench has is a repetition of it. First come groups
+that share no seed, then groups drawn with replacement, which differ as groups of new seeds would. Printed before is how
+often one look, and several with more seeds each time, claim a headline though all agents have one law.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import interval_coverage
@@ -16,45 +17,55 @@ import numpy as np
 
 from imagine_bench import statistics
 from imagine_bench.interfaces import Floats
-from imagine_bench.protocols.control import PRESETS
+from imagine_bench.protocols.control import PRESETS, protocol
 from imagine_bench.running.headlines import stages
 from imagine_bench.store.loading import load_so_far
 
-KEPT = interval_coverage.RESULTS / "arrow_puzzle-quick-fresh_seeds"
+KEPT = [interval_coverage.RESULTS / "arrow_puzzle-quick-fresh_seeds"]
 PAIRS: Sequence[tuple[str, str]] = PRESETS["quick"]["headlines"]
-SEEDS = len(PRESETS["quick"]["seeds"])
-LOOKS = stages(SEEDS, 15)
-"""Seeds at each look of --until-decided."""
+_DEFAULT = protocol("arrow_puzzle")
+COUNTS = {agent: len(_DEFAULT.seeds_of(agent)) for pair in PAIRS for agent in pair}
+"""Seeds of each agent in the default bench."""
+LOOKS = stages(len(_DEFAULT.seeds), 15)
+"""Seeds of each agent at each look of --until-decided."""
 _LEVEL = 1.0 - statistics.LEVEL
 
 
-def decided(runs: Sequence[tuple[Floats, Floats]], trials: int) -> list[bool]:
-    """Which headlines are decided, of the scores (seeds,) of both agents of each."""
-    p_values = statistics.holm([statistics.difference(*pair, trials=trials).p for pair in runs])
-    return (p_values < _LEVEL).tolist()
+def decided(scores: Mapping[str, Floats], trials: int) -> list[bool]:
+    """Which headlines are decided, of the scores (seeds,) of each agent."""
+    found = [statistics.difference(scores[agent], scores[base], trials=trials).p for agent, base in PAIRS]
+    return (statistics.holm(found) < _LEVEL).tolist()
 
 
-def repetitions(bench: Path, draws: int, rng: np.random.Generator) -> dict[str, list[list[bool]]]:
-    """Which headlines each repetition decides, of disjoint groups of seeds and of random ones."""
-    result = load_so_far(bench)
-    scores = {agent: result.success_rates(agent)[:, -1] for pair in PAIRS for agent in pair}
-    seeds = rng.permutation(len(result.protocol.seeds))
+def repetitions(benches: Sequence[Path], draws: int, rng: np.random.Generator) -> dict[str, list[list[bool]]]:
+    """Which headlines each repetition decides, of groups that share no seed and of groups drawn with replacement."""
+    results = [load_so_far(bench) for bench in benches]
+    trials = results[0].protocol.evaluation_episodes
+    scores = {
+        agent: rng.permutation(np.concatenate([result.success_rates(agent)[:, -1] for result in results]))
+        for agent in COUNTS
+    }
+    apart = min(len(scores[agent]) // count for agent, count in COUNTS.items())
     groups = {
-        "disjoint": [seeds[start : start + SEEDS] for start in range(0, len(seeds) - SEEDS + 1, SEEDS)],
-        "random": [rng.choice(seeds, SEEDS, replace=False) for _ in range(draws)],
+        "disjoint": [
+            {agent: scores[agent][place * count : (place + 1) * count] for agent, count in COUNTS.items()}
+            for place in range(apart)
+        ],
+        "drawn": [{agent: rng.choice(scores[agent], count) for agent, count in COUNTS.items()} for _ in range(draws)],
     }
-    trials = result.protocol.evaluation_episodes
-    return {
-        name: [decided([(scores[agent][some], scores[base][some]) for agent, base in PAIRS], trials) for some in each]
-        for name, each in groups.items()
-    }
+    return {name: [decided(group, trials) for group in each] for name, each in groups.items()}
 
 
-def false_claims(runs: Floats, looks: Sequence[int] = tuple(LOOKS), trials: int | None = None) -> float:
-    """Share of benches that claim a headline at any look, from scores (draws, 3, seeds) of three agents of one law."""
+def false_claims(
+    runs: Floats, looks: Sequence[Sequence[int]] = tuple((count,) * 3 for count in LOOKS), trials: int | None = None
+) -> float:
+    """Share of benches that claim a headline at any look, from scores (draws, 3, seeds) of three agents of one law.
+
+    A look is the number of seeds of the agent and of both that it is compared with.
+    """
     claimed = np.zeros(len(runs), dtype=bool)
-    for count in looks:
-        agent, *bases = (runs[:, place, :count] for place in range(3))
+    for counts in looks:
+        agent, *bases = (runs[:, place, :count] for place, count in enumerate(counts))
         p_values = [statistics.differences(agent, base, trials=trials)[3] for base in bases]
         claimed |= len(looks) * len(bases) * np.min(p_values, axis=0) < _LEVEL
     return float(claimed.mean())
@@ -71,15 +82,20 @@ def drawn(draws: int, rng: np.random.Generator) -> dict[str, Floats]:
 
 def main(words: Sequence[str]) -> None:
     """Print both measurements."""
-    bench = next((Path(word) for word in words if not word.isdigit()), KEPT)
+    benches = [Path(word) for word in words if not word.isdigit()] or KEPT
     draws = next((int(word) for word in words if word.isdigit()), 4000)
     rng = np.random.default_rng(0)
+    once = [tuple(COUNTS[agent] for agent in ("imagination", "dqn", "dqn_more_updates"))]
     for name, runs in drawn(draws, rng).items():
-        print(f"{name}: {100 * false_claims(runs):.1f} % of benches claim a difference that is none, at any of {LOOKS}")
-    for name, found in repetitions(bench, draws, rng).items():
+        shares = [100.0 * share for share in (false_claims(runs, once), false_claims(runs))]
+        print(
+            f"{name}: {shares[0]:.1f} % of benches claim a difference that is none, with {once[0]} seeds; "
+            f"{shares[1]:.1f} % at any look, with {LOOKS} seeds of each"
+        )
+    for name, found in repetitions(benches, draws, rng).items():
         both = np.mean([all(each) for each in found])
         single = np.mean(found, axis=0)
-        print(f"{len(found)} {name} repetitions of {SEEDS} seeds: both decided in {100 * both:.1f} %")
+        print(f"{len(found)} {name} repetitions of {COUNTS} seeds: both decided in {100 * both:.1f} %")
         for (agent, base), share in zip(PAIRS, single, strict=True):
             print(f"  {agent} against {base}: {100 * share:.1f} %")
 

@@ -226,6 +226,22 @@ def test_the_first_line_says_what_equal_updates_leave_of_a_gain(tmp_path: Path, 
     assert data.of("imagination")[-1]["p_holm"] == data.headlines[0].found.p
 
 
+def test_an_undecided_headline_names_a_command_that_adds_seeds_itself(tmp_path: Path) -> None:
+    agents = ("dqn", "dqn_more_updates", "imagination")
+    wanted = dataclasses.replace(
+        WIDE,
+        agents=agents,
+        seeds=tuple(range(7)),
+        headlines=(("imagination", "dqn_more_updates"),),
+        few_seeds=(("imagination", 4),),
+    )
+    levels = [100, 140, 100, 120, 130, 110, 120]
+    result = bench_result(tmp_path, protocol=wanted)
+    first = verdict(collect(shifted(result, dqn=levels, dqn_more_updates=levels, imagination=[130] * 7)))[0]
+    assert "undecided with 5 seeds of imagination and 7 of dqn_more_updates; about " in first
+    assert " more would decide: imagine-bench bench --task arrow_puzzle --until-decided;" in first
+
+
 def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) -> None:
     changed = shifted(many, dqn=[90, 92, 95, 100, 105, 108, 110], imagination=[103, 105, 108, 113, 118, 121, 123])
     data = collect(changed)

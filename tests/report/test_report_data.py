@@ -173,13 +173,15 @@ def test_the_same_starts_are_compared(tmp_path: Path) -> None:
         assert record["excess_macro_actions"] == pytest.approx(np.mean(beyond))
 
 
-def test_an_agent_of_fewer_seeds_is_paired_where_both_have_one(result: BenchResult) -> None:
+@pytest.mark.parametrize("base_has_fewer", [False, True])
+def test_an_agent_of_fewer_seeds_is_paired_where_both_have_one(result: BenchResult, base_has_fewer: bool) -> None:
     """As in the default bench, whose report must be written."""
     known = kept(result)
     agent = next(name for name in collect(known).compared if name != "dqn")
+    few = "dqn" if base_has_fewer else agent
     last = known.protocol.seeds[-2]
-    protocol = dataclasses.replace(known.protocol, few_seeds=((agent, last),))
-    runs = tuple(run for run in known.runs if run.agent != agent or run.seed <= last)
+    protocol = dataclasses.replace(known.protocol, few_seeds=((few, last),))
+    runs = tuple(run for run in known.runs if run.agent != few or run.seed <= last)
     fewer = dataclasses.replace(known, protocol=protocol, runs=runs)
     mine, base = ([run for run in runs if run.agent == name and run.seed <= last] for name in (agent, "dqn"))
     alone = sum(

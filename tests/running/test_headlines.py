@@ -27,7 +27,7 @@ FIRST = Protocol(
     seeds=(0, 1, 2, 3, 4, 5),
     budgets=(100, 500),
     headlines=PAIRS,
-    few_seeds=(("random", 2),),
+    few_seeds=(("random", 2), ("imagination", 4)),
 )
 
 
@@ -45,6 +45,9 @@ def test_headlines_of_a_preset_are_about_its_own_agents() -> None:
     assert protocol("arrow_puzzle", seeds=(7, 8)).headlines == PAIRS
     assert protocol("arrow_puzzle", agents=("dqn", "imagination")).headlines == ()
     assert protocol("arrow_puzzle", "smoke").headlines == protocol("pick_place").headlines == ()
+    assert protocol("arrow_puzzle", agents=("dqn",)).few_seeds == protocol("pick_place").few_seeds == ()
+    assert len(protocol("arrow_puzzle", agents=("dqn",)).seeds) == 6 < len(protocol("arrow_puzzle").seeds)
+    assert protocol("arrow_puzzle", seeds=(7, 8)).few_seeds == (), "nobody has more seeds than there are"
 
 
 def test_headlines_are_corrected_for_one_another_and_for_all_looks(tmp_path: Path) -> None:
@@ -65,7 +68,8 @@ def staged(tmp_path: Path) -> Callable[[int, list[Protocol]], Callable[..., Benc
 
     def with_gap(gap: int, asked: list[Protocol]) -> Callable[..., BenchResult]:
         def plan(**changes: Any) -> BenchResult:
-            asked.append(dataclasses.replace(FIRST, **changes))
+            few = tuple((agent, most - 1) for agent, most in changes.pop("few_seeds", {}).items())
+            asked.append(dataclasses.replace(FIRST, few_seeds=few, **changes))
             return result_of(asked[-1], tmp_path, gap)
 
         return plan
@@ -82,6 +86,8 @@ def test_stages_end_once_decided_or_at_the_most(staged: Any, tmp_path: Path, gap
     assert [seed for each in asked for seed in each.seeds] == list(range(seeds)), "each seed once"
     assert {each.most_looks for each in asked} == {len(stages(6, 13))} == {4}
     assert all("random" not in each.agents for each in asked[1:])
+    assert {len(whole.success_rates(agent)) for pair in PAIRS for agent in pair} == {seeds}, "all have all seeds"
+    assert begun.protocol.few_seeds == (("random", 2),)
     again: list[Protocol] = []
     assert until_decided(staged(gap, again), FIRST, most=13, root=tmp_path)[1].protocol == whole.protocol
     assert again == asked, "the same call asks for the same benches, which are then only read"
