@@ -3,7 +3,8 @@
 The benches are kept ones of the agents of the headlines, by default those of this repository; their seeds are put
 together. A group with as many seeds of each agent as the default bench has is a repetition of it. First come groups
 that share no seed, then groups drawn with replacement, which differ as groups of new seeds would. Printed before is how
-often one look, and several with more seeds each time, claim a headline though all agents have one law.
+often one look, and several with more seeds each time, claim a headline though all agents have one law. Printed last are
+the CPU seconds of these runs.
 """
 
 from __future__ import annotations
@@ -56,6 +57,15 @@ def repetitions(benches: Sequence[Path], draws: int, rng: np.random.Generator) -
     return {name: [decided(group, trials) for group in each] for name, each in groups.items()}
 
 
+def cpu_seconds(benches: Sequence[Path]) -> dict[str, float]:
+    """CPU seconds that a run of each agent takes on average, for training and tests."""
+    results = [load_so_far(bench) for bench in benches]
+    spent: dict[str, list[float]] = {agent: [] for agent in COUNTS}
+    for run in (run for result in results for run in result.runs if run.agent in COUNTS):
+        spent[run.agent].append(run.checkpoints[-1].train_cpu_s + sum(row.eval_cpu_s for row in run.checkpoints))
+    return {agent: float(np.mean(each)) for agent, each in spent.items()}
+
+
 def false_claims(
     runs: Floats, looks: Sequence[Sequence[int]] = tuple((count,) * 3 for count in LOOKS), trials: int | None = None
 ) -> float:
@@ -98,6 +108,8 @@ def main(words: Sequence[str]) -> None:
         print(f"{len(found)} {name} repetitions of {COUNTS} seeds: both decided in {100 * both:.1f} %")
         for (agent, base), share in zip(PAIRS, single, strict=True):
             print(f"  {agent} against {base}: {100 * share:.1f} %")
+    for agent, cpu_s in cpu_seconds(benches).items():
+        print(f"{agent}: {COUNTS[agent]} runs of {cpu_s:.0f} CPU s")
 
 
 if __name__ == "__main__":
