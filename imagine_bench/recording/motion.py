@@ -92,7 +92,7 @@ def _layout(recording: Recording) -> rrb.Vertical:
     words = rrb.TextDocumentView(origin="/motion/text", name="Instruction and events")
     side = rrb.Vertical(words, *([rrb.Horizontal(*cameras)] if cameras else []))
     curves = recording.shown(
-        rrb.TimeSeriesView(origin="/motion/fingers", name="Force of each finger"),
+        rrb.TimeSeriesView(origin="/motion/fingers", name="Force of each finger (closing is negative)"),
         rrb.TimeSeriesView(origin="/motion/joints", name="Torque of each joint"),
         rrb.TimeSeriesView(origin="/motion/command", name="Command"),
         rrb.TimeSeriesView(origin="/motion/reward", name="Reward"),

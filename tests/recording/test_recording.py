@@ -5,7 +5,10 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 from contextlib import closing
+from datetime import timedelta
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -25,10 +28,12 @@ from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
 from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording import episodes, stream
 from imagine_bench.recording.episodes import q_table, record_run
+from imagine_bench.recording.motion import motion_recording
 from imagine_bench.recording.stream import entity_name, log_motion, log_shapes, open_in_viewer, recording_file
 from imagine_bench.rules import ending
 from imagine_bench.running.bench import bench
 from imagine_bench.seeding import episode_seed
+from imagine_bench.tools.demonstrations import replay
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
@@ -400,3 +405,21 @@ def test_of_so_many_seeds_alone_runs_are_recorded(tmp_path: Path) -> None:
     result = bench(wanted, {}, root=tmp_path, launcher=Inline())
     assert [run.recording is not None for run in result.runs] == [True, False]
     assert bench(wanted, {}, root=tmp_path, launcher=Inline(patience=0)).missing == (), "no run lacks anything"
+
+
+def test_a_recording_of_continuous_control_shows_each_period(tmp_path: Path) -> None:
+    made: Any = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", disable_env_checker=True, size=32)
+    env = made.unwrapped
+    path = tmp_path / "motion.rrd"
+    commands = np.zeros((5, 7), np.float32)
+    with motion_recording(path, env) as watch:
+        replay(env, 0, commands, watch)
+    found = contents(path)
+    shown = {"hand", "front", "text", "fingers/left_finger_n", "joints/joint_6_n_m", "command/grip", "reward"}
+    assert set(found) >= {f"/motion/{name}" for name in shown} | {"/scene/hand_target", "/scene/finger_left"}
+    assert times(path, "/motion/front", "env_step") == set(range(6)), "the start, and five periods"
+    assert times(path, "/motion/command/grip", "env_step") == set(range(1, 6)), "no command before the start"
+    moments = sorted(times(path, "/scene/hand_target", "sim_time"))
+    since_s = [(late - early) / timedelta(seconds=1) for early, late in pairwise(moments)]
+    assert since_s == pytest.approx([0.04] * 5)
+    env.close()

@@ -20,6 +20,7 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.tools import play as module
 from imagine_bench.tools.play import KEYS, KeyboardGame, film, play
+from imagine_bench.tools.play_motion import HandGame, keys_to_commands
 
 pygame = pytest.importorskip("pygame")  # of the extra play
 WAIT = 6
@@ -196,6 +197,51 @@ def test_a_model_brings_its_task_and_its_looks_and_what_cannot_be_played_is_refu
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(SetupError, match=r"imagine-bench\[play\]"):
         play("arrow_puzzle")
+
+
+def hand_game(seed=0):
+    env = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", disable_env_checker=True, size=32, time_limit_s=0.4)
+    return HandGame(env, registry.task("arrow_puzzle_easy"), seed)
+
+
+def test_keys_move_the_hand_where_they_say():
+    game = hand_game()
+    commands = keys_to_commands()
+    axes = {"w": 0, "a": 1, "r": 2}
+    for key, opposite in zip("war", "sdf", strict=True):
+        for pressed, sign in ((key, 1.0), (opposite, -1.0)):
+            seen, _ = game.reset()
+            before_m = seen["proprio"][9:12].copy()
+            for _ in range(6):
+                seen, *_ = game.step(commands[(pressed,)])
+            moved_m = sign * (seen["proprio"][9:12] - before_m)
+            assert moved_m.argmax() == axes[key] and moved_m.max() > 0.02, pressed
+    game.close()
+
+
+def test_a_press_of_the_grip_closes_the_fingers_and_the_end_stands_still_for_two_seconds():
+    game = hand_game()
+    game.reset()
+    grip, nothing = keys_to_commands()[("g",)], np.zeros(7, np.float32)
+    openings = []
+    for command in (nothing, grip, grip, nothing, nothing, grip):
+        seen, *_ = game.step(command)
+        openings.append(float(seen["proprio"][7]))
+    assert openings[0] > 0.03 and min(openings) == openings[4] < 0.02 < openings[5] + 0.01
+    images = [game.render()]
+    steps = [game.step(nothing) for _ in range(4 + 50)]
+    assert [step[3] for step in steps] == [False] * 53 + [True], "time is over after ten periods"
+    assert game.render().shape == images[0].shape and not np.array_equal(game.render(), images[0])
+    assert game.summary() == "Solved 0 of 1 episodes (0.0%, 95 % interval 0.0% to 79.3%); optimum 100.0%."
+    game.close()
+
+
+def test_keyboard_events_move_the_hand(keyboard, capsys):
+    keyboard("wgf")
+    assert main(["play", "ArrowPuzzleEasyMotion", "--seed", "5"]) == 0
+    assert capsys.readouterr().out == "No episode was finished.\n"
+    assert main(["play", "ArrowPuzzleMotion", "--execution", "kinematic"]) == 2
+    assert "--execution goes with a task of macro-actions" in capsys.readouterr().err
 
 
 @pytest.mark.slow
