@@ -271,7 +271,7 @@ def verify(kept: Demonstrations) -> str:
             count += 1
     require(count == len(seeds), f"{kept.folder} has {count} episodes and {len(seeds)} seeds.")
     require(str(digest) == kept.card["content"], f"{kept.folder}: its episodes are not those of its card.")
-    return f"{count} of {count} episodes replay from seed and commands: equal rewards, macrostates and instructions."
+    return f"Holds. {count} of {count} episodes replay from seed and commands to equal rewards and macrostates."
 
 
 def record(kept: Demonstrations, index: int, path: Path) -> None:

@@ -90,7 +90,7 @@ def test_each_format_gives_the_episode_back(tmp_path: Path, format: str) -> None
     held = {name: array[:n_steps] for name, array in episode().items() if name in found}
     assert content_hash({name: array[:n_steps] for name, array in found.items()}) == content_hash(held)
     assert set(episode()) - set(found) == {"seed", "macrostates"}, "no learner is given them"
-    assert verify(kept).startswith("1 of 1 episodes replay")
+    assert verify(kept).startswith("Holds. 1 of 1 episodes replay")
     with pytest.raises(InvalidValueError, match="has hand commands, no macro-actions"):
         read_dataset(tmp_path / "set")
 
@@ -156,7 +156,7 @@ def test_the_command_says_whether_a_folder_holds(tmp_path: Path, capsys: pytest.
     written(tmp_path / "forged", **FORGERIES["a reward"]())
     assert main(["verify", str(tmp_path / "honest")]) == 0
     said = capsys.readouterr().out
-    assert said == "1 of 1 episodes replay from seed and commands: equal rewards, macrostates and instructions.\n"
+    assert said == "Holds. 1 of 1 episodes replay from seed and commands to equal rewards and macrostates.\n"
     assert main(["verify", str(tmp_path / "forged")]) == 1
     assert "rewards 3 is 0.0, and 1.0 was kept" in capsys.readouterr().out
 
