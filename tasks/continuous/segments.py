@@ -37,8 +37,6 @@ class Measured:
     segments: list[tuple[State, int, int, int, float, float, bool]]
     pairs: int  #: (arrangement of objects, macro-action) pairs that there are
     faults: dict[str, int]  #: the most frequent reasons of those not as ruled, with their counts
-    furthest_m: float  #: that a hand was off its observation pose after a segment
-    furthest_rad: float
     episodes: int  #: of the optimal macro-actions, one after another
     solved: int
     random_episodes: int  #: with a uniformly random hand twist each period
@@ -61,7 +59,6 @@ def measure(env: MotionEnv, *, tries: int, turns: int, random_episodes: int, see
     chosen = pairs if len(pairs) <= tries else [pairs[each] for each in sorted(rng.permutation(len(pairs))[:tries])]
     expert = Expert(env, env.another_world())
     faults: Counter[str] = Counter()
-    furthest = np.zeros(2)
     segments = []
     for number, (state, action) in enumerate(chosen):
         rng = np.random.default_rng([seed, number])
@@ -71,8 +68,7 @@ def measure(env: MotionEnv, *, tries: int, turns: int, random_episodes: int, see
             env.reset(seed=seed + 10_000 * number + attempt, options={"macrostate": state})
             if attempt:
                 _move(env, rng)
-            fault, taken_s, off = _segment(env, expert, action)
-            furthest = np.maximum(furthest, off)
+            fault, taken_s = _segment(env, expert, action)
             seconds.append(taken_s)
             as_ruled += fault is None
             faults.update([fault] if fault else [])
@@ -85,8 +81,6 @@ def measure(env: MotionEnv, *, tries: int, turns: int, random_episodes: int, see
         segments=segments,
         pairs=len(pairs),
         faults=dict(faults.most_common(10)),
-        furthest_m=float(furthest[0]),
-        furthest_rad=float(furthest[1]),
         episodes=len(solved),
         solved=sum(solved),
         random_episodes=random_episodes,
@@ -120,8 +114,8 @@ def _move(env: MotionEnv, rng: np.random.Generator) -> None:
         env.step(np.array([*twist[:3], 0.0, 0.0, twist[3], grip], dtype=np.float32))
 
 
-def _segment(env: MotionEnv, expert: Expert, action: int) -> tuple[str | None, float, Floats]:
-    """Why a macro-action was not as ruled, or None; its seconds; how far (m, rad) the hand ended off."""
+def _segment(env: MotionEnv, expert: Expert, action: int) -> tuple[str | None, float]:
+    """Why a macro-action was not as ruled, or None; and its seconds."""
     before = env.episode.macrostate
     began_s = env.elapsed_s
     expert.begin(action)
@@ -133,24 +127,22 @@ def _segment(env: MotionEnv, expert: Expert, action: int) -> tuple[str | None, f
         if info["event"]:
             events.append(info)
     seconds = env.elapsed_s - began_s
-    off = np.zeros(2) if over else _off_observation_pose(env)
     if expert.refused or len(events) != 1:
-        return expert.refused or f"{len(events)} events", seconds, off
+        return expert.refused or f"{len(events)} events", seconds
     (event,) = events
     reached = tuple(event["macrostate"].tolist())
     if event["fault"] or reached not in [each.macrostate for each in env.task.rules.outcomes(before, action)]:
-        return str(event["fault_reason"]) or "another macro-action", seconds, off
-    too_far = off[0] > START_M or off[1] > START_RAD
-    return "the hand ended further off than segments start" if too_far else None, seconds, off
+        return str(event["fault_reason"]) or "another macro-action", seconds
+    strayed = not over and _is_far(env)
+    return "the hand ended further off than segments start" if strayed else None, seconds
 
 
-def _off_observation_pose(env: MotionEnv) -> Floats:
-    """How far the hand is off the observation pose, in m and rad."""
-    columns = arm_columns(env.model).qpos[: len(ARM_JOINTS)]
-    now_m, now = env.controls.hand_pose(env.data.qpos[columns])
+def _is_far(env: MotionEnv) -> bool:
+    """Whether the hand is further off its observation pose than where segments start."""
+    now_m, now = env.controls.hand_pose(env.data.qpos[arm_columns(env.model).qpos[: len(ARM_JOINTS)]])
     rest_m, rest = env.controls.hand_pose(np.array(OBSERVATION_QPOS_RAD))
-    turned = math.acos(float(np.clip((np.trace(now.T @ rest) - 1.0) / 2.0, -1.0, 1.0)))
-    return np.array([float(np.linalg.norm(now_m - rest_m)), turned])
+    cos = (np.trace(now.T @ rest) - 1.0) / 2.0
+    return bool(np.linalg.norm(now_m - rest_m) > START_M or cos < math.cos(START_RAD))
 
 
 def _episodes(env: MotionEnv, expert: Expert, turns: int) -> list[bool]:
