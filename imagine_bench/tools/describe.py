@@ -128,7 +128,7 @@ def describe_task(name: str) -> str:
 
 
 def _by_hand(spec: TaskSpec) -> dict[str, str]:
-    """What a task is in continuous control, and how far it can be solved; nothing where it has none."""
+    """A task in continuous control, and how far it can be solved; nothing where it has none."""
     base, colon, options = spec.id.partition(":")
     if not registry.has_task(base) or not registry.task_entry(base).motion:
         return {}

@@ -124,7 +124,7 @@ class ArrowWorld(World):
         return math.remainder(-orientation.yaw_rad(*pose[3:]) - value * _QUARTER_RAD, 2 * math.pi)
 
     def _misplaced(self, index: int, pose: list[float]) -> str | None:
-        """In what a cube's pose differs from one on its slot, however it is turned."""
+        """The difference of a cube's pose from one on its slot, however it is turned."""
         name = self.object_names[index]
         tipped = self._tipped(index, pose)
         off_m = math.dist(pose[:2], self.layout.slots_xy_m[index])

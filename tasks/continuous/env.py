@@ -96,7 +96,7 @@ class MotionEnv(SceneEnv):
         make_world: Its world, at an appearance level, made for continuous control.
         instruct: The goal of a macrostate in words.
         slip: Probability that a grip slips: the fingers lose their friction and open by themselves, until they are told
-            to open. What is held at the start of an episode does not slip.
+            to open. An object held at the start of an episode does not slip.
         control: ``"twist"``, ``"pose"``, ``"joint_delta"`` or ``"joint"``.
         rate_hz: Commands a second; a period is a whole number of the simulation's steps.
         appearance: A name, or factors; drawn at the start and anew after each event.

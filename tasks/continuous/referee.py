@@ -64,7 +64,7 @@ class Referee:
 
     An object at rest that no part of the robot touches has the value that is read of its pose. One that is touched or
     moves has its value of before, until it has passed another one: a cube that is turned on its place by more than a
-    quarter and 20 degrees, an object that is gripped and lifted. So one grasp cannot skip a macrostate: what it skips
+    quarter and 20 degrees, an object that is gripped and lifted. So one grasp cannot skip a macrostate: a skipped part
     beside its place is a fault when the object comes to rest. Where one object changes, all others must stand, or be
     held, as the macrostate says.
 
