@@ -22,6 +22,8 @@ AGENTS = {
 """Color and marker of an agent of macro-actions."""
 LINES = {"planner": ("-", "planned"), "clone": ("--", "cloned")}
 """Line of planner and clone, and the word for macro-actions that they carry out."""
+MINUTES = (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
+NOT_RUN = {1: "not run: a clone of one cube; SAC for longer", 3: "not run: SAC on three cubes"}
 FLAT = ("#9a9a9a", "^")
 
 
@@ -40,10 +42,15 @@ def draw(axes: plt.Axes, cubes: int) -> None:
         minutes = [point["robot_s"] / 60 for point in curve["curve"]]
         shares = [100 * point["successes"] / point["tests"] for point in curve["curve"]]
         label = f"{curve['agent']}, {word} macro-actions"
-        axes.plot(minutes, shares, line, color=color, marker=marker, markersize=5, label=label)
+        face = color if curve["execution"] == "planner" else "white"
+        axes.plot(minutes, shares, line, color=color, marker=marker, markerfacecolor=face, markersize=6, label=label)
     axes.axhline(100 * facts.chance_level, color="#9a9a9a", linestyle=":", label="chance, macro-actions at random")
     axes.axhline(100, color="#4daf4a", linestyle=":", label="optimum of the rules")
     axes.set_xscale("log")
+    axes.set_xticks(MINUTES, [f"{each:g}" for each in MINUTES])
+    axes.minorticks_off()
+    axes.set_xlim(0.75 * MINUTES[0], 1.5 * MINUTES[-1])
+    axes.text(0.98, 0.1, NOT_RUN[cubes], transform=axes.transAxes, ha="right", fontsize=8, color="#606060")
     axes.set_ylim(-2, 104)
     axes.set_xlabel("minutes of robot time in training (logarithmic)")
     axes.set_title(f"{cubes} cube{'s' if cubes > 1 else ''}")
