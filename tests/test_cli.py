@@ -25,6 +25,7 @@ from imagine_bench import cli, errors, registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.protocols.control import protocol
 from imagine_bench.registry import AGENTS, TASKS, WORLD_MODELS
 from imagine_bench.registry.entries import Entrant, entrant
 from imagine_bench.running.bench import task_types
@@ -242,6 +243,9 @@ def test_list_describes_everything_in_a_line_each(capsys: pytest.CaptureFixture[
     for kind in task_types().values():
         assert named >= {*kind.tasks(), *kind.learners(), *kind.presets}
     assert named >= {*GRIDS, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *WORLD_MODELS, *bundled()}
+    default = protocol("arrow_puzzle")
+    counts = [len(default.seeds_of(agent)) for agent in default.agents]
+    assert f"seeds: {min(counts)} to {max(counts)}, by agent" in out
     assert main(["describe"]) == 0
     assert capsys.readouterr() == (out, "")
 

@@ -205,7 +205,9 @@ def _presets(kind: TaskType[ProtocolData]) -> dict[str, str]:
             **{field.name: field.default for field in dataclasses.fields(kind.protocol)},
             **changes,
         }
-        words = [f"seeds: {len(sizes['seeds'])}"]
+        counts = {len(sizes["seeds"]), *dict(sizes.get("few_seeds", ())).values()}
+        most = f" to {max(counts)}, by agent" if len(counts) > 1 else ""
+        words = [f"seeds: {min(counts)}{most}"]
         if "budgets" in sizes:
             words.append(f"tests: {sizes['evaluation_episodes']:,} after each of {sizes['budgets']} real episodes")
         if "networks" in sizes:
