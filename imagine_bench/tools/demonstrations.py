@@ -55,7 +55,7 @@ class Actor(Protocol):
 class DemonstrationSettings:
     """All that decides the episodes of a set."""
 
-    env_id: str
+    task: str  #: the task of macro-actions
     policy: str  #: one of :data:`POLICIES`
     seed: int
     appearance: str
@@ -89,14 +89,13 @@ def collect(
         allowed = f"1 to {MOST_EPISODES:,} episodes and a seed from 0 to {SEEDS - 1}"
         raise InvalidValueError(f"episodes is {episodes} and seed {seed}; give {allowed}.")
     spec = registry.task(task)
-    env_id = registry.motion_id(spec.env_id)
     look = appearance_name(appearance)
-    recipe = DemonstrationSettings(env_id=env_id, policy=policy, seed=seed, appearance=look, size=size)
-    env, _ = stage(env_id, look, size)  # tells what is wrong before any process begins
+    recipe = DemonstrationSettings(task=task, policy=policy, seed=seed, appearance=look, size=size)
+    env, _ = stage(task, look, size)  # tells what is wrong before any process begins
     facts = spec.facts()
     environment = describe_environment()
     card: dict[str, Json] = {
-        "task": registry.motion_name(env_id), "description": spec.description, "env_id": env_id, "policy": policy,
+        "task": spec.id, "description": spec.description, "env_id": registry.motion_id(spec.env_id), "policy": policy,
         "played": POLICIES[policy], "seed": seed, "appearance": look, "size": size, "control": env.controls.control,
         "control_names": list(env.control_names), "rate_hz": round(1.0 / env.period_s, 6),
         "action_names": list(spec.action_names), "macrostate_names": list(spec.macrostate_names),
@@ -117,7 +116,7 @@ def collect(
 
 def _collect_all(recipe: DemonstrationSettings, files: Sequence[Path], workers: int) -> None:
     failures: list[str] = []
-    with tqdm(total=len(files), desc=f"{recipe.env_id} {recipe.policy}", unit="episode", disable=None) as bar:
+    with tqdm(total=len(files), desc=f"{recipe.task} {recipe.policy}", unit="episode", disable=None) as bar:
 
         def ended(item: _Item, why: str) -> None:
             bar.update()
@@ -141,17 +140,23 @@ def _collect_one(item: _Item, on_news: Callable[[None], None]) -> str:
 
 
 @functools.lru_cache(maxsize=1)
-def stage(env_id: str, appearance: str, size: int) -> tuple[MotionEnv, Any]:
-    """An environment with both cameras, and a world for plans."""
-    made: Any = gymnasium.make(env_id, disable_env_checker=True, appearance=appearance, size=size)
-    env: MotionEnv = made.unwrapped
+def stage(task: str, appearance: str, size: int) -> tuple[MotionEnv, Any]:
+    """A task's environment of continuous control with both cameras, and a world for plans."""
+    env = _made(task, appearance=appearance, size=size)
     return env, env.another_world()
+
+
+def _made(task: str, **options: Any) -> MotionEnv:
+    env_id = registry.motion_id(registry.task(task).env_id)  # asked for, a world with options is registered
+    env: Any = gymnasium.make(env_id, disable_env_checker=True, **options)
+    unwrapped: MotionEnv = env.unwrapped
+    return unwrapped
 
 
 def demonstration(recipe: DemonstrationSettings, index: int) -> Arrays:
     """An episode of a set: the arrays of :mod:`imagine_bench.data.motion`, ``macrostates`` (N + 1, M) and ``seed``."""
     make = registry.load("imagine_bench.tasks.continuous.demonstrator:Demonstrator")
-    env, planner = stage(recipe.env_id, recipe.appearance, recipe.size)
+    env, planner = stage(recipe.task, recipe.appearance, recipe.size)
     seed = episode_seed("dataset", recipe.seed, index)
     policy = _IN_TURN[index % len(_IN_TURN)] if recipe.policy == "mixed" else recipe.policy
     rng = SeedTree(recipe.seed).child("demonstrations", index).generator()
@@ -236,10 +241,8 @@ class _Kept:
 
 def replay_env(card: Mapping[str, Any], observation: str = "proprio,state") -> MotionEnv:
     """The environment that demonstrations were made in, by default without images."""
-    options = {"appearance": card["appearance"], "size": card["size"], "observation": observation}
-    env: Any = gymnasium.make(card["env_id"], disable_env_checker=True, control=card["control"], **options)
-    unwrapped: MotionEnv = env.unwrapped
-    return unwrapped
+    options = {"appearance": card["appearance"], "size": card["size"], "control": card["control"]}
+    return _made(card["task"], observation=observation, **options)
 
 
 def replay(env: MotionEnv, seed: int, actions: Array, watch: Watch | None = None) -> Arrays:
