@@ -60,9 +60,14 @@ _CAMERA = "observation.images."
 _MOTION_TYPES = {**_TYPES, _STATE: "float32", "macro_action": "int64"}
 """Columns of demonstrations, of one number a row but for the action and the state."""
 _MOTION_NAMES = {
-    "action": "actions", _STATE: "proprio", "macro_action": "macro_action", "next.reward": "rewards",
-    "next.terminated": "terminated", "next.truncated": "truncated", "next.success": "success",
-}  # fmt: skip
+    "action": "actions",
+    _STATE: "proprio",
+    "macro_action": "macro_action",
+    "next.reward": "rewards",
+    "next.terminated": "terminated",
+    "next.truncated": "truncated",
+    "next.success": "success",
+}
 """Columns of demonstrations, and the arrays that they are of."""
 _INDEX = "__index_level_0__"
 """Where pandas keeps the index of a table."""
@@ -164,10 +169,13 @@ def _motion_part(episode: Arrays, before: Mapping[str, int], tasks: dict[str, in
     n_steps = len(said)
     count = np.arange(n_steps)
     made = {
-        "next.done": episode["terminated"] | episode["truncated"], "timestamp": count / fps, "frame_index": count,
-        _EPISODE: np.full(n_steps, before["total_episodes"]), "index": before["total_frames"] + count,
+        "next.done": episode["terminated"] | episode["truncated"],
+        "timestamp": count / fps,
+        "frame_index": count,
+        _EPISODE: np.full(n_steps, before["total_episodes"]),
+        "index": before["total_frames"] + count,
         "task_index": np.array([tasks[text] for text in said]),
-    }  # fmt: skip
+    }
     given = {theirs: episode[ours][:n_steps] for theirs, ours in _MOTION_NAMES.items()}
     columns = {name: {**given, **made}[name].astype(dtype) for name, dtype in _MOTION_TYPES.items()}
     return _Part(columns, {_CAMERA + name: episode[name][:n_steps] for name in CAMERAS}, list(dict.fromkeys(said)))

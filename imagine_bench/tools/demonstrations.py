@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import shutil
@@ -71,9 +72,17 @@ _Item = tuple[DemonstrationSettings, int, Path]
 
 
 def collect(
-    task: str, *, policy: str, episodes: int, seed: int, appearance: str, size: int, format: str, folder: Path,
+    task: str,
+    *,
+    policy: str,
+    episodes: int,
+    seed: int,
+    appearance: str,
+    size: int,
+    format: str,
+    folder: Path,
     workers: int | None = None,
-) -> Demonstrations:  # fmt: skip
+) -> Demonstrations:
     """Play episodes of a task's environment of continuous control into a new folder.
 
     The same arguments give the same episodes, whatever the number of ``workers``.
@@ -88,42 +97,55 @@ def collect(
     if not 1 <= episodes <= MOST_EPISODES or not 0 <= seed < SEEDS:
         allowed = f"1 to {MOST_EPISODES:,} episodes and a seed from 0 to {SEEDS - 1}"
         raise InvalidValueError(f"episodes is {episodes} and seed {seed}; give {allowed}.")
-    spec = registry.task(task)
     look = appearance_name(appearance)
-    recipe = DemonstrationSettings(task=task, policy=policy, seed=seed, appearance=look, size=size)
-    env, _ = stage(task, look, size)  # tells what is wrong before any process begins
-    facts = spec.facts()
-    environment = describe_environment()
-    card: dict[str, Json] = {
-        "task": spec.id, "description": spec.description, "env_id": registry.motion_id(spec.env_id), "policy": policy,
-        "played": POLICIES[policy], "seed": seed, "appearance": look, "size": size, "control": env.controls.control,
-        "control_names": list(env.control_names), "rate_hz": round(1.0 / env.period_s, 6),
-        "action_names": list(spec.action_names), "macrostate_names": list(spec.macrostate_names),
-        "optimum": facts.optimum, "optimal_return": facts.optimal_return,
-        **{name: environment[name] for name in ("commit", "command", "versions")},
-    }  # fmt: skip
+    settings = DemonstrationSettings(task=task, policy=policy, seed=seed, appearance=look, size=size)
+    stage(task, look, size)  # tells what is wrong before any process begins
     with new_folder(folder, format) as partial:
         (partial / "episodes").mkdir()
         files = [partial / f"episodes/{index:06}.npz" for index in range(episodes)]
-        _collect_all(recipe, files, at_a_time(workers))
+        _collect_all(settings, files, at_a_time(workers))
         tally = _Tally()
+        card = {**_card(settings), "format": format}
         registry.load(FORMATS[format]).write_motion(partial, tally.through(files), card)
         if format != "npz":
             shutil.rmtree(partial / "episodes")
-        whole = write_card(partial, {**card, "format": format, **tally.facts()}, {"privileged": tally.hidden()})
+        whole = write_card(partial, {**card, **tally.facts()}, {"privileged": tally.hidden()})
     return Demonstrations(folder=folder, card=whole)
 
 
-def _collect_all(recipe: DemonstrationSettings, files: Sequence[Path], workers: int) -> None:
+def _card(settings: DemonstrationSettings) -> dict[str, Json]:
+    """The facts of a set that are known before it is played."""
+    spec = registry.task(settings.task)
+    env, _ = stage(settings.task, settings.appearance, settings.size)
+    facts = spec.facts()
+    environment = describe_environment()
+    return {
+        **dataclasses.asdict(settings),
+        "task": spec.id,
+        "description": spec.description,
+        "env_id": registry.motion_id(spec.env_id),
+        "played": POLICIES[settings.policy],
+        "control": env.controls.control,
+        "control_names": list(env.control_names),
+        "rate_hz": round(1.0 / env.period_s, 6),
+        "action_names": list(spec.action_names),
+        "macrostate_names": list(spec.macrostate_names),
+        "optimum": facts.optimum,
+        "optimal_return": facts.optimal_return,
+        **{name: environment[name] for name in ("commit", "command", "versions")},
+    }
+
+
+def _collect_all(settings: DemonstrationSettings, files: Sequence[Path], workers: int) -> None:
     failures: list[str] = []
-    with tqdm(total=len(files), desc=f"{recipe.task} {recipe.policy}", unit="episode", disable=None) as bar:
+    with tqdm(total=len(files), desc=f"{settings.task} {settings.policy}", unit="episode", disable=None) as bar:
 
         def ended(item: _Item, why: str) -> None:
             bar.update()
             if why:
                 failures.append(f"Episode {item[1]} could not be played: {why}")
 
-        items = [(recipe, index, file) for index, file in enumerate(files)]
+        items = [(settings, index, file) for index, file in enumerate(files)]
         work_through(_collect_one, items, workers=workers, on_news=lambda news: None, on_end=ended)
     if failures:
         raise RunFailedError(f"{failures[0]} Nothing was written.")
@@ -131,9 +153,9 @@ def _collect_all(recipe: DemonstrationSettings, files: Sequence[Path], workers: 
 
 def _collect_one(item: _Item, on_news: Callable[[None], None]) -> str:
     """Play an episode into its file; returns why that failed, or an empty text."""
-    recipe, index, file = item
+    settings, index, file = item
     try:
-        write_arrays(file, demonstration(recipe, index))
+        write_arrays(file, demonstration(settings, index))
     except Exception as error:  # a sentence for the parent process, which ends the command
         return f"{type(error).__name__}: {error}"
     return ""
@@ -153,13 +175,13 @@ def _made(task: str, **options: Any) -> MotionEnv:
     return unwrapped
 
 
-def demonstration(recipe: DemonstrationSettings, index: int) -> Arrays:
+def demonstration(settings: DemonstrationSettings, index: int) -> Arrays:
     """An episode of a set: the arrays of :mod:`imagine_bench.data.motion`, ``macrostates`` (N + 1, M) and ``seed``."""
     make = registry.load("imagine_bench.tasks.continuous.demonstrator:Demonstrator")
-    env, planner = stage(recipe.task, recipe.appearance, recipe.size)
-    seed = episode_seed("dataset", recipe.seed, index)
-    policy = _IN_TURN[index % len(_IN_TURN)] if recipe.policy == "mixed" else recipe.policy
-    rng = SeedTree(recipe.seed).child("demonstrations", index).generator()
+    env, planner = stage(settings.task, settings.appearance, settings.size)
+    seed = episode_seed("dataset", settings.seed, index)
+    policy = _IN_TURN[index % len(_IN_TURN)] if settings.policy == "mixed" else settings.policy
+    rng = SeedTree(settings.seed).child("demonstrations", index).generator()
     return {**lived(env, seed, lambda: make(env, planner, policy, rng)), "seed": np.array(seed)}
 
 
