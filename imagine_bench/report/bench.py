@@ -59,7 +59,7 @@ from imagine_bench.store.results import BenchResult
 
 _EQUAL_UPDATES = "dqn_more_updates"
 _UNTIL = " --until-decided"
-_SEEDS_OPTION = re.compile(r" --seeds(?: [\d-]+)+")
+_SEEDS_OPTION = re.compile(r" --seeds(?: \d[\d-]*)+")
 _AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
     "against dqn": lambda record: record["agent"],
     "real episodes": lambda record: f"{record['episodes']:,}",

@@ -192,6 +192,9 @@ def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult)
     changed = shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200])
     (line,) = (line for line in verdict(collect(changed)) if line.startswith("imagination: "))
     assert line.startswith("imagination: +48.5 points against dqn at 6,000, undecided with 3 seeds; about 2 more would")
+    environment = {**changed.environment, "command": "imagine-bench bench x --seeds 0-1 7 --workers 1"}
+    (other,) = verdict(collect(dataclasses.replace(changed, environment=environment)))[-1:]
+    assert "imagine-bench bench x --workers 1 " in other, "the options behind the seeds stay"
     its_own = "--agents random oracle dqn imagination imagination_uncertainty --budgets 250 2000 6000"
     assert line.endswith(f"decide: imagine-bench bench --task arrow_puzzle {its_own} --seeds 0 1 7-9.")
     page = bench_page(changed)
