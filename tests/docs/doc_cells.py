@@ -13,6 +13,7 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
+import speed_cells
 
 from imagine_bench import reference, registry, rules, statistics
 from imagine_bench.exact.certificate import Certificate, certificate
@@ -389,20 +390,6 @@ def decomposed(folder: str, network: str, where: str, column: str) -> str:
     return rows[where][column]
 
 
-def speed(machine: str, what: str) -> str:
-    """A measured figure of ``make speed``; an en dash where that machine has none."""
-    found = [each for each in _json(f"speed/{machine}.json")["figures"] if each["what"].removeprefix(_TASK) == what]
-    return (found[0]["measured"] + ("" if found[0]["met"] else ", **missed**")) if found else "–"
-
-
-def fidelity(world: str, what: str) -> str:
-    """A figure of ``speed --worlds`` at clean and at strong, by how its name begins; an en dash where there is none."""
-    figures = {each["what"]: each for each in _json("speed/worlds.json")["figures"]}
-    starts = [f"{world}{level}: {what}" for level in ("", " at strong")]
-    found = [each["measured"] for start in starts for name, each in figures.items() if name.startswith(start)]
-    return " / ".join(found) or "–"
-
-
 def probe(cubes: str, kind: str) -> str:
     """Held-out frames read right from an encoder of so many cubes, % by seed, and CPU seconds of the last seed."""
     paths = sorted(RESULTS.glob(f"arrows-encoders/arrows_{cubes}-clean{kind}-seed_*.json"))
@@ -423,9 +410,6 @@ def walked(task: str, sense: str) -> str:
     (found,) = [each for each in _json(f"margins/{task}.json")["walks"] if each["sense"] == sense]
     text = f"{found['as_ruled']:,} of {found['actions']:,}; {found['drift_mm']:.1f} mm"
     return f"{text}; walks of {', '.join(map(str, found['lengths']))}" if found["faults"] else text
-
-
-_TASK = "arrow_puzzle: "
 
 
 def goals_and_starts(task: str) -> str:
@@ -453,6 +437,8 @@ def certified(world: str, field: str) -> str:
 
 
 CELLS: dict[str, Callable[..., str | list[Compared]]] = {
-    name: function for name, function in globals().items() if isinstance(function, FunctionType)
+    name: function
+    for name, function in {**vars(speed_cells), **globals()}.items()
+    if isinstance(function, FunctionType)
 }
-"""The words of comments: every function above."""
+"""The words of comments: every function above and of :mod:`speed_cells`."""

@@ -344,12 +344,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rounds = kept["rounds"]
     for index in range(chosen.rounds):
         rounds.append(one_round(processes, chosen.only, chosen.seconds))
+        judged = list(figures(rounds))
+        kept["figures"] = [asdict(figure) for figure in judged]
         write_json(chosen.out, kept)
         print(f"round {index + 1} of {chosen.rounds}", file=sys.stderr, flush=True)
     print("\n".join(table(rounds, kept["memory"])))
-    judged = list(figures(rounds))
     print(f"\n{HEAD}", *(figure.row for figure in judged), sep="\n")
-    write_json(chosen.out, {**kept, "figures": [asdict(figure) for figure in judged]})
     return int(not all(figure.met for figure in judged))
 
 

@@ -6,6 +6,7 @@ the same states with the same commands, and drawing the same images.
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 import time
@@ -13,6 +14,7 @@ import time
 import gymnasium
 import mujoco
 import numpy as np
+from imagine_bench.tasks.rendering import Renderer
 from imagine_bench.tasks.rendering.cameras import control_view
 from loop import IMAGE_PX, RATE_HZ, Images, Lane, actions_of, run
 
@@ -64,60 +66,70 @@ def lane_of(env: gymnasium.Env, images: Images) -> Lane:
 class MujocoAlone:
     """MuJoCo's own functions on the scene of an environment, with nothing of this suite around them."""
 
-    def __init__(self, env: gymnasium.Env, n_steps: int) -> None:
+    def __init__(self, env: gymnasium.Env, lane: Lane, images: Images) -> None:
         self._scene = env.unwrapped
-        self._model = self._scene.model
+        self._model = lane.model
+        self._n_steps = lane.physics_steps
         self._data = mujoco.MjData(self._model)
-        self._n_steps = n_steps
-        self._before = np.empty(mujoco.mj_stateSize(self._model, STATE))
+        self._cameras = [self._scene.camera(control_view(name, IMAGE_PX)) for name in cameras_of(images)]
         self._pixels = np.empty((IMAGE_PX, IMAGE_PX, 3), dtype=np.uint8)
         self._rect = mujoco.MjrRect(0, 0, IMAGE_PX, IMAGE_PX)
 
-    def remember(self) -> None:
-        """Keep the state that a step begins with."""
-        mujoco.mj_getState(self._model, self._scene.data, self._before, STATE)
+    def state(self) -> np.ndarray:
+        """All that decides how the simulation goes on, the commands included."""
+        state = np.empty(mujoco.mj_stateSize(self._model, STATE))
+        mujoco.mj_getState(self._model, self._scene.data, state, STATE)
+        return state
 
-    def simulate(self) -> float:
-        """CPU seconds of ``mj_step`` from the state kept, with the commands that the step ended with."""
-        mujoco.mj_setState(self._model, self._data, self._before, STATE)
-        self._data.ctrl[:] = self._scene.data.ctrl
+    def again(self, before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+        """CPU seconds of ``mj_step`` from one state with the commands of another, and of drawing the images."""
+        mujoco.mj_setState(self._model, self._data, after, STATE)
+        commands = self._data.ctrl.copy()
+        mujoco.mj_setState(self._model, self._data, before, STATE)
+        self._data.ctrl[:] = commands
         start = time.process_time()
         mujoco.mj_step(self._model, self._data, self._n_steps)
-        return time.process_time() - start
+        simulated_s = time.process_time() - start
+        return simulated_s, sum(self._draw(camera) for camera in self._cameras)
 
-    def draw(self, name: str) -> float:
-        """CPU seconds of ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels`` for a camera."""
-        camera = self._scene.camera(control_view(name, IMAGE_PX))
+    def _draw(self, camera: Renderer) -> float:
+        """CPU seconds of ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``."""
         context = camera._canvas.mjr
         camera._canvas.make_current()
         every = mujoco.mjtCatBit.mjCAT_ALL.value
         start = time.process_time()
-        mujoco.mjv_updateScene(
-            self._model, self._scene.data, camera._option, None, camera._camera, every, camera._scene
-        )
+        mujoco.mjv_updateScene(self._model, self._data, camera._option, None, camera._camera, every, camera._scene)
         mujoco.mjr_render(self._rect, camera._scene, context)
         mujoco.mjr_readPixels(self._pixels, None, self._rect, context)
         return time.process_time() - start
 
 
 def own(images: Images, seconds: float) -> dict[str, float]:
-    """CPU seconds of a step, and of MuJoCo alone for the same physics steps and images, in turn."""
+    """CPU seconds of a step, and of MuJoCo alone: blocks of steps, each followed by the same without this suite."""
     env = environment(images)
     lane = lane_of(env, images)
-    alone = MujocoAlone(env, lane.physics_steps)
     lane.reset()
-    actions = actions_of(lane)
+    lane.step(actions_of(lane)[0])
+    alone = MujocoAlone(env, lane, images)
     times = []
-    while np.sum(times) < seconds:
-        alone.remember()
-        start = time.process_time()
-        over, _ = lane.step(actions[len(times) % len(actions)])
-        step_s = time.process_time() - start
-        drawn_s = sum(alone.draw(name) for name in cameras_of(images))
-        times.append((step_s, alone.simulate(), drawn_s))
-        if over:
-            lane.reset()
-    step_s, simulated_s, drawn_s = np.mean(times[20:], axis=0).tolist()
+    spent_s = 0.0
+    for block in itertools.cycle(np.split(actions_of(lane), 4)):
+        states = []
+        taken_s = 0.0
+        for action in block:
+            before = alone.state()
+            start = time.process_time()
+            over, _ = lane.step(action)
+            taken_s += time.process_time() - start
+            states.append((before, alone.state()))
+            if over:
+                lane.reset()
+        found = np.mean([alone.again(*pair) for pair in states], axis=0)
+        times.append([taken_s / len(block), *found])
+        spent_s += taken_s
+        if len(times) > 1 and spent_s > seconds:
+            break
+    step_s, simulated_s, drawn_s = np.mean(times[1:], axis=0).tolist()
     return {"step_s": step_s, "mj_step_s": simulated_s, "mjr_s": drawn_s}
 
 

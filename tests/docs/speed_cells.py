@@ -1,0 +1,89 @@
+"""Cells of speed and fidelity: figures of ``make speed``, and rounds of ``tests/measure/control_speed.py``."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_SPEED = Path(__file__).parents[2] / "docs" / "results" / "speed"
+_TASK = "arrow_puzzle: "
+_OURS = ("ours", "ours_pick_place")
+
+
+@functools.cache
+def _kept(name: str) -> Any:
+    return json.loads((_SPEED / f"{name}.json").read_text())
+
+
+def speed(machine: str, what: str) -> str:
+    """A measured figure of ``make speed``; an en dash where that machine has none."""
+    found = [each for each in _kept(machine)["figures"] if each["what"].removeprefix(_TASK) == what]
+    return (found[0]["measured"] + ("" if found[0]["met"] else ", **missed**")) if found else "–"
+
+
+def fidelity(world: str, what: str) -> str:
+    """A figure of ``speed --worlds`` at clean and at strong, by how its name begins; an en dash where there is none."""
+    figures = {each["what"]: each for each in _kept("worlds")["figures"]}
+    starts = [f"{world}{level}: {what}" for level in ("", " at strong")]
+    found = [each["measured"] for start in starts for name, each in figures.items() if name.startswith(start)]
+    return " / ".join(found) or "–"
+
+
+def times_ours(peer: str, images: str) -> str:
+    """How many times as long a step of another suite takes as ours: in the arrow puzzle / in pick-and-place.
+
+    ``images`` is ``none``, ``one`` or ``two``, without shadows, mirrors and antialiasing, or ``drawn``: one image as
+    the other suite draws it. The median over rounds of the ratio within each.
+    """
+    rounds = _kept("control")["rounds"]
+    theirs = _kind(rounds[0][peer], images)
+    ours = _kind(rounds[0][peer], "one" if images == "drawn" else images)
+    ratios = [np.median([row[peer][theirs] / row[key][ours] for row in rounds]) for key in _OURS]
+    return " / ".join(f"{ratio:.1f}" for ratio in ratios)
+
+
+def _kind(row: dict[str, Any], images: str) -> str:
+    """The key of a step with so many images: one is the hand's, or the front one where no camera is on the hand."""
+    if images in {"none", "two"}:
+        return {"none": "step_s none", "two": "step_s both-plain"}[images]
+    camera = "wrist" if "step_s wrist-plain" in row else "front"
+    return f"step_s {camera}" if images == "drawn" else f"step_s {camera}-plain"
+
+
+def control_step(suite: str, images: str) -> str:
+    """CPU ms of a step, the median over rounds."""
+    rounds = _kept("control")["rounds"]
+    key = _kind(rounds[0][suite], images)
+    return f"{1e3 * np.median([row[suite][key] for row in rounds]):.3g}" if key in rounds[0][suite] else "–"
+
+
+def control_figure(suite: str, what: str, factor: str = "1") -> str:
+    """Another figure of a suite, the median over rounds, times a factor."""
+    values = [row[suite][what] for row in _kept("control")["rounds"]]
+    return f"{float(factor) * np.median(values):.3g}"
+
+
+def control_memory(suite: str) -> str:
+    """MiB of a process with one lane, and of each lane more."""
+    kept = _kept("control")["memory"][suite]
+    return f"{kept['one_mib']:.0f} + {kept['more_mib']:.0f}"
+
+
+def control_physics(suite: str) -> str:
+    """MuJoCo's version, and physics steps in a step of control."""
+    row = _kept("control")["rounds"][0][suite]
+    return f"{row['mujoco']}; {row['physics_steps']} of {row['physics_step_ms']:g} ms"
+
+
+def beside_mujoco(suite: str, images: str) -> str:
+    """How many times as long our step takes as MuJoCo alone, with the absolute figures in us."""
+    rounds = _kept("control")["rounds"]
+    parts = ("step_s", "mj_step_s", "mjr_s")
+    each = np.array([[row[suite][f"own {part} {images}"] for part in parts] for row in rounds])
+    step_us, simulated_us, drawn_us = 1e6 * np.median(each, axis=0)
+    ratio = np.median(each[:, 0] / each[:, 1:].sum(axis=1))
+    return f"{ratio:.2f} ({step_us:.0f} against {simulated_us:.0f} + {drawn_us:.0f})"
