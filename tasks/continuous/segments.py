@@ -167,7 +167,7 @@ def _random_episode(env: MotionEnv, seed: int) -> bool:
     rng = np.random.default_rng(seed)
     env.reset(seed=seed)
     while True:
-        action = rng.uniform(env.action_space.low, env.action_space.high)
+        action = rng.uniform(env.controls.space.low, env.controls.space.high)
         _, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             return bool(info["is_success"])
