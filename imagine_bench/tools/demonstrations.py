@@ -348,7 +348,7 @@ def describe(kept: Demonstrations) -> str:
         "success": f"{card['successes'] / episodes:.1%} of episodes [{low:.1%}, {high:.1%}]",
         "return": f"{card['mean_return']:.2f} an episode; optimum {card['optimal_return']:.2f}",
         "content": card["content"],
-        "task": f"{card['task']}, control {card['control']}, appearance {card['appearance']}",
+        "task": f"{card['env_id']}, control {card['control']}, appearance {card['appearance']}",
         "images": f"{' and '.join(CAMERAS)}, {card['size']} pixels",
         "policy": f"{card['policy']} ({card['played']}), seed {card['seed']}",
         "apart": "privileged.npz (seeds, macrostates): never given to a learner",
