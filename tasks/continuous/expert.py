@@ -26,7 +26,7 @@ _AT_REST_RAD = 0.05
 class HandTarget(NamedTuple):
     """Where the hand shall be at the end of a control period."""
 
-    joints_rad: Floats  #: as planned. Shape (7,).
+    joints_rad: Floats  #: as commanded by the plan, ahead of the arm by its lag. Shape (7,).
     opening_m: float  #: command to each finger
 
 
@@ -76,7 +76,7 @@ class Expert:
         self._due.clear()
         self._due.extend(self._approach())
         if executor.trajectory is not None:
-            self._due.extend(self._sampled(executor.trajectory.qpos_rad, executor.trajectory.opening_m))
+            self._due.extend(self._sampled(executor.trajectory.arm_command_rad, executor.trajectory.opening_m))
 
     @property
     def is_done(self) -> bool:
@@ -126,7 +126,7 @@ class Expert:
             waypoints=[Waypoint("observe", home_rad, float(ctrl[-1]))],
             timestep_s=self._env.model.opt.timestep,
         )
-        return self._sampled(way.qpos_rad, way.opening_m)
+        return self._sampled(way.arm_command_rad, way.opening_m)
 
     def _sampled(self, joints_rad: Floats, opening_m: Floats) -> list[HandTarget]:
         """A plan by steps of the simulation, at the end of each control period."""
