@@ -313,3 +313,16 @@ def test_a_turn_about_the_hand_leaves_its_place() -> None:
         env.step(np.array(twist, dtype=np.float32))
         off_m = env.data.site_xpos[env.world.model.site("tcp").id] - before_m
         assert np.linalg.norm(off_m) < 0.002
+
+
+@pytest.mark.parametrize(
+    ("seed", "start", "action"),
+    [(290_004, (0, 3, 1, 2), 5), (450_004, (1, 0, 3, 2), 3), (1_070_007, (2, 3, 1, 1), 5)],
+)
+def test_the_hand_keeps_to_its_plan_beside_other_cubes(seed: int, start: tuple[int, ...], action: int) -> None:
+    """Placements of ``strong`` in which a hand that lags behind its plan touches the next cube."""
+    env, expert = environment("arrows", appearance="strong")
+    env.reset(seed=seed, options={"macrostate": start})
+    (event,) = carry_out(env, expert, action)
+    assert event["macro_action"] == action
+    assert not event["fault"]
