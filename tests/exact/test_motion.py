@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
-from imagine_bench.exact.motion import certificate
+from imagine_bench.exact import motion
+from imagine_bench.exact.motion import certificate, measured
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.rules import states_of_play
+from imagine_bench.rules import shortest_plans, states_of_play, tabulate
 from imagine_bench.statistics import wilson
 
 MANY = 10**9
+MEASURED = sorted(file.stem for file in Path(motion.__file__).parent.glob("measured/*.json"))
 
 
 def measurement(
@@ -60,6 +63,20 @@ def test_pairs_that_were_not_tried_show_nothing_unless_pairs_were_sampled() -> N
     assert certificate(spec, measure).shown == pytest.approx(1.0, abs=1e-6)  # taken for a sample
     measure["pairs"] -= 1
     assert certificate(spec, measure).shown == pytest.approx((0 + 1 + 1) / 3, abs=1e-6)
+
+
+@pytest.mark.parametrize("task", MEASURED)
+@pytest.mark.parametrize("appearance", ["clean", "strong"])
+def test_what_was_measured_leaves_less_than_a_point(task: str, appearance: str) -> None:
+    """Both bounds of success within 1 point, mean time within 10 %, and room within the time limit for every plan."""
+    spec = registry.task(task)
+    found = certificate(spec, measured(task)["appearances"][appearance])
+    assert found.optimum - found.shown <= 0.01
+    assert (found.mean_high_s - found.mean_low_s) / found.mean_s <= 0.1
+    assert found.measured_pairs == found.pairs
+    assert found.solved >= 0.99 * found.episodes
+    assert found.random_solved <= 0.01 * found.random_episodes
+    assert found.macro_actions >= int(shortest_plans(tabulate(spec.rules)).max())
 
 
 @pytest.mark.parametrize("name", ["ArrowPuzzleEasyMotion", "PickPlaceMotion"])
