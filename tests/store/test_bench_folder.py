@@ -14,7 +14,7 @@ from imagine_bench.errors import ArtefactError, BusyError
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.launchers.jobs import launcher
 from imagine_bench.store.bench_folder import BenchStore, bench_folder, newest_bench, newest_recording
-from imagine_bench.store.files import make_folder
+from imagine_bench.store.files import make_folder, sealed, write_json
 
 _ENVIRONMENT = {"command": "imagine-bench bench", "commit": "abc", "versions": {"torch": "1"}, "gl_renderer": "x"}
 
@@ -76,7 +76,7 @@ def test_a_folder_of_another_kind_is_named(
 ) -> None:
     folder = tmp_path / "given"
     make_folder((folder / file).parent)
-    (folder / file).write_text("{}")
+    write_json(folder / file, sealed({}))
     for command in ("report", "verify"):
         assert main([command, str(folder)]) == 2
         (line,) = capsys.readouterr().err.splitlines()
