@@ -35,7 +35,7 @@ from imagine_bench.cli.options import (
     require_with,
     shown,
 )
-from imagine_bench.data.folder import CARD
+from imagine_bench.data.folder import read_card
 from imagine_bench.data.motion import read_demonstrations
 from imagine_bench.errors import ArtefactError, CheckFailedError, InvalidValueError, RunFailedError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
@@ -463,7 +463,7 @@ class Verify(OfBench):
 
         given, task = self.meant()
         self._require_fitting()
-        if given is not None and (given / CARD).exists():
+        if given is not None and "control" in (read_card(given) or {}):
             self._verify_demonstrations(given)
             return
         if self.causes:
