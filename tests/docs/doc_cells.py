@@ -16,6 +16,7 @@ import numpy as np
 import speed_cells
 
 from imagine_bench import reference, registry, rules, statistics
+from imagine_bench.exact import motion
 from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.registry.entries import agent_label, label_today
 from imagine_bench.report.page import over_seeds
@@ -410,6 +411,21 @@ def walked(task: str, sense: str) -> str:
     (found,) = [each for each in _json(f"margins/{task}.json")["walks"] if each["sense"] == sense]
     text = f"{found['as_ruled']:,} of {found['actions']:,}; {found['drift_mm']:.1f} mm"
     return f"{text}; walks of {', '.join(map(str, found['lengths']))}" if found["faults"] else text
+
+
+def by_hand(task: str, level: str, column: str) -> str:
+    """A figure of the certificate of continuous control."""
+    found = motion.certificate(registry.task(task), motion.measured(task)["appearances"][level])
+    columns = {
+        "at most": f"{100 * found.optimum:.1f} %",
+        "at least": f"{100 * found.shown:.1f} %",
+        "as ruled": f"{found.as_ruled:,} of {found.segments:,}",
+        "solved": f"{found.solved} of {found.episodes}",
+        "mean": f"{found.mean_s:.2f} [{found.mean_low_s:.2f}, {found.mean_high_s:.2f}]",
+        "longest": f"{found.longest_s:.1f}",
+        "chance": f"{found.random_solved} of {found.random_episodes}" if found.random_episodes else "–",
+    }
+    return columns[column]
 
 
 def goals_and_starts(task: str) -> str:
