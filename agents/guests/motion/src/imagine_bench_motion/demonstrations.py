@@ -16,7 +16,7 @@ from imagine_bench.errors import InvalidValueError
 from .instruction import GO_BACK
 from .skills import HOME_COMMAND, begin, images_of, numbers_of, skill_env
 
-NOISE_RAD = 0.012
+NOISE_RAD = 0.004
 """Standard deviation of the noise that a joint command gets each period, in every second demonstration."""
 NOISE_KEPT = 0.8
 """Share of a period's noise that goes on in the next one."""
