@@ -21,7 +21,7 @@ from .motion.executor import MacroResult
 from .observations import Observer
 from .parameters.parameters import delivered, hides
 from .rendering.cameras import FRAME_PX
-from .scene_env import BUILT, RENDER_MODES, WINDOW_HZ, SceneEnv, Step
+from .scene_env import BUILT, RENDER_MODES, WINDOW_HZ, SceneEnv, Step, require_kind
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import AGENT_CAMERA, FAR_CAMERA, HUMAN_CAMERA
@@ -252,10 +252,7 @@ class MacroEnv(SceneEnv):
         Raises:
             InvalidValueError: A state of another task, execution, appearance or physics, or none at all.
         """
-        if not isinstance(state, EnvState) or state.kind != self._kind:
-            given = state.kind if isinstance(state, EnvState) else state
-            words = "get_state() of an environment made alike"
-            raise InvalidValueError(f"{brief(given)} is no state of {brief(self._kind)}; give one of {words}.")
+        require_kind(state, EnvState, self._kind)
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
         self._macrostate = state.macrostate

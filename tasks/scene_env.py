@@ -178,6 +178,15 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
         return start
 
 
+def require_kind(state: Any, type_: type[Any], kind: tuple[object, ...]) -> None:
+    """Check a snapshot of an environment. Raises InvalidValueError: one of another kind of environment, or none."""
+    if isinstance(state, type_) and state.kind == kind:
+        return
+    given = state.kind if isinstance(state, type_) else state
+    words = "get_state() of an environment made alike"
+    raise InvalidValueError(f"{brief(given)} is no state of {brief(kind)}; give one of {words}.")
+
+
 def options_of(options: Info | None) -> Info:
     """Options of a reset, copied. Raises InvalidValueError: they are no mapping."""
     if options is not None and not isinstance(options, Mapping):

@@ -1,4 +1,4 @@
-"""A world model of macro-actions as a model of motions: it is told what a motion was planned for, and sees no command.
+"""A world model of macro-actions as a model of motions: it is told the goal of each motion, and sees no command.
 
 Where a motion fails it still imagines the macro-action: a model at the coarser level cannot know the failure.
 """

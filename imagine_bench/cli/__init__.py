@@ -17,7 +17,8 @@ import tyro
 from tyro.conf import subcommand
 
 from imagine_bench import registry
-from imagine_bench.cli.benches import Bench, Judge, Plan, Report, Sweep, Verify
+from imagine_bench.cli.benches import Bench, Plan, Report, Sweep
+from imagine_bench.cli.judging import Judge, Verify
 from imagine_bench.cli.options import require_values
 from imagine_bench.cli.tools import (
     CheckCommand,

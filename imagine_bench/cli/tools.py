@@ -43,7 +43,7 @@ from imagine_bench.tools.standard_data import standard_sets
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetCommand:
-    """Collect episodes of a task as a dataset, or say what one holds.
+    """Collect episodes of a task as a dataset, or describe one.
 
     TASK is a task of macro-actions, or one of continuous control, such as ArrowPuzzleMotion.
     """

@@ -11,7 +11,7 @@ An episode of N commands is these arrays, by name:
 ``truncated``       bool (N,)                    whether it was cut off there
 ``success``         bool (N,)                    whether it ended there in success
 ``macro_action``    int64 (N,)                   the macro-action under way, -1 where there is none
-``instruction``     str (N,)                     what the person wants at that moment, in words
+``instruction``     str (N,)                     the wish of the person at that moment, in words
 ==================  ===========================  ==============================================================
 
 LeRobot's rows are commands: there the observation after the last one is left out.

@@ -224,7 +224,7 @@ MOTION_MODELS: dict[str, WorldModelEntry] = {
         title="macro-actions by label",
         encoder_kind="latents",
         settings=_IMAGINATION_SETTINGS,
-        description="The thesis' model of macro-actions, told what a motion was planned for; it sees no command.",
+        description="The thesis' model of macro-actions, told the goal of each motion; it sees no command.",
     ),
     "recurrent": WorldModelEntry(
         make="imagine_bench.agents.world_models.recurrent:make",

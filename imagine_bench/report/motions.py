@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from imagine_bench.judge.motion_scores import DEPTH, MotionScores, Row
+from imagine_bench.judge.motion.scores import DEPTH, MotionScores, Row
 from imagine_bench.report.page import Table
 
 _CAPTION = (

@@ -20,7 +20,7 @@ from ..motion.ik import ArmModel
 from ..observations import Observer
 from ..parameters.parameters import delivered, hides
 from ..rendering.cameras import FRAME_PX
-from ..scene_env import BUILT, RENDER_MODES, SceneEnv, Step
+from ..scene_env import BUILT, RENDER_MODES, SceneEnv, Step, require_kind
 from ..scenes.appearance import Appearance
 from ..scenes.appearance import appearance as appearance_level
 from ..scenes.arm import ARM_JOINTS, arm_columns
@@ -52,7 +52,7 @@ class Episode:
     slipping: bool = False  #: whether this grip slips
     latest: Event | None = None  #: the event of the latest period
     potential: float = 0.0  #: with the dense reward, of the latest moment
-    limited: str = ""  #: what limited the latest command
+    limited: str = ""  #: the limit that changed the latest command, or empty
     observations: tuple[Observed, ...] = ()  #: of the latest moment before each of the latest events
 
 
@@ -303,10 +303,7 @@ class MotionEnv(SceneEnv):
         Raises:
             InvalidValueError: A state of another kind of environment, or none at all.
         """
-        if not isinstance(state, MotionState) or state.kind != self._kind:
-            given = state.kind if isinstance(state, MotionState) else state
-            words = "get_state() of an environment made alike"
-            raise InvalidValueError(f"{brief(given)} is no state of {brief(self._kind)}; give one of {words}.")
+        require_kind(state, MotionState, self._kind)
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
         self.begun = state.begun

@@ -1,4 +1,4 @@
-"""Models of motions are judged by what the simulator does, also where a motion grips nothing."""
+"""Models of motions are judged by the simulator, also where a motion grips nothing."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from imagine_bench.tasks.continuous.spec import make_arrows
 from imagine_bench.arrays import Array, Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.motion import Motions
-from imagine_bench.judge.motion_scores import MotionQuestions, Simulator, score
-from imagine_bench.judge.motions import MotionSource
+from imagine_bench.judge.motion.questions import MotionSource
+from imagine_bench.judge.motion.scores import MotionQuestions, Simulator, score
 
 
 class KnownFrames:

@@ -20,7 +20,7 @@ from imagine_bench.interfaces import AgentContext, TaskSpec
 from imagine_bench.interfaces.model import Untaught
 from imagine_bench.interfaces.motion import MotionModel, Motions, require_frames
 from imagine_bench.judge.models import encoder_for
-from imagine_bench.judge.motions import AnsweredMotions, MotionSource
+from imagine_bench.judge.motion.questions import AnsweredMotions, MotionSource
 from imagine_bench.judge.reading import ImageReader, reader_in
 from imagine_bench.seeding import SeedTree
 

@@ -1,0 +1,1 @@
+"""Models of motions, judged by the simulator."""
