@@ -44,7 +44,7 @@ MOVED = {
     "imagine_bench.data.episodes": "imagine_bench.interfaces.episodes",
     "imagine_bench.entrants": "imagine_bench.registry.entries",
     "imagine_bench.judge.models.outcomes": "imagine_bench.judge.truth",
-    "imagine_bench.judge.values": "imagine_bench.judge.truth",
+    "imagine_bench.judge.values": "imagine_bench.exact.values",
     "imagine_bench.machine": "imagine_bench.registry.machine",
     "imagine_bench.regression.interfaces": "imagine_bench.interfaces.regression",
     "imagine_bench.report.plots": "imagine_bench.report.figures",

@@ -31,10 +31,11 @@ import numpy as np
 
 from imagine_bench.arrays import Bools, Frame, Ints, State, read_only
 from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.exact.values import Model, action_values, rows_of, true_model
 from imagine_bench.interfaces import Agent, Observation, Outcome, Rules, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.interfaces.environments import Env
-from imagine_bench.judge.truth import Model, action_values, added_up, rows_of, total_variation, true_model
+from imagine_bench.judge.truth import added_up, total_variation
 from imagine_bench.rules import states_of
 from imagine_bench.running.run_state import make_env
 from imagine_bench.running.trained import Trained

@@ -14,21 +14,22 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from imagine_bench.arrays import Floats, Ints, State
-from imagine_bench.interfaces import Outcome, Rules, TaskSpec
+from imagine_bench.exact.changed_rules import coupled, slipping
+from imagine_bench.exact.values import branches
+from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.predictions import Predictions
 from imagine_bench.judge.questions import FRAMES, EvalSet
-from imagine_bench.judge.truth import added_up, branches
+from imagine_bench.judge.truth import added_up
 from imagine_bench.rules import Dynamics
 from imagine_bench.seeding import SeedTree
 
 STREAMS = 1_000  # streams of random macro-actions of each world
 LENGTH = 200  # transitions of each
-SLIP = 0.2  # probability that a macro-action does nothing in the world that slips
 FALSE_ALARMS = 0.01  # share of streams of the unchanged world that may raise an alarm
 _ALLOWANCE = 0.5  # standard deviations above its mean that surprise may have
 _LEAST = 0.01  # probability below which nothing is more surprising
@@ -42,38 +43,6 @@ class Streams:
     rows: Ints  #: shape (R, T)
     reached: Ints  #: index of the next macrostate. Shape (R, T).
     states: tuple[State, ...]  #: the macrostates that are reached, by index
-
-
-def slipping(rules: Rules) -> Dynamics:
-    """Every macro-action does nothing with probability :data:`SLIP`."""
-
-    def outcomes(state: State, action: int) -> list[Outcome]:
-        moved = [replace(o, probability=(1.0 - SLIP) * o.probability) for o in rules.outcomes(state, action)]
-        return [*moved, Outcome(SLIP, state, 0.0, terminated=False, success=False)]
-
-    return outcomes
-
-
-def coupled(rules: Rules, states: Sequence[State]) -> Dynamics:
-    """One macro-action also has the effect of another: the pair that leads elsewhere in most macrostates."""
-
-    def both(state: State, first: int, then: int) -> list[Outcome]:
-        found = []
-        for one in rules.outcomes(state, first):
-            for two in rules.outcomes(one.macrostate, then):
-                judged = rules.judge(state, first, two.macrostate)
-                found.append(replace(judged, probability=one.probability * two.probability))
-        return found
-
-    def elsewhere(pair: tuple[int, int]) -> int:
-        count = 0
-        for state in states:
-            alone = {o.macrostate for action in pair for o in rules.outcomes(state, action)}
-            count += {o.macrostate for o in both(state, *pair)}.isdisjoint({state, *alone})
-        return count
-
-    one, other = max(itertools.permutations(range(rules.n_actions), 2), key=elsewhere, default=(0, 0))
-    return lambda state, action: both(state, one, other) if action == one else rules.outcomes(state, action)
 
 
 def streams_of(spec: TaskSpec, questions: EvalSet) -> dict[str, Streams] | None:

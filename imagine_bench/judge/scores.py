@@ -17,24 +17,21 @@ from typing import Any
 import numpy as np
 
 from imagine_bench.arrays import Bools, Floats, State
+from imagine_bench.exact.values import Model, rows_of, true_model, values_of_planning
 from imagine_bench.interfaces import Rules, TaskSpec
 from imagine_bench.judge.predictions import Predictions
 from imagine_bench.judge.questions import FRAMES, RANKED, EvalSet
 from imagine_bench.judge.truth import (
-    Model,
     Value,
     added_up,
     expected_reward,
     hallucinated_modes,
     missed_modes,
     p_ended,
-    rows_of,
     sampling_noise_floor,
     shares,
     squared_distance,
     total_variation,
-    true_model,
-    values_of_planning,
 )
 from imagine_bench.statistics import auroc
 

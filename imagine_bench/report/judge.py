@@ -15,8 +15,9 @@ import numpy as np
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_typed
 from imagine_bench.arrays import Arrays, Pixels
+from imagine_bench.exact.changed_rules import SLIP
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.change import FALSE_ALARMS, LENGTH, SLIP
+from imagine_bench.judge.change import FALSE_ALARMS, LENGTH
 from imagine_bench.judge.judgement import Judgement, kept, shown
 from imagine_bench.judge.models import model_entry, runs_of
 from imagine_bench.recording.filmstrips import TileRow, png, transition_sheet

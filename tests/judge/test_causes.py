@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from imagine_bench import registry
+from imagine_bench.exact.values import true_model
 from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, drawn_by, place
-from imagine_bench.judge.truth import true_model
 from imagine_bench.rules import fewest_actions, states_of
 from imagine_bench.store.results import PolicyTable
 

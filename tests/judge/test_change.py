@@ -13,18 +13,16 @@ from imagine_bench.agents.world_models.limits import Exact
 from judged import STILL, judged_world
 from numpy.typing import NDArray
 
+from imagine_bench.exact.changed_rules import SLIP, coupled, slipping
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.model import Imagined
 from imagine_bench.judge.change import (
     FALSE_ALARMS,
     LENGTH,
-    SLIP,
     STREAMS,
     alarms,
     change_detection_delay,
-    coupled,
     joint_outcomes,
-    slipping,
     streams_of,
 )
 

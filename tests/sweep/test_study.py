@@ -22,8 +22,8 @@ from small_runs import Inline
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.exact.values import true_model
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
-from imagine_bench.judge.truth import true_model
 from imagine_bench.protocols.data import digest
 from imagine_bench.report.page import write_page
 from imagine_bench.report.sweep import study_page
