@@ -283,7 +283,8 @@ class CheckCommand:
     appearances: tuple[str, ...] = APPEARANCES[:1]
     """With --physics: appearance levels at which fidelity is measured."""
     random: int = 100
-    """With --physics, of continuous control: episodes of random hand twists."""
+    """With --physics, of continuous control: episodes of random hand twists. With --trials 0 they are added to those
+    that the file of --out has."""
     out: Path = Path("runs/margins.json")
     """With --physics: the file in which the figures are kept, with the machine's description."""
 

@@ -111,6 +111,17 @@ def evidence(found: MotionCertificate) -> str:
     )
 
 
+def chance(found: MotionCertificate) -> str:
+    """The success of random hand twists, with its 95 % interval, in words."""
+    if not found.random_episodes:
+        return "chance not measured"
+    low, high = wilson(found.random_solved, found.random_episodes)
+    return (
+        f"chance {100 * found.random_solved / found.random_episodes:.2g} % [{100 * low:.2g}, {100 * high:.2g}] "
+        f"({found.random_episodes:,} episodes of random twists, a new one a period)"
+    )
+
+
 def rows(spec: TaskSpec, name: str) -> dict[str, str]:
     """The certificate in words, by heading; ``name`` is that of the environment in commands."""
     levels = {level: certificate(spec, found) for level, found in measured(spec.id).get("appearances", {}).items()}
@@ -118,12 +129,10 @@ def rows(spec: TaskSpec, name: str) -> dict[str, str]:
         return {"by hand": f"not measured; imagine-bench check {name} --physics measures how far it can be solved"}
     first = next(iter(levels.values()))
     shown = ", ".join(f"{100 * each.shown:.1f} % ({level})" for level, each in levels.items())
-    chance = f"{100 * first.random_solved / max(first.random_episodes, 1):.2g} %"
     multiple = first.time_limit_s / spec.horizon / first.mean_s
     return {
         "by hand": f"optimum {100 * first.optimum:.4g} %, shown reachable {shown}, "
-        f"{first.mean_s:.1f} s a macro-action, "
-        f"chance {chance} ({first.random_episodes:,} episodes of random twists, a new one a period)",
+        f"{first.mean_s:.1f} s a macro-action, {chance(first)}",
         "shown by": "; ".join(f"{level}: {evidence(each)}" for level, each in levels.items()),
         "time limit": f"{first.time_limit_s:g} s, {multiple:.1f} times the mean for each macro-action of the horizon; "
         f"room for {first.macro_actions} macro-actions of the longest",

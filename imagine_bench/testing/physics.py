@@ -7,7 +7,8 @@ grasp hold may go before macro-actions fail.
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,13 @@ import scipy  # its parts load, slowly, when they are first used
 from imagine_bench import registry, statistics
 from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Bools, Floats, State
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, require
 from imagine_bench.exact import motion
 from imagine_bench.interfaces import APPEARANCES, SENSES, PhysicsSettings, TaskSpec
 from imagine_bench.registry.machine import describe_environment, gl_renderer
 from imagine_bench.rules import states_of_play
 from imagine_bench.seeding import SeedTree, episode_seed
-from imagine_bench.store.files import require_writable, write_json
+from imagine_bench.store.files import read_json, require_writable, write_json
 
 SWEEPS: dict[str, tuple[float, ...]] = {
     "pad_friction": (1.2, 0.6, 0.3, 0.2, 0.1, 0.05, 0.03, 0.01, 0.003, 0.001),
@@ -39,6 +40,7 @@ HEAD = "| what | required | measured | |\n|---|---|---|---|"
 """Head of a table of figures."""
 _CLEAN = APPEARANCES[0]
 _RIGHT = 0.99  # of planned macro-actions in continuous control
+_BLOCK = 500  # random episodes between two writes
 _ACTIONS_A_WALK = 200  # between two resets: errors may accumulate
 _ACTIONS_A_VARIED_WALK = 5  # where poses vary, a turn undoes the draw of the reset
 _WALKS = 5  # without a reset, of each way to sense poses
@@ -136,41 +138,83 @@ def check_motion(
 
     Args:
         name: The task as commands name it, such as ``"ArrowPuzzleMotion"``.
-        out: The JSON file to write.
+        out: The JSON file to write. Without segments it is one of an earlier call, to which random episodes are added.
         turns: Macro-actions of whole episodes of planned motions.
-        trials: Segments: single planned macro-actions.
-        random_episodes: Episodes of random hand twists, at the first appearance alone.
+        trials: Segments: single planned macro-actions. 0 to keep those of ``out``.
+        random_episodes: Episodes of random hand twists, at the first appearance alone, of the seeds 0, 1, 2 and so on.
+            The file is written after every 500, and those that it has are not played again.
         appearances: Appearance levels.
 
     Returns:
         Whether at least 99 % of the segments were as ruled.
 
     Raises:
-        InvalidValueError: No segments, or a folder to write to.
+        InvalidValueError: A negative number, or a folder to write to.
         UnknownNameError: An unknown task or appearance.
+        ArtefactError: Without segments: the file is missing, or not of this task and appearance.
         SetupError: The file cannot be written.
     """
-    if trials < 1 or out.is_dir():
-        raise InvalidValueError(f"trials is {trials} and the file {out}; give at least 1 and a JSON file to write.")
+    if min(trials, turns, random_episodes) < 0 or out.is_dir():
+        numbers = f"trials is {trials}, turns {turns}, random {random_episodes}"
+        raise InvalidValueError(f"{numbers} and the file {out}; give numbers from 0 and a JSON file.")
     task = registry.task_of_motion(name) or name
     entry = registry.task_entry(task)
     spec = registry.task(task)
+    levels = [appearance_name(each) for each in appearances]
     require_writable(out.parent)
+
+    def make(level: str) -> Any:
+        return registry.load(entry.motion)(**entry.options, appearance=level, observation="proprio")
+
+    if trials:
+        kept = _segments(make, levels, trials, turns)
+        document: dict[str, Any] = {
+            "task": spec.id,
+            "seed": 0,
+            "appearances": kept,
+            "environment": describe_environment(),
+        }
+        write_json(out, document)
+    else:
+        document = read_json(out, "measurements of continuous control")
+        known = document.get("appearances", {})
+        levels = levels[:1]
+        require(
+            document.get("task") == spec.id and levels[0] in known,
+            f"{out} has measurements of {document.get('task')} at {', '.join(known)}, not of {spec.id} at {levels[0]}.",
+        )
+    with closing(make(levels[0])) as env:
+        _add_random_episodes(env, document, document["appearances"][levels[0]], random_episodes, out)
+    right = True
+    for level in levels:
+        found = motion.certificate(spec, document["appearances"][level])
+        right &= found.as_ruled >= _RIGHT * found.segments
+        print(f"{level}: shown reachable {found.shown:.2%}; {motion.evidence(found)}; {motion.chance(found)}")
+        for reason, count in document["appearances"][level]["faults"].items():
+            print(f"  {count} times: {reason}")
+    return right
+
+
+def _segments(make: Callable[[str], Any], levels: Sequence[str], trials: int, turns: int) -> dict[str, Any]:
+    """The segments and whole episodes of a task at each appearance."""
     measure = registry.load("imagine_bench.tasks.continuous.segments:measure")
     kept = {}
-    right = True
-    for number, level in enumerate(map(appearance_name, appearances)):
-        env = registry.load(entry.motion)(**entry.options, appearance=level, observation="proprio")
-        found = measure(env, tries=trials, turns=turns, random_episodes=0 if number else random_episodes)
-        kept[level] = asdict(found)
-        both = motion.certificate(spec, kept[level])
-        right &= both.as_ruled >= _RIGHT * both.segments
-        print(f"{level}: shown reachable {both.shown:.2%}; {motion.evidence(both)}")
-        for reason, count in found.faults.items():
-            print(f"  {count} times: {reason}")
-        env.close()
-    write_json(out, {"task": spec.id, "seed": 0, "appearances": kept, "environment": describe_environment()})
-    return right
+    for level in levels:
+        with closing(make(level)) as env:
+            kept[level] = asdict(measure(env, tries=trials, turns=turns))
+    return kept
+
+
+def _add_random_episodes(env: Any, document: dict[str, Any], kept: dict[str, Any], until: int, out: Path) -> None:
+    """Play random episodes of the seeds that were not played yet, and keep their count in blocks."""
+    random_episode = registry.load("imagine_bench.tasks.continuous.segments:random_episode")
+    if kept["random_episodes"] < until:
+        document["random_environment"] = describe_environment()
+    for begin in range(kept["random_episodes"], until, _BLOCK):
+        end = min(until, begin + _BLOCK)
+        kept["random_solved"] += sum(random_episode(env, seed) for seed in range(begin, end))
+        kept["random_episodes"] = end
+        write_json(out, document)
 
 
 def make_env(spec: TaskSpec, **options: Any) -> Any:

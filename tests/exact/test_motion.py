@@ -90,6 +90,13 @@ def test_the_command_measures_and_keeps_a_certificate(name: str, tmp_path: Any, 
     assert found.solved == found.episodes >= 1
     assert kept["environment"]["commit"]
     assert "shown reachable" in capsys.readouterr().out
+    assert main([*words, "--trials", "0", "--random", "3"]) == 0  # the later value of an option counts
+    more = json.loads(out.read_text())
+    assert more["appearances"]["clean"].pop("random_episodes") == 3
+    assert kept["appearances"]["clean"].pop("random_episodes") == 1
+    assert more["appearances"] == kept["appearances"]
+    assert main(["check", "ArrowPuzzleHardMotion", "--physics", "--trials", "0", "--out", str(out)]) == 2
+    assert "not of arrow_puzzle_hard" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["ArrowPuzzleMotion", "arrow_puzzle", "ArrowsMotion:cubes=1"])
