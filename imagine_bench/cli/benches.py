@@ -47,7 +47,7 @@ from imagine_bench.sweep.run import run_study, run_suite
 if TYPE_CHECKING:
     from imagine_bench.report.page import Page
 
-_MOST_SEEDS = 15
+_MOST_SEEDS = 21
 """Where --until-decided stops."""
 
 
