@@ -43,7 +43,10 @@ MOVED = {
     "imagine_bench.certificates.certificate": "imagine_bench.exact.certificate",
     "imagine_bench.data.episodes": "imagine_bench.interfaces.episodes",
     "imagine_bench.entrants": "imagine_bench.registry.entries",
+    "imagine_bench.interfaces.motion": "imagine_bench_motion.judge.interface",
     "imagine_bench.judge.models.outcomes": "imagine_bench.judge.truth",
+    "imagine_bench.judge.motion": "imagine_bench_motion.judge",
+    "imagine_bench.judge.motion.scores": "imagine_bench_motion.judge.scores",
     "imagine_bench.judge.values": "imagine_bench.exact.values",
     "imagine_bench.machine": "imagine_bench.registry.machine",
     "imagine_bench.regression.interfaces": "imagine_bench.interfaces.regression",
@@ -56,6 +59,7 @@ MOVED = {
     "imagine_bench.suite.experiments": "imagine_bench.sweep.grid",
     "imagine_bench.suite.run": "imagine_bench.sweep.run",
     "imagine_bench.suite.score": "imagine_bench.sweep.score",
+    "imagine_bench.tasks.continuous.goals": "imagine_bench_motion.goals",
     "imagine_bench.world_models": "imagine_bench.interfaces.model",
 }
 """Where each module lies now, by the path that it had."""

@@ -56,7 +56,6 @@ FOLDERS = (
     "imagine_bench/running",
     "imagine_bench/running/launchers",
     "imagine_bench/judge",
-    "imagine_bench/judge/motion",
     "imagine_bench/sweep",
     "imagine_bench/recording",
     "imagine_bench/report",

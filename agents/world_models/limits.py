@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from imagine_bench.arrays import Floats32, Frame, Ints, Pixels, State
+from imagine_bench.arrays import Frame, Ints, Pixels, State
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, TaskSpec
 from imagine_bench.interfaces.model import Imagined, Untaught
@@ -36,11 +36,6 @@ class Copy(Untaught):
         depth = actions.shape[1] - frames.shape[1] + 1
         images = np.broadcast_to(frames[:, None, -1:], (rows, 1, depth, *frames.shape[2:]))
         return Imagined(pictures=images, probabilities=np.ones((rows, 1, depth)))
-
-    def imagine_motion(self, frames: Frame, actions: Floats32, lengths: Ints, labels: Ints) -> Frame:
-        """The frame before; see :class:`imagine_bench.interfaces.motion.MotionModel`."""
-        del actions, lengths, labels
-        return frames
 
 
 class Exact(Untaught):

@@ -28,11 +28,11 @@ from imagine_bench.errors import ArtefactError, CheckFailedError, InvalidValueEr
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.judge.judgement import Judgement, judge, kept
 from imagine_bench.judge.verify import cost
-from imagine_bench.registry.entries import file_name
 from imagine_bench.running.collect import POLICIES
 from imagine_bench.running.launchers.jobs import at_a_time, launcher
 from imagine_bench.running.retraining import Retraining
-from imagine_bench.store.files import make_folder, table_text, write_bytes
+
+_MOTION = "imagine-bench-motion"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +65,11 @@ class Judge:
 
     def __call__(self) -> None:
         """Judge and report."""
-        motion = registry.task_of_motion(self.task)
-        if motion is not None:
-            self._judge_motions(motion)
-            return
+        if registry.task_of_motion(self.task) is not None:
+            absent = [guest.install for guest in registry.absent_guests() if guest.package == _MOTION]
+            install = "".join(f" First install it: {line}" for line in absent)
+            line = f"python -m imagine_bench_motion judge {self.task}"
+            raise InvalidValueError(f"The plug-in {_MOTION} judges models of motions; type: {line}{install}")
         from imagine_bench.recording.judgement import record_judgement  # noqa: PLC0415 - as below
         from imagine_bench.report.judge import judged, judgement_page  # noqa: PLC0415 - as below
 
@@ -92,22 +93,6 @@ class Judge:
         print(f"Recording: {record_judgement(folder, judgement)}")
         if failed:
             raise RunFailedError("\n".join(failed))
-
-    def _judge_motions(self, task: str) -> None:
-        """Judge models of motions: their predictions for the commands of a task's continuous control."""
-        from imagine_bench.judge.motion.scores import SIZES, judge_motions  # noqa: PLC0415 - MuJoCo loads slowly
-        from imagine_bench.report.motions import motion_rows, motion_table  # noqa: PLC0415 - as above
-
-        others = ("samples", "appearance", "policy", "order", "encoder", "workers")
-        given = [name for name in others if getattr(self, name) != getattr(type(self), name)]
-        if given:
-            raise InvalidValueError(f"Models of motions are judged without {', '.join(given)}; leave it out.")
-        sizes = SIZES if self.sizes == type(self).sizes else self.sizes
-        folder = make_folder(self.out / f"{file_name(self.task)}-motions")
-        rows = judge_motions(task, self.models or tuple(registry.MOTION_MODELS), sizes, self.seeds, folder)
-        write_bytes(folder / "motions.csv", table_text(motion_rows(rows)).encode())
-        table = motion_table(rows)
-        print(f"{table.text}\n\n{table.caption}\nEach row: {folder / 'motions.csv'}")
 
 
 @dataclass(frozen=True, kw_only=True)

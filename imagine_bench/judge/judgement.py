@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -171,26 +171,42 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
     prepare(judgement, folder)
     cells = judgement.cells
     waiting = [cell for cell in cells if not _is_whole(folder, cell)]
-    if waiting and why_open():
+    failed = judge_fits(waiting, functools.partial(carry_out, judgement, folder), workers=workers)
+    facts = {"closed_off": why_open() or True, **describe_environment()}
+    if any((folder / cell.file).exists() for cell in cells):  # otherwise the file of another judgement stays
+        write_json(folder / "judgement.json", {**dataclasses.asdict(judgement), **facts})
+    return folder, failed
+
+
+def judge_fits(
+    cells: Sequence[ModelFit], carry: Callable[[ModelFit, Callable[[str], None]], str], *, workers: int
+) -> list[str]:
+    """Judge every cell, in this process or in so many, and show how many are done.
+
+    Args:
+        cells: The fits.
+        carry: Judges one, as :func:`carry_out` does.
+        workers: Processes at a time; 1 is this process.
+
+    Returns:
+        A sentence for each model that failed.
+    """
+    if cells and why_open():
         print(f"Note: models are judged in processes that this system cannot close off ({why_open()}).")
     failed: dict[str, None] = {}
-    with Counted("fits judged", total=len(waiting)) as counted:
+    with Counted("fits judged", total=len(cells)) as counted:
 
         def ended(cell: ModelFit, why: str) -> None:
             counted.step()
             if why:
                 failed[why if why.endswith(".") else f"World model {cell.model}: {why}."] = None
 
-        carry = functools.partial(carry_out, judgement, folder)
         if workers == 1:
-            for cell in waiting:
-                ended(cell, carry(cell))
+            for cell in cells:
+                ended(cell, carry(cell, print))
         else:
-            work_through(carry, waiting, workers=workers, on_news=print, on_end=ended)
-    facts = {"closed_off": why_open() or True, **describe_environment()}
-    if any((folder / cell.file).exists() for cell in cells):  # otherwise the file of another judgement stays
-        write_json(folder / "judgement.json", {**dataclasses.asdict(judgement), **facts})
-    return folder, list(failed)
+            work_through(carry, cells, workers=workers, on_news=print, on_end=ended)
+    return list(failed)
 
 
 def carry_out(judgement: Judgement, folder: Path, cell: ModelFit, tell: Callable[[str], None] = print) -> str:

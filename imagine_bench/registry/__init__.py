@@ -18,7 +18,6 @@ from imagine_bench.interfaces.regression import RegressionSpec, Regressor, Regre
 from imagine_bench.registry.builtin import (
     AGENTS,
     DEMONSTRATOR,
-    MOTION_MODELS,
     REGRESSIONS,
     REGRESSORS,
     TASKS,
@@ -44,7 +43,6 @@ from imagine_bench.values import Setting
 __all__ = [
     "AGENTS",
     "DEMONSTRATOR",
-    "MOTION_MODELS",
     "REGRESSIONS",
     "REGRESSORS",
     "TASKS",

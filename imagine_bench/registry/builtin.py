@@ -213,26 +213,6 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
     ),
 }
 """World models that ``imagine-bench judge`` judges."""
-MOTION_MODELS: dict[str, WorldModelEntry] = {
-    "copy": WorldModelEntry(
-        make="imagine_bench.agents.world_models.limits:Copy",
-        title="copy the frame before",
-        description="Says that no motion changes anything: one end of the scale.",
-    ),
-    "labelled": WorldModelEntry(
-        make="imagine_bench.agents.world_models.labelled:make",
-        title="macro-actions by label",
-        encoder_kind="latents",
-        settings=_IMAGINATION_SETTINGS,
-        description="The thesis' model of macro-actions, told the goal of each motion; it sees no command.",
-    ),
-    "recurrent": WorldModelEntry(
-        make="imagine_bench.agents.world_models.recurrent:make",
-        title="recurrent",
-        description="A convolutional network sees the frame, a recurrent one reads the commands; plain torch.",
-    ),
-}
-"""Models of motions that ``imagine-bench judge`` judges on a task's continuous control."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,6 @@ from imagine_bench.tasks.arrows.rules import Arrows
 from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
 from imagine_bench.tasks.continuous.env import MotionEnv, steps_in_period
 from imagine_bench.tasks.continuous.expert import Expert
-from imagine_bench.tasks.continuous.goals import GoalEnv
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
 from imagine_bench.tasks.parameters.parameters import WorldParameters
 from imagine_bench.tasks.pick_place.rules import PickPlace
@@ -250,36 +249,6 @@ def test_the_dense_reward_sums_to_the_sparse_one_less_the_potential_of_the_start
                 early = max(early, paid[0])
     assert paid[0] == pytest.approx(paid[1] - begun, abs=1e-9)
     assert early > 0.6
-
-
-@pytest.mark.parametrize(("family", "start"), [("arrows", (1, 2, 0, 1)), ("pick_place", (0, 0, 0, 1))])
-def test_a_goal_is_reached_by_the_optimal_macro_actions_alone(family: str, start: tuple[int, ...]) -> None:
-    env, expert = environment(family)
-    goals = GoalEnv(env)
-    observation, info = goals.reset(seed=0, options={"macrostate": start})
-    assert goals.observation_space.contains(observation)
-    assert not info["is_success"]
-    rewards = []
-    over = False
-    while not over:
-        expert.begin(env.task.rules.optimal_action(env.episode.macrostate))
-        while not expert.is_done and not over:
-            observation, reward, terminated, truncated, info = goals.step(expert.act())
-            rewards.append((reward, observation))
-            over = terminated or truncated
-    achieved = np.array([each["achieved_goal"] for _, each in rewards])
-    desired = np.array([each["desired_goal"] for _, each in rewards])
-    np.testing.assert_array_equal(goals.compute_reward(achieved, desired, {}), [reward for reward, _ in rewards])
-    assert rewards[0][0] == -1.0
-    assert info["is_success"] or family == "pick_place"  # what the human asks for next is a matter of chance
-    relabelled = goals.compute_reward(achieved, np.broadcast_to(achieved[-1], achieved.shape), {})
-    assert relabelled[-1] == 0.0
-    assert relabelled[0] == -1.0
-
-
-def test_goals_of_images_are_refused() -> None:
-    with pytest.raises(InvalidValueError, match="vectors"):
-        GoalEnv(make_arrows(observation="hand,proprio"))
 
 
 @pytest.mark.parametrize("family", ["arrows", "pick_place"])

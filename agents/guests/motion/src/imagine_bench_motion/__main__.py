@@ -1,16 +1,20 @@
-"""Commands: ``python -m imagine_bench_motion demonstrate | clone | try | flat | level``, each with ``--help``."""
+"""Commands: ``python -m imagine_bench_motion demonstrate | clone | try | flat | level | judge``, with ``--help``."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from imagine_bench.errors import ImagineBenchError
+
 from .cloning import Clone, Training, train
 from .demonstrations import Demonstrations, collect
+from .judge.command import add_judge
 from .skills import FAMILIES
 from .trials import summary, tries
 
@@ -26,8 +30,13 @@ def main() -> None:
     _add_try(commands.add_parser("try", help="count how often a policy carries out single macro-actions"))
     _add_flat(commands.add_parser("flat", help="train SAC of Stable-Baselines3 on one cube, without macro-actions"))
     _add_level(commands.add_parser("level", help="train an agent of macro-actions that planner or clone carry out"))
+    add_judge(commands.add_parser("judge", help="judge models of motions by the simulator"))
     given = parser.parse_args()
-    given.run(given)
+    try:
+        given.run(given)
+    except ImagineBenchError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)
 
 
 def _add_demonstrate(parser: argparse.ArgumentParser) -> None:

@@ -6,18 +6,18 @@ Where a motion fails it still imagines the macro-action: a model at the coarser 
 from __future__ import annotations
 
 import numpy as np
+from imagine_bench.agents.world_models.latent import make_ensemble
 
 from imagine_bench.arrays import Floats32, Frame, Ints
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import WorldModel
-from imagine_bench.interfaces.motion import Motions
 
-from .latent import make_ensemble
+from .interface import Motions
 
 
 class Labelled:
-    """Any world model, asked about the label of each motion; see :class:`.interfaces.motion.MotionModel`.
+    """Any world model, asked about the label of each motion; see :class:`.interface.MotionModel`.
 
     Args:
         model: The world model.

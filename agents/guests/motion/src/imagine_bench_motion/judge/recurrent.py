@@ -1,21 +1,21 @@
 """A small recurrent predictor of motions: a frame and all commands of a motion to the frame at its end, in plain torch.
 
 A convolutional network sees the scene, a gated recurrent unit reads the commands, and the output of both is painted
-over the frame, as in :mod:`.convolutional`.
+over the frame, as in :mod:`imagine_bench.agents.world_models.convolutional`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
+from imagine_bench.agents.encoders.perception import prepare_torch
+from imagine_bench.agents.networks.mlp import initialise
 from torch import Tensor, nn
 
 from imagine_bench.arrays import Floats32, Frame, Ints
 from imagine_bench.interfaces import AgentContext
-from imagine_bench.interfaces.motion import Motions
 
-from ..encoders.perception import prepare_torch
-from ..networks.mlp import initialise
+from .interface import Motions
 
 _STEPS = 4_000
 _BATCH = 32
@@ -37,11 +37,18 @@ class MotionNetwork(nn.Module):
             nn.ConvTranspose2d(64, 16, 4, stride=4), nn.ReLU(), nn.ConvTranspose2d(16, 6, 4, stride=4)
         )
 
+    def draw_weights(self, generator: torch.Generator) -> None:
+        """Draw all weights anew, by torch's own laws: its constructors draw from the global generator."""
+        initialise(self, generator)
+        bound = self.commands.hidden_size**-0.5
+        with torch.no_grad():
+            for weight in self.commands.parameters():
+                weight.uniform_(-bound, bound, generator=generator)
+
     def forward(self, frames: Tensor, actions: Tensor, lengths: Tensor) -> Tensor:
         """Frames (N, 3, 64, 64) at the ends of motions of ``lengths`` (N,) periods."""
-        placed = torch.cat([actions, 0.2 * actions.cumsum(dim=1)], dim=2)  # velocities, and where they have led
-        short = placed.shape[1] % _EVERY
-        placed = nn.functional.pad(placed, (0, 0, 0, _EVERY - short if short else 0))
+        commands = nn.functional.pad(actions, (0, 0, 0, -actions.shape[1] % _EVERY))
+        placed = torch.cat([commands, 0.2 * commands.cumsum(dim=1)], dim=2)  # velocities, and where they have led
         read, _ = self.commands(placed.reshape(len(frames), placed.shape[1] // _EVERY, -1))
         last = read[torch.arange(len(frames)), (lengths - 1) // _EVERY]
         seen = self.down(frames)
@@ -52,7 +59,7 @@ class MotionNetwork(nn.Module):
 
 
 class Recurrent:
-    """The network as a model of motions; see :class:`.interfaces.motion.MotionModel`."""
+    """The network as a model of motions; see :class:`.interface.MotionModel`."""
 
     def __init__(self) -> None:
         self.network: MotionNetwork | None = None
@@ -61,7 +68,7 @@ class Recurrent:
         """Squared error of pixels; as many steps whatever the data."""
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         network = MotionNetwork(dataset.actions.shape[2])
-        initialise(network, generator)
+        network.draw_weights(generator)
         actions = torch.from_numpy(dataset.actions)
         lengths = torch.from_numpy(dataset.lengths)
         optimiser = torch.optim.Adam(network.parameters(), lr=_RATE)
@@ -79,7 +86,7 @@ class Recurrent:
         self.network = network.requires_grad_(False)
 
     def imagine_motion(self, frames: Frame, actions: Floats32, lengths: Ints, labels: Ints) -> Frame:
-        """The frame at the end of each motion; see :class:`.interfaces.motion.MotionModel`."""
+        """The frame at the end of each motion; see :class:`.interface.MotionModel`."""
         assert self.network is not None
         del labels
         drawn = self.network(_images(frames), torch.from_numpy(actions), torch.from_numpy(lengths))

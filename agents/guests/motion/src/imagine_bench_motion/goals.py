@@ -7,18 +7,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from imagine_bench.tasks.continuous.env import MotionEnv
 from numpy.typing import NDArray
 
+from imagine_bench import registry
 from imagine_bench.arrays import Arrays, Floats, Info, Observed, State
 from imagine_bench.errors import InvalidValueError
-
-from ..motion.orientation import yaw_rad
-from ..world import MAX_SKEW_RAD
-from .dense import macro_actions_to_go
-from .env import MotionEnv
+from imagine_bench.rules import shortest_plans, tabulate
 
 WITHIN_M = 0.02
-"""An object so near its goal, and turned off it by less than 20 degrees, has reached it."""
+WITHIN_RAD = math.radians(20.0)
+"""An object that is so near its goal, and turned off it by less, has reached it."""
 _PER_OBJECT = 5
 GoalObservation = dict[str, NDArray[Any]]
 
@@ -49,7 +48,8 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
             )
         self._motion = env
         self._planned = env.another_world()
-        self._to_go = macro_actions_to_go(env.task.rules)
+        tables = tabulate(env.task.rules)
+        self._to_go = dict(zip(tables.index, shortest_plans(tables).tolist(), strict=True))
         low, high = (np.concatenate([getattr(space, end).ravel() for space in spaces]) for end in ("low", "high"))
         goal = gymnasium.spaces.Box(-2.0, 2.0, (_PER_OBJECT * len(env.world.object_names),), np.float32)
         vector = gymnasium.spaces.Box(low, high, dtype=np.float32)
@@ -58,7 +58,7 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
         self._goal = np.zeros(goal.shape, dtype=np.float32)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
-        """Start an episode, as of :class:`.env.MotionEnv`; its goal follows from the start."""
+        """Start an episode, as :class:`imagine_bench.tasks.continuous.env.MotionEnv` does; its goal follows from it."""
         seen, info = self.env.reset(seed=seed, options=options)
         self._planned.place(self._wanted(self._motion.episode.macrostate), np.random.default_rng(0))
         self._goal = _goal_of(self._planned.object_poses())
@@ -80,7 +80,7 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
         desired = np.reshape(desired_goal, shape)
         away_m = np.linalg.norm(achieved[..., :3] - desired[..., :3], axis=-1)
         aligned = (achieved[..., 3:] * desired[..., 3:]).sum(axis=-1)
-        reached = (away_m < WITHIN_M) & (aligned > math.cos(MAX_SKEW_RAD))
+        reached = (away_m < WITHIN_M) & (aligned > math.cos(WITHIN_RAD))
         return np.where(reached.all(axis=-1), 0.0, -1.0)
 
     def _reached(self, observation: Arrays) -> float:
@@ -109,5 +109,20 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
 
 def _goal_of(poses: Floats) -> NDArray[np.float32]:
     """Positions, and cosine and sine of the yaw, of poses (N, 7). Shape (5 N,)."""
-    yaws = [yaw_rad(*pose[3:]) for pose in poses.tolist()]
-    return np.column_stack([poses[:, :3], np.cos(yaws), np.sin(yaws)]).ravel().astype(np.float32)
+    w, x, y, z = poses[:, 3:].T
+    yaw_rad = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return np.column_stack([poses[:, :3], np.cos(yaw_rad), np.sin(yaw_rad)]).ravel().astype(np.float32)
+
+
+def make(task: str, **options: Any) -> GoalEnv:
+    """A task's environment of continuous control with goals, as Gymnasium's ids of this package make it.
+
+    Args:
+        task: A task of macro-actions that has continuous control.
+        **options: Those of that environment; by default it observes ``proprio,objects``.
+
+    Raises:
+        InvalidValueError: Images among the observed parts, or another option out of its range.
+    """
+    entry = registry.task_entry(task)
+    return GoalEnv(registry.load(entry.motion)(**{"observation": "proprio,objects", **entry.options, **options}))

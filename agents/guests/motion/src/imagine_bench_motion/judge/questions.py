@@ -6,18 +6,27 @@ ends in. Shapes: ``N`` motions, ``T`` control periods of the longest, ``A`` numb
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-
-from imagine_bench.arrays import Floats32, Frame, Ints, State
-from imagine_bench.interfaces.motion import Motions
-from imagine_bench.rules import states_of_play
 from imagine_bench.tasks.continuous.controls import HAND_SPEED_M_S
 from imagine_bench.tasks.continuous.env import RATE_HZ, MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 
+from imagine_bench.arrays import Arrays, Floats32, Frame, Ints, State
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Rules
+from imagine_bench.rules import states_of_play
+from imagine_bench.seeding import SeedTree
+
+from .interface import Motions
+
+PAIRS = 100
+CHAINS = 40
+DEPTH = 4
+"""Counterfactual pairs; chains of motions, and motions of each, imagined on from imagined frames."""
 VARIANTS = ("planned", "aside", "raised")
 """How a motion differs from the planner's: not at all; 8 mm to a side; 60 mm higher, so that it grips nothing."""
 ASIDE_M = 0.008
@@ -26,6 +35,8 @@ _SHARES = (0.5, 0.25, 0.25)
 _BLEND = 8
 """Control periods at the start over which a motion is shifted, and at the end over which it comes back."""
 PERIOD_S = 1.0 / RATE_HZ
+_TRIES = 10
+"""Motions that are drawn for each pair, at most."""
 _CALM = 8
 """Control periods without a command that follow a motion, so that everything comes to rest."""
 
@@ -42,6 +53,32 @@ class AnsweredMotions(Motions):
     def first(self, n: int) -> Motions:
         """The first n motions, and of them the part that a model may learn from."""
         return Motions(**{each.name: getattr(self, each.name)[:n] for each in fields(Motions)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionQuestions:
+    """The questions to every model of motions, the same for all."""
+
+    planned: AnsweredMotions
+    raised: AnsweredMotions  #: the same motions, 60 mm higher
+    chains: Sequence[AnsweredMotions]  #: by depth
+
+    def arrays(self) -> Arrays:
+        """All of it by name, for a file."""
+        parts = {"planned": self.planned, "raised": self.raised}
+        parts |= {f"chain{depth}": each for depth, each in enumerate(self.chains)}
+        return {f"{part}.{name}": array for part, motions in parts.items() for name, array in vars(motions).items()}
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Any]) -> MotionQuestions:
+        """The inverse of :meth:`arrays`."""
+        parts: dict[str, dict[str, Any]] = {}
+        for name, array in arrays.items():
+            part, _, field = name.partition(".")
+            parts.setdefault(part, {})[field] = array
+        planned = AnsweredMotions(**parts.pop("planned"))
+        raised = AnsweredMotions(**parts.pop("raised"))
+        return cls(planned=planned, raised=raised, chains=[AnsweredMotions(**parts[each]) for each in sorted(parts)])
 
 
 class _Row(NamedTuple):
@@ -65,44 +102,66 @@ class MotionSource:
     def __init__(self, env: MotionEnv) -> None:
         self._env = env
         self._expert = Expert(env, env.another_world())
+        rules = env.task.rules
+        self._moves = [(state, action) for state in states_of_play(rules) for action in moving_actions(rules, state)]
 
     def draw(self, n: int, rng: np.random.Generator) -> AnsweredMotions:
         """Motions from macrostates in which an episode can be, of all variants."""
-        rules = self._env.task.rules
-        states = states_of_play(rules)
         rows = []
         for _ in range(n):
-            state = states[int(rng.integers(len(states)))]
-            action = int(rng.integers(rules.n_actions))
+            state, action = self._moves[int(rng.integers(len(self._moves)))]
             variant = int(rng.choice(len(VARIANTS), p=_SHARES))
             rows.append(self._one(state, action, variant, rng))
         return _stacked(rows)
 
     def pairs(self, n: int, rng: np.random.Generator) -> tuple[AnsweredMotions, AnsweredMotions]:
-        """The same motions from equal scenes, once as planned and once raised, which changes nothing."""
-        rules = self._env.task.rules
-        states = states_of_play(rules)
+        """The same motions from equal scenes, once as planned and once raised, which end in different macrostates.
+
+        A pair that ends in one macrostate, as where a held object is let go a little higher, is drawn again.
+
+        Raises:
+            InvalidValueError: In this world too few such motions end differently.
+        """
         rows: tuple[list[_Row], list[_Row]] = ([], [])
-        for _ in range(n):
-            state = states[int(rng.integers(len(states)))]
-            action = int(rng.integers(rules.n_actions))
+        for _ in range(_TRIES * n):
+            if len(rows[0]) == n:
+                break
+            state, action = self._moves[int(rng.integers(len(self._moves)))]
             seed = int(rng.integers(2**31))
-            for side, variant in zip(rows, ("planned", "raised"), strict=True):
-                side.append(self._one(state, action, VARIANTS.index(variant), np.random.default_rng(seed)))
+            planned, raised = (
+                self._one(state, action, VARIANTS.index(variant), np.random.default_rng(seed))
+                for variant in ("planned", "raised")
+            )
+            if planned.proper and raised.proper and moved(planned.reached, raised.reached):
+                rows[0].append(planned)
+                rows[1].append(raised)
+        if len(rows[0]) < n:
+            raise InvalidValueError(
+                f"Only {len(rows[0])} of {_TRIES * n} motions end otherwise when they are raised; {n} are needed. "
+                "Give another task."
+            )
         return _stacked(rows[0]), _stacked(rows[1])
 
     def chains(self, n: int, depth: int, rng: np.random.Generator) -> list[AnsweredMotions]:
         """Planned motions one after another, each from where the one before ended; by depth."""
-        rules = self._env.task.rules
-        states = states_of_play(rules)
         rows: list[list[_Row]] = [[] for _ in range(depth)]
         for _ in range(n):
-            self._env.reset(
-                seed=int(rng.integers(2**31)), options={"macrostate": states[int(rng.integers(len(states)))]}
-            )
+            start, _ = self._moves[int(rng.integers(len(self._moves)))]
+            self._env.reset(seed=int(rng.integers(2**31)), options={"macrostate": start})
             for each in rows:
-                each.append(self._go_on(int(rng.integers(rules.n_actions))))
+                actions = self._lasting(self._env.episode.macrostate)
+                each.append(self._go_on(actions[int(rng.integers(len(actions)))]))
         return [_stacked(each) for each in rows]
+
+    def _lasting(self, state: State) -> list[int]:
+        """Macro-actions that move an object, and after which another one can."""
+        rules = self._env.task.rules
+        found = []
+        for action in moving_actions(rules, state):
+            reached = rules.outcomes(state, action)[0].macrostate
+            if moving_actions(rules, reached):
+                found.append(action)
+        return found
 
     def _one(self, state: State, action: int, variant: int, rng: np.random.Generator) -> _Row:
         env = self._env
@@ -143,6 +202,23 @@ class MotionSource:
             reached=np.array(env.world.read().macrostate),
             proper=not faulty,
         )
+
+
+def moved(before: Ints | State, after: Ints | State) -> bool:
+    """Whether two macrostates differ in an object; their last number is a person's gesture."""
+    return not np.array_equal(before[:-1], after[:-1])
+
+
+def moving_actions(rules: Rules, state: State) -> list[int]:
+    """The macro-actions that move an object by the rules, where nothing goes wrong."""
+    return [action for action in range(rules.n_actions) if moved(state, rules.outcomes(state, action)[0].macrostate)]
+
+
+def questions(source: MotionSource, seeds: SeedTree) -> MotionQuestions:
+    """Questions from seeds of their own, which no training has."""
+    planned, raised = source.pairs(PAIRS, seeds.child("pairs").generator())
+    chains = source.chains(CHAINS, DEPTH, seeds.child("chains").generator())
+    return MotionQuestions(planned=planned, raised=raised, chains=chains)
 
 
 def _varied(planned: Floats32, variant: str, rng: np.random.Generator) -> Floats32:

@@ -1,0 +1,76 @@
+"""The judgement of models of motions as tables, and as rows of a CSV file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from imagine_bench import statistics
+from imagine_bench.report.page import DASH, Table, printed
+
+from .interface import motion_models
+from .judgement import SIMULATOR
+from .questions import CHAINS, DEPTH, PAIRS
+
+Cell = Mapping[str, Any]
+_SHARES = {"right": "right", "raised_right": "raised", "painted": "painted", "pairs": "pairs"}
+_SCORES = (
+    f"Percent of {PAIRS} pairs of motions; means over seeds of data and model, [95 % interval] with seven seeds or "
+    "more. Right: the motion as planned; the imagined final frame shows the macrostate that the simulator ends in. "
+    "Raised: likewise of the same motion 60 mm higher, which grips nothing. Painted: raised motions of which the model "
+    "paints the end of the planned one. Pairs: both motions are right. Level: what a model is told, the commands or "
+    "the macro-action alone. The simulator's own frames show the reader's errors."
+)
+_DRIFT = (
+    f"Drift: percent of {CHAINS} chains of {DEPTH} planned motions of which every frame so far shows the right "
+    "macrostate; each motion is imagined from the frame imagined before."
+)
+
+
+def motion_tables(cells: Sequence[Cell]) -> list[Table]:
+    """The scores of each model at each number of motions, and their drift by depth."""
+    groups: dict[tuple[str, int], list[Cell]] = {}
+    for cell in cells:
+        groups.setdefault((cell["model"], cell["transitions"]), []).append(cell)
+    scores = []
+    drift = []
+    for (name, size), group in groups.items():
+        is_model = name != SIMULATOR.model
+        shares = [_shown([each[share] for each in group], PAIRS) for share in _SHARES]
+        fit_s = printed(float(np.mean([each["fit_s"] for each in group])), ".0f") if is_model else DASH
+        begin = [name, str(size) if is_model else DASH]
+        scores.append([*begin, _level(name), str(len(group)) if is_model else DASH, *shares, fit_s])
+        depths = zip(*(each["by_depth"] for each in group), strict=True)
+        drift.append([*begin, *(_shown(list(each), CHAINS) for each in depths)])
+    head = ["model", "motions"]
+    return [
+        Table("motions", [*head, "level", "seeds", *_SHARES.values(), "fit, CPU s"], scores, _SCORES),
+        Table("drift", [*head, *(f"after {depth}" for depth in range(1, DEPTH + 1))], drift, _DRIFT),
+    ]
+
+
+def motion_rows(cells: Sequence[Cell]) -> list[dict[str, float | str]]:
+    """The cells as rows of a CSV file, shares in [0, 1]."""
+    found = []
+    for cell in cells:
+        values = {name: value for name, value in cell.items() if name not in ("by_depth", "transitions")}
+        depths = {f"after_{depth}": share for depth, share in enumerate(cell["by_depth"], start=1)}
+        found.append({"model": values.pop("model"), "motions": cell["transitions"], **values, **depths})
+    return found
+
+
+def _level(name: str) -> str:
+    entry = motion_models().get(name)
+    return DASH if entry is None else entry.level
+
+
+def _shown(shares: Sequence[float | None], trials: int) -> str:
+    """The mean of shares in percent, and its interval where there are seeds enough."""
+    known = [share for share in shares if share is not None]
+    if not known:
+        return DASH
+    mean = f"{100.0 * float(np.mean(known)):.0f}"
+    low, high = statistics.interval(known, trials=trials, trim=0.0)
+    return mean if np.isnan(low) else f"{mean} [{100.0 * low:.0f}, {100.0 * high:.0f}]"

@@ -1,0 +1,65 @@
+"""Goals for hindsight experience replay: they are reached by the optimal macro-actions alone, whatever the family."""
+
+from __future__ import annotations
+
+import gymnasium
+import imagine_bench_motion
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench_motion.goals import GoalEnv, make
+from stable_baselines3 import SAC, HerReplayBuffer
+
+from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
+
+IDS = sorted(env_id for env_id in gymnasium.registry if env_id.startswith(f"{imagine_bench_motion.__name__}/"))
+
+
+@pytest.mark.parametrize(("task", "start"), [("arrow_puzzle", (1, 2, 0, 1)), ("pick_place", (0, 0, 0, 1))])
+def test_a_goal_is_reached_by_the_optimal_macro_actions_alone(task: str, start: tuple[int, ...]) -> None:
+    goals = make(task)
+    env = goals.unwrapped
+    expert = Expert(env, env.another_world())
+    observation, info = goals.reset(seed=0, options={"macrostate": start})
+    assert goals.observation_space.contains(observation)
+    assert not info["is_success"]
+    rewards = []
+    over = False
+    while not over:
+        expert.begin(env.task.rules.optimal_action(env.episode.macrostate))
+        while not expert.is_done and not over:
+            observation, reward, terminated, truncated, info = goals.step(expert.act())
+            rewards.append((reward, observation))
+            over = terminated or truncated
+    achieved = np.array([each["achieved_goal"] for _, each in rewards])
+    desired = np.array([each["desired_goal"] for _, each in rewards])
+    np.testing.assert_array_equal(goals.compute_reward(achieved, desired, {}), [reward for reward, _ in rewards])
+    assert rewards[0][0] == -1.0
+    assert info["is_success"] or task == "pick_place"  # what the human asks for next is a matter of chance
+    relabelled = goals.compute_reward(achieved, np.broadcast_to(achieved[-1], achieved.shape), {})
+    assert relabelled[-1] == 0.0
+    assert relabelled[0] == -1.0
+
+
+def test_every_task_of_continuous_control_has_goals_by_an_id_of_its_own() -> None:
+    named = [env_id for env_id in IDS if "Goals" in env_id]
+    assert len(named) == sum(bool(entry.motion) for entry in registry.TASKS.values())
+    env = gymnasium.make("imagine_bench_motion/PickPlaceGoals-v0", control="pose")
+    assert isinstance(env.unwrapped.task.id, str)
+    assert env.action_space.shape == (8,)
+
+
+def test_goals_of_images_are_refused() -> None:
+    with pytest.raises(InvalidValueError, match="vectors"):
+        make("arrow_puzzle", observation="hand,proprio")
+
+
+@pytest.mark.slow
+def test_a_checker_and_hindsight_replay_of_a_library_take_it() -> None:
+    env = gymnasium.make("imagine_bench_motion/ArrowPuzzleEasyGoals-v0")
+    check_env(GoalEnv(env.unwrapped), skip_render_check=True)
+    learner = SAC("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, learning_starts=800, seed=0)
+    learner.learn(900)
+    assert learner.num_timesteps == 900

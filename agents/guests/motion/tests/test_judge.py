@@ -1,0 +1,130 @@
+"""Models of motions are judged by the simulator, also where a motion grips nothing."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
+from imagine_bench_motion.judge.copying import CopyBefore
+from imagine_bench_motion.judge.interface import Motions
+from imagine_bench_motion.judge.questions import MotionQuestions, MotionSource, moved
+from imagine_bench_motion.judge.recurrent import MotionNetwork
+from imagine_bench_motion.judge.scores import Simulator, score
+
+from imagine_bench.arrays import Array, Ints
+from imagine_bench.errors import InvalidValueError
+
+
+class KnownFrames:
+    """Reads the frames of some motions, and nothing else."""
+
+    def __init__(self, asked: MotionQuestions) -> None:
+        self._shows = {}
+        for motions in (asked.planned, asked.raised, *asked.chains):
+            for frames, states in ((motions.before, motions.states), (motions.after, motions.reached)):
+                self._shows |= {frame.tobytes(): state for frame, state in zip(frames, states, strict=True)}
+
+    def read(self, pictures: Array) -> Ints:
+        """The macrostates (N, M) of frames."""
+        return np.array([self._shows[picture.tobytes()] for picture in pictures])
+
+
+FAMILIES = {"arrows": make_arrows, "pick_place": make_pick_place}
+
+
+@functools.cache
+def questions(family: str) -> MotionQuestions:
+    """A few questions."""
+    source = MotionSource(FAMILIES[family](observation="proprio", time_limit_s=1e9))
+    rng = np.random.default_rng(0)
+    planned, raised = source.pairs(4, rng)
+    return MotionQuestions(planned=planned, raised=raised, chains=source.chains(2, 2, rng))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_pair_begins_alike_and_only_its_height_decides_the_end(family: str) -> None:
+    asked = questions(family)
+    planned = asked.planned
+    raised = asked.raised
+    np.testing.assert_array_equal(planned.before, raised.before)
+    np.testing.assert_array_equal(planned.labels, raised.labels)
+    np.testing.assert_array_equal(planned.states, raised.states)
+    assert all(moved(*ends) for ends in zip(planned.reached, raised.reached, strict=True))
+    assert planned.proper.all()
+    assert raised.proper.all()
+
+
+def test_a_planned_motion_turns_its_cube_and_a_raised_one_nothing() -> None:
+    asked = questions("arrows")
+    planned = asked.planned
+    turned = (planned.reached - planned.states) % 4
+    cubes = np.arange(3) == planned.labels[:, None] // 2
+    np.testing.assert_array_equal(turned[:, :3], np.where(cubes, np.where(planned.labels % 2, 3, 1)[:, None], 0))
+    np.testing.assert_array_equal(asked.raised.states, asked.raised.reached)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_each_motion_of_a_chain_moves_an_object_from_where_the_one_before_ended(family: str) -> None:
+    first, second = questions(family).chains
+    np.testing.assert_array_equal(first.reached, second.states)
+    np.testing.assert_array_equal(first.after, second.before)
+    for motions in (first, second):
+        assert all(moved(*ends) for ends in zip(motions.states, motions.reached, strict=True))
+
+
+def test_questions_are_the_same_after_they_were_in_a_file() -> None:
+    arrays = questions("arrows").arrays()
+    again = MotionQuestions.of(arrays).arrays()
+    assert arrays.keys() == again.keys()
+    assert all(np.array_equal(arrays[name], again[name]) for name in arrays)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_simulator_is_right_in_all_and_a_copy_where_nothing_changes(family: str) -> None:
+    asked = questions(family)
+    reader = KnownFrames(asked)
+    exact = score("simulator", Simulator(asked), asked, reader)
+    assert (exact.right, exact.raised_right, exact.painted, exact.pairs, exact.by_depth) == (1, 1, 0, 1, (1, 1))
+    copied = score("copy", CopyBefore(), asked, reader)
+    unchanged = float(
+        np.mean([not moved(*ends) for ends in zip(asked.raised.states, asked.raised.reached, strict=True)])
+    )
+    assert (copied.right, copied.raised_right, copied.painted, copied.pairs) == (0, unchanged, 0, 0)
+    assert copied.by_depth == (0, 0)
+
+
+def test_what_is_no_frame_is_refused() -> None:
+    class Half(CopyBefore):
+        def imagine_motion(self, frames: Array, actions: Array, lengths: Ints, labels: Ints) -> Array:
+            return super().imagine_motion(frames, actions, lengths, labels)[::2]
+
+    asked = questions("arrows")
+    with pytest.raises(InvalidValueError, match=r"half: imagine_motion\(\) gave uint8 \(2, 64, 64, 3\)"):
+        score("half", Half(), asked, KnownFrames(asked))
+
+
+def test_commands_after_a_motions_end_change_nothing_that_a_network_imagines() -> None:
+    motions: Motions = questions("arrows").planned
+    generator = torch.Generator().manual_seed(0)
+    network = MotionNetwork(motions.actions.shape[2])
+    network.draw_weights(generator)
+    frames = torch.rand(len(motions), 3, 64, 64, generator=generator)
+    actions = torch.from_numpy(motions.actions)
+    lengths = torch.from_numpy(motions.lengths)
+    longer = torch.cat([actions, torch.zeros(len(actions), 7, actions.shape[2])], dim=1)
+    with torch.no_grad():
+        torch.testing.assert_close(network(frames, actions, lengths), network(frames, longer, lengths))
+
+
+def test_weights_follow_from_the_passed_generator_alone() -> None:
+    weights = []
+    for global_seed in (1, 2):
+        with torch.random.fork_rng():
+            torch.random.default_generator.manual_seed(global_seed)
+            network = MotionNetwork(7)
+            network.draw_weights(torch.Generator().manual_seed(3))
+        weights.append(torch.nn.utils.parameters_to_vector(network.parameters()))
+    assert torch.equal(*weights)
