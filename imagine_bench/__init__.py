@@ -24,9 +24,15 @@ LAZY = {
 """The functions of the Python API, which are loaded when they are first used."""
 
 MOVED = {
-    "imagine_bench.agents.factored.learned_perception": "imagine_bench.agents.factored.perception",
-    "imagine_bench.agents.factored_own": "imagine_bench.agents.factored",
-    "imagine_bench.agents.factored_own.agent": "imagine_bench.agents.factored.learned",
+    "imagine_bench.agents.factored": "imagine_bench_factored",
+    "imagine_bench.agents.factored.agent": "imagine_bench_factored.agent",
+    "imagine_bench.agents.factored.factors": "imagine_bench_factored.factors",
+    "imagine_bench.agents.factored.learned": "imagine_bench_factored.learned",
+    "imagine_bench.agents.factored.learned_perception": "imagine_bench_factored.perception",
+    "imagine_bench.agents.factored.perception": "imagine_bench_factored.perception",
+    "imagine_bench.agents.factored.settings": "imagine_bench_factored.settings",
+    "imagine_bench.agents.factored_own": "imagine_bench_factored",
+    "imagine_bench.agents.factored_own.agent": "imagine_bench_factored.learned",
     "imagine_bench.agents.library": "imagine_bench.agents.encoders",
     "imagine_bench.agents.library.latent_observation": "imagine_bench.agents.encoders.latent_observation",
     "imagine_bench.agents.memory": "imagine_bench_controls.memory",
@@ -65,7 +71,7 @@ MOVED = {
 """Where each module lies now, by the path that it had."""
 MOVED_NAMES = {
     "imagine_bench.agents.factored_own.agent:OwnPerceptionAgent": (
-        "imagine_bench.agents.factored.learned:LearnedPerceptionAgent"
+        "imagine_bench_factored.learned:LearnedPerceptionAgent"
     ),
     "imagine_bench.registry:OBSERVERS": "imagine_bench.cli.observers:OBSERVERS",
     "imagine_bench.registry:TASK_TYPES": "imagine_bench.running.bench:TASK_TYPES",

@@ -335,7 +335,8 @@ def register_agent(name: str, make: MakeAgent | str, **options: Any) -> None:
             f"An agent cannot be called {brief(name)}; give a name of letters, digits and underscores that begins with "
             "one of a to z or A to Z. register_agent gives a class another name than its own."
         )
-    if name in OUR_AGENTS or name in registry.usable(registry.AGENT_GROUP):
+    taken = name in OUR_AGENTS or registry.guest_with(registry.AGENT_GROUP, name) is not None
+    if taken or name in registry.usable(registry.AGENT_GROUP):
         raise InvalidValueError(f"There is an agent {name!r} already; give yours another name.")
     text = (getattr(make, "__doc__", None) or "").strip().partition("\n")[0]
     described = {"description": text} if text and not isinstance(make, str) else {}

@@ -24,6 +24,7 @@ _TOP = Path(__file__).parent.parent
 _PROJECT = tomllib.loads((_TOP / "pyproject.toml").read_text())
 _LOCK = (_TOP / ".ci/requirements.lock").read_text()
 _PYTHONS = ("3.11", "3.12", "3.13", "3.14")
+_GUESTS = ("controls", "factored", "motion", "peers")
 _ROOMS = ("tasks", "agents", "assets")
 
 
@@ -57,7 +58,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 def test_the_wheel_holds_only_imagine_bench(wheel: list[str]) -> None:
     tops = {name.split("/")[0] for name in wheel}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"imagine_bench"}
-    of_guests = [f"imagine_bench/agents/guests/{guest}/pyproject.toml" for guest in ("controls", "motion", "peers")]
+    of_guests = [f"imagine_bench/agents/guests/{guest}/pyproject.toml" for guest in _GUESTS]
     assert sorted(name for name in wheel if "guest" in name) == of_guests
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.wrappers import AddRenderObservation, ResizeObservation, TransformReward
-from imagine_bench.agents.factored.learned import LearnedPerceptionAgent, make
+from imagine_bench_factored.learned import LearnedPerceptionAgent, make
 
 from imagine_bench.interfaces import AgentContext, Observation, Transition
 from imagine_bench.registry.machine import describe_environment

@@ -16,7 +16,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from imagine_bench.agents.factored.agent import FactoredAgent, make
+from imagine_bench_factored.agent import FactoredAgent, make
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate

@@ -302,7 +302,11 @@ class Sweep:
 
     def _suite(self, suite: Suite) -> None:
         launcher = self.launch.chosen()
-        agents = self.agents or SUITE_AGENTS
+        agents = self.agents
+        if agents is None:
+            agents, note = registry.installed_of(SUITE_AGENTS)
+            if note:
+                print(note)
         result = run_suite(suite, agents, root=self.launch.out, launcher=launcher)
         page = registry.load(_PAGES["suite"])(result)
         write_report(page, self.launch.out / "suite" / f"{suite.name}-{suite.hash}" / "report")

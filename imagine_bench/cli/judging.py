@@ -34,6 +34,18 @@ from imagine_bench.running.retraining import Retraining
 
 _MOTION = "imagine-bench-motion"
 
+_PLUGGED_IN = ("structured",)
+"""World models of this suite's guests that are judged by default, too."""
+
+
+def _usual_models() -> tuple[str, ...]:
+    """The world models that are judged where none are named, privileged ones last; says which are not installed."""
+    own = [name for name, entry in registry.WORLD_MODELS.items() if entry.by_default]
+    installed, note = registry.installed_of((*own, *_PLUGGED_IN), registry.WORLD_MODEL_GROUP)
+    if note:
+        print(note)
+    return tuple(sorted(installed, key=lambda name: registry.world_model_entry(name).privileged))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Judge:
@@ -74,10 +86,9 @@ class Judge:
         from imagine_bench.report.judge import judged, judgement_page  # noqa: PLC0415 - as below
 
         workers = at_a_time(self.workers)
-        usual = tuple(name for name, entry in registry.WORLD_MODELS.items() if entry.by_default)
         judgement = Judgement(
             task=self.task,
-            models=self.models or usual,
+            models=self.models or _usual_models(),
             sizes=self.sizes,
             seeds=self.seeds,
             samples=self.samples,

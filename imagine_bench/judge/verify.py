@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError, brief, require
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError, brief, require
 from imagine_bench.exact.certificate import Certificate
 from imagine_bench.interfaces.environments import Env
 from imagine_bench.protocols.control import PRESETS, Protocol
@@ -229,7 +229,7 @@ class _RunCheck:
 
 def _entry_of(agent: str) -> AgentEntry | None:
     """The registry line of an agent; None where its package is not here."""
-    with suppress(UnknownNameError):
+    with suppress(UnknownNameError, SetupError):
         return registry.agent_entry(agent)
     return None
 

@@ -31,7 +31,7 @@ from imagine_bench.protocols.data import (
     RunSpec,
     require_different,
 )
-from imagine_bench.registry import agent_entry, own_settings, task, task_entry
+from imagine_bench.registry import agent_entry, installed_of, own_settings, task, task_entry
 from imagine_bench.registry import task_name as canonical
 from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import entrant
@@ -307,12 +307,22 @@ thesis' own spreads), ``sample_efficiency`` counts the first episodes of agents 
 in little time, to compare many ways of being taught."""
 
 
+def usual_agents(task_name: str, preset: str) -> tuple[str, ...]:
+    """The agents that a preset compares where none are named, also those whose package is not installed."""
+    values = {**PRESETS[preset], **task(task_name).presets.get(preset, {})}
+    agents: tuple[str, ...] = values.get("agents", Protocol.agents)
+    return agents
+
+
 def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     """The protocol of a preset as the task has it, with ``changes`` to single fields.
+
+    Where no agents are named, those of this suite's guests that are not installed are left out.
 
     Raises:
         UnknownNameError: Unknown task, preset, agent, appearance or execution.
         InvalidValueError: A value out of range.
+        SetupError: An agent is in a package that is not installed, or all of the preset's are.
     """
     require_known("preset", preset, PRESETS)
     spec = task(task_name)
@@ -322,6 +332,9 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
         if "agents" in part:  # headlines and numbers of seeds are of the agents that stand beside them
             values |= {"headlines": (), "few_seeds": {}}
         values |= part
+    if "agents" not in changes:
+        usual = usual_agents(task_name, preset)
+        values["agents"] = installed_of(usual)[0] or usual
     few = values.pop("few_seeds", {})
     if few and not {"seeds"} & {*own, *changes}:
         values["seeds"] = tuple(range(max(few.values())))

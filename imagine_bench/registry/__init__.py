@@ -144,7 +144,9 @@ def offers(group: str) -> Mapping[str, Any]:
         what, kind, own = _GROUPS[group]
         package = point.dist.name if point.dist else point.module
         offer = f"The package {package} offers {point.value} as {what} {point.name}"
-        if point.name in found or any(point.name in names for names in own):
+        guest = guest_with(group, point.name)
+        is_guests = guest is not None and guest.package != package
+        if point.name in found or is_guests or any(point.name in names for names in own):
             found.setdefault(f"{package}:{point.name}", SetupError(f"{offer}, a name that is taken; give it another."))
             continue
         try:
@@ -167,18 +169,44 @@ def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
         return own[name]
     what = _GROUPS[group].what
     there = offers(group)
+    guest = guest_with(group, name)
+    if guest is not None and name not in there:
+        raise SetupError(
+            f"The {what} {name} is in the package {guest.package}, which is not installed. "
+            f"Install it with: {guest.install}"
+        )
     if group == AGENT_GROUP and name in LABEL_OF_OLD_AGENT and name not in there:
         raise InvalidValueError(f"Agent {name!r} is now called {LABEL_OF_OLD_AGENT[name]!r}; give that name.")
-    for guest in guests():
-        if name in guest.names.get(group, ()) and name not in there:
-            raise SetupError(
-                f"The {what} {name} is in the package {guest.package}, which is not installed. "
-                f"Install it with: {guest.install}"
-            )
     entry = there[require_known(what, name, {**own, **there})]
     if isinstance(entry, SetupError):
         raise entry
     return entry
+
+
+def guest_with(group: str, name: str) -> Guest | None:
+    """The guest of this suite that offers a name in a group, installed or not; None where none does."""
+    return next((guest for guest in guests() if name in guest.names.get(group, ())), None)
+
+
+def installed_of(names: Sequence[str], group: str = AGENT_GROUP) -> tuple[tuple[str, ...], str]:
+    """The names of a default, without those of this suite's guests that are not installed, and a sentence about these.
+
+    Of the names of an entrant, its agent counts. The sentence is empty where nothing is left out.
+    """
+    absent = {}
+    for name in names:
+        guest = guest_with(group, entrant(name).agent)
+        if guest is not None and entrant(name).agent not in offers(group):
+            absent[name] = guest
+    installs = "; ".join(dict.fromkeys(guest.install for guest in absent.values()))
+    note = f"Left out, as not installed: {', '.join(absent)}. To install: {installs}" if absent else ""
+    return tuple(name for name in names if name not in absent), note
+
+
+def is_ours(target: str | CodeByValue) -> bool:
+    """Whether code is this suite's: the core's, or that of a guest of its own that needs no library of others."""
+    top = str(target).partition(":")[0].partition(".")[0]
+    return top in {"imagine_bench", *(guest.module for guest in guests() if guest.is_ours_alone)}
 
 
 def absent_guests() -> list[Guest]:

@@ -97,22 +97,6 @@ AGENTS: dict[str, AgentEntry] = {
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
         "the model is uncertain.",
     ),
-    "factored": AgentEntry(
-        make="imagine_bench.agents.factored.learned:make",
-        relative_cost=4.0,
-        needs_encoder=False,
-        settings="imagine_bench.agents.factored.settings:LEARNED",
-        description="Begins with nothing: from its own frames it learns discrete factors, which of them an action "
-        "changes, and the rewards; it explores where it is uncertain and plans in its model.",
-    ),
-    "factored:given": AgentEntry(
-        make="imagine_bench.agents.factored.agent:make",
-        relative_cost=3.0,
-        encoder_kind="codes",
-        settings="imagine_bench.agents.factored.settings:HYPERPARAMETERS",
-        description="Like factored, but it is given an encoder of discrete factors and learns no perception; it can "
-        "also show its imagination and query an oracle.",
-    ),
     "imagination_only": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make",
         relative_cost=4.0,
@@ -199,12 +183,6 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         description="The same at the settings that the thesis prints; a minute to fit, so judged only when named.",
         by_default=False,
     ),
-    "structured": WorldModelEntry(
-        make="imagine_bench.agents.world_models.structured:make",
-        title="structured",
-        encoder_kind="codes",
-        description="The model of the agent factored: tables over discrete factors, whose structure it learns.",
-    ),
     "exact": WorldModelEntry(
         make="imagine_bench.agents.world_models.limits:Exact",
         title="exact",
@@ -220,6 +198,8 @@ class Guest:
     """A package of this suite that is installed apart from it, known by name also where it is not installed."""
 
     package: str  #: its name as pip knows it
+    module: str  #: its name as Python imports it
+    is_ours_alone: bool  #: whether it needs no library of others, beyond those of this suite
     names: Mapping[str, tuple[str, ...]]  #: its offers, by group of entry points
     install: str  #: the command line that installs it
 
@@ -235,5 +215,14 @@ def guests() -> tuple[Guest, ...]:
         project = tomllib.loads(file.read_text())["project"]
         names = {group: tuple(points) for group, points in project["entry-points"].items()}
         what = f"-e {file.parent}" if (file.parent / "src").is_dir() else project["name"]
-        found.append(Guest(package=project["name"], names=names, install=f"pip install {what}"))
+        package = project["name"]
+        found.append(
+            Guest(
+                package=package,
+                module=package.replace("-", "_"),
+                is_ours_alone=all(needed.startswith("imagine-bench") for needed in project["dependencies"]),
+                names=names,
+                install=f"pip install {what}",
+            )
+        )
     return tuple(found)

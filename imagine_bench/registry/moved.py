@@ -10,6 +10,8 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
+from imagine_bench.registry.builtin import guests
+
 
 class _OldPaths(MetaPathFinder, Loader):
     """Finds modules by their old paths and fills them with the names of the new ones."""
@@ -41,10 +43,20 @@ class _OldPaths(MetaPathFinder, Loader):
         vars(module)["__getattr__"] = find
 
     def new(self, old: str) -> ModuleType:
-        """The module in which it lies now, after a warning."""
+        """The module in which it lies now, after a warning.
+
+        Raises ModuleNotFoundError: it is in a guest package that is not installed; the message says how to install it.
+        """
         message = f"{old} is now {self.moved[old]}; import it from there. The old path goes in version 1.0."
         warnings.warn(message, DeprecationWarning, stacklevel=3)
-        return importlib.import_module(self.moved[old].partition(":")[0])
+        try:
+            return importlib.import_module(self.moved[old].partition(":")[0])
+        except ModuleNotFoundError as error:
+            for guest in guests():
+                if error.name == guest.module:
+                    lacks = f"{old} is now in the package {guest.package}, which is not installed."
+                    raise ModuleNotFoundError(f"{lacks} Install it with: {guest.install}", name=error.name) from error
+            raise
 
 
 class _Package(ModuleType):

@@ -65,6 +65,19 @@ def image(name: str, draw: Callable[[], Figure], caption: str) -> Image:
     return Image(name, png, caption, styled)
 
 
+_FIRST = (
+    "random",
+    "oracle",
+    "dqn",
+    "dqn_more_updates",
+    "imagination",
+    "imagination_uncertainty",
+    "factored",
+    "factored:given",
+)
+"""Agents that have a color each, wherever they are compared, whether their packages are installed or not."""
+
+
 class LineStyle(TypedDict):
     """How the line of an agent looks, in the words of matplotlib."""
 
@@ -79,7 +92,7 @@ def line_style(name: str) -> LineStyle:
     Agents that share a color differ in marker and dash pattern: the three lengths have no common divisor, so that 280
     agents are told apart.
     """
-    names = list(registry.agents())
+    names = list(dict.fromkeys((*_FIRST, *registry.agents())))
     place = names.index(name) if name in names else crc32(name.encode())
     return LineStyle(
         color=COLORS[place % len(COLORS)],

@@ -12,7 +12,7 @@ import numpy as np
 from imagine_bench import registry
 from imagine_bench.data.folder import read_dataset, require_fits
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, plain
-from imagine_bench.protocols.control import PRESETS, Protocol, context_of, protocol
+from imagine_bench.protocols.control import PRESETS, Protocol, context_of, protocol, usual_agents
 from imagine_bench.protocols.data import Encoders, RunSpec, TaskType, digest
 from imagine_bench.registry.entries import entrant
 from imagine_bench.rules import states_of
@@ -36,6 +36,10 @@ def plan_control(
     if found is not None:
         changes = {"budgets": (len(found.episodes),), **changes, "dataset": found.identity}
     wanted = protocol(task, preset, **changes)
+    if "agents" not in changes:
+        _, note = registry.installed_of(usual_agents(task, preset))
+        if note:
+            print(note)
     if found is not None:
         require_fits(found, registry.task(task), wanted.appearance)
     if not registry.is_own(task):
@@ -78,8 +82,8 @@ def _require_sound(wanted: Protocol) -> None:
 def _rests_on_others(agent: str) -> bool:
     """Whether code decides that may not be there: a library that is an extra, or a package that offers the agent."""
     entry = registry.agent_entry(agent)
-    is_foreign = entrant(agent).agent not in registry.AGENTS or not isinstance(entry.make, str)
-    return entry.external_training_loop or is_foreign
+    is_script = entrant(agent).agent in registry.AGENTS and isinstance(entry.make, str)
+    return entry.external_training_loop or not (is_script or registry.is_ours(entry.make))
 
 
 def _check_abilities(wanted: Protocol, paths: Encoders) -> None:

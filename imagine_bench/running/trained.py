@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError, UnknownNameError
 from imagine_bench.interfaces import Agent, AgentContext, AgentState, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol, context_of
@@ -153,7 +153,7 @@ def learners(bench: Path) -> tuple[Path, ...]:
     for agent, seed in protocol.runs:
         try:
             entry = registry.agent_entry(agent)
-        except UnknownNameError:  # of a script, or of a package that is not installed here
+        except (UnknownNameError, SetupError):  # of a script, or of a package that is not installed here
             continue
         if entry.learns and not entry.external_training_loop:
             folder = store.run_folder(agent, seed)

@@ -65,8 +65,9 @@ def describe(name: str) -> str:
             pages.append(_learner(name, known[name]))
         learners |= known
     if not pages:
-        if any(name in guest.names.get(registry.AGENT_GROUP, ()) for guest in registry.absent_guests()):
-            registry.agent_entry(name)
+        for group in (registry.TASK_GROUP, registry.AGENT_GROUP, registry.WORLD_MODEL_GROUP):
+            if registry.guest_with(group, name) is not None:
+                registry.offered(name, {}, group)  # raises
         moving = [each.env_id for each in registry.tasks().values() if each.motion]
         hands = [registry.motion_name(registry.motion_id(each)) for each in moving]
         known_names = [*registry.tasks(), *hands, *registry.regressions(), *learners]

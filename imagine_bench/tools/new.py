@@ -52,7 +52,7 @@ def new_package(kind: str, name: str, out: Path) -> str:
     taken = {
         **registry.TASKS, **registry.REGRESSIONS, **registry.AGENTS, **registry.REGRESSORS, **registry.WORLD_MODELS
     }  # fmt: skip
-    if name in taken:
+    if name in taken or registry.guest_with(group, name) is not None:
         raise InvalidValueError(f"{name!r} is a name of imagine_bench already; give another name.")
     folder = expanded(out) / name
     if folder.exists():

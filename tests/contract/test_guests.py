@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 import subprocess
 import sys
@@ -16,9 +17,13 @@ import pytest
 from guest_packages import Guests
 from packaging.requirements import Requirement
 
+import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
+from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.protocols.control import PRESETS, protocol, usual_agents
 from imagine_bench.registry.builtin import guests as own_guests
+from imagine_bench.running.control import plan_control
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = sorted(file.parent for file in (ROOT / "agents" / "guests").glob("*/pyproject.toml"))
@@ -97,7 +102,70 @@ def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_l
     assert {line.split()[0]: line.split(maxsplit=1)[1] for line in marked} == {
         name: f"pip install -e {folder}" for name, folder in names.items()
     }
+    for name in ("factored", "structured", "arrow_puzzle_cloned"):
+        assert (
+            main(["describe", name]) == 2
+            and f"Install it with: pip install -e {names[name]}" in capsys.readouterr().err
+        )
     assert main(["bench", "--task", "arrow_puzzle", "--agents", "dqn", "dreamer_v3:replay_ratio=2"]) == 2
     said = capsys.readouterr().err
     where = f"Install it with: pip install -e {ROOT / 'agents' / 'guests' / 'peers'}"
     assert f"The agent dreamer_v3 is in the package imagine-bench-peers, which is not installed. {where}" in said
+
+
+@pytest.mark.usefixtures("without_guests")
+def test_a_default_leaves_out_agents_that_are_not_installed_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    install = f"To install: pip install -e {ROOT / 'agents' / 'guests' / 'factored'}"
+    default, _ = plan_control("arrow_puzzle", "quick")
+    assert capsys.readouterr().out == f"Left out, as not installed: factored:given. {install}\n"
+    assert set(usual_agents("arrow_puzzle", "quick")) - set(default.agents) == {"factored:given"}
+    assert dict(default.few_seeds).keys() <= set(default.agents) and default.headlines
+    by_hand, _ = plan_control("arrow_puzzle", "quick", agents=default.agents)
+    assert capsys.readouterr().out == "" and by_hand.agents == default.agents
+    for agents in ({}, {"agents": ("dqn", "factored")}):
+        with pytest.raises(
+            SetupError, match=r"is in the package imagine-bench-factored, which is not installed\. Install"
+        ):
+            plan_control("arrow_puzzle", "sample_efficiency", **agents)
+    models, note = registry.installed_of(("copy", "structured"), registry.WORLD_MODEL_GROUP)
+    assert models == ("copy",) and note == f"Left out, as not installed: structured. {install}"
+
+
+def test_a_default_has_every_agent_where_all_are_installed() -> None:
+    for preset in PRESETS:
+        usual = usual_agents("arrow_puzzle", preset)
+        assert protocol("arrow_puzzle", preset).agents == usual and registry.installed_of(usual) == (usual, "")
+
+
+@pytest.mark.usefixtures("without_guests")
+def test_kept_results_of_a_guest_that_is_not_installed_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = shutil.copytree(ROOT / "docs" / "results" / "arrow_puzzle-sample_efficiency", tmp_path / "kept")
+    assert main(["report", str(kept)]) == 0
+    assert "\nfactored:given" in capsys.readouterr().out
+
+
+def test_an_old_path_into_a_guest_that_is_not_installed_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "imagine_bench_factored", None)
+    for name in [name for name in sys.modules if name.startswith("imagine_bench.agents.factored")]:
+        monkeypatch.delitem(sys.modules, name)
+    with (
+        pytest.warns(DeprecationWarning),
+        pytest.raises(
+            ModuleNotFoundError, match=r"imagine-bench-factored, which is not installed\. Install it with: pip"
+        ),
+    ):
+        importlib.import_module("imagine_bench.agents.factored.settings")
+
+
+def test_no_other_package_takes_the_name_of_a_guests_agent(guests: Guests) -> None:
+    guests.write("taker", "", {registry.AGENT_GROUP: {"factored": "taker:ONE"}})
+    assert registry.agent_entry("factored").make == "imagine_bench_factored.learned:make"
+    assert any(
+        "offers taker:ONE as agent factored, a name that is taken" in str(each) for each in registry.refused_offers()
+    )
+    with pytest.raises(InvalidValueError, match="There is an agent 'factored' already"):
+        imagine_bench.register_agent("factored", "taker:ONE")

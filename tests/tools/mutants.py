@@ -37,8 +37,8 @@ ROOT = Path(__file__).resolve().parents[2]
 REASONS = Path(__file__).with_name("mutants_that_may_live.json")
 _RULES = ("tests/tasks/arrows/test_arrow_rules.py", "tests/tasks/pick_place/test_pick_place_rules.py")
 _FACTORED = (
-    "tests/agents/factored/test_factored_formulas.py", "tests/agents/factored/test_factored.py",
-    "tests/agents/test_transfer.py",
+    "agents/guests/factored/tests/test_factored_formulas.py", "agents/guests/factored/tests/test_factored.py",
+    "agents/guests/factored/tests/test_transfer.py",
 )  # fmt: skip
 _CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/running/test_runner.py")
 ROOMS: dict[str, dict[str, Sequence[str]]] = {
@@ -71,7 +71,7 @@ ROOMS: dict[str, dict[str, Sequence[str]]] = {
         ),
     },
     "own agent": {
-        f"agents/factored/{name}.py": _FACTORED
+        f"agents/guests/factored/src/imagine_bench_factored/{name}.py": _FACTORED
         for name in ("agent", "dynamics", "factors", "model", "outcomes", "perception", "planner")
     },
 }  # fmt: skip

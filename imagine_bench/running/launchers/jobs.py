@@ -164,7 +164,7 @@ def _foreign(job: Job) -> bool:
     Loading torch, MuJoCo and the like once a worker instead of once a run saves four CPU seconds a run.
     """
     task = job.spec.protocol.task
-    return not registry.is_own(task) or not str(registry.agent_entry(job.spec.agent).make).startswith("imagine_bench.")
+    return not registry.is_own(task) or not registry.is_ours(registry.agent_entry(job.spec.agent).make)
 
 
 def _never(item: object) -> bool:

@@ -144,3 +144,24 @@ def test_exploration_falls_to_that_of_the_settings() -> None:
         agent.train_in_model()
     chances = [call.args[2] for call in act.call_args_list]
     assert chances == [max(epsilon(step, agent.settings.controller), 0.2) for step in range(30)]
+
+
+@pytest.mark.parametrize("make", [imagination_agents.make_uncertainty, model_only.make_uncertainty])
+def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make) -> None:  # type: ignore[no-untyped-def]
+    moving = {"imagination.threshold": 99.0, "imagination.threshold_quantile": 0.5}
+    learner, resumed = (built(make, moving) for _ in range(2))
+    live(learner, range(8), np.random.default_rng(0))
+    before = learner.state().arrays
+    resumed.restore(learner.state())
+    for each in (learner, resumed):
+        each.reset_for_new_task()
+    after = learner.state().arrays
+    parts = ("imagination/model", "controller")
+    weights = {name for name in before if name.startswith(parts) and ".weight" in name and name.endswith("/weight")}
+    kept = {name for name in weights if np.array_equal(before[name], after[name])}
+    assert kept == {name for name in weights if name.startswith("imagination/model/dynamics.")} < weights
+    assert len(learner.real) == len(learner.imagination.memory) == learner.steps == 0
+    assert learner.imagination.filter.threshold == 99.0
+    first, second = (live(each, range(5), np.random.default_rng(1)) for each in (learner, resumed))
+    assert first == second and same(learner.state(), resumed.state())
+    assert not any(np.array_equal(before[name], learner.state().arrays[name]) for name in kept), "it goes on learning"

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from imagine_bench.agents.factored.agent import FactoredAgent
-from imagine_bench.agents.factored.factors import CodeTransition
-from imagine_bench.agents.factored.perception import CodePerception
-from imagine_bench.agents.factored.settings import HYPERPARAMETERS
+from imagine_bench_factored.agent import FactoredAgent
+from imagine_bench_factored.factors import CodeTransition
+from imagine_bench_factored.perception import CodePerception
+from imagine_bench_factored.settings import HYPERPARAMETERS
 from torch.nn import functional
 
 from imagine_bench.interfaces import Frame, Observation, Transition

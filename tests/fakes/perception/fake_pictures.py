@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import fake_codes
 import numpy as np
 from fake_codes import ACTIONS, starts
-from imagine_bench.agents.factored.learned import LearnedPerceptionAgent
-from imagine_bench.agents.factored.perception import LearnedPerception
-from imagine_bench.agents.factored.settings import LEARNED
+from imagine_bench_factored.learned import LearnedPerceptionAgent
+from imagine_bench_factored.perception import LearnedPerception
+from imagine_bench_factored.settings import LEARNED
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, Observation, Transition

@@ -6,11 +6,11 @@ import fake_codes
 import numpy as np
 import pytest
 from fake_pictures import played
-from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.count_table import CodeCountTableAgent
 from imagine_bench_controls.tabular.counts import CountTable
 from imagine_bench_controls.tabular.own import OwnCountTableAgent
 from imagine_bench_controls.tabular.settings import HYPERPARAMETERS, OWN
+from imagine_bench_factored.perception import CodePerception
 
 from imagine_bench import registry, rules
 from imagine_bench.interfaces import Observation

@@ -8,11 +8,11 @@ import fake_codes
 import numpy as np
 import pytest
 from agent_states import same
-from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
 from imagine_bench_controls.tabular.counts import CountTable
 from imagine_bench_controls.tabular.dyna_q import DynaQAgent
 from imagine_bench_controls.tabular.settings import DYNA_Q
+from imagine_bench_factored.perception import CodePerception
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation, Transition

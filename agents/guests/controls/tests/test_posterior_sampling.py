@@ -7,11 +7,11 @@ from typing import Any
 import fake_codes
 import numpy as np
 import pytest
-from imagine_bench.agents.factored.perception import CodePerception
 from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
 from imagine_bench_controls.tabular.counts import CountTable
 from imagine_bench_controls.tabular.posterior_sampling import PosteriorSamplingAgent
 from imagine_bench_controls.tabular.settings import POSTERIOR_SAMPLING
+from imagine_bench_factored.perception import CodePerception
 
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.seeding import SeedTree

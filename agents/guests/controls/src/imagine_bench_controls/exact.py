@@ -192,7 +192,7 @@ class ExactFilterAgent(ImaginingAgent):
         self.imagination.rules, self.imagination.perception = world.rules, perception
 
 
-def _drawn(outcomes: tuple[Outcome, ...], chance: float) -> Outcome:
+def _drawn(outcomes: Sequence[Outcome], chance: float) -> Outcome:
     """The outcome that a uniform number in [0, 1) chooses."""
     for outcome in outcomes[:-1]:
         chance -= outcome.probability

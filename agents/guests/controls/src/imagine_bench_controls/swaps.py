@@ -16,8 +16,8 @@ import torch
 from imagine_bench.agents import snapshot
 from imagine_bench.agents.dqn import DQN
 from imagine_bench.agents.encoders.perception import Perception, load_perception, prepare_torch
-from imagine_bench.agents.factored.factors import Code
 from imagine_bench.agents.replay import Batch, Transitions
+from imagine_bench_factored.factors import Code
 from torch import Tensor
 from torch.nn import functional
 

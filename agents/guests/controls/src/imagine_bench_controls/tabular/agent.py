@@ -10,9 +10,9 @@ import numpy as np
 from imagine_bench.agents import snapshot
 from imagine_bench.agents.dqn import epsilon
 from imagine_bench.agents.encoders.perception import prepare_torch
-from imagine_bench.agents.factored.perception import CodePerception, load_code_perception
 from imagine_bench.agents.meters import Meters
 from imagine_bench.agents.settings import flatten
+from imagine_bench_factored.perception import CodePerception, load_code_perception
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError

@@ -11,7 +11,7 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from imagine_bench.agents.factored.perception import CodePerception
+from imagine_bench_factored.perception import CodePerception
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from imagine_bench.agents.encoders.perception import prepare_torch
-from imagine_bench.agents.factored.perception import LearnedPerception
+from imagine_bench_factored.perception import LearnedPerception
 
 from imagine_bench.interfaces import AgentContext, AgentState, Arrays, Observation, Transition
 from imagine_bench.seeding import SeedTree

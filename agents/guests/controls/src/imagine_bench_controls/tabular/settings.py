@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from imagine_bench.agents.dqn_settings import FAST_3, FAST_5, GreedySettings
-from imagine_bench.agents.factored.settings import LearnedPerceptionSettings
 from imagine_bench.agents.settings import POSITIVE, RATE, UPDATES, ConfigGroup, Hyperparameters, Override, S, setting
+from imagine_bench_factored.settings import LearnedPerceptionSettings
 
 
 @dataclass(frozen=True, kw_only=True)

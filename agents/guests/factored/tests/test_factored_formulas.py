@@ -7,11 +7,11 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from imagine_bench.agents.factored.dynamics import FactorPrediction
-from imagine_bench.agents.factored.factors import Code, CodeTransition
-from imagine_bench.agents.factored.model import FactoredModel
-from imagine_bench.agents.factored.outcomes import Conjunctions, OutcomeModel
-from imagine_bench.agents.factored.settings import (
+from imagine_bench_factored.dynamics import FactorPrediction
+from imagine_bench_factored.factors import Code, CodeTransition
+from imagine_bench_factored.model import FactoredModel
+from imagine_bench_factored.outcomes import Conjunctions, OutcomeModel
+from imagine_bench_factored.settings import (
     DynamicsSettings,
     FactoredSettings,
     OutcomeSettings,

@@ -1,4 +1,4 @@
-"""The knowledge that learners keep from one task to the next of the same world, that they forget, and their queries."""
+"""The knowledge that factored:given keeps from one task to the next of the same world, and forgets; its queries."""
 
 from __future__ import annotations
 
@@ -10,15 +10,11 @@ import numpy as np
 import pytest
 from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts
-from fake_latents import built
-from fake_latents import live as live_on_latents
-from imagine_bench.agents.factored.agent import FactoredAgent
-from imagine_bench.agents.factored.dynamics import Dynamics
-from imagine_bench.agents.factored.factors import CodeTransition
-from imagine_bench.agents.factored.outcomes import OutcomeModel
-from imagine_bench.agents.factored.settings import OutcomeSettings
-from imagine_bench.agents.imagination import agent as imagination_agents
-from imagine_bench.agents.imagination import model_only as imagination_only
+from imagine_bench_factored.agent import FactoredAgent
+from imagine_bench_factored.dynamics import Dynamics
+from imagine_bench_factored.factors import CodeTransition
+from imagine_bench_factored.outcomes import OutcomeModel
+from imagine_bench_factored.settings import OutcomeSettings
 
 from imagine_bench.interfaces import Observation
 from imagine_bench.interfaces.capabilities import Label, QueryingAgent, TransferLearner
@@ -159,27 +155,3 @@ def test_queries_lead_where_the_dynamics_do(experienced: FactoredAgent) -> None:
     reached, _ = learner.model.likeliest(np.array(starts()))
     truth = [[fake_codes.step(code, action)[0] for action in range(ACTIONS)] for code in starts()]
     assert np.array_equal(reached, truth)
-
-
-# --- the thesis' agents ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("make", [imagination_agents.make_uncertainty, imagination_only.make_uncertainty])
-def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make) -> None:  # type: ignore[no-untyped-def]
-    moving = {"imagination.threshold": 99.0, "imagination.threshold_quantile": 0.5}
-    learner, resumed = (built(make, moving) for _ in range(2))
-    live_on_latents(learner, range(8), np.random.default_rng(0))
-    before = learner.state().arrays
-    resumed.restore(learner.state())
-    for each in (learner, resumed):
-        each.reset_for_new_task()
-    after = learner.state().arrays
-    parts = ("imagination/model", "controller")
-    weights = {name for name in before if name.startswith(parts) and ".weight" in name and name.endswith("/weight")}
-    kept = {name for name in weights if np.array_equal(before[name], after[name])}
-    assert kept == {name for name in weights if name.startswith("imagination/model/dynamics.")} < weights
-    assert len(learner.real) == len(learner.imagination.memory) == learner.steps == 0
-    assert learner.imagination.filter.threshold == 99.0
-    first, second = (live_on_latents(each, range(5), np.random.default_rng(1)) for each in (learner, resumed))
-    assert first == second and same(learner.state(), resumed.state())
-    assert not any(np.array_equal(before[name], learner.state().arrays[name]) for name in kept), "it goes on learning"

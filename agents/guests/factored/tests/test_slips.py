@@ -7,11 +7,11 @@ import itertools
 
 import numpy as np
 import pytest
-from imagine_bench.agents.factored.dynamics import Dynamics
-from imagine_bench.agents.factored.factors import CodeTransition
-from imagine_bench.agents.factored.model import FactoredModel
-from imagine_bench.agents.factored.planner import Planner
-from imagine_bench.agents.factored.settings import DynamicsSettings, FactoredSettings
+from imagine_bench_factored.dynamics import Dynamics
+from imagine_bench_factored.factors import CodeTransition
+from imagine_bench_factored.model import FactoredModel
+from imagine_bench_factored.planner import Planner
+from imagine_bench_factored.settings import DynamicsSettings, FactoredSettings
 
 WHEELS, SIZES, ACTIONS = 3, (4, 4, 4), 6
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+from imagine_bench.agents.encoders.perception import prepare_torch
 
 from imagine_bench.arrays import Floats, Frame, Ints, Pixels
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, until_the_end
 
-from ..encoders.perception import prepare_torch
-from ..factored.factors import Codes, CodeTransition
-from ..factored.model import FactoredModel
-from ..factored.perception import CodePerception, load_code_perception
-from ..factored.settings import HYPERPARAMETERS
+from .factors import Codes, CodeTransition
+from .model import FactoredModel
+from .perception import CodePerception, load_code_perception
+from .settings import HYPERPARAMETERS
 
 
 class StructuredModel:

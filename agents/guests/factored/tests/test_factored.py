@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts, success
-from imagine_bench.agents.factored.agent import ACCEPTED, FactoredAgent
-from imagine_bench.agents.factored.factors import CodeTransition
-from imagine_bench.agents.factored.model import FactoredModel, Moves, Results
-from imagine_bench.agents.factored.planner import TIE, Planner
-from imagine_bench.agents.factored.settings import FactoredSettings
+from imagine_bench_factored.agent import ACCEPTED, FactoredAgent
+from imagine_bench_factored.factors import CodeTransition
+from imagine_bench_factored.model import FactoredModel, Moves, Results
+from imagine_bench_factored.planner import TIE, Planner
+from imagine_bench_factored.settings import FactoredSettings
 from numpy.typing import NDArray
 
 from imagine_bench.errors import ArtefactError

@@ -10,11 +10,11 @@ import fake_codes
 import numpy as np
 import pytest
 from fake_pictures import HIDDEN, agent, hidden, played
-from imagine_bench.agents.factored import learned as own
-from imagine_bench.agents.factored.factors import CodeTransition, Memory, contradictions, remembering
-from imagine_bench.agents.factored.learned import LearnedPerceptionAgent
-from imagine_bench.agents.factored.model import FactoredModel, choose
-from imagine_bench.agents.factored.settings import LEARNED
+from imagine_bench_factored import learned as own
+from imagine_bench_factored.factors import CodeTransition, Memory, contradictions, remembering
+from imagine_bench_factored.learned import LearnedPerceptionAgent
+from imagine_bench_factored.model import FactoredModel, choose
+from imagine_bench_factored.settings import LEARNED
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import AgentState, Frame

@@ -12,13 +12,13 @@ from collections.abc import Iterator, Sequence
 from itertools import compress
 
 import numpy as np
+from imagine_bench.agents import snapshot
+from imagine_bench.agents.encoders.perception import prepare_torch
 
 from imagine_bench.arrays import Pixels
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.interfaces.capabilities import Perceived
 
-from .. import snapshot
-from ..encoders.perception import prepare_torch
 from . import appearance
 from .agent import CodeAgent
 from .factors import CodeTransition, contradictions, remembering

@@ -8,16 +8,16 @@ episodes too, that which is most probably decided by something untested. This is
 from __future__ import annotations
 
 import numpy as np
+from imagine_bench.agents import snapshot
+from imagine_bench.agents.encoders.perception import prepare_torch
+from imagine_bench.agents.meters import Meters
+from imagine_bench.agents.settings import flatten
 
 from imagine_bench.arrays import Floats32, Ints
 from imagine_bench.interfaces import AgentContext, AgentState, Floats, Frame, Observation, Transition
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, ImaginedRollout, Label, planned_actions
 from imagine_bench.seeding import SeedTree
 
-from .. import snapshot
-from ..encoders.perception import prepare_torch
-from ..meters import Meters
-from ..settings import flatten
 from .factors import Code, CodeTransition, as_arrays, from_arrays
 from .model import FactoredModel
 from .perception import CodePerception, LearnedPerception, load_code_perception

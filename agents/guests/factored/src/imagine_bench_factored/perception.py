@@ -7,6 +7,8 @@ from itertools import compress
 
 import numpy as np
 import torch
+from imagine_bench.agents.encoders.encoder import Encoder
+from imagine_bench.agents.encoders.perception import load_perception
 from torch.nn import functional
 
 from imagine_bench.arrays import Arrays, Frame, Ints
@@ -14,8 +16,6 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState
 from imagine_bench.values import Json
 
-from ..encoders.encoder import Encoder
-from ..encoders.perception import load_perception
 from . import appearance
 from .factors import Code, Codes, Mask, Memory
 from .settings import LearnedPerceptionSettings

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ..settings import COUNT, INSIDE, POSITIVE, PROBABILITY, RATE, SWITCH, Hyperparameters, between, setting
+from imagine_bench.agents.settings import (
+    COUNT,
+    INSIDE,
+    POSITIVE,
+    PROBABILITY,
+    RATE,
+    SWITCH,
+    Hyperparameters,
+    between,
+    setting,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
