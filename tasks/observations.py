@@ -112,9 +112,10 @@ class Observer:
                 columns[name] = [observer._world.object_poses().astype(np.float32) for observer, _ in moments]
             else:
                 images = self._cameras[name].frames(scenes)
-                worlds = [observer._world for observer, _ in moments]
-                seen = [world.composite(image) for world, image in zip(worlds, images, strict=True)]
-                columns[name] = seen if name == "frame" else images
+                if name == "frame":
+                    worlds = [observer._world for observer, _ in moments]
+                    images = [world.composite(image) for world, image in zip(worlds, images, strict=True)]
+                columns[name] = images
         if len(columns) == 1:
             return columns[self._names[0]]
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
@@ -126,7 +127,11 @@ class Observer:
 
     def _proprio(self) -> NDArray[np.float32]:
         data = self._world.data
-        return np.concatenate([data.qpos[self._arm_qpos], tcp_in_world(data, self._tcp)], dtype=np.float32)
+        sense = np.empty(len(_LOW), dtype=np.float32)
+        n_joints = len(self._arm_qpos)
+        sense[:n_joints] = data.qpos[self._arm_qpos]
+        sense[n_joints:] = tcp_in_world(data, self._tcp)
+        return sense
 
 
 MakeWorld = Callable[[Appearance], World]

@@ -357,6 +357,10 @@ assert set(dir(imagine_bench)) >= {"bench", "load", "register_agent", "registry"
 from imagine_bench import bench, load
 assert bench is imagine_bench.api.bench and load is imagine_bench.load
 assert not {"torch", "mujoco", "matplotlib", "rerun"} & set(sys.modules)
+import gymnasium
+for level in ("ArrowPuzzle", "ArrowPuzzleMotion"):
+    gymnasium.make(f"imagine_bench/{level}-v0")
+assert not {"torch", "mink"} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", probe], check=True)
 

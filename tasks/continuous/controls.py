@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from imagine_bench.arrays import Floats
 from imagine_bench.errors import InvalidValueError, brief, require_known
 
-from ..motion.ik import ArmModel
+from ..motion.arm_model import ArmModel
 from ..scenes.constants import TABLE_HEIGHT_M
 from .differential import DifferentialIK
 
@@ -80,6 +80,8 @@ class HandControl:
         self._lowest_m = np.array(WORKSPACE_LOW_M)
         self._highest_m = np.array(WORKSPACE_HIGH_M)
         self.space = self._space()
+        self._low = self.space.low.astype(np.float64)
+        self._high = self.space.high.astype(np.float64)
 
     def _space(self) -> gymnasium.spaces.Box[Any]:
         if self.control == "joint":
@@ -96,20 +98,23 @@ class HandControl:
         Raises:
             InvalidValueError: Another shape, no numbers, NaN, or a quaternion of zeros.
         """
-        words = f"give {len(self.names)} numbers: {', '.join(self.names)}"
         try:
             given = np.asarray(action, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise InvalidValueError(f"Action {brief(action)} is no array of numbers; {words}.") from error
+            raise self._refused(action, "is no array of numbers") from error
         if given.shape != (len(self.names),) or not np.isfinite(given).all():
-            raise InvalidValueError(f"Action {brief(action)} has another shape or a value that is not finite; {words}.")
+            raise self._refused(action, "has another shape or a value that is not finite")
         if self.control == "pose" and not given[3:7].any():
             raise InvalidValueError("The quaternion of the action is all zeros; give (1, 0, 0, 0) for no rotation.")
-        return np.minimum(np.maximum(given, self.space.low), self.space.high)
+        return np.minimum(np.maximum(given, self._low), self._high)
+
+    def _refused(self, action: Motion, why: str) -> InvalidValueError:
+        names = ", ".join(self.names)
+        return InvalidValueError(f"Action {brief(action)} {why}; give {len(self.names)} numbers: {names}.")
 
     def command(self, action: Floats, joints_rad: Floats, opening_m: float) -> Command:
         """The command for a checked action, from the command before: joints (7,) and the opening of each finger."""
-        wanted_m = MOST_OPEN_M * (action[-1] + 1.0) / 2.0
+        wanted_m = MOST_OPEN_M * (float(action[-1]) + 1.0) / 2.0
         opening_m = min(max(wanted_m, opening_m - self._most_m), opening_m + self._most_m)
         if self.control == "twist":
             joints_rad, limited = self._by_twist(self._per_unit * action[:6], joints_rad)
@@ -128,8 +133,9 @@ class HandControl:
         place_m, _ = self._ik.hand_pose(joints_rad)
         target_m = place_m + motion[:3]
         inside_m = np.minimum(np.maximum(target_m, self._lowest_m), self._highest_m)
-        step_rad, missed = self._ik.step(np.concatenate([inside_m - place_m, motion[3:]]), self._most_rad)
-        outside = bool((inside_m != target_m).any())
+        motion[:3] = inside_m - place_m
+        step_rad, missed = self._ik.step(motion, self._most_rad)
+        outside = inside_m.tolist() != target_m.tolist()
         return joints_rad + step_rad, "workspace" if outside else "reach" if missed else ""
 
     def _by_pose(self, target_m: Floats, quat: Floats, joints_rad: Floats) -> tuple[Floats, str]:

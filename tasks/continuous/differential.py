@@ -8,7 +8,7 @@ import numpy as np
 
 from imagine_bench.arrays import Floats
 
-from ..motion.ik import ArmModel
+from ..motion.arm_model import ArmModel
 from ..scenes.arm import TCP_SITE
 from ..scenes.constants import OBSERVATION_QPOS_RAD
 

@@ -15,8 +15,8 @@ from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import PhysicsSettings, TaskSpec
 from imagine_bench.values import Json
 
+from ..motion.arm_model import ArmModel
 from ..motion.executor import blew_up
-from ..motion.ik import ArmModel
 from ..observations import Observer
 from ..parameters.parameters import delivered, hides
 from ..rendering.cameras import FRAME_PX
@@ -321,7 +321,9 @@ class MotionEnv(SceneEnv):
         before = servos[columns]
         n_arm = len(ARM_JOINTS)
         command = self.controls.command(action, before[:n_arm], float(before[-1]))
-        after = np.array([*command.joints_rad, command.opening_m, command.opening_m])
+        after = np.empty_like(before)
+        after[:n_arm] = command.joints_rad
+        after[n_arm:] = command.opening_m
         self.episode.limited = command.limited
         for ctrl in before + self._ramp * (after - before):
             servos[columns] = ctrl
@@ -330,10 +332,9 @@ class MotionEnv(SceneEnv):
     def _judge(self) -> Event | None:
         """The event of the period that is over, with all that it changes in the scene."""
         episode = self.episode
-        touched = self._referee.touched()
         if self._slip:
-            self._slip_or_hold(touched)
-        event = self._referee.event(episode.macrostate, touched, self.np_random)
+            self._slip_or_hold(self._referee.touched())
+        event = self._referee.event(episode.macrostate, self.np_random)
         episode.latest = event
         if event is None:
             return None

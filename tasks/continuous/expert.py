@@ -11,7 +11,7 @@ import numpy as np
 
 from imagine_bench.arrays import Floats
 
-from ..motion.ik import ArmModel
+from ..motion.arm_model import ArmModel
 from ..motion.trajectory import Waypoint, plan
 from ..scenes.arm import ARM_JOINTS, arm_columns
 from ..scenes.constants import OBSERVATION_QPOS_RAD

@@ -44,9 +44,10 @@ class Touch:
     def bits(self) -> Ints:
         """For each object, which parts of the robot touch it in the latest step of the simulation. Shape (N,)."""
         touched = np.zeros(self._count + 1, dtype=np.int64)
-        first, second = self._data.contact.geom.T
-        np.bitwise_or.at(touched, self._object[first], self._robot[second])
-        np.bitwise_or.at(touched, self._object[second], self._robot[first])
+        geoms = self._data.contact.geom
+        robot = self._robot[geoms]
+        if robot.any():
+            np.bitwise_or.at(touched, self._object[geoms], robot[:, ::-1])
         return touched[:-1]
 
 
@@ -80,25 +81,24 @@ class Referee:
         self._values = values
         self._touch = Touch(world)
         self._speeds = world.object_qvel
-        self._asleep: bytes = b""
+        self._at_rest: tuple[State, bytes] | None = None
 
     def touched(self) -> Ints:
         """As :meth:`Touch.bits`."""
         return self._touch.bits()
 
-    def event(self, macrostate: State, touched: Ints, rng: np.random.Generator) -> Event | None:
+    def event(self, macrostate: State, rng: np.random.Generator) -> Event | None:
         """The event of the control period that is over, if there was one.
 
         Args:
             macrostate: Where the episode is.
-            touched: As :meth:`touched` says it now.
             rng: Draws the human's answer where the rules leave a choice.
         """
         poses = self._world.object_poses()
-        place = poses.tobytes() if not touched.any() else b""
-        if place and place == self._asleep:
+        stands = (macrostate, poses.tobytes())
+        if stands == self._at_rest:  # nothing has moved since it was found to be so
             return None
-        self._asleep = place
+        touched = self.touched()
         moving = self._moving()
         objects = list(macrostate[:-1])
         changed = []
@@ -122,6 +122,7 @@ class Referee:
                 changed.append(index)
                 objects[index] = value
         if not changed and not problems:
+            self._at_rest = None if touched.any() or moving.any() else stands
             return None
         at_once = [self._world.object_names[index] for index in sorted({*changed, *disturbed})]
         if not problems and len(at_once) > 1:

@@ -19,7 +19,7 @@ from imagine_bench.errors import DivergedError
 
 from ..scenes.arm import ARM_JOINTS, arm_columns
 from ..scenes.constants import OBSERVATION_QPOS_RAD
-from .ik import ArmModel
+from .arm_model import ArmModel
 from .orientation import Sensing
 from .trajectory import Trajectory, Waypoint, plan
 
@@ -40,7 +40,8 @@ _MOCAP = _STATE.mjSTATE_MOCAP_POS.value | _STATE.mjSTATE_MOCAP_QUAT.value
 _KEPT = _STATE.mjSTATE_QPOS.value | _MOCAP
 _INPUTS = _STATE.mjSTATE_CTRL.value | _MOCAP
 """The input of a rollout at every step, controls first; mocap bodies left out would fall back to their defaults."""
-_BAD_STATE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+_BAD_STATE = slice(mujoco.mjtWarning.mjWARN_BADQPOS.value, mujoco.mjtWarning.mjWARN_BADQACC.value + 1)
+"""Of MuJoCo's warnings: NaN or a huge number in positions, velocities or accelerations."""
 
 
 def back_to_rest(opening_m: float, settle_s: float) -> list[Waypoint]:
@@ -65,8 +66,7 @@ def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
 
 def blew_up(data: mujoco.MjData) -> bool:
     """Whether a simulation has seen NaN, infinity or runaway speed since its data were reset."""
-    warned = any(data.warning[int(kind)].number for kind in _BAD_STATE)
-    return warned or not np.abs(data.qvel).max() < _RUNAWAY_RAD_S
+    return any(data.warning.number.tolist()[_BAD_STATE]) or not np.abs(data.qvel).max() < _RUNAWAY_RAD_S
 
 
 class Samples(NamedTuple):

@@ -16,7 +16,7 @@ import numpy as np
 
 from imagine_bench.arrays import Floats
 
-from .ik import ArmModel
+from .arm_model import ArmModel
 
 PEAK_SPEED = 15 / 8
 PEAK_ACCELERATION = 10 / math.sqrt(3)

@@ -182,9 +182,13 @@ class _Canvas:
         self.make_current()
         return np.array_equal(self.draw(self._probe), self._probe_image)
 
+    def is_current(self) -> bool:
+        """Whether this context is known to be current in this thread, for which EGL alone can be asked."""
+        return self.address is not None and _current()() == self.address
+
     def make_current(self) -> None:
         """Make this context current, unless it is: asking costs 1 us, telling makes the driver check everything."""
-        if self.address is None or _current()() != self.address:
+        if not self.is_current():
             self.gl.make_current()
 
     def close(self) -> None:
@@ -193,7 +197,12 @@ class _Canvas:
             self.make_current()
             self.mjr.free()
             self.gl.free()
-        self.gl._context = None  # its destructor would try again
+        self.leave()
+
+    def leave(self) -> None:
+        """Never use this context again, nor let its destructor free it."""
+        self.gl._context = None
+        self.address = None
 
 
 def _drawn_as(model: mujoco.MjModel) -> bytes:
@@ -257,7 +266,7 @@ class _Canvases:
         self._others += self._canvases.values()
         self._canvases.clear()
         for canvas in self._others:
-            canvas.gl._context = None  # its destructor would free it from here
+            canvas.leave()
 
 
 def _in_quality(model: mujoco.MjModel, view: View) -> mujoco.MjModel:
@@ -330,10 +339,13 @@ class Renderer:
         """
         drawn = []
         with _canvases.lock:
-            theirs = _canvases.of_others()
-            canvas = _canvases.find(self._drawn_as, self._model, self.view, self._canvas)
-            self._canvas = canvas
-            canvas.make_current()
+            theirs = None
+            canvas = self._canvas
+            if canvas is None or not canvas.is_current():
+                theirs = _canvases.of_others()
+                canvas = _canvases.find(self._drawn_as, self._model, self.view, self._canvas)
+                self._canvas = canvas
+                canvas.make_current()
             for scene in scenes:
                 self._fill(*scene)
                 drawn.append(canvas.draw(self._scene)[::-1].copy())
@@ -345,7 +357,8 @@ class Renderer:
         """Put the geoms of the view into the scene, lit by all lights if it is for people."""
         lights = model.light_active
         as_compiled = lights.copy()
-        lights[:] = lights | self.view.for_people
+        if self.view.for_people:
+            lights[:] = True
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
         lights[:] = as_compiled
 

@@ -8,7 +8,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.motion.ik import ArmModel
+from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.scenes.constants import TIMESTEP_S
 from worlds import draw_quickly
 

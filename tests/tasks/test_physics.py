@@ -7,7 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene
-from imagine_bench.tasks.motion.ik import ArmIK, ArmModel
+from imagine_bench.tasks.motion.arm_model import ArmModel
+from imagine_bench.tasks.motion.ik import ArmIK
 from imagine_bench.tasks.motion.orientation import Sensing
 from imagine_bench.tasks.pick_place.scene import compile_pick_scene
 from imagine_bench.tasks.scenes.constants import HOME_QPOS_RAD, TABLE_HEIGHT_M

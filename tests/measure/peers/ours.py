@@ -6,7 +6,6 @@ the same states with the same commands, and drawing the same images.
 
 from __future__ import annotations
 
-import itertools
 import json
 import sys
 import time
@@ -16,12 +15,14 @@ import mujoco
 import numpy as np
 from imagine_bench.tasks.rendering import Renderer
 from imagine_bench.tasks.rendering.cameras import control_view
+from imagine_bench.tasks.world import WorldState
 from loop import IMAGE_PX, RATE_HZ, Images, Lane, actions_of, run
 
 import imagine_bench  # noqa: F401  it registers its environments
 
 ID = sys.argv[4] if len(sys.argv) > 4 else "imagine_bench/ArrowPuzzleMotion-v0"
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
+BLOCK = 64
+"""Steps that are timed together."""
 CAMERAS = {"wrist": "hand", "front": "front"}
 
 
@@ -64,28 +65,23 @@ def lane_of(env: gymnasium.Env, images: Images) -> Lane:
 
 
 class MujocoAlone:
-    """MuJoCo's own functions on the scene of an environment, with nothing of this suite around them."""
+    """MuJoCo's own functions on a scene like that of an environment, with nothing of this suite around them."""
 
     def __init__(self, env: gymnasium.Env, lane: Lane, images: Images) -> None:
-        self._scene = env.unwrapped
-        self._model = lane.model
+        self._world = env.unwrapped.another_world()
+        self._model = self._world.model
+        self._data = self._world.data
         self._n_steps = lane.physics_steps
-        self._data = mujoco.MjData(self._model)
-        self._cameras = [self._scene.camera(control_view(name, IMAGE_PX)) for name in cameras_of(images)]
+        self._cameras = [env.unwrapped.camera(control_view(name, IMAGE_PX)) for name in cameras_of(images)]
         self._pixels = np.empty((IMAGE_PX, IMAGE_PX, 3), dtype=np.uint8)
         self._rect = mujoco.MjrRect(0, 0, IMAGE_PX, IMAGE_PX)
 
-    def state(self) -> np.ndarray:
-        """All that decides how the simulation goes on, the commands included."""
-        state = np.empty(mujoco.mj_stateSize(self._model, STATE))
-        mujoco.mj_getState(self._model, self._scene.data, state, STATE)
-        return state
+    def again(self, before: WorldState, commands: np.ndarray) -> tuple[float, float]:
+        """CPU seconds of ``mj_step`` from a moment on with the commands of the next, and of drawing the images.
 
-    def again(self, before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-        """CPU seconds of ``mj_step`` from one state with the commands of another, and of drawing the images."""
-        mujoco.mj_setState(self._model, self._data, after, STATE)
-        commands = self._data.ctrl.copy()
-        mujoco.mj_setState(self._model, self._data, before, STATE)
+        Bodies that slept then sleep: they cost nothing.
+        """
+        self._world.set_state(before)
         self._data.ctrl[:] = commands
         start = time.process_time()
         mujoco.mj_step(self._model, self._data, self._n_steps)
@@ -105,30 +101,38 @@ class MujocoAlone:
 
 
 def own(images: Images, seconds: float) -> dict[str, float]:
-    """CPU seconds of a step, and of MuJoCo alone: blocks of steps, each followed by the same without this suite."""
+    """CPU seconds of a step, and of MuJoCo alone.
+
+    A block of steps is timed, then taken again from the same state, which leads to the same bits, to keep the moments
+    between them; from these MuJoCo simulates and draws alone.
+    """
     env = environment(images)
+    scene = env.unwrapped
     lane = lane_of(env, images)
     lane.reset()
     lane.step(actions_of(lane)[0])
     alone = MujocoAlone(env, lane, images)
     times = []
-    spent_s = 0.0
-    for block in itertools.cycle(np.split(actions_of(lane), 4)):
-        states = []
+    while len(times) < 2 or sum(each[0] for each in times[1:]) * BLOCK < seconds:
+        block = actions_of(lane)[len(times) * BLOCK % 256 :][:BLOCK]
+        begun = scene.get_state()
         taken_s = 0.0
         for action in block:
-            before = alone.state()
             start = time.process_time()
             over, _ = lane.step(action)
             taken_s += time.process_time() - start
-            states.append((before, alone.state()))
             if over:
                 lane.reset()
-        found = np.mean([alone.again(*pair) for pair in states], axis=0)
-        times.append([taken_s / len(block), *found])
-        spent_s += taken_s
-        if len(times) > 1 and spent_s > seconds:
-            break
+        scene.set_state(begun)
+        moments = []
+        for action in block:
+            before = scene.world.get_state()
+            over, _ = lane.step(action)
+            moments.append((before, scene.data.ctrl.copy()))
+            if over:
+                lane.reset()
+        found = np.mean([alone.again(*moment) for moment in moments], axis=0)
+        times.append([taken_s / BLOCK, *found])
     step_s, simulated_s, drawn_s = np.mean(times[1:], axis=0).tolist()
     return {"step_s": step_s, "mj_step_s": simulated_s, "mjr_s": drawn_s}
 

@@ -7,7 +7,7 @@ import time
 import mink
 import numpy as np
 from imagine_bench.tasks.continuous.differential import DifferentialIK
-from imagine_bench.tasks.motion.ik import ArmModel
+from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.scenes.arm import ARM_JOINTS, JOINT_SPEED_LIMITS_RAD_S, TCP_SITE
 from imagine_bench.tasks.scenes.constants import OBSERVATION_QPOS_RAD
 

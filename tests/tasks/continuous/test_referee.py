@@ -20,6 +20,7 @@ from imagine_bench.tasks.scenes.objects import OBJECTS, SLOTS_XY_M, standing_m
 from imagine_bench.tasks.world import World
 from scripted_hand import CLOSED_M, SQUEEZE_M, WIDE_M, Hand
 
+from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import Outcome, State
 from imagine_bench.rules import evaluate, greedy, optimal_policy, tabulate
 
@@ -253,6 +254,15 @@ def stands(env: MotionEnv) -> None:
     del env
 
 
+class ToldReferee(Referee):
+    """A referee that is told which objects are touched."""
+
+    told: tuple[int, ...] = ()
+
+    def touched(self) -> Ints:
+        return np.array(self.told)
+
+
 @pytest.mark.parametrize(
     ("before", "touched", "prepare", "fault"),
     [
@@ -274,8 +284,9 @@ def test_an_event_is_a_macro_action_or_says_what_else_it_is(
     env = free()
     env.reset(seed=0, options={"macrostate": START})
     prepare(env)
-    referee = Referee(env.world, env.task.rules, env.task.macrostate_values)
-    event = referee.event(before, np.array(touched), np.random.default_rng(0))
+    referee = ToldReferee(env.world, env.task.rules, env.task.macrostate_values)
+    referee.told = touched
+    event = referee.event(before, np.random.default_rng(0))
     assert event is not None
     assert event.fault == fault
     assert event.outcome.terminated == (fault is not None)

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene, layout
+from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.motion.executor import MAX_SAVED
-from imagine_bench.tasks.motion.ik import ArmModel
 from imagine_bench.tasks.motion.orientation import Sensing
 from imagine_bench.tasks.motion.turn import TurnExecutor
 from imagine_bench.tasks.scenes.arm import arm_columns

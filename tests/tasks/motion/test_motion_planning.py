@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.rules import MAX_CUBES
 from imagine_bench.tasks.arrows.scene import layout
-from imagine_bench.tasks.motion.ik import ArmIK, ArmModel, Reach, pointing_down
+from imagine_bench.tasks.motion.arm_model import ArmModel
+from imagine_bench.tasks.motion.ik import ArmIK, Reach, pointing_down
 from imagine_bench.tasks.motion.trajectory import (
     EFFORT_SHARE,
     PEAK_ACCELERATION,
