@@ -65,7 +65,7 @@ MOVED = {
     "imagine_bench.suite.experiments": "imagine_bench.sweep.grid",
     "imagine_bench.suite.run": "imagine_bench.sweep.run",
     "imagine_bench.suite.score": "imagine_bench.sweep.score",
-    "imagine_bench.tasks.continuous.goals": "imagine_bench_motion.goals",
+    "imagine_bench.tasks.continuous.goals": "imagine_bench_motion.control.goals",
     "imagine_bench.world_models": "imagine_bench.interfaces.model",
 }
 """Where each module lies now, by the path that it had."""

@@ -94,6 +94,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
         ("plan --max-epistemic little", "--max-epistemic was given 'little'; it takes numbers."),
         ("check toy_regression", "toy_regression is a regression task, in which no agent acts"),
         ("play toy_regression", "toy_regression is a regression task, in which no agent acts"),
+        ("judge ArrowPuzzleMotion", "type: python -m imagine_bench_motion judge ArrowPuzzleMotion"),
         ("check arrow_puzzle --turns 5", "--turns goes with --physics; leave it out"),
         ("check arrow_puzzle --physics --agent random", "Physics is measured of a task; give one, and no --agent"),
         ("play arrow_puzzle --out x.gif", "--out goes with --film; leave it out"),

@@ -32,8 +32,6 @@ from imagine_bench.running.collect import POLICIES
 from imagine_bench.running.launchers.jobs import at_a_time, launcher
 from imagine_bench.running.retraining import Retraining
 
-_MOTION = "imagine-bench-motion"
-
 _PLUGGED_IN = ("structured",)
 """World models of this suite's guests that are judged by default, too."""
 
@@ -78,10 +76,9 @@ class Judge:
     def __call__(self) -> None:
         """Judge and report."""
         if registry.task_of_motion(self.task) is not None:
-            absent = [guest.install for guest in registry.absent_guests() if guest.package == _MOTION]
-            install = "".join(f" First install it: {line}" for line in absent)
+            registry.require_guest(registry.MOTION, "Judging models of motions")
             line = f"python -m imagine_bench_motion judge {self.task}"
-            raise InvalidValueError(f"The plug-in {_MOTION} judges models of motions; type: {line}{install}")
+            raise InvalidValueError(f"The plug-in {registry.MOTION} judges models of motions; type: {line}")
         from imagine_bench.recording.judgement import record_judgement  # noqa: PLC0415 - as below
         from imagine_bench.report.judge import judged, judgement_page  # noqa: PLC0415 - as below
 

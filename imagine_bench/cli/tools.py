@@ -247,7 +247,8 @@ class Play:
             if motion is not None:
                 require_with("a task of macro-actions", self, "model", "execution", "encoder")
                 look = self.appearance or APPEARANCES[0]
-                play_motion = registry.load("imagine_bench.tools.play_motion:play_motion")
+                registry.require_guest(registry.MOTION, "Playing continuous control by keys")
+                play_motion = registry.load("imagine_bench_motion.control.keyboard:play_motion")
                 print(play_motion(motion, seed=self.seed, appearance=look, camera=self.camera))
                 return
             options = {"execution": self.execution, "appearance": self.appearance, "encoder": self.encoder}

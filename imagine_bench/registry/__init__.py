@@ -56,6 +56,8 @@ __all__ = [
     "refuse_while_loading",
 ]
 
+MOTION = "imagine-bench-motion"
+"""The plug-in of continuous control."""
 TASK_GROUP = "imagine_bench.tasks"
 AGENT_GROUP = "imagine_bench.agents"
 ENCODER_GROUP = "imagine_bench.encoders"
@@ -213,6 +215,20 @@ def absent_guests() -> list[Guest]:
     """The guests of this suite that are not installed here."""
     installed = guest_packages()
     return [guest for guest in guests() if guest.package not in installed]
+
+
+def require_guest(package: str, doing: str) -> None:
+    """Raise SetupError, with the line that installs it, where a plug-in of this suite is missing that does something.
+
+    Args:
+        package: The plug-in, as pip knows it.
+        doing: The work that needs it, as the beginning of a sentence.
+    """
+    for guest in absent_guests():
+        if guest.package == package:
+            raise SetupError(
+                f"{doing} needs the package {package}, which is not installed. Install it with: {guest.install}"
+            )
 
 
 def guest_packages() -> dict[str, set[str]]:

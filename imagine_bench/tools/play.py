@@ -116,11 +116,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
     def summary(self) -> str:
         """How often the person solved the task, beside chance and optimum, and how often the model foresaw it."""
         facts = self._task.facts()
-        said = "No episode was finished"
-        if self.episodes:
-            low, high = wilson(self.solved, self.episodes)
-            share = f"{self.solved / self.episodes:.1%}, 95 % interval {low:.1%} to {high:.1%}"
-            said = f"Solved {self.solved} of {self.episodes} episodes ({share})"
+        said = solved_words(self.solved, self.episodes)
         foreseen = f"\nThe model foresaw {self.foreseen} of {self.imagined} macrostates." if self.imagined else ""
         return f"{said}; chance {facts.chance_level:.1%}, optimum {facts.optimum:.1%}.{foreseen}"
 
@@ -240,6 +236,15 @@ def play(
     with closing(KeyboardGame(env, spec, imaginer, seed)) as game:
         keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)
     return game.summary()
+
+
+def solved_words(solved: int, episodes: int) -> str:
+    """How often a person solved a task, with its 95 % interval."""
+    if not episodes:
+        return "No episode was finished"
+    low, high = wilson(solved, episodes)
+    share = f"{solved / episodes:.1%}, 95 % interval {low:.1%} to {high:.1%}"
+    return f"Solved {solved} of {episodes} episodes ({share})"
 
 
 def keyboard_player() -> Callable[..., None]:

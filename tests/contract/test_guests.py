@@ -111,6 +111,10 @@ def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_l
     said = capsys.readouterr().err
     where = f"Install it with: pip install -e {ROOT / 'agents' / 'guests' / 'peers'}"
     assert f"The agent dreamer_v3 is in the package imagine-bench-peers, which is not installed. {where}" in said
+    install = f"which is not installed. Install it with: pip install -e {ROOT / 'agents' / 'guests' / 'motion'}"
+    for words in (["judge", "ArrowPuzzleMotion"], ["play", "ArrowPuzzleMotion"]):
+        assert main(words) == 2
+        assert f"needs the package imagine-bench-motion, {install}" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("without_guests")

@@ -12,6 +12,7 @@ import matplotlib
 import numpy as np
 import pytest
 from fake_agents import FakeImaginer
+from imagine_bench_motion.control.keyboard import HandGame, keys_to_commands
 from PIL import Image, ImageSequence
 from worlds import draw_quickly
 
@@ -20,7 +21,6 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.tools import play as module
 from imagine_bench.tools.play import KEYS, KeyboardGame, film, play
-from imagine_bench.tools.play_motion import HandGame, keys_to_commands
 
 pygame = pytest.importorskip("pygame")  # of the extra play
 WAIT = 6

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from imagine_bench.tasks.continuous.expert import Expert
-from imagine_bench_motion.goals import GoalEnv, make
+from imagine_bench_motion.control.goals import GoalEnv, make
 from stable_baselines3 import SAC, HerReplayBuffer
 
 from imagine_bench import registry

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
-from imagine_bench_motion.judge.copying import CopyBefore
 from imagine_bench_motion.judge.interface import Motions
+from imagine_bench_motion.judge.no_change import NoChange
 from imagine_bench_motion.judge.questions import MotionQuestions, MotionSource, moved
 from imagine_bench_motion.judge.recurrent import MotionNetwork
 from imagine_bench_motion.judge.scores import Simulator, score
@@ -88,7 +88,7 @@ def test_the_simulator_is_right_in_all_and_a_copy_where_nothing_changes(family: 
     reader = KnownFrames(asked)
     exact = score("simulator", Simulator(asked), asked, reader)
     assert (exact.right, exact.raised_right, exact.painted, exact.pairs, exact.by_depth) == (1, 1, 0, 1, (1, 1))
-    copied = score("copy", CopyBefore(), asked, reader)
+    copied = score("no_change", NoChange(), asked, reader)
     unchanged = float(
         np.mean([not moved(*ends) for ends in zip(asked.raised.states, asked.raised.reached, strict=True)])
     )
@@ -97,7 +97,7 @@ def test_the_simulator_is_right_in_all_and_a_copy_where_nothing_changes(family: 
 
 
 def test_what_is_no_frame_is_refused() -> None:
-    class Half(CopyBefore):
+    class Half(NoChange):
         def imagine_motion(self, frames: Array, actions: Array, lengths: Ints, labels: Ints) -> Array:
             return super().imagine_motion(frames, actions, lengths, labels)[::2]
 

@@ -16,7 +16,7 @@ def _register_goals() -> None:
     for task, entry in TASKS.items():
         env_id = entry.env_id.replace("imagine_bench/", "imagine_bench_motion/").replace("-v", "Goals-v")
         if entry.motion and env_id not in gymnasium.registry:
-            gymnasium.register(env_id, "imagine_bench_motion.goals:make", kwargs={"task": task})
+            gymnasium.register(env_id, "imagine_bench_motion.control.goals:make", kwargs={"task": task})
 
 
 _register_goals()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from .interface import MotionModelEntry
 
-COPY = MotionModelEntry(
-    make="imagine_bench_motion.judge.copying:make",
+NO_CHANGE = MotionModelEntry(
+    make="imagine_bench_motion.judge.no_change:make",
     level="commands",
     description="Says that no motion changes anything: one end of the scale.",
 )

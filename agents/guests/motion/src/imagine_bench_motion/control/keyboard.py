@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from imagine_bench import registry
-from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Arrays, Frame, Info
-from imagine_bench.data.motion import CAMERAS
 from imagine_bench.errors import require_integer, require_known
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.rules import ending
-from imagine_bench.statistics import wilson
 from imagine_bench.tools import play
 
+CAMERAS = ("hand", "front")
 Command = NDArray[np.float32]
 SPEED = 0.25
 """Of the hand while a key is down, as a share of the largest twist: 0.25 m/s, 1.5 rad/s."""
@@ -123,12 +121,8 @@ class HandGame(gymnasium.Wrapper[Arrays, Command, Arrays, Command]):
 
     def summary(self) -> str:
         """How often the person solved the task, beside the optimum."""
-        if not self.episodes:
-            return "No episode was finished."
-        low, high = wilson(self.solved, self.episodes)
-        share = f"{self.solved / self.episodes:.1%}, 95 % interval {low:.1%} to {high:.1%}"
-        optimum = f"optimum {self._task.facts().optimum:.1%}"
-        return f"Solved {self.solved} of {self.episodes} episodes ({share}); {optimum}."
+        said = play.solved_words(self.solved, self.episodes)
+        return f"{said}; optimum {self._task.facts().optimum:.1%}." if self.episodes else f"{said}."
 
     def render(self) -> Frame:
         """The window: the scene, both cameras, the person's wish, and the keys. Shape (H, W, 3)."""
@@ -176,7 +170,7 @@ def play_motion(task: str, *, seed: int = 0, appearance: str = "clean", camera: 
     spec = registry.task(task)
     keyboard = play.keyboard_player()
     env_id = registry.motion_id(spec.env_id)
-    env = gymnasium.make(env_id, disable_env_checker=True, appearance=appearance_name(appearance), camera=camera)
+    env = gymnasium.make(env_id, disable_env_checker=True, appearance=appearance, camera=camera)
     noop = np.zeros(_GRIP + 1, np.float32)
     with closing(HandGame(env, spec, seed)) as game:
         keyboard(game, fps=_FPS, keys_to_action=keys_to_commands(), noop=noop)

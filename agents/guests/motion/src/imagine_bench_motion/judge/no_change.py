@@ -7,7 +7,7 @@ from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.model import Untaught
 
 
-class CopyBefore(Untaught):
+class NoChange(Untaught):
     """Hands back the frame before; see :class:`.interface.MotionModel`."""
 
     def imagine_motion(self, frames: Frame, actions: Floats32, lengths: Ints, labels: Ints) -> Frame:
@@ -16,7 +16,7 @@ class CopyBefore(Untaught):
         return frames
 
 
-def make(context: AgentContext) -> CopyBefore:
+def make(context: AgentContext) -> NoChange:
     """The model for any task."""
     del context
-    return CopyBefore()
+    return NoChange()

@@ -1,0 +1,1 @@
+"""Continuous control in other forms: with goals, and by keys."""
