@@ -21,7 +21,7 @@ from .motion.executor import MacroResult
 from .observations import Observer
 from .parameters.parameters import delivered, hides
 from .rendering.cameras import FRAME_PX
-from .scene_env import BUILT, RENDER_MODES, WINDOW_HZ, SceneEnv, Step, require_kind
+from .scene_env import BUILT, RENDER_MODES, WINDOW_HZ, SceneEnv, Step
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
 from .scenes.constants import AGENT_CAMERA, FAR_CAMERA, HUMAN_CAMERA
@@ -246,13 +246,10 @@ class MacroEnv(SceneEnv):
             episode={name: getattr(self, name) for name in _EPISODE},
         )
 
-    def set_state(self, state: EnvState) -> None:
-        """Go on from where :meth:`get_state` was called, in this or another environment of the same kind, to the bit.
-
-        Raises:
-            InvalidValueError: A state of another task, execution, appearance or physics, or none at all.
-        """
-        require_kind(state, EnvState, self._kind)
+    def _put_state(self, state: EnvState) -> None:
+        self._require_values(state.macrostate)
+        if state.episode.keys() != set(_EPISODE):
+            raise InvalidValueError(f"its episode has the parts {', '.join(state.episode)}")
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
         self._macrostate = state.macrostate

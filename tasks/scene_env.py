@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 from imagine_bench.arrays import Frame, Info, Observed, State
-from imagine_bench.errors import InvalidValueError, brief, require_integer, require_known
+from imagine_bench.errors import InvalidValueError, brief, require_integer, require_known, why
 from imagine_bench.interfaces import PhysicsSettings, TaskSpec
 from imagine_bench.rules import states_of
 
@@ -122,6 +122,40 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
         A simulation that blows up truncates the episode, and no episode is begun then.
         """
 
+    def set_state(self, state: Any) -> None:
+        """Go on from where :meth:`get_state` was called, in this or another environment of the same kind, to the bit.
+
+        Raises:
+            InvalidValueError: A state of another kind of environment, a damaged one, or none at all; then nothing has
+                changed.
+        """
+        before = self.get_state()
+        if not isinstance(state, type(before)) or state.kind != before.kind:
+            given = state.kind if isinstance(state, type(before)) else state
+            words = "get_state() of an environment made alike"
+            raise InvalidValueError(f"{brief(given)} is no state of {brief(before.kind)}; give one of {words}.")
+        try:
+            self._put_state(state)
+        except Exception as error:  # a damaged state can be wrong in any way
+            self._put_state(before)
+            raise InvalidValueError(f"The state is damaged: {why(error)}. The environment stands as before.") from error
+
+    @abc.abstractmethod
+    def get_state(self) -> Any:
+        """All that decides how the episode goes on, copied; of a wrapper it knows nothing."""
+
+    @abc.abstractmethod
+    def _put_state(self, state: Any) -> None:
+        """Take over a state of this kind of environment; one that is damaged may raise anything halfway."""
+
+    def _require_values(self, macrostate: State) -> None:
+        """Raise InvalidValueError: a macrostate has not one value for each of its names."""
+        values = self.task.macrostate_values
+        if len(macrostate) != len(values) or any(
+            value not in range(len(names)) for value, names in zip(macrostate, values, strict=True)
+        ):
+            raise InvalidValueError(f"its macrostate is {brief(macrostate)}")
+
     def prepare(self) -> None:
         """Make the parts that actions need, in the thread that calls; nothing by default."""
 
@@ -176,15 +210,6 @@ class SceneEnv(FilmedScene, gymnasium.Env[Observed, Any]):
             listed = f"one of the {len(self._known)} of imagine_bench.registry.task({self.task.id!r}).rules.states"
             raise InvalidValueError(f"No macrostate {brief(given)}; give {listed}, such as {starts[0]}.")
         return start
-
-
-def require_kind(state: Any, type_: type[Any], kind: tuple[object, ...]) -> None:
-    """Check a snapshot of an environment. Raises InvalidValueError: one of another kind of environment, or none."""
-    if isinstance(state, type_) and state.kind == kind:
-        return
-    given = state.kind if isinstance(state, type_) else state
-    words = "get_state() of an environment made alike"
-    raise InvalidValueError(f"{brief(given)} is no state of {brief(kind)}; give one of {words}.")
 
 
 def options_of(options: Info | None) -> Info:

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from imagine_bench.arrays import Floats, Frame, Ints, State
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import PhysicsSettings
 
 from .motion import orientation
@@ -43,9 +44,10 @@ class Reading:
 
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
-_ASLEEP = ("body_awake", "body_awake_ind", "dof_awake_ind", "parent_awake_ind", "tree_asleep", "tree_awake")
+_ASLEEP = ("body_awake", "body_awake_ind", "dof_awake_ind", "parent_awake_ind", "tree_asleep", "tree_awake", "qacc")
 _N_AWAKE = ("nbody_awake", "nparent_awake", "ntree_awake", "nv_awake")
-"""Arrays and numbers of ``mjData`` that say which bodies sleep: they decide the next steps, and no state has them."""
+"""Arrays and numbers of ``mjData`` that say which bodies sleep, and the accelerations at which they begin when they
+wake: they decide the next steps, and no state has them."""
 Sleep = Mapping[str, Ints | int]
 
 
@@ -145,12 +147,17 @@ class World(abc.ABC):
         )
 
     def set_state(self, state: WorldState) -> None:
-        """Put the scene as it was, to the bit."""
+        """Put the scene as it was, to the bit. Raises InvalidValueError: it has values that are not finite."""
+        if not all(np.isfinite(each).all() for each in (state.physics, *state.looks)):
+            raise InvalidValueError("the scene has values that are not finite")
         for mine, then in zip(looks_of(self.model), state.looks, strict=True):
             mine[:] = then
         self._composite = state.composite
         self.sensing.aside_m = state.sensing.aside_m
         self.sensing.turned_rad = state.sensing.turned_rad
+        mujoco.mj_resetData(self.model, self.data)  # nothing sleeps
+        self.set_physics_state(state.physics)
+        mujoco.mj_forward(self.model, self.data)  # else a body that sleeps wakes without its inertia
         self.set_physics_state(state.physics)
         self._set_sleep(state.sleep)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from imagine_bench.appearance import STORED_AS
 from imagine_bench.arrays import Frame, Ints, Macrostate, State
-from imagine_bench.errors import InvalidValueError, UnknownNameError, require_known
+from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, require_known
 from imagine_bench.rules import RuleFacts, Rules
 from imagine_bench.values import Setting
 
@@ -62,7 +62,7 @@ class PhysicsSettings:
         if isinstance(given, PhysicsSettings):
             return given
         if not isinstance(given, Mapping):
-            raise InvalidValueError(f"Physics {given!r} is no mapping; give some of {', '.join(cls.__annotations__)}.")
+            raise InvalidValueError(f"Physics {brief(given)} is no mapping; give some of {', '.join(cls.__annotations__)}.")
         for name in given:
             if name not in cls.__annotations__:
                 raise UnknownNameError("physics setting", name, cls.__annotations__)

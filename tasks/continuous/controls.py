@@ -99,9 +99,12 @@ class HandControl:
             InvalidValueError: Another shape, no numbers, NaN, or a quaternion of zeros.
         """
         try:
-            given = np.asarray(action, dtype=np.float64)
+            given = np.asarray(action)
         except (TypeError, ValueError) as error:
             raise self._refused(action, "is no array of numbers") from error
+        if given.dtype.kind not in "biuf" or np.ma.is_masked(action):
+            raise self._refused(action, "has parts that are no real numbers")
+        given = given.astype(np.float64)
         if given.shape != (len(self.names),) or not np.isfinite(given).all():
             raise self._refused(action, "has another shape or a value that is not finite")
         if self.control == "pose" and not given[3:7].any():

@@ -20,7 +20,7 @@ from ..motion.executor import blew_up
 from ..observations import Observer
 from ..parameters.parameters import delivered, hides
 from ..rendering.cameras import FRAME_PX
-from ..scene_env import BUILT, RENDER_MODES, SceneEnv, Step, require_kind
+from ..scene_env import BUILT, RENDER_MODES, SceneEnv, Step
 from ..scenes.appearance import Appearance
 from ..scenes.appearance import appearance as appearance_level
 from ..scenes.arm import ARM_JOINTS, arm_columns
@@ -297,18 +297,17 @@ class MotionEnv(SceneEnv):
             episode=copy.deepcopy(self.episode),
         )
 
-    def set_state(self, state: MotionState) -> None:
-        """Go on from where :meth:`get_state` was called, in this or another environment of the same kind, to the bit.
-
-        Raises:
-            InvalidValueError: A state of another kind of environment, or none at all.
-        """
-        require_kind(state, MotionState, self._kind)
+    def _put_state(self, state: MotionState) -> None:
+        episode = copy.deepcopy(state.episode)
+        if state.begun:
+            self._require_values(episode.macrostate)
+        if episode.periods < 0 or not isinstance(episode.observations, tuple):
+            raise InvalidValueError(f"it is one of {episode.periods} periods, or has no observations")
         self.world.set_state(state.world)
         self.np_random.bit_generator.state = copy.deepcopy(state.generator)
-        self.begun = state.begun
-        self.episode = copy.deepcopy(state.episode)
-        self.world.set_slipping(self.episode.slipping)
+        self.begun = bool(state.begun)
+        self.episode = episode
+        self.world.set_slipping(episode.slipping)
 
     # --- details -------------------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ from imagine_bench.rules import states_of_play
 
 from ..scenes.arm import ARM_JOINTS, arm_columns
 from ..scenes.constants import OBSERVATION_QPOS_RAD
+from ..world import MAX_SKEW_RAD
 from .controls import HAND_SPEED_M_S, HAND_TURN_RAD_S, MOST_OPEN_M
 from .env import MotionEnv
 from .expert import Expert
@@ -26,6 +27,12 @@ START_RAD = math.radians(15.0)
 """A segment starts with the hand off its observation pose by up to so much along each axis, and about the vertical."""
 _MOVE_PERIODS = 10
 """Periods in which the hand is moved there."""
+_PADS_M = 0.022
+"""The point between the fingers is at most so far above an object that both touch: half the diagonal of a pad."""
+_LEAST_TURN_RAD = math.pi / 2 - MAX_SKEW_RAD
+"""A cube that is turned by less still has its direction."""
+_SINKS_M = 0.01
+"""An object that is put down may rest so much higher than it stands."""
 
 
 @dataclass(kw_only=True)
@@ -39,6 +46,7 @@ class Measured:
     faults: dict[str, int]  #: the most frequent reasons of those not as ruled, with their counts
     episodes: int  #: of the optimal macro-actions, one after another
     solved: int
+    least_s: list[float]  #: of each pair, as :func:`least_seconds`
     time_limit_s: float  #: of the environment
     random_episodes: int = 0  #: with a uniformly random hand twist each period
     random_solved: int = 0
@@ -82,8 +90,46 @@ def measure(env: MotionEnv, *, tries: int, turns: int, seed: int = 0) -> Measure
         faults=dict(faults.most_common(10)),
         episodes=len(solved),
         solved=sum(solved),
+        least_s=[least_seconds(env, state, action) for state, action in chosen],
         time_limit_s=env.time_limit_s,
     )
+
+
+def least_seconds(env: MotionEnv, state: State, action: int) -> float:
+    """A lower bound of the duration of a segment, in whole control periods; docs/explanation/certificates.md proves it.
+
+    The hand moves at the largest twist. Only heights count. A standing object is gripped where it stands, turned if
+    its macro-action turns it, and the hand comes back if the episode goes on. A held object is thrown down.
+    """
+    outcome = env.task.rules.outcomes(state, action)[0]
+    after_m, _ = _heights_m(env, outcome.macrostate)
+    before_m, tops_m = _heights_m(env, state)
+    (index,) = np.flatnonzero(np.not_equal(state[:-1], outcome.macrostate[:-1]))
+    hand_m = env.controls.hand_pose(np.array(OBSERVATION_QPOS_RAD))[0][2] - START_M
+    drop_m = before_m[index] - after_m[index]
+    if drop_m > START_M:
+        gravity_m_s2 = -float(env.model.opt.gravity[2])
+        fall_m = max(0.0, drop_m - START_M - _SINKS_M)
+        seconds = (math.sqrt(HAND_SPEED_M_S**2 + 2.0 * gravity_m_s2 * fall_m) - HAND_SPEED_M_S) / gravity_m_s2
+    else:
+        is_turned = abs(drop_m) < _SINKS_M
+        ways = 1 if outcome.terminated else 2
+        seconds = ways * max(0.0, hand_m - tops_m[index] - _PADS_M - _SINKS_M) / HAND_SPEED_M_S
+        seconds += is_turned * _LEAST_TURN_RAD / HAND_TURN_RAD_S
+    return round(math.ceil(seconds / env.period_s - 1e-9) * env.period_s, 3)
+
+
+def _heights_m(env: MotionEnv, state: State) -> tuple[Floats, Floats]:
+    """Heights of the objects of a macrostate, and of their tops. Shapes (N,)."""
+    env.restart(seed=0, options={"macrostate": state})
+    model = env.model
+    upward = env.data.geom_xmat[:, 6:]
+    centers, halves = np.hsplit(model.geom_aabb, 2)
+    tops_m = env.data.geom_xpos[:, 2] + (upward * centers + np.abs(upward) * halves).sum(axis=1)
+    highest_m = [
+        tops_m[(model.geom_bodyid == body) & (model.geom_contype > 0)].max() for body in env.world.object_bodies
+    ]
+    return env.world.object_poses()[:, 2], np.array(highest_m)
 
 
 def _pairs(env: MotionEnv) -> list[tuple[State, int]]:

@@ -25,8 +25,10 @@ from small_runs import FORMATS, Inline, collected, exact, small, written
 from storms import as_word, damages, hostile, interrupted, one_sentence
 
 from imagine_bench import registry
+from imagine_bench.arrays import content_hash
 from imagine_bench.cli import exit_code
 from imagine_bench.data.folder import read_apart, read_dataset
+from imagine_bench.data.motion import read_demonstrations
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.judge.judgement import Judgement, judge, kept, shown
 from imagine_bench.running.bench import bench
@@ -35,6 +37,7 @@ from imagine_bench.store.files import make_folder, write_json
 from imagine_bench.store.loading import archive_files, load_so_far
 from imagine_bench.sweep.grid import Study, Variant, read_grid
 from imagine_bench.sweep.run import run_study
+from imagine_bench.tools import demonstrations
 
 pytestmark = pytest.mark.slow
 _FEW: dict[str, Any] = {"budgets": (2, 4), "evaluation_episodes": 2}
@@ -62,6 +65,23 @@ def a_dataset(folder: Path, format: str) -> object:
     return found.episodes.hash, exact(read_apart(found))
 
 
+def demonstrations_of(folder: Path, format: str) -> object:
+    """Demonstrations there, collected unless they are there, and their content, which replays."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demonstrations, "work_through", in_this_process)
+        if not (folder / "set").exists():
+            what: dict[str, Any] = {"policy": "mixed", "episodes": 2, "seed": 0, "appearance": "clean", "size": 32}
+            demonstrations.collect("arrow_puzzle_easy", **what, format=format, folder=folder / "set", workers=1)
+    found = read_demonstrations(folder / "set")
+    return demonstrations.verify(found), found.card["content"], [content_hash(dict(each)) for each in found]
+
+
+def in_this_process(function: Any, items: Any, *, on_end: Any, **_: object) -> None:
+    """Items one after another, so that the files of all are written where the test counts them."""
+    for item in items:
+        on_end(item, function(item, lambda _: None))
+
+
 def an_encoder(folder: Path) -> object:
     """The latents of a black frame by a world's own encoder, which is trained once into the cache."""
     with pytest.MonkeyPatch.context() as patch:
@@ -84,6 +104,7 @@ def a_judgement(folder: Path) -> object:
 
 DEATHS: dict[str, tuple[Callable[[Path], object], int]] = {
     **{format: (functools.partial(a_dataset, format=format), 1) for format in FORMATS},
+    **{f"motion {format}": (functools.partial(demonstrations_of, format=format), 4) for format in FORMATS},
     "encoder": (an_encoder, 1),
     "sweep": (a_sweep, 3),
     "judge": (a_judgement, 3),
@@ -150,6 +171,7 @@ def of_judgement(folder: Path) -> object:
 
 DAMAGED: dict[str, Callable[[Path], object]] = {
     **{format: functools.partial(a_dataset, format=format) for format in FORMATS},
+    **{f"motion {format}": functools.partial(demonstrations_of, format=format) for format in FORMATS},
     "encoder": of_encoder,
     "judge": of_judgement,
     "kept": lambda folder: [run.checkpoints for run in load_so_far(folder).runs],
@@ -162,8 +184,8 @@ _WRITTEN_BY_PEOPLE = ("results.csv", "mine.toml")
 
 def _fill(folder: Path, door: str) -> list[Path]:
     """The files of a door that are damaged."""
-    if door in FORMATS:
-        a_dataset(folder, door)
+    if door.rsplit(maxsplit=1)[-1] in FORMATS:
+        DAMAGED[door](folder)
         return sorted(path for path in folder.rglob("*") if path.is_file())
     if door == "judge":
         place, _ = judge(_JUDGEMENT, folder, workers=1)

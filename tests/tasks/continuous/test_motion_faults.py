@@ -1,0 +1,189 @@
+"""Fault injection in continuous control: hostile actions, options and states; copies and lanes to the bit."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
+from imagine_bench.tasks.continuous.env import MotionEnv
+from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
+from imagine_bench.tasks.scene_env import SceneEnv
+from storms import hostile, one_sentence
+
+from imagine_bench.errors import ImagineBenchError, InvalidValueError
+
+FAMILIES = {"arrows": make_arrows, "pick_place": make_pick_place}
+IDS = sorted(each for each in gymnasium.registry if re.fullmatch(r"imagine_bench/\w+Motion-v0", each))
+
+
+def wrong_actions(n: int) -> Iterator[Any]:
+    """Values that are no n real numbers."""
+    zeros = np.zeros(n)
+    for value in (np.nan, np.inf, -np.inf):
+        yield np.append(zeros[1:], value)
+    yield from (zeros[1:], np.zeros(n + 1), zeros[None], 0.0, None, "left", b"\0" * n, {}, len)
+    yield from (["0"] * n, np.array(["0.5"] * n), [None] * n, [[0], *[0] * (n - 1)], [10**400] * n, [1j] * n)
+    yield from (zeros.astype(kind) for kind in (complex, "datetime64[s]", "timedelta64[s]", [("a", float)], object))
+    yield np.ma.masked_array(zeros, mask=[True] + [False] * (n - 1))
+
+
+@pytest.mark.parametrize("control", CONTROL_NAMES)
+def test_an_action_that_is_no_real_numbers_is_refused_and_moves_nothing(control: str) -> None:
+    env = make_arrows(control=control, observation="proprio")
+    env.reset(seed=0)
+    before = pickle.dumps(env.get_state())
+    for action in wrong_actions(len(env.control_names)):
+        with pytest.raises(InvalidValueError) as refusal:
+            env.step(action)
+        one_sentence(refusal.value)
+        assert pickle.dumps(env.get_state()) == before
+    for size in (1e300, -1e300, 1):
+        assert np.isfinite(env.step(np.full(len(env.control_names), size))[0]).all()
+
+
+OPTIONS: list[dict[str, Any]] = [
+    {"cubes": 2, "goal": "00", "forbid": "none"}, {"cubes": 9}, {"goal": "000", "forbid": "none"}, {"goal": "human"},
+    {"forbid": "agent"}, {"appearance": "mild"}, {"appearance": "patched"}, {"appearance": {"light": 1.0}},
+    {"gesture": "first"}, {"gesture": 0.5}, {"distractors": 2}, {"goal_change": 0.5}, {"fickle": 0.5}, {"slip": 0.5},
+    {"lag": 2}, {"told": True}, {"horizon": 3}, {"shuffle": 1}, {"coupling": "neighbour"}, {"split": "plan_length=2"},
+    {"execution": "kinematic"}, {"motion_hz": 10}, {"rate_hz": 2}, {"rate_hz": 12.5}, {"reward": "dense"},
+    *({"control": control} for control in CONTROL_NAMES),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_every_option_with_every_id_works_or_is_refused_in_a_sentence(env_id: str) -> None:
+    works = 0
+    for option in OPTIONS:
+        try:
+            env = gymnasium.make(env_id, disable_env_checker=True, observation="proprio", **option)
+        except ImagineBenchError as error:
+            one_sentence(error)
+            continue
+        env.reset(seed=0)
+        assert env.observation_space.contains(env.step(env.action_space.sample())[0])
+        works += 1
+    assert 8 <= works < len(OPTIONS)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_hostile_values_of_options_are_refused_in_a_sentence(family: str) -> None:
+    rng = np.random.default_rng(0)
+    names = [*MotionEnv.KEYWORDS, "slip", "lag", "gesture", "goal_change", "distractors", "horizon", "cubes", "x" * 99]
+    refused = 0
+    for name in names:
+        for value in (hostile(rng) for _ in range(8)):
+            try:
+                FAMILIES[family](**{"observation": "proprio", name: value}).reset(seed=0)
+            except ImagineBenchError as error:
+                one_sentence(error)
+                refused += 1
+    assert refused > 6 * len(names)
+
+
+def damaged(state: Any) -> Iterator[Any]:
+    """States of the same kind with a part that is missing, of another shape, or impossible."""
+    world = state.world
+    worlds: list[dict[str, Any]] = [
+        *({"physics": each} for each in (None, world.physics[1:], world.physics[None], world.physics * np.nan)),
+        *({"looks": each} for each in (None, world.looks[1:], (world.looks[0] * np.inf, *world.looks[1:]))),
+        {"sensing": None},
+        {"sleep": {"nothing": 1}},
+    ]
+    yield from (replace(state, world=replace(world, **each)) for each in worlds)
+    other = np.random.Generator(np.random.MT19937(0)).bit_generator.state
+    yield from (replace(state, **each) for each in ({"world": None}, {"generator": other}, {"episode": None}))
+    for macrostate in ((), (9, 9, 9, 9), (0, 0)):
+        if hasattr(state, "macrostate"):
+            yield replace(state, macrostate=macrostate)
+        else:
+            yield replace(state, episode=replace(state.episode, macrostate=macrostate))
+    yield from (None, pickle.dumps(state), replace(state, kind=("another",)))
+
+
+@pytest.mark.parametrize("name", ["arrows", "pick_place", "macro-actions"])
+def test_a_damaged_state_is_refused_and_changes_nothing(name: str) -> None:
+    def made() -> Any:
+        if name in FAMILIES:
+            return FAMILIES[name](observation="proprio")
+        return gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic").unwrapped
+
+    source: SceneEnv = made()
+    env: SceneEnv = made()
+    for each, seed in ((source, 0), (env, 1)):
+        each.reset(seed=seed)
+    before = pickle.dumps(env.get_state())
+    for state in damaged(source.get_state()):
+        with pytest.raises(InvalidValueError) as refusal:
+            env.set_state(state)
+        one_sentence(refusal.value)
+        assert pickle.dumps(env.get_state()) == before
+
+
+@pytest.mark.parametrize("control", CONTROL_NAMES)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_copies_and_states_in_the_middle_of_a_grasp_go_on_to_the_bit(family: str, control: str) -> None:
+    make = FAMILIES[family]
+    env = make(control=control, observation="hand,proprio,objects", size=32)
+    start = (1, 2, 3, 0) if family == "arrows" else (0, 0, 0, 0)
+    env.reset(seed=5, options={"macrostate": start})
+    expert = Expert(env, env.another_world())
+    expert.begin(0)
+    while not env._referee.touched().any():
+        env.step(expert.act())
+    env.step(expert.act())
+    actions = [expert.act() for _ in range(12)]
+    another = make(control=control, observation="hand,proprio,objects", size=32)
+    another.reset(seed=9)
+    another.set_state(env.get_state())
+    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env)), another]
+    for action in actions:
+        seen, *results, info = env.step(action)
+        for each in copies:
+            also, *same, info_also = each.step(action)
+            assert same == results
+            for name, array in (*seen.items(), *info.items()):
+                np.testing.assert_array_equal({**also, **info_also}[name], array)
+    assert env._referee.touched().any()
+
+
+def single(name: str, **options: Any) -> Any:
+    return gymnasium.make(f"imagine_bench/{name}Motion-v0", disable_env_checker=True, **options).unwrapped
+
+
+@pytest.mark.parametrize("name", ["ArrowPuzzle", "PickPlace"])
+def test_lanes_are_single_environments_to_the_bit(name: str) -> None:
+    """Beyond the ends of episodes, and from a lane's state in the middle of one."""
+    options: dict[str, Any] = {"observation": "hand,proprio", "size": 32, "time_limit_s": 0.6, "appearance": "strong", "slip": 0.5}
+    lanes = gymnasium.make_vec(f"imagine_bench/{name}Motion-vector-v0", 2, **options)
+    singles = [single(name, **options) for _ in range(2)]
+    lanes.reset(seed=3)
+    for lane, env in enumerate(singles):
+        env.reset(seed=3 + lane)
+    rng = np.random.default_rng(0)
+    ends = 0
+    for step in range(40):
+        actions = rng.uniform(-1, 1, lanes.action_space.shape).astype(np.float32)
+        seen, *results, _ = lanes.step(actions)
+        for lane, env in enumerate(singles):
+            one, *same, _ = env.step(actions[lane])
+            assert same == [each[lane] for each in results]
+            if same[1] or same[2]:
+                ends += 1
+                one, _ = env.reset()
+            for part, array in one.items():
+                np.testing.assert_array_equal(seen[part][lane], array)
+        if step == 20:
+            singles = [single(name, **options) for _ in range(2)]
+            for env, lane_env in zip(singles, lanes.unwrapped.envs, strict=True):
+                env.set_state(lane_env.get_state())
+    assert ends >= 4
