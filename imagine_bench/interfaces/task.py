@@ -62,7 +62,9 @@ class PhysicsSettings:
         if isinstance(given, PhysicsSettings):
             return given
         if not isinstance(given, Mapping):
-            raise InvalidValueError(f"Physics {brief(given)} is no mapping; give some of {', '.join(cls.__annotations__)}.")
+            raise InvalidValueError(
+                f"Physics {brief(given)} is no mapping; give some of {', '.join(cls.__annotations__)}."
+            )
         for name in given:
             if name not in cls.__annotations__:
                 raise UnknownNameError("physics setting", name, cls.__annotations__)

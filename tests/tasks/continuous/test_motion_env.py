@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import pickle
 from typing import Any
 
 import gymnasium
@@ -99,36 +98,6 @@ def test_a_grasp_that_turns_twice_passes_the_state_between() -> None:
             events.append(info["macro_action"])
     assert events == [1]
     assert env.episode.macrostate[0] == 0
-
-
-def test_a_state_set_in_the_middle_of_a_motion_goes_on_to_the_bit() -> None:
-    """And a step that is taken again from its state has the same reward and the same end, events included."""
-    env, expert = environment("arrows", **FREE)
-    env.reset(seed=5, options={"macrostate": (1, 2, 3, 0)})
-    expert.begin(0)
-    actions = []
-    while not expert.is_done:
-        actions.append(expert.act())
-        state = env.get_state()
-        first = env.step(actions[-1])[1:4]
-        env.set_state(state)
-        assert env.step(actions[-1])[1:4] == first
-    env.reset(seed=5, options={"macrostate": (1, 2, 3, 0)})
-    for action in actions[:25]:
-        env.step(action)
-    state = env.get_state()
-    places = [env.step(action)[0]["objects"] for action in actions[25:]]
-    env.reset(seed=9)
-    for action in actions[:7]:
-        env.step(action)
-    env.set_state(state)
-    copied = pickle.loads(pickle.dumps(env))
-    another = make_arrows(observation="proprio,objects", **FREE)
-    another.set_state(state)
-    for each in (env, copied, another):
-        again = [each.step(action)[0]["objects"] for action in actions[25:]]
-        np.testing.assert_array_equal(places, again)
-        assert each.episode.macrostate == (2, 2, 3, 0)
 
 
 @pytest.mark.parametrize(

@@ -163,7 +163,13 @@ def single(name: str, **options: Any) -> Any:
 @pytest.mark.parametrize("name", ["ArrowPuzzle", "PickPlace"])
 def test_lanes_are_single_environments_to_the_bit(name: str) -> None:
     """Beyond the ends of episodes, and from a lane's state in the middle of one."""
-    options: dict[str, Any] = {"observation": "hand,proprio", "size": 32, "time_limit_s": 0.6, "appearance": "strong", "slip": 0.5}
+    options: dict[str, Any] = {
+        "observation": "hand,proprio",
+        "size": 32,
+        "time_limit_s": 0.6,
+        "appearance": "strong",
+        "slip": 0.5,
+    }
     lanes = gymnasium.make_vec(f"imagine_bench/{name}Motion-vector-v0", 2, **options)
     singles = [single(name, **options) for _ in range(2)]
     lanes.reset(seed=3)
