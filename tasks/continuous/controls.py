@@ -6,6 +6,7 @@ nothing. Speeds, joint ranges and the workspace hold for every action; the servo
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -105,7 +106,7 @@ class HandControl:
         if given.dtype.kind not in "biuf" or np.ma.is_masked(action):
             raise self._refused(action, "has parts that are no real numbers")
         given = given.astype(np.float64)
-        if given.shape != (len(self.names),) or not np.isfinite(given).all():
+        if given.shape != (len(self.names),) or not all(map(math.isfinite, given.tolist())):
             raise self._refused(action, "has another shape or a value that is not finite")
         if self.control == "pose" and not given[3:7].any():
             raise InvalidValueError("The quaternion of the action is all zeros; give (1, 0, 0, 0) for no rotation.")

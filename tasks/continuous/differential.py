@@ -75,7 +75,8 @@ class DifferentialIK:
         mujoco.mj_jacSite(self._model, data, jacobian[:3], jacobian[3:], self._tcp)
         weighted = self._weights[:, None] * jacobian
         wanted = self._weights * motion
-        hessian = weighted.T @ weighted + self._regular
+        hessian = weighted.T @ weighted
+        hessian += self._regular
         pull = self._pull * (self._posture_rad - qpos_rad)
         upper = np.minimum(most_rad, self.upper_rad - qpos_rad)
         lower = np.maximum(-most_rad, self.lower_rad - qpos_rad)

@@ -64,12 +64,12 @@ class Suite:
         return "wrist-plain" if self.has_wrist else "front-plain"
 
 
-def _ours(task: str) -> Suite:
+def _ours(task: str, more: str = "", words: str = "") -> Suite:
     return Suite(
-        name=f"imagine_bench {task}",
+        name=f"imagine_bench {task}{words}",
         worker="ours.py",
         imports="import gymnasium, imagine_bench",
-        arguments=(f"imagine_bench/{task}-v0",),
+        arguments=(f"imagine_bench/{task}{more}-v0",),
         has_effects=False,
     )
 
@@ -77,6 +77,7 @@ def _ours(task: str) -> Suite:
 SUITES = {
     "ours": _ours("ArrowPuzzleMotion"),
     "ours_pick_place": _ours("PickPlaceMotion"),
+    "vector": _ours("ArrowPuzzleMotion", "-vector", ", 8 lanes of its vector environment"),
     "fetch": Suite(
         name="Gymnasium-Robotics FetchPickAndPlace-v4",
         venv="gymnasium_robotics",
@@ -110,7 +111,8 @@ SUITES = {
         imports="import robosuite",
     ),
 }
-OURS = [key for key in SUITES if key.startswith("ours")]
+OURS = ["ours", "ours_pick_place"]
+PEERS = [key for key, suite in SUITES.items() if suite.venv]
 
 
 class Processes:
@@ -265,7 +267,7 @@ def beside_peers(rounds: Sequence[Rows], key: str) -> Iterator[Figure]:
 def slowdowns(rounds: Sequence[Rows], key: str, words: str) -> dict[str, float]:
     """How many times as long a step of each peer takes as ours, at its fastest kind of so many images."""
     found = {}
-    for peer in [each for each in rounds[0] if each not in OURS]:
+    for peer in [each for each in PEERS if each in rounds[0]]:
         one = SUITES[peer].one_image
         kinds = {"no image": ["none"], "one image": [one, one.removesuffix("-plain")], "two images": ["both-plain"]}
         found[peer] = min(ratio(rounds, key, peer, images) for images in kinds[words])
@@ -317,8 +319,8 @@ def _number(value: float | None, factor: float) -> str:
 def versions(processes: Processes, suites: Sequence[str]) -> dict[str, list[str]]:
     """The packages of each suite's virtual environment."""
     code = "from importlib.metadata import distributions as d; print(*sorted(f'{x.name}=={x.version}' for x in d()))"
-    peers = [key for key in suites if SUITES[key].venv]
-    return {key: _last_line(SUITES[key], processes.start(SUITES[key], 0, "-c", code)).split() for key in peers}
+    peers = [SUITES[key] for key in suites if key in PEERS]
+    return {suite.venv: _last_line(suite, processes.start(suite, 0, "-c", code)).split() for suite in peers}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -52,7 +52,7 @@ class Images:
 
 @dataclass
 class Lane:
-    """One environment, in the manner of its own suite."""
+    """One environment, or several at once, in the manner of its own suite."""
 
     reset: Callable[[], None]
     step: Callable[[np.ndarray], tuple[bool, list[np.ndarray]]]  #: whether the episode is over, and the images
@@ -61,6 +61,7 @@ class Lane:
     model: mujoco.MjModel
     physics_steps: int  #: in a step of control
     own_rate_hz: float = RATE_HZ  #: the rate of commands that the suite has by itself
+    lanes: int = 1  #: environments that a step moves, each of which counts
 
 
 Make = Callable[[Images], Lane]
@@ -116,8 +117,8 @@ def steps(make: Make, images: Images, seconds: float) -> dict[str, str | float]:
     period_s = lane.physics_steps * lane.model.opt.timestep
     return {
         "made_s": made_s,
-        "step_s": step_s / n_steps,
-        "reset_s": reset_s / max(n_resets, 1),
+        "step_s": step_s / n_steps / lane.lanes,
+        "reset_s": reset_s / max(n_resets, 1) / lane.lanes,
         "mujoco": mujoco.__version__,
         "control_hz": 1.0 / period_s,
         "physics_steps": lane.physics_steps,
@@ -150,7 +151,7 @@ def memory(make: Make, images: Images, lanes: int) -> dict[str, float]:
         kept.append(lane)
         if count == 0:
             first_mib = resident_mib()
-    return {"one_mib": first_mib, "more_mib": (resident_mib() - first_mib) / lanes}
+    return {"one_mib": first_mib, "more_mib": (resident_mib() - first_mib) / lanes / lane.lanes}
 
 
 def wall(make: Make, images: Images, seconds: float) -> dict[str, float]:
@@ -171,7 +172,7 @@ def wall(make: Make, images: Images, seconds: float) -> dict[str, float]:
         if over:
             lane.reset()
     return {
-        "steps": n_steps,
+        "steps": n_steps * lane.lanes,
         "wall_s": time.perf_counter() - start,
         "cpu_s": time.process_time() - cpu_before,
     }
