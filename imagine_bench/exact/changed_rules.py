@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from imagine_bench.arrays import State
@@ -42,3 +42,38 @@ def coupled(rules: Rules, states: Sequence[State]) -> Dynamics:
 
     one, other = max(itertools.permutations(range(rules.n_actions), 2), key=elsewhere, default=(0, 0))
     return lambda state, action: both(state, one, other) if action == one else rules.outcomes(state, action)
+
+
+def one_change_each(rules: Rules, states: Sequence[State], goals: Mapping[str, State]) -> dict[str, Dynamics]:
+    """Worlds that differ from the rules in one thing, by name; ``goals`` are macrostates that become the goal."""
+    best = max(o.reward for state in states for action in range(rules.n_actions) for o in rules.outcomes(state, action))
+
+    def changed(change: Callable[[Outcome], Outcome]) -> Dynamics:
+        return lambda state, action: [change(outcome) for outcome in rules.outcomes(state, action)]
+
+    def goal_at(goal: State) -> Dynamics:
+        def change(o: Outcome) -> Outcome:
+            if o.macrostate == goal:
+                return replace(o, reward=best, terminated=True, success=True)
+            return replace(o, reward=0.0, terminated=False, success=False) if o.success else o
+
+        return changed(change)
+
+    last = rules.n_actions - 1
+    return {
+        "failures cost nothing": changed(lambda o: replace(o, reward=0.0) if _fails(o) else o),
+        "failures pay": changed(lambda o: replace(o, reward=best) if _fails(o) else o),
+        "failures end nothing": changed(lambda o: replace(o, terminated=False) if _fails(o) else o),
+        "steps cost nothing": changed(lambda o: o if o.terminated else replace(o, reward=0.0)),
+        "successes pay nothing": changed(lambda o: replace(o, reward=0.0) if o.success else o),
+        "successes cost": changed(lambda o: replace(o, reward=-o.reward) if o.success else o),
+        "macro-actions are reversed": lambda state, action: rules.outcomes(state, last - action),
+        "macro-actions are shifted": lambda state, action: rules.outcomes(state, (action + 1) % rules.n_actions),
+        "macro-actions slip": slipping(rules),
+        "one macro-action has another's effect, too": coupled(rules, states),
+        **{f"the goal is {name}": goal_at(goal) for name, goal in goals.items()},
+    }
+
+
+def _fails(outcome: Outcome) -> bool:
+    return outcome.terminated and not outcome.success

@@ -15,6 +15,8 @@ from imagine_bench.arrays import Bools, Floats, Ints, State
 from imagine_bench.rules import Dynamics, Rules, every_outcome
 
 _TIE = 1e-9
+NEVER = -1e6
+"""Reward of a macro-action that was never tried, for an agent that has nothing but its experience."""
 
 
 class Branches(NamedTuple):
@@ -48,8 +50,13 @@ class Model(NamedTuple):
 
 def true_model(rules: Rules, states: Sequence[State]) -> Model:
     """The rules as a model of some macrostates."""
-    found = branches(states, rules.n_actions, rules.outcomes)
-    following = np.minimum(found.following, len(states))
+    return model_of(branches(states, rules.n_actions, rules.outcomes))
+
+
+def model_of(found: Branches) -> Model:
+    """Outcomes as a model of the macrostates that were asked about."""
+    states = found.following
+    following = np.minimum(states, len(states))
     expected = (found.probability * found.reward).sum(axis=2)
     return Model(following, found.probability * ~found.terminated, expected)
 

@@ -31,7 +31,7 @@ import numpy as np
 
 from imagine_bench.arrays import Bools, Frame, Ints, State, read_only
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.exact.values import Model, action_values, rows_of, true_model
+from imagine_bench.exact.values import NEVER, Model, action_values, rows_of, true_model
 from imagine_bench.interfaces import Agent, Observation, Outcome, Rules, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.interfaces.environments import Env
@@ -56,7 +56,6 @@ CAUSES = {
 MOST_STATES = 2_000
 """A task of more macrostates is too large to ask an agent about every one."""
 _TRIES = 8  # frames of a macrostate, until the agent reads one right
-_NOWHERE = -1e6  # reward of a transition that was never experienced, for an agent that has nothing but its experience
 _TIE = 1e-6
 
 
@@ -138,7 +137,7 @@ class Attribution:
         known = known[:-1]  # physics can leave a scene that is no macrostate
         model = held.model
         if model is None:
-            own = Model(truth.following, truth.p_continues * known[..., None], np.where(known, truth.reward, _NOWHERE))
+            own = Model(truth.following, truth.p_continues * known[..., None], np.where(known, truth.reward, NEVER))
         else:
             expected = Model(rows_of(model.macrostates, states), model.p_continues, model.reward)
             own = _mixed(readable[:, None], expected, truth)

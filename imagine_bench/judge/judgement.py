@@ -15,7 +15,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Arrays, State, content_hash
+from imagine_bench.arrays import Arrays, Ints, State, content_hash
 from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import TaskSpec
@@ -23,10 +23,18 @@ from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.change import Streams, change_detection_delay, counterfactual_error, streams_of
 from imagine_bench.judge.models import JudgedModel, model_entry, one_name, opened, runs_of, source_of
+from imagine_bench.judge.policies.levels import counted_table
+from imagine_bench.judge.policies.policy_set import PolicyWorld, policy_world
 from imagine_bench.judge.predictions import Predictions, ask_together, call, evaluate, imagined_by
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.reading import READER_FILE, ImageReader, RenderedFrameIndex, making, reader_in
-from imagine_bench.judge.scores import after_the_end_scores, by_depth, one_step_scores, ranking_scores
+from imagine_bench.judge.scores import (
+    after_the_end_scores,
+    by_depth,
+    one_step_scores,
+    policy_scores,
+    ranking_scores,
+)
 from imagine_bench.judge.truth import Distribution, shares
 from imagine_bench.protocols.data import digest
 from imagine_bench.registry.entries import file_name
@@ -152,11 +160,17 @@ class AskedWorld:
     asked: dict[str, EvalSet]  # "one_step", "rollouts", "ranked" and, where there is such, "after" the end
     counterfactuals: tuple[EvalSet, ...]
     streams: dict[str, Streams] | None  # None where not all of the world is asked about
+    policies: PolicyWorld | None  # likewise
 
     @functools.cached_property
     def digest(self) -> str:
         """Of the frames that are asked about: without rendering them nobody can tell their order from its seed."""
         return content_hash({name: each.frames for name, each in self.asked.items()})
+
+    @property
+    def policies_digest(self) -> str:
+        """Of the policies; nothing where there are none."""
+        return "" if self.policies is None else self.policies.policies.digest
 
 
 def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list[str]]:
@@ -168,11 +182,11 @@ def judge(judgement: Judgement, root: Path, *, workers: int) -> tuple[Path, list
     folder = make_folder(root / judgement.folder_name)
     for seed in judgement.seeds if judgement.learning else ():
         data_of(judgement, folder, seed)
-    prepare(judgement, folder)
+    world = prepare(judgement, folder)
     cells = judgement.cells
     waiting = [cell for cell in cells if not _is_whole(folder, cell)]
     failed = judge_fits(waiting, functools.partial(carry_out, judgement, folder), workers=workers)
-    facts = {"closed_off": why_open() or True, **describe_environment()}
+    facts = {"policies": world.policies_digest, "closed_off": why_open() or True, **describe_environment()}
     if any((folder / cell.file).exists() for cell in cells):  # otherwise the file of another judgement stays
         write_json(folder / "judgement.json", {**dataclasses.asdict(judgement), **facts})
     return folder, failed
@@ -254,11 +268,15 @@ def _judged(
     judgement: Judgement, folder: Path, cell: ModelFit, world: AskedWorld, judged: JudgedModel, seeds: SeedTree
 ) -> tuple[dict[str, Any], Arrays]:
     asked = world.asked
+    table = None
     if judged.visited is not None:  # its data and the cost of its training are its bench's to say
         seen = judged.visited
         learned: Costs = {"data": "", "fit_s": math.nan, "parameters": math.nan}
     else:
-        seen, learned = _fit(judged, cell, data_of(judgement, folder, cell.seed), seeds.child("fit").generator())
+        dataset = data_of(judgement, folder, cell.seed)
+        seen, learned = _fit(judged, cell, dataset, seeds.child("fit").generator())
+        if world.policies is not None:
+            table = counted_table(dataset.episodes, macrostates_of(dataset), cell.transitions, world.policies)
     order = SeedTree(judgement.order).child("judge", judgement.task, "order", world.digest)
 
     def ask(questions: EvalSet, name: str) -> Predictions:
@@ -277,6 +295,8 @@ def _judged(
     answers = ask_together(ask, asked)
     again = [ask(each, "counterfactuals") for each in world.counterfactuals]
     scores = one_step_scores(world.spec, asked["one_step"], answers["one_step"], seen)
+    one_step = (asked["one_step"], answers["one_step"])
+    ranks, film = policy_scores(world.policies, *one_step, world.spec.rules, table, seeds.child("exploit"))
     futures = [answers["rollouts"].distribution(0, step) for step in range(questions.DEPTH)]
     cpu_s = sum(each.cpu_s for each in answers.values())
     found = {
@@ -288,6 +308,8 @@ def _judged(
         **after_the_end_scores(asked.get("after"), answers.get("after"), answers["one_step"]),
         **change_detection_delay(world.streams, answers["one_step"]),
         "counterfactual": counterfactual_error(world.counterfactuals, again),
+        **ranks,
+        "film": None if film is None else film.told(world.spec),
         "futures": {
             "real": [_named(world.spec, shares(outcomes)) for outcomes in asked["rollouts"].truth[0]],
             "imagined": [_named(world.spec, each) for each in futures],
@@ -295,9 +317,11 @@ def _judged(
         "imagine_s_per_1000": 1000.0 * cpu_s / sum(each.steps for each in answers.values()),
         **judged.cost,
         "reader": world.reader_digest,
+        "policies": world.policies_digest,
         "privileged": model_entry(cell.model).privileged,
     }
-    return found, _images(cell.model, judged.model, world, scores["worst"], seeds.child("pictures").generator())
+    images = _images(cell.model, judged.model, world, scores["worst"], seeds.child("pictures").generator())
+    return found, images if film is None else images | film.images(world.index.frame)
 
 
 def _fit(
@@ -342,9 +366,14 @@ def _collected(judgement: Judgement, place: Path, seed: int) -> Dataset:
         episodes *= 2
 
 
+def macrostates_of(dataset: Dataset) -> Ints:
+    """The macrostate of every frame (F, M); no model is given them."""
+    return read_apart(dataset)["privileged"]["macrostates"]
+
+
 def visited(dataset: Dataset, transitions: int) -> set[tuple[State, int]]:
     """The (macrostate, action) pairs of the first so many transitions; no model is given them."""
-    macrostates = read_apart(dataset)["privileged"]["macrostates"][dataset.episodes.rows[0][:transitions]]
+    macrostates = macrostates_of(dataset)[dataset.episodes.rows[0][:transitions]]
     return set(zip(map(tuple, macrostates.tolist()), dataset.episodes.actions[:transitions].tolist(), strict=True))
 
 
@@ -359,7 +388,9 @@ def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
     reader = reader_in(spec, judgement.appearance, folder)
     file = folder / READER_FILE
     digest = sha256(file)[:12] if file.exists() else ""
-    return AskedWorld(spec, index, reader, digest, there, again, streams_of(spec, there["one_step"]))
+    one_step = there["one_step"]
+    policies = policy_world(spec, one_step.macrostates)
+    return AskedWorld(spec, index, reader, digest, there, again, streams_of(spec, one_step), policies)
 
 
 def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], rng: np.random.Generator) -> Arrays:
@@ -395,12 +426,16 @@ def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
     """Every cell of a judgement that is kept. Raises ArtefactError: one is damaged."""
     cells = sorted(judgement.cells, key=lambda cell: judgement.models.index(cell.model))
     found = [read_sealed(folder / cell.file, "a judged cell") for cell in cells if (folder / cell.file).exists()]
-    readers = {cell.get("reader", "") for cell in found}
-    if len(readers) > 1:
-        raise ArtefactError(
-            f"Cells in {folder} were read by different readers ({', '.join(sorted(readers))}) and cannot be compared; "
-            "give another folder with --out."
-        )
+    made_by = {
+        "read by different readers": {cell.get("reader", "") for cell in found},
+        "judged by different policies": {cell["policies"] for cell in found if "policies" in cell},
+    }
+    for how, digests in made_by.items():
+        if len(digests) > 1:
+            raise ArtefactError(
+                f"Cells in {folder} were {how} ({', '.join(sorted(digests))}) and cannot be compared; "
+                "give another folder with --out."
+            )
     for cell in found:
         if "privileged" in cell and cell["privileged"] != model_entry(cell["model"]).privileged:
             was = "privileged" if cell["privileged"] else "not privileged"

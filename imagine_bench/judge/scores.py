@@ -11,7 +11,7 @@ a perfect sampler would have, and :func:`.truth.squared_distance`, which is free
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,10 @@ import numpy as np
 from imagine_bench.arrays import Bools, Floats, State
 from imagine_bench.exact.values import Model, rows_of, true_model, values_of_planning
 from imagine_bench.interfaces import Rules, TaskSpec
+from imagine_bench.judge.policies.exploit import Exploit
+from imagine_bench.judge.policies.film import Expected, Film, course
+from imagine_bench.judge.policies.levels import SCORES, level_scores
+from imagine_bench.judge.policies.policy_set import PolicyWorld
 from imagine_bench.judge.predictions import Predictions
 from imagine_bench.judge.questions import FRAMES, RANKED, EvalSet
 from imagine_bench.judge.truth import (
@@ -33,10 +37,11 @@ from imagine_bench.judge.truth import (
     squared_distance,
     total_variation,
 )
+from imagine_bench.seeding import SeedTree
 from imagine_bench.statistics import auroc
 
 _BINS = 10
-_MOST = 0.5  # share of a transition's frames in which a filter keeps it
+_MOST = 0.5  # share of a transition's frames in which a filter keeps it; probability from which an episode goes on
 _AVOIDED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # shares of the transitions, those that a model knows least of
 _WRONG = 0.5  # total variation from which a transition counts as imagined wrongly
 _TIE = 1e-9
@@ -223,6 +228,73 @@ def _costs(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dict
     if accepted is not None:
         found["worth_of_filter"] = gain(by_pair(accepted) >= _MOST)
     return found
+
+
+def policy_scores(
+    world: PolicyWorld | None,
+    questions: EvalSet,
+    predictions: Predictions,
+    rules: Rules,
+    table: Model | None,
+    seeds: SeedTree,
+) -> tuple[Scores, Film | None]:
+    """The scores of :func:`.policies.levels.level_scores` by the model's own rewards and ends, and by the rules'.
+
+    The latter end in ``_ruled``. The film is by the model's own, or by the rules' where it predicts none. NaN, and no
+    film, where not all of the world is asked about.
+
+    Args:
+        world: The policies.
+        questions: Those of single transitions, as :func:`.questions.one_step` makes them.
+        predictions: The model's answers.
+        rules: The task's rules.
+        table: The counts of the data that the model learned from.
+        seeds: Has a generator for each search.
+    """
+    found = {f"{name}{kind}": math.nan for name in SCORES for kind in ("", "_ruled")}
+    if world is None:
+        return found, None
+    film = None
+    for kind, model in imagined_models(questions, predictions, rules).items():  # "ruled" comes first
+        scores, exploit = level_scores(world, model, table, seeds.child(kind).generator())
+        found |= {f"{name}{'_ruled' if kind == 'ruled' else ''}": value for name, value in scores.items()}
+        film = _film(world, exploit, _likeliest_imagined(world, predictions, model), rules)
+    return found, film
+
+
+def _film(
+    world: PolicyWorld, exploit: Exploit, believed: Callable[[State, int], Expected], rules: Rules
+) -> Film | None:
+    """The film of an exploit, from where its returns differ most; None where they differ nowhere."""
+
+    def real(state: State, action: int) -> Expected:
+        likely = max(rules.outcomes(state, action), key=lambda each: each.probability)
+        return Expected(likely.macrostate, likely.reward, likely.terminated)
+
+    gaps = np.where(world.starts > 0.0, exploit.believed - exploit.real, -np.inf)
+    row = int(gaps.argmax())
+    if gaps[row] <= _TIE:
+        return None
+    start = world.states[row]
+    return Film(
+        start=start,
+        returns=(float(exploit.believed[row]), float(exploit.real[row])),
+        believed=course(start, exploit.plan, world.states, believed),
+        real=course(start, exploit.plan, world.states, real),
+    )
+
+
+def _likeliest_imagined(world: PolicyWorld, predictions: Predictions, model: Model) -> Callable[[State, int], Expected]:
+    """The outcome that a model expects most of a macro-action in a macrostate."""
+
+    def outcome(state: State, action: int) -> Expected:
+        row = world.states.index(state)
+        first = FRAMES * (row * model.reward.shape[1] + action)
+        likely = added_up(pair for frame in range(FRAMES) for pair in predictions.futures(first + frame, 0))
+        over = float(model.p_continues[row, action].sum()) < _MOST
+        return Expected(max(likely, key=likely.__getitem__), float(model.reward[row, action]), over)
+
+    return outcome
 
 
 def _calibration(of: str, pairs: Pairs[Value]) -> Scores:

@@ -6,7 +6,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from imagine_bench.judge.judgement import Judgement, kept, shown
 from imagine_bench.judge.models import model_entry, runs_of
 from imagine_bench.recording.filmstrips import TileRow, png, transition_sheet
 from imagine_bench.registry.entries import file_name
+from imagine_bench.report.levels import LEVELS, claims_table, film_image
 from imagine_bench.report.page import (
     DASH,
     Image,
@@ -65,6 +66,13 @@ QUESTIONS = {
         "notice_slip": "transitions until a slip", "notice_coupling": "until a coupling",
         "counterfactual": "counterfactuals wrong",
     },
+    "Which policies does it overrate?": {
+        "policy_r": "policies, r", "policy_tau": "policies, τ", "policy_error": "policies, error", "lift": "lift",
+        "exploit": "exploit", "exploit_bound": "exploit, at most",
+        "policy_r_ruled": "r, rules' rewards", "policy_tau_ruled": "τ, rules' rewards",
+        "policy_error_ruled": "error, rules' rewards", "lift_ruled": "lift, rules' rewards",
+        "exploit_ruled": "exploit, rules' rewards", "exploit_bound_ruled": "at most, rules' rewards",
+    },
     "What does it cost?": {
         "fit_s": "CPU s to fit", "imagine_s_per_1000": "CPU s, 1,000 steps", "parameters": "parameters",
         "encoder_frames": "frames beforehand",
@@ -101,12 +109,21 @@ _WORDS = {
     f"probability {SLIP}, or that one also has another's effect, at false alarms in {FALSE_ALARMS:.0%} of "
     f"unchanged streams of {LENGTH}; {LENGTH}: never. Counterfactuals: its imagination of two macro-actions with the "
     "same draws that cannot both be.",
+    "Which policies does it overrate?": "The expected returns of about 40 policies (random, optimal, optimal for a "
+    "wrong rule, trained by Q-learning, adversarial) are enumerated in the model and in the truth. r and τ are "
+    "Pearson's and Kendall's correlations of the two, 1 is best; the error is the mean absolute difference. They are a "
+    "dash where all policies are worth the same in the model. Lift: the true return of the plan that is optimal in the "
+    "model, less that of the plan that is optimal in a table that counts the same transitions, and knows their "
+    "macrostates; above 0 the model is of use. Exploit: how far the model overrates the policy that it overrates most, "
+    "found by a search from many starts, or, below 0, that it underrates all; no policy is overrated by more than “at "
+    "most”, which is proved. All returns are means over starts, in units of reward. Only the model's "
+    "own futures are sampled, and nothing of the truth.",
     "What does it cost?": "CPU seconds are those of one core: of fitting, and of imagining 1,000 macro-actions. Frames "
     "beforehand are those on which the model's encoder had been trained before.",
 }
 SHORT = (
     *("total_variation", "perfect_sampler", "unbiased", "unbiased_10", "nothing", "value_loss", "value_loss_ruled"),
-    *("auroc_wrong", "notice_slip", "counterfactual", "fit_s"),
+    *("policy_tau", "lift", "exploit", "auroc_wrong", "notice_slip", "counterfactual", "fit_s"),
 )
 _SHARES = {
     *("total_variation", "tv_3", "tv_5", "tv_10", "perfect_sampler", "perfect_10", "after_the_end", "nothing"),
@@ -232,6 +249,24 @@ def question(found: Judged, title: str) -> Section:
     return Section(title, [_WORDS[title]], tables=[_scores(found, name, QUESTIONS[title])])
 
 
+def levels(found: Judged) -> Section:
+    """The scores of each level L0 to L7, its claims, and the policy that each model overrates most."""
+    errors = read_json(found.folder / "reader.json", "errors")
+    reader = (
+        f"Returns of policies in a model hold the errors of the reader of its images, too: it takes "
+        f"{errors['misread']:.2%} of real frames for another macrostate and does not recognize {errors['refused']:.2%}."
+    )
+    level_of = {name: level.name for level in LEVELS for name in level.measures}
+    films = []
+    for model, arrays in shown(found.folder, found.judgement).items():
+        if arrays.get("film"):
+            films.append(film_image(model, _title(model), found.spec, arrays["film"], arrays))
+    scores = _scores(found, "levels", level_of)
+    header = [*scores.header[:2], *(f"{level} {COLUMNS[name]}" for name, level in level_of.items())]
+    tables = [replace(scores, header=header), claims_table()]
+    return Section("From looks to exploits: L0 to L7", [reader], tables=tables, images=films)
+
+
 def compared(found: Judged) -> Section:
     """Each pair's difference in unbiased Brier score at the most transitions, and a line on the two best that learned.
 
@@ -295,6 +330,7 @@ def _joined(images: Pixels) -> Pixels:
 
 SECTIONS: tuple[Callable[[Judged], Section | None], ...] = (
     in_short,
+    levels,
     images,
     *(functools.partial(question, title=title) for title in QUESTIONS),
     compared,

@@ -249,15 +249,20 @@ def test_a_command_that_judges_nothing_leaves_the_report_of_others(said: Said) -
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_each_cell_names_its_reader_and_is_not_compared_with_those_of_another(said: Said, tmp_path: Path) -> None:
+def test_each_cell_names_reader_and_policies_and_is_not_compared_with_those_of_another(
+    said: Said, tmp_path: Path
+) -> None:
     folder = tmp_path / said.folder.name
     shutil.copytree(said.folder, folder)
     cell = folder / ModelFit("copy", 1000, 60).file
-    found = {**read_sealed(cell, "a cell"), "reader": "0123456789ab"}
-    write_json(cell, sealed(found))
-    with pytest.raises(ArtefactError, match=r"read by different readers \(, 0123456789ab\) and cannot be compared"):
-        kept(folder, _of("copy", "exact"))
-    assert kept(folder, _of("exact"))
+    before = read_sealed(cell, "a cell")
+    protocol = json.loads((folder / "judgement.json").read_text())
+    assert len(before["policies"]) == 12 and before["policies"] == protocol["policies"]
+    for name, words in (("reader", "read by different readers"), ("policies", "judged by different policies")):
+        write_json(cell, sealed({**before, name: "0123456789ab"}))
+        with pytest.raises(ArtefactError, match=rf"{words} \(.*0123456789ab.*\) and cannot be compared"):
+            kept(folder, _of("copy", "exact"))
+        assert kept(folder, _of("exact"))
     images = folder / ModelFit("exact", 1000, 60).images
     write_arrays(images, {name: np.zeros_like(array) for name, array in read_arrays(images).items()})
     with pytest.raises(ArtefactError, match="is damaged: it is not as it was written"):
@@ -276,9 +281,20 @@ def test_a_model_of_theirs_is_judged(said: Said) -> None:
     futures = scored["exact", 60]["futures"]
     assert [pytest.approx(each) for each in futures["real"]] == futures["imagined"]
     assert scored["copy", 20]["data"] == scored["exact", 60]["data"]
+    (theirs,) = (cell for cell in kept(said.folder, _of("nearest")) if cell["transitions"] == 60)
+    assert 0.0 <= theirs["exploit_ruled"] <= theirs["exploit_bound_ruled"] + 1e-9
+    assert scored["exact", 60]["lift"] == scored["exact", 60]["lift_ruled"] >= theirs["lift_ruled"]
+    assert scored["exact", 60]["film"] is None, "it overrates nothing"
+    film = shown(said.folder, _of("nearest"))["nearest"]
+    for course in ("believed", "real"):
+        assert len(film[f"film_{course}"]) == 1 + len(film["film"][course]) > 1
+    assert (said.folder / "report/film_nearest.png").exists()
+    assert "L7 exploit" in (said.folder / "report/index.html").read_text()
 
 
-_SINCE = re.compile("perfect|unbiased|.*_ruled")  # scores that judgements before 2026-11-28 lack
+_SINCE = re.compile(
+    "perfect|unbiased|policy|lift|exploit|film|.*_ruled"
+)  # scores that judgements before 2026-11-28 lack
 
 
 def test_scores_that_an_older_judgement_lacks_are_dashes(said: Said) -> None:

@@ -1,0 +1,64 @@
+"""Levels 5 to 7 of a model: it ranks policies, training in it pays, and no policy exploits it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from imagine_bench.arrays import Ints
+from imagine_bench.exact.values import NEVER, Model, rows_of, values_of_planning
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.judge.policies.agreement import dense, kendall, pearson, values_of
+from imagine_bench.judge.policies.exploit import Exploit, largest_exploit, upper_bound
+from imagine_bench.judge.policies.policy_set import PolicyWorld
+
+SCORES = ("policy_r", "policy_tau", "policy_error", "lift", "exploit", "exploit_bound")
+
+
+def level_scores(
+    world: PolicyWorld, held: Model, table: Model | None, rng: np.random.Generator
+) -> tuple[dict[str, float], Exploit]:
+    """The scores of a model, and the policy that it overrates most. Returns are expected, from a start, undiscounted.
+
+    ``policy_r`` and ``policy_tau`` compare the returns of the world's policies in model and truth, and ``policy_error``
+    is their mean absolute difference. ``lift`` is the return, in the truth, of the plan that is optimal in the model,
+    less that of the plan that is optimal in ``table``, the counts of the model's data; NaN without a table. ``exploit``
+    and ``exploit_bound`` enclose the largest difference that any policy has between model and truth.
+    """
+    model = dense(held)
+    imagined = values_of(model, world.policies.tables, world.horizon) @ world.starts
+    found = largest_exploit(model, world.dense_truth, world.starts, world.policies.tables, world.horizon, rng)
+    lift = math.nan
+    if table is not None:
+        in_model, in_table = (values_of_planning(world.truth, each, world.horizon) for each in (held, table))
+        lift = float((in_model - in_table) @ world.starts)
+    scores = (
+        pearson(imagined, world.real),
+        kendall(imagined, world.real),
+        float(np.abs(imagined - world.real).mean()),
+        lift,
+        float((found.believed - found.real) @ world.starts),
+        float(upper_bound(model, world.dense_truth, world.horizon) @ world.starts),
+    )
+    return dict(zip(SCORES, scores, strict=True)), found
+
+
+def counted_table(episodes: Episodes, macrostates: Ints, transitions: int, world: PolicyWorld) -> Model:
+    """The model that counts the first transitions of a dataset: shares of outcomes, and mean rewards.
+
+    A macro-action that was never tried has the reward :data:`.NEVER`, so that a plan tries it only where it must.
+    ``macrostates`` (F, M) are those of the dataset's frames.
+    """
+    n_states, n_actions = world.truth.reward.shape
+    first = episodes.rows[0][:transitions]
+    before, after = (rows_of(macrostates[each], world.states) for each in (first, first + 1))
+    actions = episodes.actions[:transitions]
+    onward = np.zeros((n_states + 1, n_actions, n_states + 1))
+    np.add.at(onward, (before, actions, after), ~episodes.terminated[:transitions])
+    paid, tried = np.zeros((2, n_states + 1, n_actions))
+    np.add.at(paid, (before, actions), episodes.rewards[:transitions])
+    np.add.at(tried, (before, actions), 1.0)
+    often = np.maximum(tried, 1.0)[:-1]
+    following = np.broadcast_to(np.arange(n_states + 1), (n_states, n_actions, n_states + 1))
+    return Model(following, onward[:-1] / often[..., None], np.where(tried[:-1] > 0, paid[:-1] / often, NEVER))

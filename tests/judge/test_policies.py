@@ -1,0 +1,241 @@
+"""Policies in a model and in the truth: ranks, lift and exploits are those of brute force and of the rules."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+
+import numpy as np
+import pytest
+from imagine_bench.agents.world_models.limits import Exact
+from judged import STILL, judged_world
+from scipy.stats import kendalltau
+
+from imagine_bench import registry
+from imagine_bench.arrays import Floats
+from imagine_bench.exact.values import NEVER, values_of_planning
+from imagine_bench.interfaces import Outcome, State
+from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.interfaces.model import WorldModel
+from imagine_bench.judge.policies.agreement import DenseModel, kendall, pearson, values_of
+from imagine_bench.judge.policies.exploit import largest_exploit, upper_bound
+from imagine_bench.judge.policies.film import Film
+from imagine_bench.judge.policies.levels import SCORES, counted_table
+from imagine_bench.judge.policies.policy_set import PolicyWorld, policy_world
+from imagine_bench.judge.scores import policy_scores
+from imagine_bench.report.judge import COLUMNS
+from imagine_bench.report.levels import LEVELS
+from imagine_bench.rules import evaluate, horizon_optimum, states_of_play, tabulate
+from imagine_bench.seeding import SeedTree
+
+ARROWS, SLIPS = "arrows:cubes=2", "arrows:cubes=2,slip=0.2"
+WORLDS = pytest.mark.parametrize("task", [ARROWS, SLIPS, "pick_place"])
+
+
+@functools.cache
+def world_of(task: str) -> PolicyWorld:
+    spec = judged_world(task).spec
+    found = policy_world(spec, judged_world(task).one_step.macrostates)
+    assert found is not None
+    return found
+
+
+def scores_of(task: str, model: WorldModel) -> tuple[dict[str, float], Film | None]:
+    judged = judged_world(task)
+    predictions = judged.predictions(model, judged.one_step)
+    return policy_scores(world_of(task), judged.one_step, predictions, judged.spec.rules, None, SeedTree(0))
+
+
+# Ranks -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "tau"),
+    [
+        ([1, 2, 3], [10, 20, 30], 1.0),
+        ([1, 2, 3], [3, 2, 1], -1.0),
+        ([1, 2, 3], [1, 3, 2], 1 / 3),  # two pairs alike, one otherwise
+        ([1, 1, 2], [1, 2, 3], 2 / math.sqrt(2 * 3)),  # one pair is tied in the first row
+        ([1, 1 + 1e-12, 2], [1, 2, 3], 2 / math.sqrt(2 * 3)),  # rounding parts no pair
+        ([5, 5, 5], [1, 2, 3], math.nan),
+    ],
+)
+def test_rank_correlations_are_those_of_pairs_by_hand(one: list[float], other: list[float], tau: float) -> None:
+    assert kendall(np.array(one, dtype=float), np.array(other, dtype=float)) == pytest.approx(tau, nan_ok=True)
+
+
+def test_rank_correlation_is_tau_b_and_r_that_of_standard_scores() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        one, other = rng.integers(0, 5, size=(2, 12)).astype(float)
+        assert kendall(one, other) == pytest.approx(kendalltau(one, other).statistic)
+        scores = [(row - row.mean()) / row.std() for row in (one, other)]
+        assert pearson(one, other) == pytest.approx(np.mean(scores[0] * scores[1]))
+    assert math.isnan(pearson(np.ones(3), np.arange(3.0)))
+
+
+@WORLDS
+def test_policies_of_a_world_are_many_different_and_fixed(task: str) -> None:
+    world, again = world_of(task), policy_world(registry.task(task), states_of_play(registry.task(task).rules))
+    names, tables = world.policies
+    assert again is not None and again.policies.digest == world.policies.digest
+    assert 20 <= len(names) == len(set(names)) <= 50 and len(np.unique(tables.round(6), axis=0)) >= 20
+    assert tables.min() >= 0.0 and tables.sum(axis=2) == pytest.approx(1.0)
+    assert len({world_of(each).policies.digest for each in (ARROWS, SLIPS, "pick_place")}) == 3
+    real = dict(zip(names, world.real, strict=True))
+    assert real["optimal"] == max(world.real) and real["worst"] < real["uniform"] < real["optimal"]
+
+
+@WORLDS
+def test_values_in_the_truth_are_those_of_the_rules(task: str) -> None:
+    """By another way: the sparse tables of the rules."""
+    world, spec = world_of(task), judged_world(task).spec
+    tables = tabulate(spec.rules)
+    rows = [tables.index[state] for state in world.states]
+    for table, real in zip(world.policies.tables, world.real, strict=True):
+        policy = np.full(tables.reward.shape, 1.0 / spec.n_actions)
+        policy[:, rows] = table.T
+        assert evaluate(tables, policy, spec.horizon).returns[tables.starts].mean() == pytest.approx(real)
+
+
+@WORLDS
+def test_exact_ranks_as_the_truth_does_and_is_not_exploited(task: str) -> None:
+    judged = judged_world(task)
+    found, film = scores_of(task, Exact(judged.spec, judged.index))
+    for kind in ("", "_ruled"):
+        assert (found[f"policy_r{kind}"], found[f"policy_tau{kind}"]) == (pytest.approx(1.0), 1.0)
+        for name in ("policy_error", "exploit", "exploit_bound"):
+            assert found[name + kind] == pytest.approx(0.0, abs=1e-9)
+    assert film is None, "nothing is overrated"
+
+
+def test_copy_overrates_just_what_enumeration_says() -> None:
+    """It believes that each macro-action costs a step and changes nothing; the worst is to break a rule at the end."""
+    judged, horizon = judged_world(ARROWS), world_of(ARROWS).horizon
+    rules = judged.spec.rules
+    found, film = scores_of(ARROWS, STILL)
+    costs = {rules.judge(state, action, state).reward for state, action in judged.one_step.pairs}
+    assert costs == {-1.0}
+
+    @functools.cache
+    def worst(state: State, left: int) -> float:
+        def after(o: Outcome) -> float:
+            return o.probability * (o.reward + (0.0 if o.terminated or left == 1 else worst(o.macrostate, left - 1)))
+
+        return min(sum(map(after, rules.outcomes(state, action))) for action in range(rules.n_actions))
+
+    gaps = {start: -horizon - worst(start, horizon) for start in rules.start_states}
+    assert found["exploit_ruled"] == pytest.approx(np.mean(list(gaps.values()))) == found["exploit_bound_ruled"]
+    assert film is not None and gaps[film.start] == max(gaps.values()) > 0.0
+    assert film.returns == pytest.approx((-horizon, worst(film.start, horizon)))
+    assert [step.outcome.reached for step in film.believed] == [film.start] * horizon
+    assert film.real[-1].outcome.over and sum(step.outcome.reward for step in film.real) == film.returns[1]
+    world = world_of(ARROWS)
+    assert found["policy_error_ruled"] == pytest.approx(np.abs(-horizon - world.real).mean())
+    assert math.isnan(found["policy_r_ruled"]) and math.isnan(found["policy_tau_ruled"]), "all are worth the same"
+    assert all(math.isnan(found[name]) for name in SCORES), "it predicts no rewards"
+
+
+def test_no_level_lacks_a_score_and_no_score_a_column() -> None:
+    assert [level.name for level in LEVELS] == [f"L{number}" for number in range(8)]
+    measures = {name for level in LEVELS for name in level.measures}
+    assert measures | {f"{name}{kind}" for name in SCORES for kind in ("", "_ruled")} <= COLUMNS.keys()
+
+
+# Exploits ----------------------------------------------------------------------------------------------------------
+
+
+def random_model(rng: np.random.Generator, states: int, actions: int) -> DenseModel:
+    """Some macro-actions end the episode more often than others."""
+    onward = rng.dirichlet(np.full(states + 1, 0.5), size=(states, actions))[..., :-1]
+    return DenseModel(onward, rng.normal(size=(states, actions)))
+
+
+def by_recursion(model: DenseModel, plan: Floats, state: int, left: int) -> float:
+    """The return of a plan (H, S), one macro-action after another."""
+    if not left:
+        return 0.0
+    action = int(plan[left - 1, state])
+    onward = [p * by_recursion(model, plan, after, left - 1) for after, p in enumerate(model.onward[state, action])]
+    return float(model.reward[state, action]) + sum(onward)
+
+
+@pytest.mark.parametrize(("states", "actions", "horizon"), [(2, 2, 2), (2, 3, 2), (3, 2, 2), (1, 3, 3)])
+def test_exploits_lie_between_those_of_every_plan_and_the_bound(states: int, actions: int, horizon: int) -> None:
+    """Every deterministic plan, tried; the search finds the best one, and the bound is above it."""
+    rng = np.random.default_rng(states)
+    starts = rng.dirichlet(np.ones(states))
+    for _ in range(3):
+        model, truth = (random_model(rng, states, actions) for _ in range(2))
+        gaps = []
+        for choice in itertools.product(range(actions), repeat=states * horizon):
+            plan = np.array(choice).reshape(horizon, states)
+            values = [[by_recursion(each, plan, state, horizon) for state in range(states)] for each in (model, truth)]
+            gaps.append(float(starts @ (np.array(values[0]) - values[1])))
+        policies = np.full((4, states, actions), 1.0 / actions)
+        found = largest_exploit(model, truth, starts, policies, horizon, rng)
+        bound = float(starts @ upper_bound(model, truth, horizon))
+        assert starts @ (found.believed - found.real) == pytest.approx(max(gaps)) and max(gaps) <= bound + 1e-9
+        for values, each in ((found.believed, model), (found.real, truth)):
+            again = [by_recursion(each, found.plan, state, horizon) for state in range(states)]
+            assert values == pytest.approx(again)
+
+
+def test_no_policy_passes_the_search_and_no_search_passes_the_bound() -> None:
+    rng = np.random.default_rng(0)
+    for states, actions, horizon in ((5, 3, 4), (12, 4, 10), (30, 2, 6)):
+        truth, other = (random_model(rng, states, actions) for _ in range(2))
+        starts = np.full(states, 1.0 / states)
+        policies = rng.dirichlet(np.ones(actions), size=(10, states))
+        for share in (0.01, 0.3, 1.0):  # from nearly right to wrong
+            model = DenseModel(*((1.0 - share) * a + share * b for a, b in zip(truth, other, strict=True)))
+            gaps = (values_of(model, policies, horizon) - values_of(truth, policies, horizon)) @ starts
+            found = largest_exploit(model, truth, starts, policies, horizon, rng)
+            lower = starts @ (found.believed - found.real)
+            assert gaps.max() <= lower + 1e-9 <= starts @ upper_bound(model, truth, horizon) + 2e-9
+        assert upper_bound(truth, truth, horizon) == pytest.approx(0.0, abs=1e-12)
+
+
+# Lift --------------------------------------------------------------------------------------------------------------
+
+
+def episodes_of(world: PolicyWorld, walks: list[list[tuple[int, int]]]) -> tuple[Episodes, Floats]:
+    """Episodes of (row, macro-action) in a world without chance, and the macrostates of their frames."""
+    frames: list[tuple[int, ...]] = []
+    actions, rewards, ends = [], [], []
+    for walk in walks:
+        for row, action in walk:
+            frames.append(world.states[row])
+            actions.append(action)
+            rewards.append(world.truth.reward[row, action])
+            ends.append(world.truth.p_continues[row, action].sum() < 0.5)
+        after = int(world.truth.following[row, action, 0])
+        frames.append(world.states[after] if after < len(world.states) else (-1,) * len(world.states[0]))
+    n = len(frames)
+    lengths = np.array([len(walk) for walk in walks])
+    episodes = Episodes(
+        lengths=lengths,
+        frames=np.zeros((n, 64, 64, 3), dtype=np.uint8),
+        action_masks=np.ones((n, world.truth.reward.shape[1]), dtype=np.int8),
+        actions=np.array(actions),
+        rewards=np.array(rewards),
+        terminated=np.array(ends),
+        truncated=np.isin(np.arange(len(actions)) + 1, lengths.cumsum()) & ~np.array(ends),
+        success=np.zeros(len(actions), dtype=bool),
+    )
+    return episodes, np.array(frames)
+
+
+def test_a_table_of_every_transition_plans_as_the_truth_and_one_of_none_never_tries() -> None:
+    world = world_of(ARROWS)
+    every = [[pair] for pair in itertools.product(*map(range, world.truth.reward.shape))]
+    best_return = world.starts @ values_of_planning(world.truth, world.truth, world.horizon)
+    tables = tabulate(judged_world(ARROWS).spec.rules)
+    assert best_return == pytest.approx(horizon_optimum(tables, world.horizon).returns[tables.starts].mean())
+    table = counted_table(*episodes_of(world, every), len(every), world)
+    assert table.reward == pytest.approx(world.truth.reward)
+    assert world.starts @ values_of_planning(world.truth, table, world.horizon) == pytest.approx(best_return)
+    half = counted_table(*episodes_of(world, every), 2, world)
+    assert (half.reward == NEVER).sum() == len(every) - 2
+    assert half.reward[0, :2] == pytest.approx(world.truth.reward[0, :2])
