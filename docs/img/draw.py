@@ -370,6 +370,37 @@ def vary(factor: str) -> list[np.ndarray]:
     return list(world.render_macrostates(np.array([(0, 1, 2, 1)] * 4), factor or "clean", rng))
 
 
+def levels() -> None:
+    """Total variation of each judged model, and its exploit with the upper bound, by the size of its data."""
+    with (RESULTS / "arrow_puzzle_clockwise-levels-judge" / "scores.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["exploit"]]
+    sizes = sorted({int(row["transitions"]) for row in rows})
+    plot, axes = plt.subplots(figsize=(8, 4.6), layout="constrained")
+    for place, model in enumerate(dict.fromkeys(row["model"] for row in rows)):
+        style = {"color": figures.COLORS[place], "marker": figures.MARKERS[place]}
+        label = registry.world_model_entry(model).label
+        for size in sizes:
+            kept = [row for row in rows if row["model"] == model and int(row["transitions"]) == size]
+            away, low, high = (
+                np.mean([float(row[name]) for row in kept]) for name in ("total_variation", "exploit", "exploit_bound")
+            )
+            axes.errorbar(away, low, [[0.0], [high - low]], color=style["color"], capsize=4, linewidth=1.5)
+            area = 30 * (1 + sizes.index(size)) ** 1.5
+            axes.scatter(away, low, s=area, label=label if size == sizes[0] else None, alpha=0.8, **style)
+    axes.axvline(0.1, color="gray", linewidth=1, linestyle=":")
+    axes.axhline(20.0, color="gray", linewidth=1, linestyle=":")
+    axes.set_xscale("symlog", linthresh=0.01)
+    axes.set_xlim(-0.001, 1.1)
+    axes.set_xticks([0.0, 0.01, 0.1, 1.0], ["0", "0.01", "0.1", "1"])
+    axes.set_xlabel("total variation of one macro-action (L1; linear below 0.01, then logarithmic)")
+    axes.set_ylabel("exploit (L7), reward")
+    axes.set_title("Largest marks: " + f"{sizes[-1]:,} transitions; smallest: {sizes[0]:,}", fontsize=10)
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    plot.savefig(HERE / "levels.png", dpi=100)
+
+
 def strips(rows: Mapping[str, list[np.ndarray]], titles: Sequence[str]) -> np.ndarray:
     """Named rows of frames below one another, with titles above the first row."""
     drawn = []
@@ -396,7 +427,7 @@ def tasks() -> None:
     runpy.run_path(str(HERE / "draw_tasks.py"))["tasks"]()
 
 
-FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, parameters, tasks)
+FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, levels, parameters, tasks)
 PICTURES = {each.__name__: each for each in FIGURES}
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_typed
-from imagine_bench.arrays import Array, Arrays, content_hash
+from imagine_bench.arrays import Array, Arrays, Ints, content_hash
 from imagine_bench.errors import ArtefactError, InvalidValueError, require_known, writing
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.episodes import Episodes
@@ -179,6 +179,11 @@ def read_apart(dataset: Dataset) -> dict[str, Arrays]:
     Raises ArtefactError: a file is missing or damaged.
     """
     return read_files(dataset.folder, dataset.card or {})
+
+
+def macrostates_of(dataset: Dataset) -> Ints:
+    """The macrostate of every frame, which no learner is given. Shape (N + E, M). Raises as :func:`read_apart`."""
+    return read_apart(dataset)["privileged"]["macrostates"]
 
 
 def read_files(folder: Path, card: Mapping[str, Any]) -> dict[str, Arrays]:

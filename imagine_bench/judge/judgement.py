@@ -15,8 +15,8 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
-from imagine_bench.arrays import Arrays, Ints, State, content_hash
-from imagine_bench.data.folder import Dataset, read_apart, read_dataset, write_dataset
+from imagine_bench.arrays import Arrays, State, content_hash
+from imagine_bench.data.folder import Dataset, macrostates_of, read_dataset, write_dataset
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, brief
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.model import WorldModel
@@ -364,11 +364,6 @@ def _collected(judgement: Judgement, place: Path, seed: int) -> Dataset:
         if len(played.actions) >= judgement.sizes[-1]:
             return write_dataset(place, played, apart, card, "npz")
         episodes *= 2
-
-
-def macrostates_of(dataset: Dataset) -> Ints:
-    """The macrostate of every frame (F, M); no model is given them."""
-    return read_apart(dataset)["privileged"]["macrostates"]
 
 
 def visited(dataset: Dataset, transitions: int) -> set[tuple[State, int]]:
