@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from imagine_bench.tasks import robot_ik, toy_regression
+from imagine_bench_regression import robot_ik, toy_regression
 from matplotlib import pyplot as plt
 from PIL import Image, ImageDraw
 

@@ -101,18 +101,11 @@ class BenchObserver(RunObserver):
 
 OBSERVERS = (f"{__name__}:{BenchObserver.__name__}",)
 """The observers of every run of a control task, each as ``"module:attr"``."""
-RECORDERS = {
-    "toy_regression": "imagine_bench.recording.regression:record_toy",
-    "robot_ik": "imagine_bench.recording.regression:record_robot",
-}
-"""Functions that record the regression tasks of this suite; another package's task names its own."""
 
 
 def observers_of(protocol: ProtocolData) -> tuple[str, ...]:
     """The observers of each run of a bench, by ``"module:attr"``."""
-    if isinstance(protocol, Protocol):
-        return OBSERVERS
-    return (RECORDERS[protocol.task],) if protocol.task in RECORDERS else ()
+    return OBSERVERS if isinstance(protocol, Protocol) else ()  # a regression task names its own recorder
 
 
 @dataclass(frozen=True)

@@ -254,7 +254,7 @@ def task_entry(name: str) -> TaskEntry:
         SetupError: Its package offers something else under this name, or nothing that can be loaded.
     """
     base, colon, said = name.partition(":") if isinstance(name, str) else (name, "", "")
-    if base in REGRESSIONS and base not in TASKS:
+    if base not in TASKS and base in regressions():
         raise InvalidValueError(f"{base} is a regression task, in which no agent acts; give one of agents.")
     if not colon or name in offers(TASK_GROUP):
         entry: TaskEntry = offered(name, TASKS, TASK_GROUP)

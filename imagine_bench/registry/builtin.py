@@ -12,6 +12,7 @@ from importlib import resources
 from pathlib import Path
 
 from imagine_bench.interfaces import OBSERVATIONS
+from imagine_bench.interfaces.regression import RegressionSpec
 from imagine_bench.registry.entries import AgentEntry, RegressorEntry, TaskEntry, WorldModelEntry
 
 _ARROWS = TaskEntry(
@@ -119,24 +120,12 @@ DEMONSTRATOR = "oracle"
 """The registered agent, privileged and optimal, that plays the episodes which learners are shown."""
 
 
-REGRESSIONS = {
-    "toy_regression": "imagine_bench.tasks.toy_regression:SPEC",
-    "robot_ik": "imagine_bench.tasks.robot_ik:SPEC",
-}
-"""Regression tasks, each the ``"module:attr"`` of its RegressionSpec."""
+REGRESSIONS: dict[str, str | RegressionSpec] = {}
+"""Regression tasks that this process registered, each a RegressionSpec or its ``"module:attr"``. Those of the suite are
+in its plug-in package ``imagine-bench-regression``."""
 
-REGRESSORS: dict[str, RegressorEntry] = {
-    "mc_dropout": RegressorEntry(
-        make="imagine_bench.agents.regressors.regressor:make_mc_dropout",
-        title="MC dropout",
-        description="One network whose hidden units are dropped at random, again and again: the thesis' Bayesian MDN.",
-    ),
-    "ensemble": RegressorEntry(
-        make="imagine_bench.agents.regressors.regressor:make_ensemble",
-        title="deep ensemble",
-        description="Several networks that began and trained differently; where they disagree, they do not know.",
-    ),
-}
+REGRESSORS: dict[str, RegressorEntry] = {}
+"""Regressors that this process registered."""
 
 WORLD_MODELS: dict[str, WorldModelEntry] = {
     "copy": WorldModelEntry(

@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.protocols.data import ProtocolData, digest, require_different
 from imagine_bench.registry.entries import entrant
 from imagine_bench.values import Setting
-
-_SETTINGS = "imagine_bench.agents.regressors.settings:resolve_all"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +76,17 @@ def plan(task: str, preset: str, **changes: Any) -> tuple[RegressionProtocol, di
     if preset == "smoke":
         values.setdefault("variants", registry.regression(task).variants[:2])
     wanted = RegressionProtocol(task=task, preset=preset, **values)
-    check = registry.load(_SETTINGS)
+    offered: dict[str, Any] = {}
     for agent in wanted.agents:
-        check(wanted.hyperparameters, wanted.overrides_of(agent))
-    settings = check(wanted.hyperparameters, dict(wanted.overrides))
-    return replace(wanted, settings_digest=digest([asdict(one) for one in settings])), {}
+        target = registry.regressor_entry(agent).settings
+        if target:
+            offered[target] = registry.load(target)
+            offered[target].resolve(wanted.hyperparameters, wanted.overrides_of(agent), entrant(agent).agent)
+        elif wanted.overrides_of(agent):
+            raise InvalidValueError(f"Regressor {agent} has no settings; leave {brief(wanted.overrides_of(agent))} out.")
+    settings = [
+        asdict(each.resolve(wanted.hyperparameters, dict(wanted.overrides), group))
+        for each in offered.values()
+        for group in each.groups
+    ]
+    return replace(wanted, settings_digest=digest(settings)), {}

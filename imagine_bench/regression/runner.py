@@ -182,11 +182,10 @@ def _go_on(spec: RunSpec[RegressionProtocol], folder: Path, on_progress: OnProgr
         evaluations[variant] = arrays
         write_bytes(folder / METRICS, table_text(rows).encode())  # first: the arrays say which variants are done
         write_arrays(folder / EVALUATION, pack(evaluations)[1])
-    recorder = task.recorder or next(iter(spec.observers), None)
-    if recorder is not None and protocol.recorded:
+    if task.recorder is not None and protocol.recorded:
         tell("recording", "recording")
         path = run_folder.recording_path(folder)
-        registry.load(recorder)(evaluations, task=task, name=spec.agent, path=path)
+        registry.load(task.recorder)(evaluations, task=task, name=spec.agent, path=path)
     run_folder.mark_done(folder, ["config.json", METRICS, EVALUATION])
     tell("done", "done")
 

@@ -33,11 +33,6 @@ _APPEARANCES = (
     "Light, colors, camera and the poses of objects and of the hand vary much.",
     "Each frame is patched from fragments of a finite pool.",
 )
-_REGRESSIONS = {
-    "toy_regression": "A number x leads to one of three curves, plus noise; is it known where data lack?",
-    "robot_ik": "A planar arm learns by moving at random which joint angles lead to a place.",
-}
-"""Descriptions of the regression tasks of this suite; loading one loads MuJoCo."""
 _LAUNCHERS = (
     "Processes of this machine: the default.",
     "The cluster at RAY_ADDRESS, else one that is started here; needs the extra ray.",
@@ -45,7 +40,6 @@ _LAUNCHERS = (
     "One run after another in this process, for a debugger.",
 )
 """Descriptions of executions, appearances and launchers, in their order."""
-_REGRESSOR_SETTINGS = "imagine_bench.agents.regressors.settings:HYPERPARAMETERS"
 _MOST = 10
 """Plan lengths that are listed one by one."""
 
@@ -81,15 +75,12 @@ def _learner(name: str, entry: AgentEntry | RegressorEntry | WorldModelEntry) ->
     page = _page(entry.title or name, entry.description, {"command": f"imagine-bench {command} {name}"})
     cases = OF_AGENTS
     if isinstance(entry, RegressorEntry):
-        target = _REGRESSOR_SETTINGS
         cases = {"": ("fast", name), "preset thesis": ("published", name)}
-    else:
-        target = entry.settings
-    if not target:
+    if not entry.settings:
         return f"{page}\n\nIt has no settings."
     colon = "," if ":" in name else ":"
     head = f"Settings of the preset quick, in brackets of others; changed in a command as {name}{colon}NAME=VALUE"
-    return f"{page}\n\n{head}\n{settings_in_words(target, cases)}"
+    return f"{page}\n\n{head}\n{settings_in_words(entry.settings, cases)}"
 
 
 def describe_task(name: str) -> str:
@@ -194,8 +185,7 @@ def _tasks() -> dict[str, str]:
 
 
 def _regressions() -> dict[str, str]:
-    offered = registry.regressions()
-    return {name: _REGRESSIONS.get(name, "") if isinstance(of, str) else of.description for name, of in offered.items()}
+    return {name: registry.regression(name).description for name in registry.regressions()}
 
 
 def _presets(kind: TaskType[ProtocolData]) -> dict[str, str]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from imagine_bench.agents.imagination.settings import Settings
-from imagine_bench.agents.regressors import settings as regressor_settings
+from imagine_bench_regression import settings as regressor_settings
 from imagine_bench.agents.settings import CONFIG_GROUPS, SETS, Hyperparameters, flatten, replaced
 
 from imagine_bench import registry
@@ -124,7 +124,7 @@ def test_every_override_is_applied_allowed_and_has_a_reason(agent: str, group: s
 
 def test_settings_load_no_torch() -> None:
     named = {entry.settings.partition(":")[0] for entry in registry.agents().values()} - {""}
-    modules = ", ".join({*named, "imagine_bench.agents.regressors.settings"})
+    modules = ", ".join({*named, "imagine_bench_regression.settings"})
     subprocess.run([sys.executable, "-c", f"import {modules}, sys; assert 'torch' not in sys.modules"], check=True)
 
 

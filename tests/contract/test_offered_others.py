@@ -57,7 +57,7 @@ RANDOM = Variant(name="random", factor="base", agent="random")
 STUDY = Study(name="their_study", question="Whose?", budgets=(2,), variants=(RANDOM,))
 DATA = dataclasses.replace(registry.regression("toy_regression"), id="their_data", variants=("base",))
 REGRESSOR = RegressorEntry(
-    make="imagine_bench.agents.regressors.regressor:make_mc_dropout", title="theirs", description="A regressor."
+    make="imagine_bench_regression.regressor:make_mc_dropout", title="theirs", description="A regressor."
 )
 '''
 

@@ -25,7 +25,7 @@ from small_runs import do
 import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import ELSEWHERE, Bench, parsed
-from imagine_bench.registry import AGENTS, REGRESSIONS, has_task, task_of_motion
+from imagine_bench.registry import AGENTS, has_task, regressions, task_of_motion
 
 WRITTEN = [*PAGES, ROOT / "CHANGELOG.md"]
 COMMAND = re.compile(r"(?:^|`)imagine-bench ([a-z]+ [^`\n#]+)", re.MULTILINE)
@@ -79,7 +79,7 @@ def test_commands_could_be_carried_out() -> None:
         except SystemExit:
             pytest.fail(f"{page} names a command that is not understood: imagine-bench {said}")
         task = getattr(command, "task", None)
-        is_known = task in (None, "TASK", "my_task", *REGRESSIONS, *AGENTS) or has_task(task)
+        is_known = task in (None, "TASK", "my_task", *regressions(), *AGENTS) or has_task(task)
         assert is_known or task_of_motion(task), f"{page}: {said}"
         if isinstance(command, Bench) and not (
             command.learner.dataset or str(command.learner.encoder).endswith(".safetensors")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from imagine_bench.tasks import toy_regression as toy
+from imagine_bench_regression import toy_regression as toy
 from scipy import stats
 
 from imagine_bench.errors import UnknownNameError

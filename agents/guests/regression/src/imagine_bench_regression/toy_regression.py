@@ -124,4 +124,6 @@ SPEC = RegressionSpec(
     error_name="distance to the nearest branch (standard deviations of the noise)",
     wrong_above=3.0,
     evaluate=evaluate,
+    sections="imagine_bench_regression.sections:toy_sections",
+    recorder="imagine_bench_regression.recordings:record_toy",
 )

@@ -12,7 +12,7 @@ import torch
 from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
 from imagine_bench.agents.networks.normed_mlp import NormedMLP
 from imagine_bench.agents.networks.weight_samples import sample_outputs
-from imagine_bench.agents.regressors.regressor import MixtureRegressor, make_ensemble, make_mc_dropout
+from imagine_bench_regression.regressor import MixtureRegressor, make_ensemble, make_mc_dropout
 
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces.regression import RegressionData, RegressorContext

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.values import Setting
 
-from .. import settings as kinds
-from ..settings import COUNT, POSITIVE, PROBABILITY, ConfigGroup, Hyperparameters, Override, Range, between, setting
+from imagine_bench.agents import settings as kinds
+from imagine_bench.agents.settings import COUNT, POSITIVE, PROBABILITY, ConfigGroup, Hyperparameters, Override, Range, between, setting
 
 _DROPOUT = Range(
     lambda value: value == 0.0 or 1 / 256 <= value <= 0.95,
@@ -99,8 +99,3 @@ HYPERPARAMETERS = Hyperparameters({
     "mc_dropout": ConfigGroup(RegressorSettings(), _SETS, unused=frozenset({"members"})),
     "ensemble": ConfigGroup(RegressorSettings(), _ENSEMBLE_SETS, unused=frozenset({"dropout"})),
 })  # fmt: skip
-
-
-def resolve_all(hyperparameters: str, overrides: Mapping[str, Setting]) -> tuple[RegressorSettings, ...]:
-    """The settings of one network and of an ensemble; raises the errors of any regressor for them."""
-    return tuple(HYPERPARAMETERS.resolve(hyperparameters, overrides, group) for group in HYPERPARAMETERS.groups)

@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks import robot_ik as ik
+from imagine_bench_regression import robot_ik as ik
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.regression import Prediction

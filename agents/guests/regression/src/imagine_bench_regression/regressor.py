@@ -19,15 +19,15 @@ from imagine_bench.arrays import Floats
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces.regression import Prediction, RegressorContext
 
-from ..encoders.perception import prepare_torch
-from ..imagination import mixture as mdn
-from ..imagination.mixture import Mixture
-from ..imagination.uncertainty import decompose, jensen_shannon, nll, sampled_component_variance
-from ..networks.adam import Adam
-from ..networks.mlp import clip_member_gradients, dropout_mask
-from ..networks.normed_mlp import NormedMLP
-from ..networks.precision import hidden_dtype, settle
-from ..networks.weight_samples import sample_outputs
+from imagine_bench.agents.encoders.perception import prepare_torch
+from imagine_bench.agents.imagination import mixture as mdn
+from imagine_bench.agents.imagination.mixture import Mixture
+from imagine_bench.agents.imagination.uncertainty import decompose, jensen_shannon, nll, sampled_component_variance
+from imagine_bench.agents.networks.adam import Adam
+from imagine_bench.agents.networks.mlp import clip_member_gradients, dropout_mask
+from imagine_bench.agents.networks.normed_mlp import NormedMLP
+from imagine_bench.agents.networks.precision import hidden_dtype, settle
+from imagine_bench.agents.networks.weight_samples import sample_outputs
 from .settings import HYPERPARAMETERS, RegressorSettings
 
 _ROWS = 256

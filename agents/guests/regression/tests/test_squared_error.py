@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.uncertainty import decompose
-from imagine_bench.tasks import toy_regression as toy
+from imagine_bench_regression import toy_regression as toy
 
 PAIRS = 400_000
 SURE = 4.5

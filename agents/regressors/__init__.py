@@ -1,1 +1,0 @@
-"""The regressors of chapter 4: Bayesian mixture density networks."""
