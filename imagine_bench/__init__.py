@@ -40,6 +40,9 @@ MOVED = {
     "imagine_bench.agents.memory.imagination": "imagine_bench_controls.memory.imagination",
     "imagine_bench.agents.memory.recurrence": "imagine_bench_controls.memory.sequences",
     "imagine_bench.agents.memory.settings": "imagine_bench_controls.memory.settings",
+    "imagine_bench.agents.regressors": "imagine_bench_regression",
+    "imagine_bench.agents.regressors.regressor": "imagine_bench_regression.regressor",
+    "imagine_bench.agents.regressors.settings": "imagine_bench_regression.settings",
     "imagine_bench.bench": "imagine_bench.running",
     "imagine_bench.bench.bench": "imagine_bench.running.bench",
     "imagine_bench.bench.launchers": "imagine_bench.running.launchers",
@@ -56,6 +59,7 @@ MOVED = {
     "imagine_bench.judge.values": "imagine_bench.exact.values",
     "imagine_bench.machine": "imagine_bench.registry.machine",
     "imagine_bench.regression.interfaces": "imagine_bench.interfaces.regression",
+    "imagine_bench.recording.regression": "imagine_bench_regression.recordings",
     "imagine_bench.report.plots": "imagine_bench.report.figures",
     "imagine_bench.store.archive": "imagine_bench.store.loading",
     "imagine_bench.studies": "imagine_bench.sweep.grid",
@@ -66,6 +70,9 @@ MOVED = {
     "imagine_bench.suite.run": "imagine_bench.sweep.run",
     "imagine_bench.suite.score": "imagine_bench.sweep.score",
     "imagine_bench.tasks.continuous.goals": "imagine_bench_motion.control.goals",
+    "imagine_bench.tasks.continuous.goals": "imagine_bench_motion.goals",
+    "imagine_bench.tasks.robot_ik": "imagine_bench_regression.robot_ik",
+    "imagine_bench.tasks.toy_regression": "imagine_bench_regression.toy_regression",
     "imagine_bench.world_models": "imagine_bench.interfaces.model",
 }
 """Where each module lies now, by the path that it had."""

@@ -47,7 +47,6 @@ FOLDERS = (
     "agents/encoders",
     "agents",
     "agents/imagination",
-    "agents/regressors",
     "agents/world_models",
     "imagine_bench/registry",
     "imagine_bench/protocols",

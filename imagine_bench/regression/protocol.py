@@ -79,11 +79,12 @@ def plan(task: str, preset: str, **changes: Any) -> tuple[RegressionProtocol, di
     offered: dict[str, Any] = {}
     for agent in wanted.agents:
         target = registry.regressor_entry(agent).settings
+        given = wanted.overrides_of(agent)
         if target:
             offered[target] = registry.load(target)
-            offered[target].resolve(wanted.hyperparameters, wanted.overrides_of(agent), entrant(agent).agent)
-        elif wanted.overrides_of(agent):
-            raise InvalidValueError(f"Regressor {agent} has no settings; leave {brief(wanted.overrides_of(agent))} out.")
+            offered[target].resolve(wanted.hyperparameters, given, entrant(agent).agent)
+        elif given:
+            raise InvalidValueError(f"Regressor {agent} has no settings; leave {brief(given)} out.")
     settings = [
         asdict(each.resolve(wanted.hyperparameters, dict(wanted.overrides), group))
         for each in offered.values()

@@ -185,7 +185,7 @@ def _tasks() -> dict[str, str]:
 
 
 def _regressions() -> dict[str, str]:
-    return {name: registry.regression(name).description for name in registry.regressions()}
+    return {name: registry.regression(name).description.partition(". ")[0] for name in registry.regressions()}
 
 
 def _presets(kind: TaskType[ProtocolData]) -> dict[str, str]:

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 from imagine_bench.agents.imagination.settings import Settings
-from imagine_bench_regression import settings as regressor_settings
 from imagine_bench.agents.settings import CONFIG_GROUPS, SETS, Hyperparameters, flatten, replaced
+from imagine_bench_regression import settings as regressor_settings
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError

@@ -13,9 +13,9 @@ from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, WorldModelSettings
 from imagine_bench.agents.imagination.world_model import EnvironmentModel, log_cosh
+from imagine_bench.agents.replay import Batch
 from imagine_bench_regression.regressor import MixtureRegressor
 from imagine_bench_regression.settings import RegressorSettings
-from imagine_bench.agents.replay import Batch
 from torch import Tensor, nn
 from torch.nn import functional
 

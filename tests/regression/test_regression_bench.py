@@ -13,7 +13,6 @@ from imagine_bench_regression import settings as regressor_settings
 from imagine_bench_regression.sections import choices, claim, squared_error_terms
 from recordings import contents, times
 
-from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.cli.observers import observers_of
 from imagine_bench.errors import ArtefactError
@@ -247,9 +246,8 @@ def test_wrong_words_get_one_line_and_write_nothing(
 @pytest.mark.parametrize("name", ["minimal", "fast", "published"])
 def test_an_ensemble_is_compared_fairly_with_one_network(name: str) -> None:
     """It never costs more; dropout is of the one, members of the other; published, both sample as many values."""
-    one, ensemble = (
-        regressor_settings.HYPERPARAMETERS.resolve(name, {"dropout": 0.1}, group) for group in ("mc_dropout", "ensemble")
-    )
+    resolve = regressor_settings.HYPERPARAMETERS.resolve
+    one, ensemble = (resolve(name, {"dropout": 0.1}, group) for group in ("mc_dropout", "ensemble"))
     assert ensemble.epochs * ensemble.members <= one.epochs
     assert (one.dropout, one.members, ensemble.dropout) == (0.1, 1, 0.0)
     if name == "published":

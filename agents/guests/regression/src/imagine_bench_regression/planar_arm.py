@@ -7,10 +7,11 @@ from importlib import resources
 
 import mujoco
 import numpy as np
+from imagine_bench.tasks.scene_reader import body_poses, motion_of, shapes_of
+
 from imagine_bench.arrays import Floats
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Motion, Shape3D
-from imagine_bench.tasks.scene_reader import body_poses, motion_of, shapes_of
 
 MOVE_S = 1.6
 """Simulated seconds of a movement; the servos have come to rest by then (a test says how near)."""

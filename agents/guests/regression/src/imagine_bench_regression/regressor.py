@@ -13,12 +13,6 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from torch import Tensor
-
-from imagine_bench.arrays import Floats
-from imagine_bench.errors import DivergedError
-from imagine_bench.interfaces.regression import Prediction, RegressorContext
-
 from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
@@ -28,6 +22,12 @@ from imagine_bench.agents.networks.mlp import clip_member_gradients, dropout_mas
 from imagine_bench.agents.networks.normed_mlp import NormedMLP
 from imagine_bench.agents.networks.precision import hidden_dtype, settle
 from imagine_bench.agents.networks.weight_samples import sample_outputs
+from torch import Tensor
+
+from imagine_bench.arrays import Floats
+from imagine_bench.errors import DivergedError
+from imagine_bench.interfaces.regression import Prediction, RegressorContext
+
 from .settings import HYPERPARAMETERS, RegressorSettings
 
 _ROWS = 256

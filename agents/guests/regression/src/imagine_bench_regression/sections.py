@@ -1,5 +1,7 @@
-"""Sections of the report of the two tasks: the toy regression shows a number for every claim of thesis 4.5.1, figure 4.1
-and equation 4.8; the robot shows table 4.1 and figures 4.2 and 4.3.
+"""The two tasks' own sections of a report.
+
+The toy regression shows a number for every claim of thesis 4.5.1, figure 4.1 and equation 4.8. The robot shows table
+4.1, and figures 4.2 and 4.3.
 """
 
 from __future__ import annotations
@@ -8,14 +10,15 @@ from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
 from imagine_bench import reference, statistics
 from imagine_bench.arrays import Arrays, Floats
 from imagine_bench.interfaces.regression import SCORES
 from imagine_bench.regression.runner import PairResult, RegressionResult
 from imagine_bench.report.figures import INK, image, small_multiples
 from imagine_bench.report.page import DASH, Section, Table, decimals, estimate, mean_std, number
-from matplotlib.figure import Figure
-from scipy import stats
 
 Cells = dict[str, str]
 """A row of a table, by column."""
@@ -36,6 +39,7 @@ def in_words(name: str) -> str:
 
 
 def toy_sections(result: RegressionResult) -> list[Section]:
+    """The claims in numbers, figure 4.1, and the terms of equation 4.8."""
     claims = _claims(result)
     variants = result.protocol.variants
     return [
@@ -182,6 +186,7 @@ def figure_4_1(data: Mapping[str, Arrays]) -> Figure:
 
 
 def robot_sections(result: RegressionResult) -> list[Section]:
+    """Table 4.1, and figures 4.2 and 4.3."""
     pairs = result.pairs.values()
     rows = [row for pair in pairs for part in ("decision", "disc") for row in choices(pair, part)]
     printed = reference.load("robot_ik")["cumulative_error"]["criteria"]

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
-from imagine_bench.errors import InvalidValueError
-from imagine_bench.values import Setting
-
 from imagine_bench.agents import settings as kinds
-from imagine_bench.agents.settings import COUNT, POSITIVE, PROBABILITY, ConfigGroup, Hyperparameters, Override, Range, between, setting
+from imagine_bench.agents.settings import (
+    COUNT,
+    POSITIVE,
+    PROBABILITY,
+    ConfigGroup,
+    Hyperparameters,
+    Override,
+    Range,
+    between,
+    setting,
+)
+
+from imagine_bench.errors import InvalidValueError
 
 _DROPOUT = Range(
     lambda value: value == 0.0 or 1 / 256 <= value <= 0.95,
