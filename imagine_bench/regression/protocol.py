@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError, brief, require_known
+from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.protocols.data import ProtocolData, digest, require_different
 from imagine_bench.registry.entries import entrant
 from imagine_bench.values import Setting
@@ -82,9 +82,11 @@ def plan(task: str, preset: str, **changes: Any) -> tuple[RegressionProtocol, di
         given = wanted.overrides_of(agent)
         if target:
             offered[target] = registry.load(target)
-            offered[target].resolve(wanted.hyperparameters, given, entrant(agent).agent)
+            group = entrant(agent).agent
+            groups = offered[target].groups
+            offered[target].resolve(wanted.hyperparameters, given, group if group in groups else next(iter(groups)))
         elif given:
-            raise InvalidValueError(f"Regressor {agent} has no settings; leave {brief(given)} out.")
+            raise InvalidValueError(f"Regressor {agent} names no settings; leave {', '.join(sorted(given))} out.")
     settings = [
         asdict(each.resolve(wanted.hyperparameters, dict(wanted.overrides), group))
         for each in offered.values()

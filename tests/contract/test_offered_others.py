@@ -31,7 +31,10 @@ _OFFERS = {
     },
     registry.STUDY_GROUP: {"their_study": "their_things:STUDY", "smoke": "their_things:STUDY"},
     registry.REGRESSION_GROUP: {"their_data": "their_things:DATA"},
-    registry.REGRESSOR_GROUP: {"their_regressor": "their_things:REGRESSOR"},
+    registry.REGRESSOR_GROUP: {
+        "their_regressor": "their_things:REGRESSOR",
+        "their_plain_regressor": "their_things:PLAIN",
+    },
 }
 _MODULE = '''
 import dataclasses
@@ -57,8 +60,12 @@ RANDOM = Variant(name="random", factor="base", agent="random")
 STUDY = Study(name="their_study", question="Whose?", budgets=(2,), variants=(RANDOM,))
 DATA = dataclasses.replace(registry.regression("toy_regression"), id="their_data", variants=("base",))
 REGRESSOR = RegressorEntry(
-    make="imagine_bench_regression.regressor:make_mc_dropout", title="theirs", description="A regressor."
+    make="imagine_bench_regression.regressor:make_mc_dropout",
+    title="theirs",
+    description="A regressor.",
+    settings="imagine_bench_regression.settings:HYPERPARAMETERS",
 )
+PLAIN = dataclasses.replace(REGRESSOR, settings="")
 '''
 
 
@@ -134,3 +141,6 @@ def test_their_regressor_learns_their_data(tmp_path: Path) -> None:
     wanted, none = plan("their_data", "smoke", agents=("their_regressor",), test_points=10, overrides=tiny)
     found = run(RunSpec(protocol=wanted, agent="their_regressor", seed=0), tmp_path, lambda progress: None)
     assert not none and {row["variant"] for row in found.rows} == {"base"}
+    with pytest.raises(InvalidValueError, match="their_plain_regressor names no settings; leave components, "):
+        plan("their_data", "smoke", agents=("their_plain_regressor",), overrides=tiny)
+    assert plan("their_data", "smoke", agents=("their_plain_regressor",))[0].agents == ("their_plain_regressor",)

@@ -224,7 +224,7 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--task", "toy_regression", "--agents", "dqn"], "No regressor 'dqn'. Known: mc_dropout, ensemble."),
+        (["--task", "toy_regression", "--agents", "dqn"], "No regressor 'dqn'. Known: ensemble, mc_dropout."),
         (
             ["--task", "toy_regression", "--networks", "0"],
             "networks is 0 and test_points 50; they must lie in [1, 1000",

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from imagine_bench_regression import robot_ik as ik
+from imagine_bench_regression.planar_arm import MOVE_S
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.regression import Prediction
@@ -48,7 +49,7 @@ def test_joints_that_are_no_numbers_are_not_carried_out() -> None:
 def test_a_movement_is_sampled_to_its_end() -> None:
     q = joints(1, seed=4)
     motion = ik.arm().movement(q[0], 25.0)
-    assert motion.time_s[0] == 0.0 and motion.time_s[-1] == pytest.approx(ik.MOVE_S)
+    assert motion.time_s[0] == 0.0 and motion.time_s[-1] == pytest.approx(MOVE_S)
     np.testing.assert_allclose(np.diff(motion.time_s), 1 / 25)
     still = ik.arm().movement(q[0], 100.0).poses_in_world[-1]
     np.testing.assert_allclose(motion.poses_in_world[-1], still, atol=1e-12)
