@@ -286,7 +286,7 @@ def test_describe_says_what_every_setting_means(
         if target := getattr(entry, "settings", ""):
             settings = registry.load(target)
             assert {head for head, _ in heads} == settings.names()
-            default = dotted(dataclasses.asdict(settings.resolve("fast", {}, "chapter_5")))
+            default = dotted(dataclasses.asdict(settings.resolve("fast", {}, name if name in settings.groups else "chapter_5")))
             for head, value in heads:
                 typed = f"{name}{',' if ':' in name else ':'}{head}={value}"
                 assert str(entrant(typed)) == str(Entrant(name, {head: default[head]})), typed

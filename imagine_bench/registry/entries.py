@@ -89,8 +89,8 @@ class RegressorEntry:
     make: str  #: ``"module:attr"`` of a function from RegressorContext to Regressor
     title: str  #: For headings, legends and tables
     description: str  #: One sentence for a reader who knows none of this
-    #: Its settings, ``"module:attr"`` of an :class:`imagine_bench.agents.settings.Hyperparameters`, of which the group of
-    #: this regressor's name or else the first one counts; by default it has none.
+    #: Its settings, ``"module:attr"`` of an :class:`imagine_bench.agents.settings.Hyperparameters`, of which the group
+    #: of this regressor's name or else the first one counts; by default it has none.
     settings: str = ""
 
 
