@@ -272,12 +272,12 @@ def test_whoever_launches_names_every_launcher(command: str, capsys: pytest.Capt
     assert f"--launcher {{{','.join(LAUNCHERS)}}}" in said
 
 
-@pytest.mark.parametrize("group", [registry.agents, registry.world_models, registry.regressors])
+@pytest.mark.parametrize("offered", [registry.agents, registry.world_models, registry.regressors])
 def test_describe_says_what_every_setting_means(
-    group: Callable[[], Mapping[str, Any]], capsys: pytest.CaptureFixture[str]
+    offered: Callable[[], Mapping[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each as it is typed, with a meaning beside its range; those of an agent are all that its settings name."""
-    for name, entry in group().items():
+    for name, entry in offered().items():
         if ":" not in name:
             assert main(["describe", name]) == 0
         found = describe(name).partition("\nSettings of the preset quick")[2]
@@ -286,7 +286,8 @@ def test_describe_says_what_every_setting_means(
         if target := getattr(entry, "settings", ""):
             settings = registry.load(target)
             assert {head for head, _ in heads} == settings.names()
-            default = dotted(dataclasses.asdict(settings.resolve("fast", {}, name if name in settings.groups else "chapter_5")))
+            group = name if name in settings.groups else "chapter_5"
+            default = dotted(dataclasses.asdict(settings.resolve("fast", {}, group)))
             for head, value in heads:
                 typed = f"{name}{',' if ':' in name else ':'}{head}={value}"
                 assert str(entrant(typed)) == str(Entrant(name, {head: default[head]})), typed
