@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Bools, Floats, Ints, State
+from imagine_bench.arrays import Bools, Floats, Info, Ints, State
 from imagine_bench.errors import InvalidValueError
 
 if TYPE_CHECKING:
@@ -318,7 +318,7 @@ def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
     return PolicyValues(success=successes, failure=failures, returns=returns, length=length)
 
 
-def ending(info: Mapping[str, Any], *, terminated: bool) -> str:
+def ending(info: Info, *, terminated: bool) -> str:
     """How an episode ended, in words; ``info`` and ``terminated`` are of its last step."""
     if info["is_success"]:
         return "solved"

@@ -352,7 +352,7 @@ def _end_scores(questions: EvalSet, predictions: Predictions) -> Scores:
     }
 
 
-def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Floats, seen: Bools) -> dict[str, Any]:
+def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Floats, seen: Bools) -> Scores:
     """How well each uncertainty offered tells what it should."""
     wrong = away > _WRONG
     entropy = np.array([-sum(p * math.log(p) for p in exact.values()) for exact, _ in pairs])
@@ -363,7 +363,7 @@ def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Flo
         "noisy": ("aleatoric", entropy > np.median(entropy)),
         "several": ("modal", np.array([len(exact) > 1 for exact, _ in pairs])),
     }
-    found: dict[str, Any] = {}
+    found: Scores = {}
     for name, (uncertainty, truth) in to_tell.items():
         offered = predictions.of_one_step(uncertainty)
         found[f"auroc_{name}"] = math.nan if offered is None else auroc(offered, truth)

@@ -71,7 +71,7 @@ class ProtocolData(ABC):
         object.__setattr__(self, "seeds", tuple(sorted(self.seeds)))
         require_different("agents", self.agents)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Json]:
         """A JSON-serialisable copy; fields marked :data:`LATER` are in it where they say something."""
         later = {field.name: field.default for field in dataclasses.fields(self) if field.metadata == LATER}
         values = {n: value for n, value in dataclasses.asdict(self).items() if n not in later or value != later[n]}

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import rerun as rr
 import rerun.blueprint as rrb
 
-from imagine_bench.arrays import Info, Observed
+from imagine_bench.arrays import Array, Info, Observed
 from imagine_bench.recording.stream import ROOT, Recording, recording_file, scene_view
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _YELLOW = (240, 180, 0)
 
 
 @contextmanager
-def motion_recording(path: Path, env: MotionEnv) -> Iterator[Callable[[Any, Observed, float, Info], None]]:
+def motion_recording(path: Path, env: MotionEnv) -> Iterator[Callable[[Array | None, Observed, float, Info], None]]:
     """A recording of an environment, made of the values that are handed to it.
 
     Yields:
@@ -46,7 +46,7 @@ class _MotionRecorder:
         self._env = env
         self._events: list[str] = []
 
-    def log(self, action: Any, seen: Observed, reward: float, info: Info) -> None:
+    def log(self, action: Array | None, seen: Observed, reward: float, info: Info) -> None:
         """Log a period that is over."""
         recording = self._recording
         env = self._env

@@ -46,9 +46,3 @@ def gain(task_reference: str, agent: str) -> dict[int, float]:
     """Gains over DQN in tables 5.2 and 5.4: real episodes to (P_aug - P_base) / P_base."""
     rows = load(task_reference).get("gain", {}).get("agents", {}).get(agent, {})
     return {int(episodes): percent / 100.0 for episodes, percent in rows.items()}
-
-
-def random_success(task_reference: str) -> float | None:
-    """The success share the thesis measured for its random agent, in [0, 1], or None where it did not."""
-    row = load(task_reference).get("random_agent")
-    return None if row is None else float(row["success"]) / 100.0

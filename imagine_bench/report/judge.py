@@ -185,7 +185,7 @@ def judgement_page(found: Judged) -> Page:
 
 
 def _csv(found: Judged) -> str:
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, float | str]] = []
     for cell in itertools.chain.from_iterable(found.cells.values()):
         rows.append({name: cell[name] for name in ("model", "transitions", "seed")})
         rows[-1]["privileged"] = str(model_entry(cell["model"]).privileged).lower()

@@ -24,6 +24,7 @@ from imagine_bench.statistics import iqm
 from imagine_bench.store.files import json_text, table_text, with_null
 from imagine_bench.sweep.grid import Study, Variant
 from imagine_bench.sweep.run import Line, SuiteResult
+from imagine_bench.values import Json
 
 Row = dict[str, float | str]
 
@@ -90,7 +91,11 @@ def suite_page(result: SuiteResult) -> Page:
     environments = [each.environment for levels in result.levels.values() for each in levels if each.environment]
     commits = sorted({str(each.get("commit")) for each in environments})
     made = {**(environments[0] if environments else {}), "commits of all benches": ", ".join(commits)}
-    definition = {"suite": dataclasses.asdict(suite), "hash": suite.hash, "agents": list(result.agents)}
+    definition: dict[str, Json] = {
+        "suite": dataclasses.asdict(suite),
+        "hash": suite.hash,
+        "agents": list(result.agents),
+    }
     table = _scores(result)
     questions = [f"{each.name}: {each.question}" for each in suite.experiments]
     return Page(

@@ -93,17 +93,17 @@ def make_plain(log: Path) -> None:
             log.unlink()
 
 
-def with_null(value: Any) -> Any:
+def with_null(value: Json) -> Any:
     """The value that JSON gives back of ``value``, None for NaN and infinities, for which JSON has no word."""
     return json.loads(json.dumps(value), parse_constant=lambda _: None)
 
 
-def json_text(value: Any) -> str:
+def json_text(value: Json) -> str:
     """``value`` as JSON, as every file here has it."""
     return json.dumps(value, indent=1) + "\n"
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: Json) -> None:
     """Write ``value`` as JSON, atomically. Raises SetupError: it cannot be written."""
     write_bytes(path, json_text(value).encode())
 
@@ -153,7 +153,7 @@ def read_json(path: Path, what: str) -> Any:
         return found
 
 
-def sealed(values: Mapping[str, Any]) -> dict[str, Json]:
+def sealed(values: Mapping[str, Json]) -> dict[str, Json]:
     """Values with the digest of all of them, under ``seal``."""
     return {**values, "seal": _seal(values)}
 

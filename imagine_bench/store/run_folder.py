@@ -114,7 +114,7 @@ def save_snapshot(folder: Path, snapshot: Snapshot) -> Path:
             content = save({array_name: np.asarray(array, order="C") for array_name, array in arrays.items()})
             write_bytes(partial / name, content)
             digests[name] = hashlib.sha256(content).hexdigest()
-        state = {
+        state: dict[str, Json] = {
             "format": _SNAPSHOT,
             "name": final.name,
             "episode": snapshot.episode,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -27,6 +27,10 @@ from imagine_bench.registry.machine import describe_environment, gl_renderer
 from imagine_bench.rules import states_of_play
 from imagine_bench.seeding import SeedTree, episode_seed
 from imagine_bench.store.files import read_json, require_writable, write_json
+from imagine_bench.values import Json
+
+if TYPE_CHECKING:
+    from imagine_bench.tasks.continuous.env import MotionEnv
 
 SWEEPS: dict[str, tuple[float, ...]] = {
     "pad_friction": (1.2, 0.6, 0.3, 0.2, 0.1, 0.05, 0.03, 0.01, 0.003, 0.001),
@@ -116,7 +120,7 @@ def check_physics(
     levels = [appearance_name(each) for each in appearances]
     require_writable(out.parent)
     gl_renderer()  # fails here, in one sentence, rather than in a macro-action
-    kept: dict[str, Any] = {"task": task, "seed": 0}
+    kept: dict[str, Json] = {"task": task, "seed": 0}
     figures = []
     if turns:
         print(HEAD)
@@ -163,7 +167,7 @@ def check_motion(
     levels = [appearance_name(each) for each in appearances]
     require_writable(out.parent)
 
-    def make(level: str) -> Any:
+    def make(level: str) -> MotionEnv:
         return registry.load(entry.motion)(**entry.options, appearance=level, observation="proprio")
 
     if trials:
@@ -195,7 +199,7 @@ def check_motion(
     return right
 
 
-def _segments(make: Callable[[str], Any], levels: Sequence[str], trials: int, turns: int) -> dict[str, Any]:
+def _segments(make: Callable[[str], MotionEnv], levels: Sequence[str], trials: int, turns: int) -> dict[str, Any]:
     """The segments and whole episodes of a task at each appearance."""
     measure = registry.load("imagine_bench.tasks.continuous.segments:measure")
     kept = {}
@@ -205,7 +209,7 @@ def _segments(make: Callable[[str], Any], levels: Sequence[str], trials: int, tu
     return kept
 
 
-def _add_random_episodes(env: Any, document: dict[str, Any], kept: dict[str, Any], until: int, out: Path) -> None:
+def _add_random_episodes(env: MotionEnv, document: dict[str, Any], kept: dict[str, Any], until: int, out: Path) -> None:
     """Play random episodes of the seeds that were not played yet, and keep their count in blocks."""
     random_episode = registry.load("imagine_bench.tasks.continuous.segments:random_episode")
     if kept["random_episodes"] < until:
@@ -371,7 +375,7 @@ def slips(world: str, found: Fidelity) -> Iterator[Figure]:
 # Margins -----------------------------------------------------------------------------------------------------------
 
 
-def measure_margins(spec: TaskSpec, trials: int) -> dict[str, Any]:
+def measure_margins(spec: TaskSpec, trials: int) -> dict[str, Json]:
     """Sweep each setting alone, walk with true and nominal poses, print a Markdown table and return the figures.
 
     A task whose environment takes no ``physics`` has none. A trial is one macro-action from a start that moves an

@@ -51,6 +51,7 @@ from imagine_bench.store.files import (
     write_json,
 )
 from imagine_bench.store.loading import load_so_far
+from imagine_bench.values import Json
 
 RECORDING = "recording.rrd"
 _SHOWN = 6  # the first plans, and the first that failed, as filmstrips
@@ -80,7 +81,7 @@ def chosen(given: Path | None, root: Path, task: str | None) -> Path:
     return given or newest_bench(root, *(registry.tasks() if task is None else (task,)))
 
 
-def provenance(protocol_hash: str) -> dict[str, object]:
+def provenance(protocol_hash: str) -> dict[str, Json]:
     """Protocol, commit and command of a figure."""
     environment = describe_environment()
     return {"protocol_hash": protocol_hash, "commit": environment.get("commit"), "command": environment.get("command")}
@@ -116,8 +117,12 @@ def plan_report(
     name = f"{execution}-{count}{'' if max_epistemic is None else f'-below-{max_epistemic:g}'}"
     folder = make_folder(run / "plans" / name)
     spec = trained.spec
-    whose = {"agent": spec.agent, "seed": spec.seed, "episodes": trained.episodes}
-    how = {"appearance": spec.protocol.appearance, "execution": execution, "max_epistemic": max_epistemic}
+    whose: dict[str, Json] = {"agent": spec.agent, "seed": spec.seed, "episodes": trained.episodes}
+    how: dict[str, Json] = {
+        "appearance": spec.protocol.appearance,
+        "execution": execution,
+        "max_epistemic": max_epistemic,
+    }
     with lock(folder / ".lock", f"The folder {folder}"):
         made = make_plans(trained, count=count, execution=execution, max_epistemic=max_epistemic)
         plans = list(counted(made, "plans", total=count))
@@ -151,7 +156,7 @@ def plan_table(plans: Sequence[PlanResult], task: TaskSpec) -> Table:
     return Table("plans", ["open-loop plans, carried out blindly", "here", "thesis"], rows)
 
 
-def write_plans(folder: Path, plans: Sequence[PlanResult], task: TaskSpec, origin: Mapping[str, object]) -> str:
+def write_plans(folder: Path, plans: Sequence[PlanResult], task: TaskSpec, origin: Mapping[str, Json]) -> str:
     """Write ``plans.csv``, ``summary.json``, ``plans.png``, the first plans, and ``failed.png``, the first failed.
 
     The files of an earlier call, its recording included, go. ``summary.json`` holds the ``origin`` too.

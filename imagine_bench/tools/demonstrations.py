@@ -31,6 +31,7 @@ from imagine_bench.values import Json
 
 if TYPE_CHECKING:
     from imagine_bench.tasks.continuous.env import MotionEnv
+    from imagine_bench.tasks.world import World
 
 POLICIES = {
     "expert": "optimal macro-actions, as planned",
@@ -48,7 +49,7 @@ class Actor(Protocol):
 
     macro_action: int
 
-    def act(self) -> Any:
+    def act(self) -> Array | None:
         """The next command, or None, which leaves the episode."""
 
 
@@ -63,7 +64,7 @@ class DemonstrationSettings:
     size: int  #: edge of images in pixels
 
 
-Watch = Callable[[Any, Observed, float, Info], None]
+Watch = Callable[[Array | None, Observed, float, Info], None]
 """Is shown each period: the command, and the results of the step; at the start None, the observation, 0 and
 ``info``.
 """
@@ -162,7 +163,7 @@ def _collect_one(item: _Item, on_news: Callable[[None], None]) -> str:
 
 
 @functools.lru_cache(maxsize=1)
-def stage(task: str, appearance: str, size: int) -> tuple[MotionEnv, Any]:
+def stage(task: str, appearance: str, size: int) -> tuple[MotionEnv, World]:
     """A task's environment of continuous control with both cameras, and a world for plans."""
     env = _made(task, appearance=appearance, size=size)
     return env, env.another_world()
@@ -221,7 +222,7 @@ class _Tally:
         self._returns: list[float] = []
         self._successes = 0
         self._steps = 0
-        self._hidden: list[tuple[Any, Any]] = []
+        self._hidden: list[tuple[Array, Array]] = []
 
     def through(self, files: Sequence[Path]) -> Iterator[Arrays]:
         """The episodes of files, without the arrays apart."""

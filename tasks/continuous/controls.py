@@ -43,7 +43,7 @@ CONTROL_NAMES = {
     "joint": (*_JOINTS, "grip"),
 }
 """The meaning of each number of an action, by the name of the control."""
-Motion = NDArray[np.floating[Any] | np.integer[Any]]
+Motion = NDArray[np.floating | np.integer]
 """An action of continuous control."""
 
 

@@ -102,6 +102,8 @@ def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_l
     assert {line.split()[0]: line.split(maxsplit=1)[1] for line in marked} == {
         name: f"pip install -e {folder}" for name, folder in names.items()
     }
+    with pytest.raises(InvalidValueError, match="There is an agent 'factored' already"):
+        imagine_bench.register_agent("factored", "some:agent")
     for name in ("factored", "structured", "arrow_puzzle_cloned"):
         assert (
             main(["describe", name]) == 2
@@ -171,5 +173,18 @@ def test_no_other_package_takes_the_name_of_a_guests_agent(guests: Guests) -> No
     assert any(
         "offers taker:ONE as agent factored, a name that is taken" in str(each) for each in registry.refused_offers()
     )
-    with pytest.raises(InvalidValueError, match="There is an agent 'factored' already"):
-        imagine_bench.register_agent("factored", "taker:ONE")
+
+
+@pytest.mark.parametrize(
+    ("target", "ours"),
+    [
+        ("imagine_bench.agents.dqn:make", True),
+        ("imagine_bench_factored.agent:make", True),
+        ("imagine_bench_controls.swaps:make", True),
+        ("imagine_bench_peers.sb3:make_dqn", False),
+        ("imagine_bench_of_others:make", False),
+        ("__main__:make", False),
+    ],
+)
+def test_runs_share_a_process_unless_code_of_others_takes_part(target: str, ours: bool) -> None:
+    assert registry.is_ours(target) == ours

@@ -91,24 +91,25 @@ def test_what_is_remembered_follows_from_what_is_seen() -> None:
     assert found[None][1, 0, 1] > 0.03, "apart, they would contradict each other"
 
 
-def test_what_was_covered_is_found_and_nothing_where_nothing_was() -> None:
-    settings = LEARNED.resolve("fast", {}, "chapter_5")
-    rows, begins = lived(150, np.random.default_rng(0), covered=True)
-    assert contradictions(rows)
-    assert choose(rows, begins, SIZES, ACTIONS, settings) == Memory(factor=2, hidden=HIDDEN)
-    sceptical = LEARNED.resolve("fast", {"memory_evidence": 1e6}, "chapter_5")
-    assert choose(rows, begins, SIZES, ACTIONS, sceptical) is None
-    rows, begins = lived(150, np.random.default_rng(0), covered=False)
-    assert not contradictions(rows) and choose(rows, begins, SIZES, ACTIONS, settings) is None
-
-
-def test_chance_alone_is_no_reason_to_remember() -> None:
-    """Rewards that nothing explains contradict one another, and no memory explains them better."""
+@pytest.mark.parametrize(
+    ("covered", "by_chance", "evidence", "wanted"),
+    [
+        (True, False, 10.0, Memory(factor=2, hidden=HIDDEN)),
+        (True, False, 1e6, None),  # a sceptic
+        (False, False, 10.0, None),
+        (False, True, 10.0, None),  # rewards by chance contradict one another, and no memory explains them better
+    ],
+)
+def test_what_was_covered_is_remembered_and_nothing_else(
+    covered: bool, by_chance: bool, evidence: float, wanted: Memory | None
+) -> None:
     rng = np.random.default_rng(0)
-    rows, begins = lived(150, rng, covered=False)
-    rows = [row._replace(reward=float(rng.integers(2))) if not row.terminated else row for row in rows]
-    assert contradictions(rows)
-    assert choose(rows, begins, SIZES, ACTIONS, LEARNED.resolve("fast", {}, "chapter_5")) is None
+    rows, begins = lived(150, rng, covered=covered)
+    if by_chance:
+        rows = [row if row.terminated else row._replace(reward=float(rng.integers(2))) for row in rows]
+    settings = LEARNED.resolve("fast", {"memory_evidence": evidence}, "chapter_5")
+    assert bool(contradictions(rows)) == (covered or by_chance)
+    assert choose(rows, begins, SIZES, ACTIONS, settings) == wanted
 
 
 def watched(learner: LearnedPerceptionAgent, episodes: range, *, covered: bool = False, worth: float = 1.0) -> None:
