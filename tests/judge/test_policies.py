@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import math
@@ -20,7 +21,7 @@ from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge.policies.agreement import DenseModel, kendall, pearson, values_of
 from imagine_bench.judge.policies.exploit import largest_exploit, upper_bound
-from imagine_bench.judge.policies.film import Film
+from imagine_bench.judge.policies.film import Expected, Film, course
 from imagine_bench.judge.policies.levels import SCORES, counted_table
 from imagine_bench.judge.policies.policy_set import PolicyWorld, policy_world
 from imagine_bench.judge.scores import policy_scores
@@ -197,6 +198,12 @@ def test_no_policy_passes_the_search_and_no_search_passes_the_bound() -> None:
         assert upper_bound(truth, truth, horizon) == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.parametrize(("reached", "over", "steps"), [((1,), False, 3), ((1,), True, 1), ((7,), False, 1)])
+def test_a_course_ends_with_the_episode_the_plan_or_the_known_world(reached: State, over: bool, steps: int) -> None:
+    plan = np.zeros((3, 2), dtype=np.int64)
+    assert len(course((0,), plan, [(0,), (1,)], lambda state, action: Expected(reached, 0.0, over))) == steps
+
+
 # Lift --------------------------------------------------------------------------------------------------------------
 
 
@@ -236,6 +243,9 @@ def test_a_table_of_every_transition_plans_as_the_truth_and_one_of_none_never_tr
     table = counted_table(*episodes_of(world, every), len(every), world)
     assert table.reward == pytest.approx(world.truth.reward)
     assert world.starts @ values_of_planning(world.truth, table, world.horizon) == pytest.approx(best_return)
-    half = counted_table(*episodes_of(world, every), 2, world)
+    episodes, macrostates = episodes_of(world, every)
+    ended = dataclasses.replace(episodes, terminated=~np.zeros_like(episodes.terminated))
+    assert not counted_table(ended, macrostates, len(every), world).p_continues.any(), "nothing follows an end"
+    half = counted_table(episodes, macrostates, 2, world)
     assert (half.reward == NEVER).sum() == len(every) - 2
     assert half.reward[0, :2] == pytest.approx(world.truth.reward[0, :2])
