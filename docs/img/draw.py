@@ -16,7 +16,7 @@ from PIL import Image
 
 from imagine_bench import appearance, reference, registry, statistics
 from imagine_bench.exact.certificate import certificate
-from imagine_bench.judge.causes import CAUSES
+from imagine_bench.judge.causes import CAUSES, FORMER_CAUSES
 from imagine_bench.recording.filmstrips import Tile, sheet
 from imagine_bench.registry.entries import label_today
 from imagine_bench.report import figures
@@ -302,7 +302,8 @@ def why() -> None:
         agent = label_today(run["agent"])
         seeds[agent] += 1
         for budget, counts in run["failures"].items():
-            found.setdefault(agent, {}).setdefault(budget, Counter()).update(counts)
+            now = {FORMER_CAUSES.get(cause, cause): count for cause, count in counts.items()}
+            found.setdefault(agent, {}).setdefault(budget, Counter()).update(now)
     shown = [agent for agent in found if agent != "factored:given"]
     figure, both = plt.subplots(1, len(shown), figsize=(3.4 * len(shown), 3.4), sharey=True, layout="constrained")
     for axes, agent in zip(both, shown, strict=True):

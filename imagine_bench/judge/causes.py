@@ -2,16 +2,16 @@
 
 An episode that no optimal policy would have solved with the same draws of chance was bad luck. Of all else, the agent's
 perception is made right first, then its plan, then its model of transitions that it never experienced, then all of its
-model, then physics. Each stage keeps the truth of those before it, and the first that solves the episode names its
-cause; the last is the optimal policy, which does. So every failure has exactly one cause. A policy cannot be learned
-anew in a model that was made right; so the plan comes before the model: where perfect planning in the agent's own model
-solves the episode, that model was right enough. If every frame of a macrostate is misread, the agent cannot be queried
-there. The optimal action and the true model are used instead.
+model, then the execution of its macro-actions. Each stage keeps the truth of those before it, and the first that solves
+the episode names its cause; the last is the optimal policy, which does. So every failure has exactly one cause. A
+policy cannot be learned anew in a model that was made right; so the plan comes before the model: where perfect planning
+in the agent's own model solves the episode, that model was right enough. If every frame of a macrostate is misread, the
+agent cannot be queried there. The optimal action and the true model are used instead.
 
 An agent without a model has its experience in place of one: true where it was, and nothing elsewhere.
 
-An episode is lived again by the rules. Where a stage takes the agent's own action in a step, the same happens, faults
-of physics included. Else a uniform number decides among the outcomes, as in an environment: in every step the one that
+An episode is lived again by the rules. Where a stage takes the agent's own action in a step, the same happens, motor
+failures included. Else a uniform number decides among the outcomes, as in an environment: in every step the one that
 decided then, as far as the episode tells where it lay. So whoever slips in a step slips there whatever they do.
 
 Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizon.
@@ -49,10 +49,12 @@ CAUSES = {
     "model": "its model was wrong, though it was experienced",
     "planning": "its model was right; its plan was cut off, or its policy not greedy in it",
     "values": "its values were wrong, though it had experienced all that it needed (no model)",
-    "fault": "physics disagreed with the rules",
+    "execution": "motor failure: a macro-action was carried out, but what the arm did to the scene is no outcome of it",
     "unlucky": "an optimal policy would have failed too",
 }
 """Causes in the order in which tables and figures have them."""
+FORMER_CAUSES = {"fault": "execution"}
+"""Today's name of each cause that kept files call otherwise."""
 MOST_STATES = 2_000
 """A task of more macrostates is too large to ask an agent about every one."""
 _TRIES = 8  # frames of a macrostate, until the agent reads one right
@@ -66,7 +68,7 @@ class FailedEpisode:
     states: Sequence[State]  # length L + 1
     actions: Sequence[int]  # length L
     terminated: bool  # whether it ended in a terminal macrostate
-    faults: Sequence[bool]  # whether physics disagreed with the rules. Length L.
+    faults: Sequence[bool]  # motor failures: whether the result is no outcome of that macro-action. Length L.
     misread: Sequence[bool]  # whether the agent misread the frame before each macro-action. Length L.
     seed: int  # of the uniform numbers
 
@@ -147,7 +149,7 @@ class Attribution:
             ("planning" if model else "values", self._plan(own)),
             ("unexperienced", self._plan(_mixed(known, own, truth))),
             ("model", self._best),
-        )  # and "fault": the best plan, without faults
+        )  # and "execution": the best plan, without motor failures
 
     def cause(self, episode: FailedEpisode) -> str:
         """One of :data:`CAUSES`."""
@@ -157,7 +159,7 @@ class Attribution:
         for name, plan in self._stages[0 if any(episode.misread) else 1 :]:
             if self._solves(episode, drawn, plan, faults=True):
                 return name
-        return "fault"
+        return "execution"
 
     def _drawn(self, episode: FailedEpisode) -> list[float]:
         """The uniform number of each step until the horizon."""
@@ -288,7 +290,7 @@ def causes_of(trained: Trained) -> tuple[Tested, ...]:
     readable = ~misread(trained.agent, frames, np.array(states_of(spec.rules), dtype=np.int64))
     found = []
     with closing(make_env(protocol, protocol.task, testing=True)) as env:
-        lived = functools.cache(functools.partial(lived_again, env, trained.agent))
+        lived = functools.cache(functools.partial(lived_again, env, trained.agent, spec.rules))
         for row in run.checkpoints:
             if row.kept is None or run.tried is None:
                 raise ArtefactError(f"{trained.folder} keeps no test episodes; run its bench anew, elsewhere.")
@@ -304,8 +306,16 @@ def causes_of(trained: Trained) -> tuple[Tested, ...]:
     return tuple(found)
 
 
-def lived_again(env: Env, agent: Agent, seed: int, actions: Sequence[int]) -> FailedEpisode:
-    """A failed test episode, played again to find the frames that the agent misread."""
+def is_outcome(rules: Rules, before: State, action: int, after: State) -> bool:
+    """Whether the rules say that a macro-action can lead from one macrostate to another.
+
+    A skill that does nothing, or another macro-action than it was asked for, leads elsewhere; no fault says so.
+    """
+    return any(outcome.macrostate == after for outcome in rules.outcomes(before, action))
+
+
+def lived_again(env: Env, agent: Agent, rules: Rules, seed: int, actions: Sequence[int]) -> FailedEpisode:
+    """A failed test episode, played again to find the frames that the agent misread, and motor failures."""
     frame, info = env.reset(seed=seed)
     frames = []
     infos = [info]
@@ -315,11 +325,16 @@ def lived_again(env: Env, agent: Agent, seed: int, actions: Sequence[int]) -> Fa
         frame, _, terminated, _, info = env.step(action)
         infos.append(info)
     states = np.array([info["macrostate"] for info in infos], dtype=np.int64)
+    visited = [tuple(state) for state in states.tolist()]
+    known = set(states_of(rules))
+    faults = []
+    for before, action, after, info in zip(visited, actions, visited[1:], infos[1:], strict=False):
+        faults.append(bool(info["fault"]) or (before in known and not is_outcome(rules, before, action, after)))
     return FailedEpisode(
-        states=[tuple(state) for state in states.tolist()],
+        states=visited,
         actions=actions,
         terminated=bool(terminated),
-        faults=[bool(info["fault"]) for info in infos[1:]],
+        faults=faults,
         misread=misread(agent, np.array(frames), states[:-1]).tolist(),
         seed=seed,
     )

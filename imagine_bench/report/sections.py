@@ -12,7 +12,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from imagine_bench.arrays import Arrays
-from imagine_bench.judge.causes import CAUSES
+from imagine_bench.judge.causes import CAUSES, FORMER_CAUSES
 from imagine_bench.recording.filmstrips import episode_strip, filmstrip, png, sampled_filmstrips
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
@@ -82,7 +82,7 @@ def causes(data: ReportData) -> Section | None:
         "An episode that an optimal policy fails with the same draws of chance, too, was bad luck. Else truth is "
         "swapped in, one stage at a time, until the episode is solved: frames read right; then a perfect plan in the "
         "agent's own model; then the truth about transitions that it never experienced; then all of the truth; then "
-        "physics as the rules say. The first stage that solves it names the cause."
+        "every macro-action carried out as the rules say. The first stage that solves it names the cause."
     )
     return Section("Why agents failed", [words], tables=[table]) if table.rows else None
 
@@ -109,9 +109,10 @@ def causes_table(rows: Iterable[Sequence[object]]) -> Table:
     """
     counts: dict[tuple[str, str], Counter[str]] = {}
     tested: dict[tuple[str, str], dict[str, int]] = {}
-    for agent, seed, budget, tests, _, cause in (map(str, row) for row in rows):
+    for agent, seed, budget, tests, _, named in (map(str, row) for row in rows):
+        cause = FORMER_CAUSES.get(named, named)
         if cause not in ("", *CAUSES):
-            raise ValueError(f"{cause!r} is no cause")
+            raise ValueError(f"{named!r} is no cause")
         tested.setdefault((agent, budget), {})[seed] = int(tests)
         counts.setdefault((agent, budget), Counter())[cause] += bool(cause)
     lines = []

@@ -14,9 +14,9 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, ImagineBenchError
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.judge import causes
-from imagine_bench.judge.causes import CAUSES, beliefs, frames_to_ask_with, misread
+from imagine_bench.judge.causes import CAUSES, FORMER_CAUSES, beliefs, frames_to_ask_with, misread
 from imagine_bench.report.page import Page, texts
-from imagine_bench.report.sections import read_causes
+from imagine_bench.report.sections import causes_table, read_causes
 from imagine_bench.rules import states_of
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.seeding import SeedTree
@@ -69,6 +69,13 @@ def test_tests_in_which_nothing_failed_are_counted_too(tmp_path: Path, monkeypat
     folder = bench(small(evaluation_episodes=1), {}, root=tmp_path, launcher=Inline()).folder
     why_report(folder, root=tmp_path, task=None, encoder=None)
     assert [line[1:3] for line in read_causes(folder).rows] == [["4", "2 of 7"], ["9", "0 of 7"]]
+
+
+@pytest.mark.parametrize("former", FORMER_CAUSES)
+def test_a_cause_by_its_former_name_counts_as_the_one_of_today(former: str) -> None:
+    then, now = (causes_table([("dqn", 0, 5, 9, 1, cause)]).rows for cause in (former, FORMER_CAUSES[former]))
+    assert then == now
+    assert former not in CAUSES
 
 
 def test_a_run_that_keeps_no_episodes_is_one_sentence(tmp_path: Path) -> None:

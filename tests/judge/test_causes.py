@@ -146,7 +146,7 @@ def test_every_failure_has_exactly_one_cause() -> None:
                 counted[found.cause(dataclasses.replace(happened, misread=misread))] += 1
                 assert found.cause(happened) != "misread"
     assert all(counted[name] for name in ("misread", "unexperienced", "model", "planning", "values"))
-    assert counted["fault"] == counted["unlucky"] == 0, "the rules leave nothing to chance, and always a way"
+    assert counted["execution"] == counted["unlucky"] == 0, "the rules leave nothing to chance, and always a way"
 
 
 def test_a_number_finds_the_outcome_that_it_stands_for() -> None:

@@ -111,7 +111,7 @@ def test_commands_after_a_motions_end_change_nothing_that_a_network_imagines() -
     generator = torch.Generator().manual_seed(0)
     network = MotionNetwork(motions.actions.shape[2])
     network.draw_weights(generator)
-    frames = torch.rand(len(motions), 3, 64, 64, generator=generator)
+    frames = torch.rand(len(motions), 16, 16, 48, generator=generator)
     actions = torch.from_numpy(motions.actions)
     lengths = torch.from_numpy(motions.lengths)
     longer = torch.cat([actions, torch.zeros(len(actions), 7, actions.shape[2])], dim=1)

@@ -36,8 +36,11 @@ from .questions import AnsweredMotions, MotionQuestions, MotionSource, questions
 from .scores import MotionScores, Simulator, score
 from .serving import opened
 
-SIZES = (600,)
+SIZES = (400,)
 """Motions that models learn from, by default."""
+PAIRS = 100
+CHAINS = 40
+"""Counterfactual pairs, and chains of motions that are imagined on from imagined frames, by default."""
 SEEDS = tuple(range(7))
 """Seeds by default: of fewer than seven the suite gives no interval."""
 SIMULATOR = ModelFit("simulator", 0, 0)
@@ -57,6 +60,8 @@ class MotionJudgement:
     models: tuple[str, ...]  #: names in :data:`.interface.GROUP`
     sizes: tuple[int, ...] = SIZES  #: motions of the same data, ascending
     seeds: tuple[int, ...] = SEEDS  #: each of data and of models
+    pairs: int = PAIRS  #: counterfactual pairs that are asked about
+    chains: int = CHAINS  #: chains of motions that are asked about
 
     def __post_init__(self) -> None:
         if not registry.task_entry(self.task).motion:
@@ -68,6 +73,8 @@ class MotionJudgement:
                 raise InvalidValueError(f"{name} is {brief(given)}; give each once.")
         if not self.sizes or sorted(set(self.sizes)) != list(self.sizes) or self.sizes[0] < 1:
             raise InvalidValueError(f"sizes is {self.sizes}; give ascending numbers of motions, at least 1.")
+        if min(self.pairs, self.chains) < 1:
+            raise InvalidValueError(f"pairs is {self.pairs} and chains is {self.chains}; give at least 1 of each.")
         for name in self.models:
             motion_model_entry(name)
 
@@ -79,7 +86,7 @@ class MotionJudgement:
     @property
     def folder_name(self) -> str:
         """Where it is kept: the same for all that can be compared."""
-        return f"{file_name(self.task)}-motions-{self.sizes[-1]}"
+        return f"{file_name(self.task)}-motions-{self.sizes[-1]}-{self.pairs}-{self.chains}"
 
 
 @dataclass(frozen=True)
@@ -107,7 +114,7 @@ def judge(judgement: MotionJudgement, root: Path, *, workers: int) -> tuple[Path
         ArtefactError: A file in it is damaged.
     """
     folder = make_folder(root / judgement.folder_name)
-    stage(judgement.task, folder)
+    stage(judgement, folder)
     for seed in judgement.seeds:
         data_of(judgement, folder, seed)
     waiting = [cell for cell in judgement.cells if not _is_kept(folder, cell)]
@@ -140,7 +147,7 @@ def judge_cell(judgement: MotionJudgement, folder: Path, cell: ModelFit) -> dict
     Raises:
         ImagineBenchError: It cannot be made, or fails.
     """
-    there = stage(judgement.task, folder)
+    there = stage(judgement, folder)
     known = {**cell._asdict(), "questions": there.digest}
     if cell == SIMULATOR:
         return {**known, **asdict(score(cell.model, Simulator(there.asked), there.asked, there.reader))}
@@ -159,15 +166,16 @@ def judge_cell(judgement: MotionJudgement, folder: Path, cell: ModelFit) -> dict
 
 
 @functools.lru_cache(maxsize=1)
-def stage(task: str, folder: Path) -> MotionStage:
-    """The questions of a task, made once in a judgement's folder, and the reader of its frames."""
-    spec = registry.task(task)
+def stage(judgement: MotionJudgement, folder: Path) -> MotionStage:
+    """The questions of a judgement, made once in its folder, and the reader of frames."""
+    spec = registry.task(judgement.task)
     place = folder / "questions.npz"
     reader = reader_in(spec, "clean", folder)
     with making(folder):
         if not place.exists():
             seeds = SeedTree(0).child("evaluation", "motions", spec.id)
-            write_arrays(place, questions(_source(task), seeds).arrays())
+            asked = questions(_source(judgement.task), judgement.pairs, judgement.chains, seeds)
+            write_arrays(place, asked.arrays())
     return MotionStage(spec, MotionQuestions.of(read_arrays(place, "the questions of a judgement")), reader)
 
 

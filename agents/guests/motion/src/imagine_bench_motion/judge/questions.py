@@ -23,10 +23,8 @@ from imagine_bench.seeding import SeedTree
 
 from .interface import Motions
 
-PAIRS = 100
-CHAINS = 40
 DEPTH = 4
-"""Counterfactual pairs; chains of motions, and motions of each, imagined on from imagined frames."""
+"""Motions of a chain."""
 VARIANTS = ("planned", "aside", "raised")
 """How a motion differs from the planner's: not at all; 8 mm to a side; 60 mm higher, so that it grips nothing."""
 ASIDE_M = 0.008
@@ -214,11 +212,11 @@ def moving_actions(rules: Rules, state: State) -> list[int]:
     return [action for action in range(rules.n_actions) if moved(state, rules.outcomes(state, action)[0].macrostate)]
 
 
-def questions(source: MotionSource, seeds: SeedTree) -> MotionQuestions:
-    """Questions from seeds of their own, which no training has."""
-    planned, raised = source.pairs(PAIRS, seeds.child("pairs").generator())
-    chains = source.chains(CHAINS, DEPTH, seeds.child("chains").generator())
-    return MotionQuestions(planned=planned, raised=raised, chains=chains)
+def questions(source: MotionSource, pairs: int, chains: int, seeds: SeedTree) -> MotionQuestions:
+    """So many counterfactual pairs and chains, from seeds of their own, which no training has."""
+    planned, raised = source.pairs(pairs, seeds.child("pairs").generator())
+    drawn = source.chains(chains, DEPTH, seeds.child("chains").generator())
+    return MotionQuestions(planned=planned, raised=raised, chains=drawn)
 
 
 def _varied(planned: Floats32, variant: str, rng: np.random.Generator) -> Floats32:

@@ -11,25 +11,26 @@ from imagine_bench import statistics
 from imagine_bench.report.page import DASH, Table, printed
 
 from .interface import motion_models
-from .judgement import SIMULATOR
-from .questions import CHAINS, DEPTH, PAIRS
+from .judgement import SIMULATOR, MotionJudgement
+from .questions import DEPTH
 
 Cell = Mapping[str, Any]
-_SHARES = {"right": "right", "raised_right": "raised", "painted": "painted", "pairs": "pairs"}
+_SHARES = {"right": "right", "unread": "unread", "raised_right": "raised", "painted": "painted", "pairs": "pairs"}
 _SCORES = (
-    f"Percent of {PAIRS} pairs of motions; means over seeds of data and model, [95 % interval] with seven seeds or "
+    "Percent of {pairs} pairs of motions; means over seeds of data and model, [95 % interval] with seven seeds or "
     "more. Right: the motion as planned; the imagined final frame shows the macrostate that the simulator ends in. "
-    "Raised: likewise of the same motion 60 mm higher, which grips nothing. Painted: raised motions of which the model "
+    "Unread: likewise, but the frame shows nothing of this world. "
+    "Raised: right for the same motion 60 mm higher, which grips nothing. Painted: raised motions of which the model "
     "paints the end of the planned one. Pairs: both motions are right. Level: what a model is told, the commands or "
     "the macro-action alone. The simulator's own frames show the reader's errors."
 )
 _DRIFT = (
-    f"Drift: percent of {CHAINS} chains of {DEPTH} planned motions of which every frame so far shows the right "
+    "Drift: percent of {chains} chains of {depth} planned motions of which every frame so far shows the right "
     "macrostate; each motion is imagined from the frame imagined before."
 )
 
 
-def motion_tables(cells: Sequence[Cell]) -> list[Table]:
+def motion_tables(judgement: MotionJudgement, cells: Sequence[Cell]) -> list[Table]:
     """The scores of each model at each number of motions, and their drift by depth."""
     groups: dict[tuple[str, int], list[Cell]] = {}
     for cell in cells:
@@ -38,16 +39,18 @@ def motion_tables(cells: Sequence[Cell]) -> list[Table]:
     drift = []
     for (name, size), group in groups.items():
         is_model = name != SIMULATOR.model
-        shares = [_shown([each[share] for each in group], PAIRS) for share in _SHARES]
+        shares = [_shown([each[share] for each in group], judgement.pairs) for share in _SHARES]
         fit_s = printed(float(np.mean([each["fit_s"] for each in group])), ".0f") if is_model else DASH
         begin = [name, str(size) if is_model else DASH]
         scores.append([*begin, _level(name), str(len(group)) if is_model else DASH, *shares, fit_s])
         depths = zip(*(each["by_depth"] for each in group), strict=True)
-        drift.append([*begin, *(_shown(list(each), CHAINS) for each in depths)])
+        drift.append([*begin, *(_shown(list(each), judgement.chains) for each in depths)])
     head = ["model", "motions"]
+    about_scores = _SCORES.format(pairs=judgement.pairs)
+    about_drift = _DRIFT.format(chains=judgement.chains, depth=DEPTH)
     return [
-        Table("motions", [*head, "level", "seeds", *_SHARES.values(), "fit, CPU s"], scores, _SCORES),
-        Table("drift", [*head, *(f"after {depth}" for depth in range(1, DEPTH + 1))], drift, _DRIFT),
+        Table("motions", [*head, "level", "seeds", *_SHARES.values(), "fit, CPU s"], scores, about_scores),
+        Table("drift", [*head, *(f"after {depth}" for depth in range(1, DEPTH + 1))], drift, about_drift),
     ]
 
 

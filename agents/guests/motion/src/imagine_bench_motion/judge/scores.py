@@ -21,6 +21,7 @@ class MotionScores:
     """Shares of questions, in [0, 1]."""
 
     right: float  #: planned motions whose imagined final frame shows the macrostate that the simulator ends in
+    unread: float  #: planned motions whose imagined final frame shows nothing of this world, as the reader says
     raised_right: float  #: likewise of the raised motions, which grip nothing
     painted: float  #: raised motions of which the frame shows the end of the planned one, where that is another end
     pairs: float  #: counterfactual pairs of which both are right
@@ -50,7 +51,8 @@ def score(name: str, model: Imagines, asked: MotionQuestions, reader: FrameReadi
 
     planned = asked.planned
     raised = asked.raised
-    right = _shows(reader, imagined(planned, planned.before), planned.reached)
+    of_planned = imagined(planned, planned.before)
+    right = _shows(reader, of_planned, planned.reached)
     of_raised = imagined(raised, raised.before)
     raised_right = _shows(reader, of_raised, raised.reached)
     differ = (planned.reached[:, :-1] != raised.reached[:, :-1]).any(axis=1)
@@ -64,6 +66,7 @@ def score(name: str, model: Imagines, asked: MotionQuestions, reader: FrameReadi
         by_depth.append(float(still.mean()))
     return MotionScores(
         right=float(right.mean()),
+        unread=float((reader.read(of_planned)[:, 0] < 0).mean()),
         raised_right=float(raised_right.mean()),
         painted=float(painted.mean()) if differ.any() else float("nan"),
         pairs=float((right & raised_right).mean()),
