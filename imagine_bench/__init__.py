@@ -58,6 +58,7 @@ MOVED = {
     "imagine_bench.judge.motion.scores": "imagine_bench_motion.judge.scores",
     "imagine_bench.judge.values": "imagine_bench.exact.values",
     "imagine_bench.machine": "imagine_bench.registry.machine",
+    "imagine_bench.recording.motion": "imagine_bench_motion.control.recording",
     "imagine_bench.regression.interfaces": "imagine_bench.interfaces.regression",
     "imagine_bench.recording.regression": "imagine_bench_regression.recordings",
     "imagine_bench.report.plots": "imagine_bench.report.figures",

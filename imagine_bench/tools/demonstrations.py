@@ -305,13 +305,14 @@ def record(kept: Demonstrations, index: int, path: Path) -> None:
 
     Raises:
         InvalidValueError: There is no such episode.
-        SetupError: Rerun is not installed, or the file cannot be written.
+        SetupError: Rerun or the plug-in is not installed, or the file cannot be written.
     """
     seeds = read_files(kept.folder, kept.card)["privileged"]["seeds"]
     if not 0 <= index < len(seeds):
         raise InvalidValueError(f"Episode {index} is not in {kept.folder}; give 0 to {len(seeds) - 1}.")
     (episode,) = itertools.islice(kept, index, index + 1)
-    recording = registry.load("imagine_bench.recording.motion:motion_recording")
+    registry.require_guest(registry.MOTION, "Recording a demonstration")
+    recording = registry.load("imagine_bench_motion.control.recording:motion_recording")
     with closing(replay_env(kept.card, "hand,front,proprio")) as env, recording(path, env) as watch:
         replay(env, int(seeds[index]), episode["actions"], watch)
 

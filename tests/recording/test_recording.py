@@ -16,6 +16,7 @@ import pytest
 import rerun as rr
 import rerun.blueprint as rrb
 from fake_agents import FakeAgent, FakeImaginer
+from imagine_bench_motion.control.recording import motion_recording
 from numpy.typing import NDArray
 from recordings import contents, rerun, times, view_names
 from rerun.chunk import RrdReader
@@ -28,7 +29,6 @@ from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
 from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording import episodes, stream
 from imagine_bench.recording.episodes import q_table, record_run
-from imagine_bench.recording.motion import motion_recording
 from imagine_bench.recording.stream import entity_name, log_motion, log_shapes, open_in_viewer, recording_file
 from imagine_bench.rules import ending
 from imagine_bench.running.bench import bench

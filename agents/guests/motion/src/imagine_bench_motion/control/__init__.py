@@ -1,1 +1,1 @@
-"""Continuous control in other forms: with goals, and by keys."""
+"""Continuous control in other forms: with goals, by keys, and recorded."""

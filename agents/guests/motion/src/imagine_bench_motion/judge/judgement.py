@@ -115,8 +115,6 @@ def judge(judgement: MotionJudgement, root: Path, *, workers: int) -> tuple[Path
     """
     folder = make_folder(root / judgement.folder_name)
     stage(judgement, folder)
-    for seed in judgement.seeds:
-        data_of(judgement, folder, seed)
     waiting = [cell for cell in judgement.cells if not _is_kept(folder, cell)]
     failed = judge_fits(waiting, functools.partial(carry_out, judgement, folder), workers=workers)
     if any((folder / cell.file).exists() for cell in judgement.cells):

@@ -18,9 +18,9 @@ Cell = Mapping[str, Any]
 _SHARES = {"right": "right", "unread": "unread", "raised_right": "raised", "painted": "painted", "pairs": "pairs"}
 _SCORES = (
     "Percent of {pairs} pairs of motions; means over seeds of data and model, [95 % interval] with seven seeds or "
-    "more. Right: the motion as planned; the imagined final frame shows the macrostate that the simulator ends in. "
-    "Unread: likewise, but the frame shows nothing of this world. "
-    "Raised: right for the same motion 60 mm higher, which grips nothing. Painted: raised motions of which the model "
+    "more, else (lowest to highest seed). Right: the motion as planned; the imagined final frame shows the macrostate "
+    "that the simulator ends in. Unread: likewise, but the frame shows nothing of this world. Raised: right for the "
+    "same motion 60 mm higher, which grips nothing. Painted: raised motions of which the model "
     "paints the end of the planned one. Pairs: both motions are right. Level: what a model is told, the commands or "
     "the macro-action alone. The simulator's own frames show the reader's errors."
 )
@@ -70,10 +70,13 @@ def _level(name: str) -> str:
 
 
 def _shown(shares: Sequence[float | None], trials: int) -> str:
-    """The mean of shares in percent, and its interval where there are seeds enough."""
+    """The mean of shares in percent, and its interval; of fewer seeds than that needs, the lowest and the highest."""
     known = [share for share in shares if share is not None]
     if not known:
         return DASH
     mean = f"{100.0 * float(np.mean(known)):.0f}"
     low, high = statistics.interval(known, trials=trials, trim=0.0)
-    return mean if np.isnan(low) else f"{mean} [{100.0 * low:.0f}, {100.0 * high:.0f}]"
+    if not np.isnan(low):
+        return f"{mean} [{100.0 * low:.0f}, {100.0 * high:.0f}]"
+    ends = f"({100.0 * min(known):.0f} to {100.0 * max(known):.0f})"
+    return f"{mean} {ends}" if min(known) < max(known) else mean

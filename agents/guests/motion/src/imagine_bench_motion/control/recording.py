@@ -8,16 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import rerun as rr
 import rerun.blueprint as rrb
+from imagine_bench.tasks.continuous.env import MotionEnv
 
 from imagine_bench.arrays import Array, Info, Observed
 from imagine_bench.recording.stream import ROOT, Recording, recording_file, scene_view
-
-if TYPE_CHECKING:
-    from imagine_bench.tasks.continuous.env import MotionEnv
 
 _TARGET_M = 0.012
 _YELLOW = (240, 180, 0)
