@@ -30,6 +30,12 @@ MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)
 """An object that is tipped, or turned off where it may stand, by more is a problem."""
 MAX_OTHER_SHIFT_M = 0.005
+MAX_PLACEMENT_M = 0.04
+PLACEMENT_YAW_RAD = math.radians(5.0)
+"""How far off their slots places may be drawn, and how far turned."""
+_DRAWS = 10_000
+_APART_M = 0.085
+"""Places drawn off the slots are so far apart, along x or along y: fingers fit between any two objects."""
 SLIP_FRICTION = 0.02
 SLIP_FORCE_N = 2.0
 """Friction of fingertips whose grip slips, and the force (N) by which such fingers open, in continuous control."""
@@ -59,6 +65,7 @@ class WorldState:
     looks: tuple[Floats, ...]
     composite: Composite | None  #: where frames are patched, the fragments of the latest
     sensing: Sensing
+    places: tuple[tuple[float, ...], ...] = ()  #: as :attr:`World.places`
     sleep: Sleep = field(default_factory=dict)  #: the sleeping bodies, by the names in ``mjData``
 
 
@@ -102,6 +109,7 @@ class World(abc.ABC):
         self._tips = [index for index in range(model.ngeom) if TIP_IN_NAME in model.geom(index).name]
         self._tip_friction = model.geom_friction[self._tips, :1].copy()
         self._people = [model.material(name).id for name in ("skin", "cloth")]
+        self.places = tuple((0.0, 0.0, 0.0) for _ in starts)  #: of each object, off its slot: x, y (m) and yaw (rad)
         self._placement_noise = [[0.0, 0.0, 0.0] for _ in starts]
         self._read_at: tuple[bytes, bytes] | None = None
         self._latest_objects: tuple[State, str | None] = ((), None)
@@ -143,6 +151,7 @@ class World(abc.ABC):
             looks=looks,
             composite=self._composite,
             sensing=replace(self.sensing),
+            places=self.places,
             sleep=self._sleep(),
         )
 
@@ -153,6 +162,7 @@ class World(abc.ABC):
         for mine, then in zip(looks_of(self.model), state.looks, strict=True):
             mine[:] = then
         self._composite = state.composite
+        self.places = state.places
         self.sensing.aside_m = state.sensing.aside_m
         self.sensing.turned_rad = state.sensing.turned_rad
         mujoco.mj_resetData(self.model, self.data)  # nothing sleeps
@@ -197,7 +207,7 @@ class World(abc.ABC):
 
     def decisive(self) -> tuple[Hashable, ...]:
         """All values that decide, with the model and the arguments, the result of :meth:`execute`."""
-        noise = tuple(each for offset in self._placement_noise for each in offset)
+        noise = tuple(each for index, share in enumerate(self._placement_noise) for each in self._off(index, share))
         return self.physics().tobytes(), noise, self.sensing.aside_m, self.sensing.turned_rad
 
     def place(self, macrostate: State, rng: np.random.Generator) -> None:
@@ -212,6 +222,22 @@ class World(abc.ABC):
         if self._distraction is not None:
             self._distraction.place(self.data, rng)
         self.update()
+
+    def draw_places(self, most_m: float, rng: np.random.Generator) -> None:
+        """Draw each object's place of an episode off its slot: up to so many metres along x and y, and turned.
+
+        Raises:
+            InvalidValueError: There are no such places apart from each other.
+        """
+        slots_m = np.array([self._slot_m(index) for index in range(len(self.places))])
+        later, earlier = np.tril_indices(len(slots_m), -1)
+        for _ in range(_DRAWS):
+            drawn = rng.uniform(-1.0, 1.0, (len(slots_m), 3)) * (most_m, most_m, PLACEMENT_YAW_RAD)
+            places_m = slots_m + drawn[:, :2]
+            if (np.abs(places_m[later] - places_m[earlier]).max(axis=1) >= _APART_M).all():
+                self.places = tuple(map(tuple, drawn.tolist()))
+                return
+        raise InvalidValueError(f"No places {most_m:g} m off their slots keep objects apart; give a smaller placement.")
 
     def draw_placement_noise(self, rng: np.random.Generator) -> None:
         """Draw where the next macro-action puts objects down: as far off their places as at a start.
@@ -298,6 +324,10 @@ class World(abc.ABC):
     # --- for each task -------------------------------------------------------------------------------------------
 
     @abc.abstractmethod
+    def _slot_m(self, index: int) -> tuple[float, float]:
+        """The nominal place of an object on the table, in x and y."""
+
+    @abc.abstractmethod
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Put an object where ``value`` says, off by shares of the ranges of the appearance in x, y and yaw."""
 
@@ -333,6 +363,17 @@ class World(abc.ABC):
         """Shares of the ranges of the appearance, in x, y and yaw, as metres and radians."""
         x, y, yaw = offset
         return self.level.object_offset_m * x, self.level.object_offset_m * y, self.level.object_yaw_rad * yaw
+
+    def _off(self, index: int, offset: Sequence[float]) -> tuple[float, float, float]:
+        """How far an object is off its slot, in metres and radians, that is off its place by such shares."""
+        x_m, y_m, yaw_rad = self._scaled(offset)
+        place_x_m, place_y_m, place_yaw_rad = self.places[index]
+        return place_x_m + x_m, place_y_m + y_m, place_yaw_rad + yaw_rad
+
+    def _place_m(self, index: int) -> tuple[float, float]:
+        """An object's place of this episode on the table, in x and y."""
+        x_m, y_m = self._slot_m(index)
+        return x_m + self.places[index][0], y_m + self.places[index][1]
 
     def set_gesture(self, gesture: int, offset_m: Sequence[float] = (0.0, 0.0, 0.0), yaw_rad: float = 0.0) -> None:
         """Put people's hands where they say ``gesture``, off that by an offset (3,) in m and a yaw in rad."""

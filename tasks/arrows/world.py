@@ -69,7 +69,7 @@ class ArrowWorld(World):
                 cube=turn.cube,
                 clockwise=turn.clockwise,
                 slips=turn.cube in slipping,
-                noise=self._scaled(self._placement_noise[turn.cube]),
+                noise=self._off(turn.cube, self._placement_noise[turn.cube]),
             )
             for turn in turns
         ]
@@ -89,9 +89,12 @@ class ArrowWorld(World):
         """Whether a cube whose turn is due has slipped: its direction is to be the one that it has."""
         return self._objects()[0][cube] == intended[cube]
 
+    def _slot_m(self, index: int) -> tuple[float, float]:
+        return self.layout.slots_xy_m[index]
+
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         x_m, y_m = self.layout.slots_xy_m[index]
-        right_m, up_m, turned_rad = self._scaled(offset)
+        right_m, up_m, turned_rad = self._off(index, offset)
         self.data.qpos[self.object_qpos[index]] = (
             x_m + right_m,
             y_m + up_m,
@@ -100,11 +103,12 @@ class ArrowWorld(World):
         )
 
     def _hands_m(self, gesture: int) -> dict[int, c.Point]:
-        return {self._hand: self.layout.fingertips_m[gesture]}
+        x_m, y_m, z_m = self.layout.fingertips_m[gesture]
+        return {self._hand: (x_m + self.places[gesture][0], y_m + self.places[gesture][1], z_m)}
 
     def read_object(self, index: int, pose: list[float]) -> tuple[int, str | None]:
         """The nearest direction of a cube's arrow, and the fault of the cube's pose."""
-        turned_rad = orientation.yaw_rad(*pose[3:])
+        turned_rad = orientation.yaw_rad(*pose[3:]) - self.places[index][2]
         quarters = round(turned_rad / _QUARTER_RAD)
         skew_rad = abs(turned_rad - quarters * _QUARTER_RAD)
         problem = self._misplaced(index, pose)
@@ -114,20 +118,19 @@ class ArrowWorld(World):
 
     def progress(self, index: int, pose: list[float], before: int, after: int) -> float:
         """The share of its quarter turn that a cube has made."""
-        del index
         sense = math.remainder(after - before, 4)
-        return sense * self._turned_rad(pose, before) / _QUARTER_RAD
+        return sense * self._turned_rad(index, pose, before) / _QUARTER_RAD
 
-    @staticmethod
-    def _turned_rad(pose: list[float], value: int) -> float:
+    def _turned_rad(self, index: int, pose: list[float], value: int) -> float:
         """How far a cube is turned clockwise, as seen in the frame, from a direction. In (-pi, pi]."""
-        return math.remainder(-orientation.yaw_rad(*pose[3:]) - value * _QUARTER_RAD, 2 * math.pi)
+        turned_rad = orientation.yaw_rad(*pose[3:]) - self.places[index][2]
+        return math.remainder(-turned_rad - value * _QUARTER_RAD, 2 * math.pi)
 
     def _misplaced(self, index: int, pose: list[float]) -> str | None:
         """The difference of a cube's pose from one on its slot, however it is turned."""
         name = self.object_names[index]
         tipped = self._tipped(index, pose)
-        off_m = math.dist(pose[:2], self.layout.slots_xy_m[index])
+        off_m = math.dist(pose[:2], self._place_m(index))
         if tipped is not None or off_m > MAX_OFF_SLOT_M:
             return tipped or f"{name} stands {1e3 * off_m:.0f} mm off its slot"
         return f"{name} is not on the table" if abs(pose[2] - c.CUBE_REST_Z_M) > MAX_LIFT_OFF_M else None
@@ -137,13 +140,13 @@ class ArrowWorld(World):
         del gripped
         if self._misplaced(index, pose):
             return value
-        turned_rad = self._turned_rad(pose, value)
+        turned_rad = self._turned_rad(index, pose, value)
         if abs(turned_rad) <= _QUARTER_RAD + MAX_SKEW_RAD:
             return value
         return (value + (1 if turned_rad > 0 else -1)) % 4
 
     def _read_gesture(self) -> int:
-        """The slot that the fingertip is over."""
-        fingertip_y_m = float(self.data.mocap_pos[self._hand, 1])
-        slots = self.layout.slots_xy_m
-        return min(range(len(slots)), key=lambda slot: abs(slots[slot][1] - fingertip_y_m))
+        """The cube whose place the fingertip is over."""
+        tip_m = self.data.mocap_pos[self._hand, :2].tolist()
+        tips_m = [self._hands_m(cube)[self._hand][:2] for cube in range(len(self.places))]
+        return min(range(len(tips_m)), key=lambda cube: math.dist(tips_m[cube], tip_m))

@@ -25,7 +25,7 @@ from ..scenes.appearance import Appearance
 from ..scenes.appearance import appearance as appearance_level
 from ..scenes.arm import ARM_JOINTS, arm_columns
 from ..scenes.constants import FAR_CAMERA, HUMAN_CAMERA
-from ..world import World, WorldState
+from ..world import MAX_PLACEMENT_M, World, WorldState
 from .controls import HandControl, Motion
 from .dense import Potential
 from .referee import GRIPPED, Event, Referee
@@ -103,6 +103,9 @@ class MotionEnv(SceneEnv):
         reward: ``"sparse"``, the rules' alone; or ``"dense"``, with the growth of :class:`.dense.Potential` added.
         observation: The observation: some of ``hand``, ``front``, ``proprio``, ``objects``, ``state``.
         size: Edge of observed images in pixels, 32 to 256.
+        placement: Where an object starts and belongs, drawn at each reset: up to so many metres off its slot along x
+            and along y, and turned by up to 5 degrees; 0 to 0.04. Faults, the pointing hand and the directions of
+            cubes refer to this place.
         told: Whether ``info["instruction"]`` says the goal in words, and no image shows the pointing hand.
         time_limit_s: Seconds before truncation; None is 3 s for each macro-action of the horizon.
         render_mode: None, ``"rgb_array"``, or ``"human"``, a window.
@@ -126,6 +129,7 @@ class MotionEnv(SceneEnv):
         "reward",
         "observation",
         "size",
+        "placement",
         "told",
         "time_limit_s",
         "render_mode",
@@ -149,6 +153,7 @@ class MotionEnv(SceneEnv):
         reward: str = "sparse",
         observation: str = "hand,front,proprio",
         size: int = FRAME_PX,
+        placement: float = 0.0,
         told: bool = False,
         time_limit_s: float | None = None,
         render_mode: str | None = None,
@@ -181,6 +186,9 @@ class MotionEnv(SceneEnv):
         if not isinstance(told, (bool, np.bool_)):
             raise InvalidValueError(f"told is {brief(told)}; give True or False.")
         self._told = bool(told)
+        if not isinstance(placement, Real) or isinstance(placement, bool) or not 0.0 <= placement <= MAX_PLACEMENT_M:
+            raise InvalidValueError(f"placement is {brief(placement)}; give metres from 0 to {MAX_PLACEMENT_M:g}.")
+        self.placement_m = float(placement)
         self._sight = spec.sight
         self._lag = spec.sight.lag if spec.sight else 0
         self._n_steps = steps_in_period(rate_hz, self.model.opt.timestep)
@@ -198,7 +206,7 @@ class MotionEnv(SceneEnv):
             if not isinstance(time_limit_s, Real) or isinstance(time_limit_s, bool) or not time_limit_s > 0:
                 raise InvalidValueError(f"time_limit_s is {brief(time_limit_s)}; give seconds above 0, or None.")
             self.time_limit_s = float(time_limit_s)
-        self._kind = (spec.id, "motion", control, self._n_steps, level.name, self.physics, slip, told)
+        self._kind = (spec.id, "motion", control, self._n_steps, level.name, self.physics, slip, told, self.placement_m)
         self.episode = Episode()
 
     # --- Gymnasium -----------------------------------------------------------------------------------------------
@@ -208,6 +216,8 @@ class MotionEnv(SceneEnv):
         return self.controls.checked(action)
 
     def _begin(self, start: State) -> Info:
+        if self.placement_m:
+            self.world.draw_places(self.placement_m, self.np_random)
         self.world.place(start, self.np_random)
         reading = self.world.read()
         self.begun = True

@@ -58,6 +58,7 @@ class Expert:
         env = self._env
         self.macro_action = macro_action
         planner = self._planner
+        planner.places = env.world.places
         data = planner.data
         mujoco.mj_resetData(planner.model, data)
         for array, now in ((data.qpos, env.data.qpos), (data.ctrl, env.data.ctrl)):

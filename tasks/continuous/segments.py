@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imagine_bench.arrays import Floats, State
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.rules import states_of_play
 
 from ..scenes.arm import ARM_JOINTS, arm_columns
@@ -60,7 +61,14 @@ def measure(env: MotionEnv, *, tries: int, turns: int, seed: int = 0) -> Measure
         tries: Segments, spread evenly over the pairs, each pair once at least; of more pairs, a sample of so many.
         turns: Macro-actions of whole episodes of the optimal policy; the last episode is played to its end.
         seed: Of everything random.
+
+    Raises:
+        InvalidValueError: An environment with a placement, which the certificate does not tell apart.
     """
+    if env.placement_m:
+        raise InvalidValueError(
+            f"placement is {env.placement_m:g}; a certificate is of objects on their slots, so leave it out."
+        )
     rng = np.random.default_rng(seed)
     pairs = _pairs(env)
     chosen = pairs if len(pairs) <= tries else [pairs[each] for each in sorted(rng.permutation(len(pairs))[:tries])]

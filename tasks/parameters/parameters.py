@@ -24,6 +24,10 @@ from imagine_bench.values import Setting
 
 GESTURES = ("always", "first")
 HIDDEN = -1
+_OF_COMMANDS = (
+    "macro-actions begin and end with objects on their slots, so give it to an environment of continuous control: "
+    "gymnasium.make('imagine_bench/ArrowPuzzleMotion-v0', placement=0.03)"
+)
 _Seen = TypeVar("_Seen")
 
 
@@ -157,11 +161,13 @@ class WorldParameters:
 
         Raises:
             UnknownKeywordError: An argument that is neither a parameter nor one of the others.
-            InvalidValueError: A parameter given twice, by both of its names.
+            InvalidValueError: A parameter given twice, by both of its names; or one of continuous control alone.
         """
         spellings = cls.spellings()
         given: dict[str, Any] = {}
         for name in list(options):
+            if name == "placement" and name not in others:
+                raise InvalidValueError(f"placement is {brief(options[name])}; {_OF_COMMANDS}.")
             if name not in (*spellings, *others):
                 raise UnknownKeywordError.of(name, (*spellings, *others))
             if name not in spellings:

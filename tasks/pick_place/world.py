@@ -70,6 +70,9 @@ class PickWorld(World):
 
     # --- putting -------------------------------------------------------------------------------------------------
 
+    def _slot_m(self, index: int) -> tuple[float, float]:
+        return SLOTS_XY_M[index]
+
     def _put(self, index: int, value: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Put an object on its place, into the gripper or into the palm."""
         spec = OBJECTS[index]
@@ -77,6 +80,7 @@ class PickWorld(World):
         share = 1.0
         if value == PLACED:
             base_m = standing_m(index)
+            right_m, up_m, turned_rad = self._off(index, offset)
         elif value == PICKED:
             base_m = self._tcp_at_rest_m
             share = _GRIP_SHARE
@@ -96,7 +100,7 @@ class PickWorld(World):
         """The right hand points, the left one opens its palm; idle hands rest at the table's edge."""
         points = gesture not in (OPEN_PALM, WITHDRAWN)
         return {
-            self._hand: fingertip_m(SLOTS_XY_M[gesture]) if points else IDLE_FINGERTIP_M,
+            self._hand: fingertip_m(self._place_m(gesture)) if points else IDLE_FINGERTIP_M,
             self._palm: PALM_M if gesture == OPEN_PALM else IDLE_PALM_M,
         }
 
@@ -152,13 +156,12 @@ class PickWorld(World):
                 return executor.hand_over(index=held, palm_m=palm_m)
             place_m = np.array([*PALM_M[:2], PALM_M[2] + _VAIN_M])
         elif HANDED_OVER not in objects and held == action and not stays:
-            noise = self._scaled(self._placement_noise[action])
+            noise = self._off(action, self._placement_noise[action])
             return executor.place(index=action, noise=noise)
         elif HANDED_OVER not in objects and held is None and not stays:
             return executor.pick(index=action)
         else:
-            x_m, y_m, z_m = standing_m(action)
-            place_m = np.array([x_m, y_m, z_m + _VAIN_M])
+            place_m = np.array([*self._place_m(action), standing_m(action)[2] + _VAIN_M])
         return executor.visit(place_m=place_m, held=held)
 
     # --- reading -------------------------------------------------------------------------------------------------
@@ -176,15 +179,14 @@ class PickWorld(World):
         in_palm = math.dist(position_m[:2], palm_m[:2]) < PALM_REACH_M
         if in_palm and abs(position_m[2] - palm_m[2] - spec.grip_height_m) < MAX_LIFT_OFF_M:
             return HANDED_OVER, self._tipped(index, pose) if spec.upright else None
-        slot_m = standing_m(index)
-        off_m = math.dist(position_m[:2], slot_m[:2])
-        if abs(position_m[2] - slot_m[2]) > MAX_LIFT_OFF_M:
+        off_m = math.dist(position_m[:2], self._place_m(index))
+        if abs(position_m[2] - standing_m(index)[2]) > MAX_LIFT_OFF_M:
             return PLACED, f"{name} is neither on the table nor held nor in the palm"
         if off_m > MAX_OFF_SLOT_M:
             return PLACED, f"{name} stands {1e3 * off_m:.0f} mm off its place"
         if not spec.upright:
             return PLACED, None
-        turned_rad = abs(orientation.yaw_rad(*pose[3:]))
+        turned_rad = abs(orientation.yaw_rad(*pose[3:]) - self.places[index][2])
         skewed = f"{name} is turned by {math.degrees(turned_rad):.0f} degrees" if turned_rad > MAX_SKEW_RAD else None
         return PLACED, self._tipped(index, pose) or skewed
 
@@ -193,7 +195,7 @@ class PickWorld(World):
         del before
         if after == PICKED:
             return (pose[2] - standing_m(index)[2]) / _LIFTED_M
-        place_m = standing_m(index) if after == PLACED else PALM_M
+        place_m = (*self._place_m(index), standing_m(index)[2]) if after == PLACED else PALM_M
         return 1.0 - math.dist(pose[:3], place_m) / _FAR_M
 
     def value_in_hand(self, index: int, pose: list[float], value: int, *, gripped: bool) -> int:
@@ -207,4 +209,4 @@ class PickWorld(World):
             return OPEN_PALM
         if fingertip_x_m > _HANDS_FORWARD_X_M:
             return WITHDRAWN
-        return min(range(N_OBJECTS), key=lambda index: abs(SLOTS_XY_M[index][1] - fingertip_y_m))
+        return min(range(N_OBJECTS), key=lambda index: abs(self._place_m(index)[1] - fingertip_y_m))

@@ -60,6 +60,7 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observed, Info]:
         """Start an episode, as :class:`imagine_bench.tasks.continuous.env.MotionEnv` does; its goal follows from it."""
         seen, info = self.env.reset(seed=seed, options=options)
+        self._planned.places = self._motion.world.places
         self._planned.place(self._wanted(self._motion.episode.macrostate), np.random.default_rng(0))
         self._goal = _goal_of(self._planned.object_poses())
         observation = self._observation(seen)
