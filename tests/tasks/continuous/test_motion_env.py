@@ -10,14 +10,17 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.rules import Arrows
+from imagine_bench.tasks.arrows.world import MAX_OFF_SLOT_M
 from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
 from imagine_bench.tasks.continuous.env import MotionEnv, steps_in_period
 from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench.tasks.continuous.segments import measure
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
 from imagine_bench.tasks.parameters.parameters import WorldParameters
 from imagine_bench.tasks.pick_place.rules import PickPlace
 from imagine_bench.tasks.scenes.appearance import appearance
 from imagine_bench.tasks.specs import world_maker
+from imagine_bench.tasks.world import Reading
 
 from imagine_bench.errors import InvalidValueError, UnknownKeywordError
 
@@ -148,6 +151,8 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"cubes": 7}, "give an integer from 1 to 6"),
     ({"goal": "all", "forbid": "equal"}, "no start"),
     ({"rate_hz": 2}, "from 5 to 125"),
+    ({"placement": 0.05}, "give metres from 0 to 0.04"),
+    ({"placement": "far"}, "give metres from 0 to 0.04"),
 ]
 
 
@@ -169,6 +174,7 @@ def test_options_without_meaning_for_a_hand_are_refused(option: dict[str, Any], 
         {"appearance": "strong"},
         {"slip": 0.5},
         {"told": True},
+        {"placement": 0.04},
     ],
 )
 def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(name: str, option: dict[str, Any]) -> None:
@@ -243,6 +249,55 @@ def test_a_grip_that_slips_leaves_the_object_where_it_is(family: str) -> None:
         assert tuple(info["macrostate"])[:-1] == expected[:-1]
         slipped += slips
     assert 2 <= slipped <= 12  # 99.8 % of binomial draws
+
+
+@pytest.mark.parametrize(("family", "cubes"), [("arrows", 1), ("arrows", 3), ("arrows", 6), ("pick_place", None)])
+def test_a_placement_moves_objects_apart_from_each_other_and_reads_as_before(family: str, cubes: int | None) -> None:
+    """In 100 starts some object is more than 3 cm off its slot, none more than 4.3 cm, and none touches another."""
+    options = {} if cubes is None else {"cubes": cubes}
+    placed, _ = environment(family, placement=0.04, **options)
+    plain, _ = environment(family, **options)
+    plain.reset(seed=0)
+    slots_m = plain.world.object_poses()[:, :2]
+    bodies = placed.world.object_bodies
+    off_m = []
+    for seed in range(100):
+        _, info = placed.reset(seed=seed)
+        assert placed.world.read() == Reading(macrostate=tuple(info["macrostate"]), problem=None)
+        touching = placed.model.geom_bodyid[placed.data.contact.geom]
+        assert not np.isin(touching, bodies).all(axis=1).any()
+        off_m.append(np.abs(placed.world.object_poses()[:, :2] - slots_m).max())
+    assert 0.03 < max(off_m) < 0.045
+    places = placed.world.places
+    placed.reset(seed=0)
+    assert placed.world.places != places
+    placed.reset(seed=99)
+    assert placed.world.places == places
+
+
+def test_a_turned_cube_belongs_to_the_place_of_its_start() -> None:
+    """And not to its slot; also in an environment that was set to this state, and whatever its own starts were."""
+    env, _ = environment("arrows", placement=0.04, **FREE)
+    again = make_arrows(observation="proprio", placement=0.04, **FREE)
+    again.reset(seed=1)
+    expert = Expert(again, again.another_world())
+    off_m = []
+    for seed in range(3):
+        env.reset(seed=seed, options={"macrostate": (1, 2, 3, 0)})
+        before_m = env.world.object_poses()[:, :2]
+        off_m.append(math.hypot(*env.world.places[0][:2]))
+        again.set_state(env.get_state())
+        events = [carry_out(again, expert, action)[0] for action in (0, 5)]
+        assert [each["macro_action"] for each in events] == [0, 5]
+        assert np.abs(again.world.object_poses()[:, :2] - before_m).max() < 0.005
+    assert max(off_m) > MAX_OFF_SLOT_M
+
+
+def test_macro_actions_and_certificates_refuse_a_placement() -> None:
+    with pytest.raises(InvalidValueError, match="macro-actions begin and end with objects on their slots"):
+        gymnasium.make("imagine_bench/Arrows-v0", placement=0.03)
+    with pytest.raises(InvalidValueError, match="a certificate is of objects on their slots"):
+        measure(make_arrows(observation="proprio", placement=0.03), tries=1, turns=1)
 
 
 def test_a_turn_about_the_hand_leaves_its_place() -> None:
