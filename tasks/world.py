@@ -34,6 +34,8 @@ MAX_PLACEMENT_M = 0.04
 PLACEMENT_YAW_RAD = math.radians(5.0)
 """How far off their slots places may be drawn, and how far turned."""
 _DRAWS = 10_000
+Place = tuple[float, float, float]
+"""x and y (m) and yaw (rad)."""
 _APART_M = 0.085
 """Places drawn off the slots are so far apart, along x or along y: fingers fit between any two objects."""
 SLIP_FRICTION = 0.02
@@ -65,7 +67,7 @@ class WorldState:
     looks: tuple[Floats, ...]
     composite: Composite | None  #: where frames are patched, the fragments of the latest
     sensing: Sensing
-    places: tuple[tuple[float, ...], ...] = ()  #: as :attr:`World.places`
+    places: tuple[Place, ...] = ()  #: as :attr:`World.places`
     sleep: Sleep = field(default_factory=dict)  #: the sleeping bodies, by the names in ``mjData``
 
 
@@ -109,7 +111,7 @@ class World(abc.ABC):
         self._tips = [index for index in range(model.ngeom) if TIP_IN_NAME in model.geom(index).name]
         self._tip_friction = model.geom_friction[self._tips, :1].copy()
         self._people = [model.material(name).id for name in ("skin", "cloth")]
-        self.places = tuple((0.0, 0.0, 0.0) for _ in starts)  #: of each object, off its slot: x, y (m) and yaw (rad)
+        self.places: tuple[Place, ...] = ((0.0, 0.0, 0.0),) * len(starts)  #: of each object, off its slot
         self._placement_noise = [[0.0, 0.0, 0.0] for _ in starts]
         self._read_at: tuple[bytes, bytes] | None = None
         self._latest_objects: tuple[State, str | None] = ((), None)
@@ -235,7 +237,7 @@ class World(abc.ABC):
             drawn = rng.uniform(-1.0, 1.0, (len(slots_m), 3)) * (most_m, most_m, PLACEMENT_YAW_RAD)
             places_m = slots_m + drawn[:, :2]
             if (np.abs(places_m[later] - places_m[earlier]).max(axis=1) >= _APART_M).all():
-                self.places = tuple(map(tuple, drawn.tolist()))
+                self.places = tuple((x_m, y_m, yaw_rad) for x_m, y_m, yaw_rad in drawn.tolist())
                 return
         raise InvalidValueError(f"No places {most_m:g} m off their slots keep objects apart; give a smaller placement.")
 
@@ -364,7 +366,7 @@ class World(abc.ABC):
         x, y, yaw = offset
         return self.level.object_offset_m * x, self.level.object_offset_m * y, self.level.object_yaw_rad * yaw
 
-    def _off(self, index: int, offset: Sequence[float]) -> tuple[float, float, float]:
+    def _off(self, index: int, offset: Sequence[float]) -> Place:
         """How far an object is off its slot, in metres and radians, that is off its place by such shares."""
         x_m, y_m, yaw_rad = self._scaled(offset)
         place_x_m, place_y_m, place_yaw_rad = self.places[index]
