@@ -147,17 +147,3 @@ def clip_unit_norms(network: MemberMLP, limit: float) -> None:
     for weight in network.weights:
         squares = weight.square().sum(dim=1, keepdim=True)  # [E, 1, out]; ``norm`` takes four times as long
         weight.mul_((limit * squares.clamp_min(1e-24).rsqrt()).clamp_max(1.0))
-
-
-@torch.no_grad()
-def clip_member_gradients(network: nn.Module, limit: float) -> Tensor:
-    """Scale the gradient of each member down to a norm of at most ``limit``; parameters begin with the member axis.
-
-    Returns the norms before. Shape (E,).
-    """
-    gradients = [parameter.grad.flatten(1) for parameter in network.parameters() if parameter.grad is not None]
-    norms = torch.stack([gradient.square().sum(dim=1) for gradient in gradients]).sum(dim=0).sqrt()
-    scale = (limit / norms.clamp_min(1e-30)).clamp_max(1.0).unsqueeze(1)
-    for gradient in gradients:
-        gradient.mul_(scale)
-    return norms

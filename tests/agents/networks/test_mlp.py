@@ -1,10 +1,10 @@
-"""Member networks, dropout masks, the max-norm constraint and clipping."""
+"""Member networks, dropout masks, the max-norm constraint."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from imagine_bench.agents.networks.mlp import MemberMLP, clip_member_gradients, clip_unit_norms, dropout_mask, mlp
+from imagine_bench.agents.networks.mlp import MemberMLP, clip_unit_norms, dropout_mask, mlp
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -60,23 +60,6 @@ def test_max_norm_limits_each_unit_and_leaves_the_others() -> None:
     torch.testing.assert_close(norms[1], torch.tensor(3.0))
     torch.testing.assert_close(network.weights[0][0, :, 1] / 1.5, torch.ones(4))  # the direction stays
     assert torch.equal(network.weights[0][0, :, [0, 2]], before[0, :, [0, 2]])
-
-
-def test_member_gradients_are_clipped_one_by_one() -> None:
-    network = MemberMLP((3, 4, 1), members=2, dropout=0.0, generator=generator())
-    x = torch.randn(2, 5, 3, generator=generator(1)) * torch.tensor([1e-6, 1e3]).view(2, 1, 1)
-    network(x).square().sum().backward()
-    before = [parameter.grad.clone() for parameter in network.parameters()]
-    norms = clip_member_gradients(network, 0.5)
-    after = [parameter.grad for parameter in network.parameters()]
-    for member, (given, kept) in enumerate(zip(_norms(before), _norms(after), strict=True)):
-        assert norms[member] == pytest.approx(given)
-        assert kept == pytest.approx(min(given, 0.5), rel=1e-4)
-    assert _norms(before)[0] < 0.5 < _norms(before)[1], "one within the limit, one beyond"
-
-
-def _norms(gradients: list[torch.Tensor]) -> list[float]:
-    return [float(torch.cat([gradient[member].flatten() for gradient in gradients]).norm()) for member in range(2)]
 
 
 def test_a_single_network_begins_glorot_uniform() -> None:

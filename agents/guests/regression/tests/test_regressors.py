@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
-from imagine_bench.agents.networks.normed_mlp import NormedMLP
 from imagine_bench.agents.networks.weight_samples import sample_outputs
+from imagine_bench_regression.normed_mlp import NormedMLP, clip_member_gradients
 from imagine_bench_regression.regressor import MixtureRegressor, make_ensemble, make_mc_dropout
 
 from imagine_bench.errors import DivergedError
@@ -166,3 +166,20 @@ def test_a_likelihood_that_is_not_finite_changes_nothing() -> None:
     assert len(before) > len(list(model.network.parameters())), "the running statistics must be among them"
     assert all(torch.equal(each, after[name]) for name, each in before.items())
     assert model.network.batches == 0
+
+
+def test_member_gradients_are_clipped_one_by_one() -> None:
+    network = MemberMLP((3, 4, 1), members=2, dropout=0.0, generator=generator())
+    x = torch.randn(2, 5, 3, generator=generator(1)) * torch.tensor([1e-6, 1e3]).view(2, 1, 1)
+    network(x).square().sum().backward()
+    before = [parameter.grad.clone() for parameter in network.parameters()]
+    norms = clip_member_gradients(network, 0.5)
+    after = [parameter.grad for parameter in network.parameters()]
+    for member, (given, kept) in enumerate(zip(_norms(before), _norms(after), strict=True)):
+        assert norms[member] == pytest.approx(given)
+        assert kept == pytest.approx(min(given, 0.5), rel=1e-4)
+    assert _norms(before)[0] < 0.5 < _norms(before)[1], "one within the limit, one beyond"
+
+
+def _norms(gradients: list[torch.Tensor]) -> list[float]:
+    return [float(torch.cat([gradient[member].flatten() for gradient in gradients]).norm()) for member in range(2)]

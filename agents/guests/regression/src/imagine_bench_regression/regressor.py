@@ -18,8 +18,7 @@ from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.uncertainty import decompose, jensen_shannon, nll, sampled_component_variance
 from imagine_bench.agents.networks.adam import Adam
-from imagine_bench.agents.networks.mlp import clip_member_gradients, dropout_mask
-from imagine_bench.agents.networks.normed_mlp import NormedMLP
+from imagine_bench.agents.networks.mlp import dropout_mask
 from imagine_bench.agents.networks.precision import hidden_dtype, settle
 from imagine_bench.agents.networks.weight_samples import sample_outputs
 from torch import Tensor
@@ -28,6 +27,7 @@ from imagine_bench.arrays import Floats
 from imagine_bench.errors import DivergedError
 from imagine_bench.interfaces.regression import Prediction, RegressorContext
 
+from .normed_mlp import NormedMLP, clip_member_gradients
 from .settings import HYPERPARAMETERS, RegressorSettings
 
 _ROWS = 256

@@ -2,7 +2,7 @@
 
 While training, activations are kept as units x rows: standardising a unit over its batch is then layer normalisation
 over the last axis, which torch has as one fused operation. For prediction the standardisation is folded into the
-weights, so the predictor is an ordinary :class:`~.mlp.MemberMLP`. Shapes: ``E`` members, ``H`` units, ``N`` rows.
+weights, so the predictor is an ordinary ``MemberMLP``. Shapes: ``E`` members, ``H`` units, ``N`` rows.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
+from imagine_bench.agents.networks.mlp import MemberMLP, dropout_mask
 from torch import Tensor, nn
-
-from .mlp import MemberMLP, dropout_mask
 
 EPSILON = 1e-5
 """Added to every variance (the default of PyTorch): little, as decay makes units small."""
@@ -127,3 +126,17 @@ class NormedMLP(nn.Module):
             network.weights[layer].copy_(scaled.mT[members])
             network.biases[layer].copy_((bias - scaled @ mean).mT[members])
         return network
+
+
+@torch.no_grad()
+def clip_member_gradients(network: nn.Module, limit: float) -> Tensor:
+    """Scale the gradient of each member down to a norm of at most ``limit``; parameters begin with the member axis.
+
+    Returns the norms before. Shape (E,).
+    """
+    gradients = [parameter.grad.flatten(1) for parameter in network.parameters() if parameter.grad is not None]
+    norms = torch.stack([gradient.square().sum(dim=1) for gradient in gradients]).sum(dim=0).sqrt()
+    scale = (limit / norms.clamp_min(1e-30)).clamp_max(1.0).unsqueeze(1)
+    for gradient in gradients:
+        gradient.mul_(scale)
+    return norms
