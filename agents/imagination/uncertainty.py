@@ -12,9 +12,6 @@ from torch import Tensor
 from . import mixture as mdn
 from .mixture import Mixture
 
-_CHUNK = 2_000_000
-"""Component densities computed at a time."""
-
 
 class Uncertainty(NamedTuple):
     """Predictive variance by cause, a dimension at a time; the three sum to the total (equation 4.24)."""
@@ -50,52 +47,10 @@ def component_variance(samples: Mixture, members: int) -> Tensor:
     return torch.cat((noise + means.var(dim=1, correction=0)).unbind(0), dim=-2)
 
 
-def sampled_component_variance(samples: Mixture, predictive: Mixture, values: Tensor, members: int = 1) -> Tensor:
-    """:func:`component_variance` of the components that ``values`` (..., Z) came from, summed over dimensions: (...).
-
-    Each component of ``predictive``, the samples' average, counts by its posterior probability of having been the one.
-    """
-    scaled = (values.unsqueeze(-2) - predictive.means) * torch.exp(-predictive.log_sigmas)  # [..., K, Z]
-    log_joint = predictive.log_weights - (0.5 * scaled.square() + predictive.log_sigmas).sum(dim=-1)
-    own = component_variance(samples, members).sum(dim=-1)  # [..., K]
-    return (log_joint.softmax(dim=-1) * own).sum(dim=-1)
-
-
 def nll(samples: Mixture, values: Tensor) -> Tensor:
     """Negative log-likelihood of sampled values under all weight samples together, in nats: (..., Z) to (...)."""
     log_p = mdn.log_likelihood(samples, values.unsqueeze(0))  # [T, ...]
     return math.log(len(log_p)) - torch.logsumexp(log_p, dim=0)
-
-
-@torch.no_grad()
-def jensen_shannon(samples: Mixture, draws: int, generator: torch.Generator) -> Tensor:
-    """How much the predictive distribution itself changes with the weights: an epistemic score for any mixture.
-
-    The thesis (4.3) leaves as future work a measure of the variability of the distributions {p(y | x; w_t)}. Here it
-    is their Jensen-Shannon divergence with equal weights (Lin 1991, equation 5.1), which is the mutual information of
-    prediction and weights (Depeweg et al. 2018, equation 4):
-
-        J = (1/T) sum_t KL(p_t || p_mean) = H[p_mean] - (1/T) sum_t H[p_t]   in nats, 0 <= J <= log T.
-
-    Unlike the variance of the means it sees samples that put the same mean together from other branches, it does not
-    depend on the unit of y, and it treats all dimensions of y together. Estimated by Monte Carlo: every mixture is
-    drawn from equally often (stratified over t), so that only the value within it is chance: the standard error falls
-    as 1 / sqrt(T S) with ``draws`` S from each. Mixtures (T, N) give shape (N,), cut to [0, log T].
-    """
-    count, _, components, size = samples.means.shape
-    piece = max(1, _CHUNK // (draws * count * count * components * size))
-    parts = (samples.log_weights, samples.means, samples.log_sigmas)
-    found = []
-    for rows in zip(*(part.split(piece, dim=1) for part in parts), strict=True):
-        some = Mixture(*rows)
-        flat = some.map(lambda part: part.flatten(0, 1).repeat_interleave(draws, dim=0))
-        values = mdn.sample(flat, 1.0, generator).view(count, -1, draws, size).transpose(1, 2)  # [T, S, N, D]
-        every = some.map(lambda part: part[:, None, None])
-        log_p = mdn.log_likelihood(every, values.unsqueeze(0))  # every value under every mixture: [T', T, S, N]
-        log_mean = torch.logsumexp(log_p, dim=0) - math.log(count)
-        own = log_p.diagonal(dim1=0, dim2=1).movedim(-1, 0)
-        found.append((own - log_mean).mean(dim=(0, 1)).clamp(0.0, math.log(count)))
-    return torch.cat(found)
 
 
 REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {

@@ -16,7 +16,7 @@ import torch
 from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.uncertainty import decompose, jensen_shannon, nll, sampled_component_variance
+from imagine_bench.agents.imagination.uncertainty import decompose, nll
 from imagine_bench.agents.networks.adam import Adam
 from imagine_bench.agents.networks.mlp import dropout_mask
 from imagine_bench.agents.networks.precision import hidden_dtype, settle
@@ -29,6 +29,7 @@ from imagine_bench.interfaces.regression import Prediction, RegressorContext
 
 from .normed_mlp import NormedMLP, clip_member_gradients
 from .settings import HYPERPARAMETERS, RegressorSettings
+from .uncertainty import jensen_shannon, sampled_component_variance
 
 _ROWS = 256
 """Rows predicted at a time: T mixtures of each are in memory."""
