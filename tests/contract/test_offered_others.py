@@ -11,11 +11,12 @@ import pytest
 from guest_packages import Guests
 from imagine_bench.agents.encoders import training
 from imagine_bench.agents.encoders.encoder import Encoder
+from imagine_bench_motion.judge.interface import GROUP, motion_model_entry, motion_models
 from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.registry.machine import versions
 from imagine_bench.regression.runner import run
@@ -35,6 +36,7 @@ _OFFERS = {
         "their_regressor": "their_things:REGRESSOR",
         "their_plain_regressor": "their_things:PLAIN",
     },
+    GROUP: {"their_motion_model": "their_things:MOTION", "no_entry": "their_things:STUDY"},
 }
 _MODULE = '''
 import dataclasses
@@ -42,6 +44,7 @@ import numpy as np
 from imagine_bench import registry
 from imagine_bench.registry import EncoderEntry, RegressorEntry
 from imagine_bench.sweep.grid import Study, Variant
+from imagine_bench_motion.judge.interface import MotionModelEntry
 
 class Tiles:
     """Mean colors of 16 tiles, in thousands, so that somebody must scale them."""
@@ -59,6 +62,7 @@ BLIND = EncoderEntry(make="their_things:Blind")
 RANDOM = Variant(name="random", factor="base", agent="random")
 STUDY = Study(name="their_study", question="Whose?", budgets=(2,), variants=(RANDOM,))
 DATA = dataclasses.replace(registry.regression("toy_regression"), id="their_data", variants=("base",))
+MOTION = MotionModelEntry(make="their_things:Tiles", level="commands", description="A model.")
 REGRESSOR = RegressorEntry(
     make="imagine_bench_regression.regressor:make_mc_dropout",
     title="theirs",
@@ -134,6 +138,13 @@ def test_a_study_of_theirs_runs(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "No variant 'none'" in capsys.readouterr().err
     found = registry.offered("their_study", {}, registry.STUDY_GROUP)
     assert found.question == "Whose?" and main([*words[:3], "--name", "thei_study"]) == 2
+
+
+def test_their_model_of_motions_is_judged_as_the_suites_own_are() -> None:
+    assert {"their_motion_model", "no_change", "recurrent"} <= set(motion_models())
+    assert motion_model_entry("their_motion_model").make == "their_things:Tiles"
+    with pytest.raises(SetupError, match=r"as model of motions no_entry, which is .* and no MotionModelEntry; mend"):
+        motion_model_entry("no_entry")
 
 
 def test_their_regressor_learns_their_data(tmp_path: Path) -> None:

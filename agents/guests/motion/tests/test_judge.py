@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
 from imagine_bench_motion.judge.interface import Motions
+from imagine_bench_motion.judge.judgement import SIMULATOR, MotionJudgement, judge, judged
 from imagine_bench_motion.judge.no_change import NoChange
 from imagine_bench_motion.judge.questions import MotionQuestions, MotionSource, moved
 from imagine_bench_motion.judge.recurrent import MotionNetwork
+from imagine_bench_motion.judge.report import motion_tables
 from imagine_bench_motion.judge.scores import Simulator, score
 
 from imagine_bench.arrays import Array, Ints
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 
 
 class KnownFrames:
@@ -32,6 +37,7 @@ class KnownFrames:
         return np.array([self._shows[picture.tobytes()] for picture in pictures])
 
 
+FEW = MotionJudgement(task="arrow_puzzle", models=("no_change",), sizes=(3,), seeds=(0,), pairs=2, chains=1)
 FAMILIES = {"arrows": make_arrows, "pick_place": make_pick_place}
 
 
@@ -94,6 +100,43 @@ def test_the_simulator_is_right_in_all_and_a_copy_where_nothing_changes(family: 
     )
     assert (copied.right, copied.raised_right, copied.painted, copied.pairs) == (0, unchanged, 0, 0)
     assert copied.by_depth == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"task": "arrow_puzzle_cloned"}, "has no continuous control"),
+        ({"models": ()}, "There is nothing to judge"),
+        ({"models": ("no_change", "no_change")}, "give each once"),
+        ({"models": ("patches",)}, "No model of motions 'patches'"),
+        ({"sizes": (9, 3)}, "give ascending numbers of motions"),
+        ({"seeds": (-1,)}, "one seed of at least 0"),
+        ({"pairs": 0}, "give at least 1 of each"),
+    ],
+)
+def test_a_judgement_that_cannot_be_is_one_sentence(change: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ImagineBenchError, match=sentence):
+        replace(FEW, **change)
+
+
+@pytest.mark.slow
+def test_a_judgement_goes_on_where_it_was_stopped_and_refuses_what_is_damaged(tmp_path: Path) -> None:
+    folder, failed = judge(FEW, tmp_path, workers=1)
+    assert not failed
+    (cell,) = [each for each in FEW.cells if each != SIMULATOR]
+    first = (folder / cell.file).read_bytes()
+    more = replace(FEW, seeds=(0, 1))
+    assert judge(more, tmp_path, workers=2) == (folder, [])
+    assert (folder / cell.file).read_bytes() == first
+    kept = judged(more, folder)
+    assert len(kept) == len(more.cells)
+    assert len({each["questions"] for each in kept}) == 1
+    assert len({each["data"] for each in kept if "data" in each}) == 2
+    scores, drift = motion_tables(more, kept)
+    assert [row[0] for row in scores.rows] == [row[0] for row in drift.rows] == ["simulator", "no_change"]
+    (folder / cell.file).write_bytes(first.replace(b'"right": 0.0', b'"right": 1.0'))
+    with pytest.raises(ArtefactError, match="is damaged"):
+        judge(more, tmp_path, workers=1)
 
 
 def test_what_is_no_frame_is_refused() -> None:
