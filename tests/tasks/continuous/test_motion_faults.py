@@ -156,6 +156,23 @@ def test_copies_and_states_in_the_middle_of_a_grasp_go_on_to_the_bit(family: str
     assert env._referee.touched().any()
 
 
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_step_that_is_taken_again_from_its_state_has_its_event_again(family: str) -> None:
+    env = FAMILIES[family](observation="proprio")
+    env.reset(seed=5, options={"macrostate": (1, 2, 3, 0) if family == "arrows" else (0, 0, 0, 0)})
+    expert = Expert(env, env.another_world())
+    expert.begin(0)
+    is_event = False
+    while not is_event:
+        action = expert.act()
+        state = env.get_state()
+        _, *results, info = env.step(action)
+        is_event = bool(info["event"])
+        env.set_state(state)
+        _, *again, info = env.step(action)
+        assert (again, bool(info["event"])) == (results, is_event)
+
+
 def single(name: str, **options: Any) -> Any:
     return gymnasium.make(f"imagine_bench/{name}Motion-v0", disable_env_checker=True, **options).unwrapped
 
