@@ -371,35 +371,33 @@ def vary(factor: str) -> list[np.ndarray]:
     return list(world.render_macrostates(np.array([(0, 1, 2, 1)] * 4), factor or "clean", rng))
 
 
-def levels() -> None:
-    """Total variation of each judged model, and its exploit with the upper bound, by the size of its data."""
+def evidence() -> None:
+    """Total variation of each judged fit, and its exploit with the upper bound, by the size of its data."""
     with (RESULTS / "arrow_puzzle_clockwise-levels-judge" / "scores.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["exploit"]]
     sizes = sorted({int(row["transitions"]) for row in rows})
-    plot, axes = plt.subplots(figsize=(8, 4.6), layout="constrained")
-    for place, model in enumerate(dict.fromkeys(row["model"] for row in rows)):
-        style = {"color": figures.COLORS[place], "marker": figures.MARKERS[place]}
+    plot, axes = plt.subplots(figsize=(8, 4.4), layout="constrained")
+    for place, model in enumerate(dict.fromkeys(row["model"] for row in rows), 2):
+        style = {"color": figures.COLORS[place % 8], "marker": figures.MARKERS[place % 7], "alpha": 0.7}
         label = registry.world_model_entry(model).label
-        for size in sizes:
-            kept = [row for row in rows if row["model"] == model and int(row["transitions"]) == size]
-            away, low, high = (
-                np.mean([float(row[name]) for row in kept]) for name in ("total_variation", "exploit", "exploit_bound")
-            )
-            axes.errorbar(away, low, [[0.0], [high - low]], color=style["color"], capsize=4, linewidth=1.5)
-            area = 30 * (1 + sizes.index(size)) ** 1.5
-            axes.scatter(away, low, s=area, label=label if size == sizes[0] else None, alpha=0.8, **style)
+        for row in (row for row in rows if row["model"] == model):
+            away, low, high = (float(row[name]) for name in ("total_variation", "exploit", "exploit_bound"))
+            area = 30 * (1 + sizes.index(int(row["transitions"]))) ** 1.5
+            axes.vlines(away, low, high, color=style["color"])
+            axes.scatter(away, low, s=area, label=label, **style)
+            label = None
     axes.axvline(0.1, color="gray", linewidth=1, linestyle=":")
     axes.axhline(20.0, color="gray", linewidth=1, linestyle=":")
     axes.set_xscale("symlog", linthresh=0.01)
     axes.set_xlim(-0.001, 1.1)
     axes.set_xticks([0.0, 0.01, 0.1, 1.0], ["0", "0.01", "0.1", "1"])
-    axes.set_xlabel("total variation of one macro-action (L1; linear below 0.01, then logarithmic)")
-    axes.set_ylabel("exploit (L7), reward")
-    axes.set_title("Largest marks: " + f"{sizes[-1]:,} transitions; smallest: {sizes[0]:,}", fontsize=10)
+    axes.set_xlabel("total variation of one macro-action, L1 (linear below 0.01, then logarithmic)")
+    axes.set_ylabel("exploit, L7 (units of reward)")
+    axes.set_title(f"A mark a fit; the larger, the more transitions: {', '.join(map(str, sizes))}", fontsize=10)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    plot.savefig(HERE / "levels.png", dpi=100)
+    axes.legend(loc="upper right", frameon=False)
+    plot.savefig(HERE / "evidence.png", dpi=100)
 
 
 def strips(rows: Mapping[str, list[np.ndarray]], titles: Sequence[str]) -> np.ndarray:
@@ -428,7 +426,7 @@ def tasks() -> None:
     runpy.run_path(str(HERE / "draw_tasks.py"))["tasks"]()
 
 
-FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, levels, parameters, tasks)
+FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, evidence, parameters, tasks)
 PICTURES = {each.__name__: each for each in FIGURES}
 
 if __name__ == "__main__":
