@@ -33,20 +33,6 @@ def decompose(samples: Mixture) -> Uncertainty:
     return Uncertainty(means.var(dim=0, correction=0), aleatoric.mean(dim=0), modal.mean(dim=0))
 
 
-def component_variance(samples: Mixture, members: int) -> Tensor:
-    """How uncertain each component of the averaged mixture is by itself: its noise, and the effect of weights on its
-    mean.
-
-    The law of total variance given the component: ``mean_t sigma_k^2 + var_t mu_k``. Unlike the three parts of
-    :func:`decompose` it does not count that there are other components, which says nothing about a value that was
-    sampled from this one. Samples are (E T, ..., K, Z), member by member; the result is (..., E K, Z), in the order of
-    :func:`~.mixture.average`.
-    """
-    means = samples.means.unflatten(0, (members, -1))
-    noise = torch.exp(2.0 * samples.log_sigmas).unflatten(0, (members, -1)).mean(dim=1)
-    return torch.cat((noise + means.var(dim=1, correction=0)).unbind(0), dim=-2)
-
-
 def nll(samples: Mixture, values: Tensor) -> Tensor:
     """Negative log-likelihood of sampled values under all weight samples together, in nats: (..., Z) to (...)."""
     log_p = mdn.log_likelihood(samples, values.unsqueeze(0))  # [T, ...]

@@ -7,15 +7,28 @@ import math
 import torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.uncertainty import component_variance
 from torch import Tensor
 
 _CHUNK = 2_000_000
 """Component densities computed at a time."""
 
 
+def component_variance(samples: Mixture, members: int) -> Tensor:
+    """How uncertain each component of the averaged mixture is by itself: its noise, and the effect of weights on its
+    mean.
+
+    The law of total variance given the component: ``mean_t sigma_k^2 + var_t mu_k``. Unlike the three parts of
+    ``decompose`` it does not count that there are other components, which says nothing about a value that was
+    sampled from this one. Samples are (E T, ..., K, Z), member by member; the result is (..., E K, Z), in the order of
+    ``mixture.average``.
+    """
+    means = samples.means.unflatten(0, (members, -1))
+    noise = torch.exp(2.0 * samples.log_sigmas).unflatten(0, (members, -1)).mean(dim=1)
+    return torch.cat((noise + means.var(dim=1, correction=0)).unbind(0), dim=-2)
+
+
 def sampled_component_variance(samples: Mixture, predictive: Mixture, values: Tensor, members: int = 1) -> Tensor:
-    """``component_variance`` of the components that ``values`` (..., Z) came from, summed over dimensions: (...).
+    """:func:`component_variance` of the components that ``values`` (..., Z) came from, summed over dimensions: (...).
 
     Each component of ``predictive``, the samples' average, counts by its posterior probability of having been the one.
     """
