@@ -49,7 +49,7 @@ CAUSES = {
     "model": "its model was wrong, though it was experienced",
     "planning": "its model was right; its plan was cut off, or its policy not greedy in it",
     "values": "its values were wrong, though it had experienced all that it needed (no model)",
-    "execution": "motor failure: a macro-action was carried out, but what the arm did to the scene is no outcome of it",
+    "execution": "motor failure: the arm's motion had a result that the rules exclude for that macro-action",
     "unlucky": "an optimal policy would have failed too",
 }
 """Causes in the order in which tables and figures have them."""
