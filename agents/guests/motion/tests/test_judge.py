@@ -14,7 +14,7 @@ from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
 from imagine_bench_motion.judge.interface import Motions
 from imagine_bench_motion.judge.judgement import SIMULATOR, MotionJudgement, judge, judged
 from imagine_bench_motion.judge.no_change import NoChange
-from imagine_bench_motion.judge.questions import MotionQuestions, MotionSource, moved
+from imagine_bench_motion.judge.questions import MotionQuestions, MotionSource, moved, moving_actions
 from imagine_bench_motion.judge.recurrent import MotionNetwork
 from imagine_bench_motion.judge.report import motion_tables
 from imagine_bench_motion.judge.scores import Simulator, score
@@ -47,7 +47,7 @@ def questions(family: str) -> MotionQuestions:
     source = MotionSource(FAMILIES[family](observation="proprio", time_limit_s=1e9))
     rng = np.random.default_rng(0)
     planned, raised = source.pairs(4, rng)
-    return MotionQuestions(planned=planned, raised=raised, chains=source.chains(2, 2, rng))
+    return MotionQuestions(planned=planned, raised=raised, chains=source.chains(8, 2, rng))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -79,6 +79,8 @@ def test_each_motion_of_a_chain_moves_an_object_from_where_the_one_before_ended(
     np.testing.assert_array_equal(first.after, second.before)
     for motions in (first, second):
         assert all(moved(*ends) for ends in zip(motions.states, motions.reached, strict=True))
+        rules = FAMILIES[family](observation="proprio").task.rules
+        assert all(moving_actions(rules, tuple(state)) for state in motions.reached.tolist()), "another can follow"
 
 
 def test_questions_are_the_same_after_they_were_in_a_file() -> None:
