@@ -6,10 +6,10 @@ import gymnasium
 import imagine_bench_motion
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from imagine_bench.tasks.continuous.expert import Expert
-from imagine_bench_motion.control.goals import GoalEnv, make
+from imagine_bench_motion.control.goals import make
 from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.env_checker import check_env
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
@@ -59,7 +59,7 @@ def test_goals_of_images_are_refused() -> None:
 @pytest.mark.slow
 def test_a_checker_and_hindsight_replay_of_a_library_take_it() -> None:
     env = gymnasium.make("imagine_bench_motion/ArrowPuzzleEasyGoals-v0")
-    check_env(GoalEnv(env.unwrapped), skip_render_check=True)
+    check_env(env, skip_render_check=True)
     learner = SAC("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, learning_starts=800, seed=0)
     learner.learn(900)
     assert learner.num_timesteps == 900
