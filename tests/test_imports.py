@@ -56,6 +56,7 @@ FOLDERS = (
     "imagine_bench/running",
     "imagine_bench/running/launchers",
     "imagine_bench/judge/policies",
+    "imagine_bench/judge/worlds",
     "imagine_bench/judge",
     "imagine_bench/sweep",
     "imagine_bench/recording",

@@ -232,6 +232,9 @@ class Play:
     """Camera of the scene: human looks at the table from nearby, far at the whole arm."""
     seed: int = 0
     """Chooses the episodes."""
+    quiz: int = 0
+    """Answer so many questions about the task's whole world instead, as world models are asked; with --appearance and
+    --seed. Their images are written into runs/quiz."""
     film: bool = False
     """Film an episode of optimal macro-actions in contact physics instead, as a GIF."""
     out: Path = Path("film.gif")
@@ -241,6 +244,9 @@ class Play:
         """Play, or film."""
         from imagine_bench.tools import play  # noqa: PLC0415 - pillow loads slowly
 
+        if self.quiz:
+            self._quiz()
+            return
         if not self.film:
             require_with("--film", self, "out")
             motion = None if self.task is None else registry.task_of_motion(self.task)
@@ -261,6 +267,14 @@ class Play:
             )
         look = self.appearance or APPEARANCES[0]
         print(play.film(self.task, self.out, seed=self.seed, appearance=look, camera=self.camera))
+
+    def _quiz(self) -> None:
+        from imagine_bench.tools.quiz import quiz  # noqa: PLC0415 - as above
+
+        require_with("a game", self, "model", "execution", "encoder", "film", "out")
+        if self.task is None:
+            raise InvalidValueError("There is nothing to ask about; give a task, such as play arrow_puzzle --quiz 16.")
+        print(quiz(self.task, self.quiz, seed=self.seed, appearance=self.appearance or APPEARANCES[0]))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,12 +6,12 @@ Shapes: ``N`` questions, ``K`` frames of history, ``D`` imagined depth, ``S`` im
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Array, Arrays, Floats, Frame, Images, Ints
+from imagine_bench.arrays import Array, Arrays, Bools, Floats, Frame, Images, Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.episodes import Episodes
 
@@ -58,6 +58,24 @@ class WorldModel(Protocol):
         """Numbers that were fitted."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class LearnedGraph:
+    """Which factors of a model decide which, by its own account."""
+
+    #: Value of each factor in N frames. Shape (N, P).
+    values: Ints
+    #: By macro-action, factor that it changes, and factor that decides the change. Shape (A, P, P), bool.
+    edges: Bools
+
+
+@runtime_checkable
+class GraphLearner(Protocol):
+    """A world model that learns a factor graph, which is compared with that of the rules."""
+
+    def factor_graph(self, frames: Frame) -> LearnedGraph | None:
+        """The graph, with the values of its factors in frames (N, 64, 64, 3); None where there is none."""
+
+
 class Untaught:
     """The methods that a world model that learns nothing shares with others."""
 
@@ -91,6 +109,28 @@ def require_imagined(imagined: object, *, name: str, rows: int, depth: int, samp
     _require_shapes(offered, said, (rows, samples, depth))
     _require_ranges(offered, said)
     return imagined
+
+
+def require_graph(learned: object, *, name: str, rows: int, n_actions: int | None = None) -> LearnedGraph:
+    """The graph of a model, checked; ``n_actions`` None leaves that number open.
+
+    Raises:
+        InvalidValueError: A wrong type or shape.
+    """
+    said = f"World model {name}: factor_graph()"
+    if not isinstance(learned, LearnedGraph):
+        raise InvalidValueError(f"{said} gave {type(learned).__name__}; give a LearnedGraph or None.")
+    values = np.asarray(learned.values)
+    edges = np.asarray(learned.edges)
+    if values.dtype.kind not in "iu" or edges.dtype.kind != "b":
+        raise InvalidValueError(f"{said} gave values of {values.dtype} and edges of {edges.dtype}; give int and bool.")
+    factors = values.shape[-1] if values.ndim else 0
+    actions = edges.shape[:1] if n_actions is None else (n_actions,)
+    wanted = ((rows, factors), (*actions, factors, factors))
+    if (values.shape, edges.shape) != wanted or not values.size:
+        given = f"values of shape {values.shape} and edges of {edges.shape}"
+        raise InvalidValueError(f"{said} gave {given}; give (N, P) of {rows} frames and (A, P, P), P at least 1.")
+    return learned
 
 
 def _require_shapes(offered: Arrays, said: str, asked: tuple[int, int, int]) -> None:

@@ -34,8 +34,10 @@ from imagine_bench.judge.scores import (
     one_step_scores,
     policy_scores,
     ranking_scores,
+    whole_world_scores,
 )
 from imagine_bench.judge.truth import Distribution, shares
+from imagine_bench.judge.worlds.making import WorldQuestions
 from imagine_bench.protocols.data import digest
 from imagine_bench.registry.entries import file_name
 from imagine_bench.registry.machine import describe_environment
@@ -161,6 +163,7 @@ class AskedWorld:
     counterfactuals: tuple[EvalSet, ...]
     streams: dict[str, Streams] | None  # None where not all of the world is asked about
     policies: PolicyWorld | None  # likewise
+    whole: WorldQuestions | None  # likewise
 
     @functools.cached_property
     def digest(self) -> str:
@@ -307,6 +310,7 @@ def _judged(
         **ranking_scores(world.spec, asked["ranked"], answers["ranked"]),
         **after_the_end_scores(asked.get("after"), answers.get("after"), answers["one_step"]),
         **change_detection_delay(world.streams, answers["one_step"]),
+        "worlds": whole_world_scores(cell.model, judged.model, asked["one_step"], answers["one_step"], world.whole),
         "counterfactual": counterfactual_error(world.counterfactuals, again),
         **ranks,
         "film": None if film is None else film.told(world.spec),
@@ -383,9 +387,11 @@ def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
     reader = reader_in(spec, judgement.appearance, folder)
     file = folder / READER_FILE
     digest = sha256(file)[:12] if file.exists() else ""
-    one_step = there["one_step"]
-    policies = policy_world(spec, one_step.macrostates)
-    return AskedWorld(spec, index, reader, digest, there, again, streams_of(spec, one_step), policies)
+    single = there["one_step"]
+    policies = policy_world(spec, single.macrostates)
+    streams = streams_of(spec, single)
+    whole = None if streams is None else questions.about_whole_world(spec, single)
+    return AskedWorld(spec, index, reader, digest, there, again, streams, policies, whole)
 
 
 def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], rng: np.random.Generator) -> Arrays:

@@ -20,8 +20,17 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, TaskSpec
 from imagine_bench.interfaces.capabilities import Imaginer, begin_episode
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, Untaught, WorldModel, until_the_end
-from imagine_bench.judge.predictions import imagined_by
+from imagine_bench.interfaces.model import (
+    UNCERTAINTIES,
+    GraphLearner,
+    Imagined,
+    LearnedGraph,
+    Untaught,
+    WorldModel,
+    require_graph,
+    until_the_end,
+)
+from imagine_bench.judge.predictions import call, imagined_by
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.registry.entries import WorldModelEntry, agent_label, entrant
 from imagine_bench.registry.loading import importable
@@ -89,6 +98,11 @@ class ServedModel:
         offered = {field.name: getattr(found, field.name) for field in fields(Imagined)}
         return {name: np.ascontiguousarray(array) for name, array in offered.items() if array is not None}
 
+    def factor_graph(self, frames: Frame) -> Arrays:
+        """The fields of the model's :class:`LearnedGraph`, by name; none where it offers none."""
+        learned = graph_of(self.model, self.name, frames)
+        return {} if learned is None else {"values": learned.values, "edges": learned.edges}
+
     def parameters(self) -> Arrays:
         """Their number."""
         return {"parameters": np.array(int(self.model.parameters()))}
@@ -108,9 +122,22 @@ class IsolatedModel:
         """As of the model; how far ``rng`` was drawn from there is not known here."""
         return Imagined(**self.process.call("imagine", frames, actions, samples, rng))
 
+    def factor_graph(self, frames: Frame) -> LearnedGraph | None:
+        """As of the model."""
+        found = self.process.call("factor_graph", frames)
+        return LearnedGraph(**found) if found else None
+
     def parameters(self) -> int:
         """As of the model."""
         return int(self.process.call("parameters")["parameters"])
+
+
+def graph_of(model: WorldModel, name: str, frames: Frame) -> LearnedGraph | None:
+    """The factor graph of a model; None where it offers none. Raises InvalidValueError: it fails, or gives no graph."""
+    if not isinstance(model, GraphLearner):
+        return None
+    learned = call(name, "factor_graph", model.factor_graph, frames)
+    return None if learned is None else require_graph(learned, name=name, rows=len(frames))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from imagine_bench.arrays import Arrays, Floats, Frame, Ints, State
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench.exact.values import rows_of
 from imagine_bench.interfaces.model import UNCERTAINTIES, Imagined, WorldModel, require_imagined, weights_of
-from imagine_bench.judge.questions import EvalSet
+from imagine_bench.judge.questions import FRAMES, EvalSet
 from imagine_bench.judge.reading import ImageReader, RenderedFrameIndex
 from imagine_bench.judge.truth import Distribution, added_up
+from imagine_bench.judge.worlds.tables import TransitionTable
 from imagine_bench.registry.loading import fault
 from imagine_bench.running.isolation import GuestError
 
@@ -110,6 +112,22 @@ def evaluate(
         cpu_s=cpu_s,
         steps=sum(int(np.prod(each.pictures.shape[:3])) for each in answers),
     )
+
+
+def transition_table(questions: EvalSet, predictions: Predictions, states: Sequence[State]) -> TransitionTable:
+    """A model's predictions for the questions of one step, in the order of :func:`.questions.one_step`.
+
+    Args:
+        questions: Every macro-action in every macrostate in which an episode goes on.
+        predictions: The model's.
+        states: The T macrostates of the table's columns.
+    """
+    columns = rows_of(predictions.states[:, :, 0], states)  # [N, S]
+    shares = np.zeros((len(columns), len(states) + 1))
+    np.add.at(shares, (np.arange(len(columns))[:, None], columns), predictions.weights[:, :, 0])
+    shape = (len(questions.macrostates), -1, FRAMES)
+    by_frame = shares.reshape(*shape, len(states) + 1)
+    return TransitionTable(by_frame=by_frame, drawn=predictions.drawn.reshape(shape))
 
 
 def imagined_by(

@@ -14,6 +14,7 @@ import numpy as np
 
 from imagine_bench.arrays import Frame, Ints, State
 from imagine_bench.interfaces import Rules, TaskSpec
+from imagine_bench.judge.worlds.making import WorldQuestions, whole_world
 from imagine_bench.rules import Outcomes, advance, outcomes_by_depth, states_of, states_of_play
 from imagine_bench.seeding import SeedTree
 
@@ -113,6 +114,13 @@ def counterfactuals(spec: TaskSpec, render: Render) -> tuple[EvalSet, ...]:
         truth = tuple(outcomes_by_depth(spec.rules, state, [action]) for state in states)
         found.append(replace(first, actions=np.full_like(first.actions, action), truth=truth))
     return tuple(found)
+
+
+def about_whole_world(spec: TaskSpec, single: EvalSet) -> WorldQuestions:
+    """Questions about the whole world, of which ``single`` has every macro-action as :func:`one_step` has it."""
+    of_one = single.frames.reshape(-1, FRAMES, *single.frames.shape[1:])
+    looks = bool((of_one[:, 0] != of_one[:, -1]).any())
+    return whole_world(spec, single.macrostates, FRAMES, looks=looks)
 
 
 SETS = {"one_step": one_step, "rollouts": rollouts, "ranked": ranked, "after": after_the_end}

@@ -19,11 +19,13 @@ import numpy as np
 from imagine_bench.arrays import Bools, Floats, State
 from imagine_bench.exact.values import Model, rows_of, true_model, values_of_planning
 from imagine_bench.interfaces import Rules, TaskSpec
+from imagine_bench.interfaces.model import WorldModel, require_graph
+from imagine_bench.judge.models import graph_of
 from imagine_bench.judge.policies.exploit import Exploit
 from imagine_bench.judge.policies.film import Expected, Film, course
 from imagine_bench.judge.policies.levels import SCORES, level_scores
 from imagine_bench.judge.policies.policy_set import PolicyWorld
-from imagine_bench.judge.predictions import Predictions
+from imagine_bench.judge.predictions import Predictions, transition_table
 from imagine_bench.judge.questions import FRAMES, RANKED, EvalSet
 from imagine_bench.judge.truth import (
     Value,
@@ -37,6 +39,8 @@ from imagine_bench.judge.truth import (
     squared_distance,
     total_variation,
 )
+from imagine_bench.judge.worlds.making import WorldQuestions
+from imagine_bench.judge.worlds.scores import FamilyScores, graph_scores, world_scores
 from imagine_bench.seeding import SeedTree
 from imagine_bench.statistics import auroc
 
@@ -394,4 +398,24 @@ def filter_scores(epistemic: Floats | None, kept: Any, away: Floats) -> Scores:
         levels, places = np.unique(epistemic, return_inverse=True)
         of_wrong, of_right = (np.bincount(places[rows], minlength=len(levels)) / rows.sum() for rows in (wrong, ~wrong))
         found["best_skill"] = float(max(0.0, (of_right - of_wrong).cumsum().max()))
+    return found
+
+
+def whole_world_scores(
+    name: str, model: WorldModel, single: EvalSet, predictions: Predictions, whole: WorldQuestions | None
+) -> dict[str, FamilyScores]:
+    """The scores of questions about the whole world, and the distance of the model's factor graph if it offers one.
+
+    ``single`` and ``predictions`` are of single macro-actions; nothing is scored where ``whole`` is None.
+
+    Raises:
+        InvalidValueError: The model offers a graph and fails, or gives one of wrong types or shapes.
+    """
+    if whole is None:
+        return {}
+    found = world_scores(whole, transition_table(single, predictions, whole.states))
+    learned = graph_of(model, name, single.frames[:, -1])
+    if learned is not None:
+        checked = require_graph(learned, name=name, rows=len(single.states), n_actions=len(whole.edges))
+        found |= graph_scores(checked, whole.edges, np.array(single.states, dtype=np.int64))
     return found

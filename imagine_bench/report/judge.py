@@ -34,6 +34,7 @@ from imagine_bench.report.page import (
     over_seeds,
     p_value,
 )
+from imagine_bench.report.worlds import worlds_csv, worlds_section
 from imagine_bench.statistics import can_show, difference, holm, iqm
 from imagine_bench.store import encoders
 from imagine_bench.store.files import read_json, table_text
@@ -178,8 +179,9 @@ def judgement_page(found: Judged) -> Page:
         subtitle=f"{data} · appearance “{looks}” · {judgement.samples} futures a question",
         question="Which model imagines what really happens, how sure is it, and what do its mistakes cost?",
         table=sections[0].tables[0],
+        more=[table for section in sections for table in section.tables if table.name == "worlds"],
         sections=sections,
-        files={"scores.csv": _csv(found)},
+        files={"scores.csv": _csv(found), "worlds.csv": worlds_csv(found.cells)},
         facts=read_json(found.folder / "judgement.json", "a judgement"),
     )
 
@@ -328,11 +330,17 @@ def _joined(images: Pixels) -> Pixels:
     return images.reshape(-1, *images.shape[2:])
 
 
+def whole_world(found: Judged) -> Section | None:
+    """Questions about the whole world, at the most transitions."""
+    return worlds_section(found.last, {model: _title(model) for model in found.last})
+
+
 SECTIONS: tuple[Callable[[Judged], Section | None], ...] = (
     in_short,
     levels,
     images,
     *(functools.partial(question, title=title) for title in QUESTIONS),
+    whole_world,
     compared,
 )
 """The sections of the page, in their order. A new one is a function and a line here."""

@@ -118,6 +118,7 @@ class Page:
     sections: Sequence[Section]  # in their order
     files: Mapping[str, str]  # the CSV files beside the page, by name
     facts: Mapping[str, object]  # how it was made, protocol and settings: JSON-like
+    more: Sequence[Table] = ()  # further tables for a terminal
 
     @property
     def answers(self) -> list[str]:
@@ -127,7 +128,8 @@ class Page:
     @property
     def summary(self) -> str:
         """The report on a terminal."""
-        return "\n".join([self.title, self.subtitle, "", self.table.text, "", *self.answers]).rstrip()
+        tables = [line for table in (self.table, *self.more) for line in (table.text, "")]
+        return "\n".join([self.title, self.subtitle, "", *tables, *self.answers]).rstrip()
 
 
 # How numbers are printed -------------------------------------------------------------------------------------------

@@ -101,6 +101,11 @@ class FactorDynamics:
         weight = np.exp(self.evidence - self.evidence.max(axis=1, keepdims=True))
         return weight / weight.sum(axis=1, keepdims=True)
 
+    def likeliest_parents(self) -> list[tuple[int, ...]]:
+        """The factors that decide this one's change in the likeliest structure of each action; none if it stays."""
+        structures = [(), (self.factor,), *self.parents, *self.parents]
+        return [structures[best] for best in self.weights().argmax(axis=1)]
+
     def pool(self) -> Floats:
         """Learn how it changes by itself; how often actions that change it were tried, and left it as it was: (2,)."""
         self._pool_turns()

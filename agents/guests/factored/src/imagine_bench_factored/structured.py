@@ -8,7 +8,7 @@ from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.arrays import Floats, Frame, Ints, Pixels
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes
-from imagine_bench.interfaces.model import Imagined, until_the_end
+from imagine_bench.interfaces.model import Imagined, LearnedGraph, until_the_end
 
 from .factors import Codes, CodeTransition
 from .model import FactoredModel
@@ -22,6 +22,7 @@ class StructuredModel:
     def __init__(self, perception: CodePerception, context: AgentContext) -> None:
         self.perception = perception
         self.sizes = perception.sizes
+        self.n_actions = context.n_actions
         settings = HYPERPARAMETERS.resolve(context.hyperparameters, {}, context.config_group)
         self.model = FactoredModel(self.sizes, context.n_actions, settings)
 
@@ -80,6 +81,18 @@ class StructuredModel:
         different, which = np.unique(codes.reshape(-1, codes.shape[-1]), axis=0, return_inverse=True)
         drawn = self.perception.images(different)
         return (drawn * 255.0).round().astype(np.uint8)[which.ravel()]
+
+    def factor_graph(self, frames: Frame) -> LearnedGraph:
+        """Of each factor the likeliest structure after each macro-action; see :class:`.interfaces.model.GraphLearner`.
+
+        A factor that changes by itself decides its own change.
+        """
+        factors = self.model.dynamics.factors
+        edges = np.zeros((self.n_actions, len(factors), len(factors)), dtype=bool)
+        for child, factor in enumerate(factors):
+            for action, parents in enumerate(factor.likeliest_parents()):
+                edges[action, child, list(parents)] = True
+        return LearnedGraph(values=np.array(self.perception.codes(frames), dtype=np.int64), edges=edges)
 
     def parameters(self) -> int:
         """Entries of the tables of the dynamics."""

@@ -1,0 +1,1 @@
+"""Questions about a whole world, whose answers and their exact probabilities are enumerated."""

@@ -1,0 +1,78 @@
+"""A person answers the questions that models are asked; scores stand beside those of chance, models and the rules."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from imagine_bench import registry
+from imagine_bench.cli import exit_code as main
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.judge.worlds.making import whole_world
+from imagine_bench.rules import states_of_play
+from imagine_bench.tools.quiz import quiz, words_of
+
+EASY = "arrow_puzzle_easy"
+
+
+def typed(*words: str) -> Callable[[str], str]:
+    """A person who types these and leaves."""
+    left: Iterator[str] = iter(words)
+
+    def ask(prompt: str) -> str:
+        word = next(left, None)
+        if word is None:
+            raise EOFError(prompt)
+        return word
+
+    return ask
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
+def test_every_family_has_words_and_an_answer_for_each_option(task: str) -> None:
+    spec = registry.task(task)
+    asked = whole_world(spec, states_of_play(spec.rules), 2, looks=True)
+    for family in asked.families:
+        options = np.atleast_2d(family.options[0])
+        found = words_of(spec, asked, family, 0)
+        assert len(found) == len(options)
+        for words, mine in zip(found, options, strict=True):
+            assert words.text and words.images
+            assert len({*words.answers} | {*words.answer_images}) == len(mine), family.name
+
+
+def test_a_person_is_asked_until_the_last_question_or_until_leaving(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "judge" / "it" / "report"
+    report.mkdir(parents=True)
+    (report.parent / "judgement.json").write_text(json.dumps({"task": EASY, "appearance": "clean"}))
+    rows = ["model,transitions,seed,family,right", "patches,9,0,masked frame,0.1"]
+    rows += [f"patches,30,{seed},masked frame,{right}" for seed, right in enumerate((0.25, 0.75))]
+    (report / "worlds.csv").write_text("\n".join(rows))
+    said = quiz(EASY, 8, ask=typed("x", "0", "9", "1", "2"), judged=tmp_path / "judge", folder=tmp_path)
+    lines = [line.split() for line in said.splitlines()]
+    assert ["family", "questions", "you", "chance", "copy", "exact", "patches"] in lines
+    (masked,) = (line for line in lines if line[:2] == ["masked", "frame"])
+    assert masked[2] == "1" and masked[3] in ("0.0", "100.0") and masked[-2:] == ["100.0", "50.0"]
+    (plan,) = (line for line in lines if line[:2] == ["shortest", "plan"])
+    assert plan[-1] == "–", "the model was not judged on it"
+    images = sorted((tmp_path / EASY).glob("*.png"))
+    assert [image.name for image in images] == [f"question_{number}.png" for number in (1, 2, 3)]
+    assert all(np.asarray(Image.open(image)).std() > 1.0 for image in images)
+    assert "Masked frame. First “" in capsys.readouterr().out
+    assert quiz(EASY, 1, ask=typed(), judged=tmp_path, folder=tmp_path) == "No question was answered."
+
+
+def test_a_quiz_that_cannot_be_is_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InvalidValueError, match="nothing is asked about its whole world"):
+        quiz("arrows:cubes=3,gesture=first", 1)
+    for words in (["--quiz", "3"], [EASY, "--quiz", "-1"], [EASY, "--quiz", "3", "--film"]):
+        assert main(["play", *words]) == 2
+    said = capsys.readouterr().err
+    assert "give a task" in said and "quiz" in said and "--film goes with a game" in said
