@@ -52,10 +52,9 @@ class Reading:
 
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
-_ASLEEP = ("body_awake", "body_awake_ind", "dof_awake_ind", "parent_awake_ind", "tree_asleep", "tree_awake", "qacc")
+_ASLEEP = ("body_awake", "body_awake_ind", "dof_awake_ind", "parent_awake_ind", "tree_asleep", "tree_awake")
 _N_AWAKE = ("nbody_awake", "nparent_awake", "ntree_awake", "nv_awake")
-"""Arrays and numbers of ``mjData`` that say which bodies sleep, and the accelerations at which they begin when they
-wake: they decide the next steps, and no state has them."""
+"""Arrays and numbers of ``mjData`` that say which bodies sleep: they decide the next steps, and no state has them."""
 Sleep = Mapping[str, Ints | int]
 
 

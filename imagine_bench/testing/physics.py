@@ -170,14 +170,12 @@ def check_motion(
     def make(level: str) -> MotionEnv:
         return registry.load(entry.motion)(**entry.options, appearance=level, observation="proprio")
 
+    for level in levels:
+        make(level).close()  # a level that is refused is so before anything is measured
     if trials:
-        kept = _segments(make, levels, trials, turns)
-        document: dict[str, Any] = {
-            "task": spec.id,
-            "seed": 0,
-            "appearances": kept,
-            "environment": describe_environment(),
-        }
+        document: dict[str, Any] = {"task": spec.id, "seed": 0}
+        document["appearances"] = _segments(make, levels, trials, turns)
+        document["environment"] = describe_environment()
         write_json(out, document)
     else:
         document = read_json(out, "measurements of continuous control")

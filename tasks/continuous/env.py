@@ -165,7 +165,7 @@ class MotionEnv(SceneEnv):
         level = appearance_level(appearance)
         if level.pool is not None:
             raise InvalidValueError(
-                f"Appearance {appearance!r} patches images of macrostates; give clean, mild, strong or factors."
+                "Appearance 'patched' patches images of macrostates; give clean, mild, strong or factors."
             )
         super().__init__(
             spec,

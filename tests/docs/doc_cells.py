@@ -421,9 +421,10 @@ def by_hand(task: str, level: str, column: str) -> str:
         "at least": f"{100 * found.shown:.1f} %",
         "as ruled": f"{found.as_ruled:,} of {found.segments:,}",
         "solved": f"{found.solved} of {found.episodes}",
+        "least": f"{found.least_s:.2f}",
         "mean": f"{found.mean_s:.2f} [{found.mean_low_s:.2f}, {found.mean_high_s:.2f}]",
         "longest": f"{found.longest_s:.1f}",
-        "chance": f"{found.random_solved} of {found.random_episodes}" if found.random_episodes else "–",
+        "chance": f"{found.random_solved} of {found.random_episodes:,}" if found.random_episodes else "–",
     }
     return columns[column]
 

@@ -27,8 +27,9 @@ def measurement(
     states = states_of_play(spec.rules)
     pairs = sorted({(state[:-1], action) for state in states for action in range(spec.n_actions)})
     segments = [[list(objects), action, of, right, longest_s, longest_s, False] for objects, action in pairs]
+    least_s = [0.5 * longest_s] * len(pairs)
     counts = {"episodes": 0, "solved": 0, "random_episodes": 0, "random_solved": 0}
-    return {"segments": segments, "pairs": len(pairs), "time_limit_s": limit_s, **counts}
+    return {"segments": segments, "pairs": len(pairs), "least_s": least_s, "time_limit_s": limit_s, **counts}
 
 
 @pytest.mark.parametrize("task", ["arrow_puzzle", "arrow_puzzle_hard", "pick_place", "arrows:cubes=2,goal_change=0.2"])
@@ -76,6 +77,7 @@ def test_what_was_measured_leaves_less_than_a_point(task: str, appearance: str) 
     assert found.measured_pairs == found.pairs
     assert found.solved >= 0.99 * found.episodes
     assert found.random_solved <= 0.01 * found.random_episodes
+    assert 0.1 < found.least_s < found.mean_s
     assert found.macro_actions >= int(shortest_plans(tabulate(spec.rules)).max())
 
 
@@ -91,12 +93,15 @@ def test_the_command_measures_and_keeps_a_certificate(name: str, tmp_path: Any, 
     assert kept["environment"]["commit"]
     assert "shown reachable" in capsys.readouterr().out
     assert main([*words, "--trials", "0", "--random", "3"]) == 0  # the later value of an option counts
+    assert main([*words, "--appearances", "clean", "patched"]) == 2  # before anything is measured
     more = json.loads(out.read_text())
     assert more["appearances"]["clean"].pop("random_episodes") == 3
     assert kept["appearances"]["clean"].pop("random_episodes") == 1
     assert more["appearances"] == kept["appearances"]
     assert main(["check", "ArrowPuzzleHardMotion", "--physics", "--trials", "0", "--out", str(out)]) == 2
-    assert "not of arrow_puzzle_hard" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "'patched' patches" in said
+    assert "not of arrow_puzzle_hard" in said
 
 
 @pytest.mark.parametrize("name", ["ArrowPuzzleMotion", "arrow_puzzle", "ArrowsMotion:cubes=1"])

@@ -233,9 +233,18 @@ def test_every_region_of_every_file_may_be_damaged(
 
 _BEGINS = 77
 """The exit code of a command that would begin its work: its options have been accepted."""
-_WORK = ("cli.tools.collect", "cli.benches.judge", "cli.benches.run_study", "cli.benches.run_suite")
+_WORK = (
+    "cli.tools.collect",
+    "tools.demonstrations.collect",
+    "testing.physics._segments",
+    "cli.judging.judge",
+    "cli.benches.run_study",
+    "cli.benches.run_suite",
+)
 _FLAGS = {
     "dataset": ["policy", "format", "seed", "execution", "appearance", "motion-hz", "episodes", "describe"],
+    "dataset ArrowPuzzleMotion": ["policy", "format", "seed", "size", "appearance", "episodes", "workers", "describe"],
+    "check ArrowPuzzleMotion --physics": ["turns", "trials", "random", "appearances", "out"],
     "judge": ["models", "sizes", "seeds", "samples", "appearance", "policy", "encoder", "workers", "order"],
     "sweep": ["file", "variants", "experiment", "agents", "seeds", "workers", "launcher"],
     "encoder": ["appearance", "recipe", "seed", "steps", "batch", "latents", "device"],
@@ -276,7 +285,8 @@ def _read(folder: Path, study: dict[str, Any]) -> None:
 def a_command(rng: np.random.Generator, root: Path) -> str:
     """A command line of a door; it says no in a sentence or in tyro's own box."""
     name = str(rng.choice(list(_FLAGS)))
-    words = [name, "arrow_puzzle", f"--{rng.choice(_FLAGS[name])}", as_word(hostile(rng)), "--out", str(root / "out")]
+    door = name.split() if " " in name else [name, "arrow_puzzle"]
+    words = [*door, "--out", str(root / "out"), f"--{rng.choice(_FLAGS[name])}", as_word(hostile(rng))]
     said = io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stderr", said)

@@ -14,7 +14,7 @@ from imagine_bench.tasks.arrows.world import MAX_OFF_SLOT_M
 from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
 from imagine_bench.tasks.continuous.env import MotionEnv, steps_in_period
 from imagine_bench.tasks.continuous.expert import Expert
-from imagine_bench.tasks.continuous.segments import measure
+from imagine_bench.tasks.continuous.segments import least_seconds, measure
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
 from imagine_bench.tasks.parameters.parameters import WorldParameters
 from imagine_bench.tasks.pick_place.rules import PickPlace
@@ -325,3 +325,28 @@ def test_the_hand_keeps_to_its_plan_beside_other_cubes(seed: int, start: tuple[i
     (event,) = carry_out(env, expert, action)
     assert event["macro_action"] == action
     assert not event["fault"]
+
+
+def test_the_least_time_of_a_macro_action_follows_from_heights_and_the_largest_twist() -> None:
+    env, _ = environment("arrows", **FREE)
+    down_m = 0.1952 - 0.04 - (-0.1 + 0.055) - 0.022 - 0.01
+    turn_s = math.radians(70) / 6.0
+    for ways, state in ((2, (1, 2, 3, 0)), (1, (1, 0, 0, 0))):
+        assert least_seconds(env, state, 1) == pytest.approx(math.ceil((ways * down_m + turn_s) / 0.04) * 0.04)
+    env, _ = environment("pick_place")
+    assert least_seconds(env, (1, 0, 0, 2), 0) < least_seconds(env, (0, 0, 0, 0), 0)
+
+
+@pytest.mark.parametrize("axis", [2, 5])
+def test_the_hand_keeps_to_the_largest_twist(axis: int) -> None:
+    """At full speed, down or about the vertical, from rest at the observation pose: what the least time assumes."""
+    env, _ = environment("arrows")
+    env.reset(seed=0)
+    site = env.world.model.site("tcp").id
+    height_m = env.data.site_xpos[site, 2]
+    before = env.data.site_xmat[site].reshape(3, 3).copy()
+    for period in range(1, 6):
+        env.step(-np.eye(7, dtype=np.float32)[axis])
+        turned = before.T @ env.data.site_xmat[site].reshape(3, 3)
+        assert height_m - env.data.site_xpos[site, 2] <= 1.0 * period * env.period_s + 1e-3
+        assert math.acos(min(1.0, (np.trace(turned) - 1.0) / 2.0)) <= 6.0 * period * env.period_s + 1e-3
