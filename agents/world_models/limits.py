@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from imagine_bench.arrays import Frame, Ints, Pixels, State
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, TaskSpec
-from imagine_bench.interfaces.model import Imagined, Untaught
+from imagine_bench.interfaces.model import Imagined, Untaught, imagined_outcomes
 from imagine_bench.rules import Outcomes, outcomes_by_depth
 
 
@@ -50,22 +51,8 @@ class Exact(Untaught):
         del samples, rng
         depth = actions.shape[1] - frames.shape[1] + 1
         found = [self._outcomes(history[-1], row[-depth:]) for history, row in zip(frames, actions, strict=True)]
-        futures = max(len(outcomes) for steps in found for outcomes in steps)
-        shape = (len(frames), futures, depth)
-        images = np.zeros((*shape, *frames.shape[2:]), dtype=np.uint8)
-        weights = np.zeros(shape)
-        rewards = np.zeros(shape)
-        ended = np.zeros(shape)
-        for row, steps in enumerate(found):
-            for step, outcomes in enumerate(steps):
-                for slot, ((state, over), (share, reward)) in enumerate(outcomes.items()):
-                    place = (row, slot, step)
-                    images[place] = self.renderer.frame(state)
-                    weights[place] = share
-                    rewards[place] = reward
-                    ended[place] = over
         unknown = np.zeros((len(frames), depth))
-        return Imagined(pictures=images, probabilities=weights, rewards=rewards, p_ended=ended, epistemic=unknown)
+        return replace(imagined_outcomes(found, self.renderer.frame), epistemic=unknown)
 
     def _outcomes(self, frame: Frame, actions: Ints) -> tuple[Outcomes, ...]:
         state = self.renderer.shows(frame)

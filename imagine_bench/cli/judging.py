@@ -83,9 +83,10 @@ class Judge:
         from imagine_bench.report.judge import judged, judgement_page  # noqa: PLC0415 - as below
 
         workers = at_a_time(self.workers)
+        models = self.models or _usual_models()
         judgement = Judgement(
             task=self.task,
-            models=self.models or _usual_models(),
+            models=tuple(registry.spelled(name, registry.WORLD_MODEL_GROUP) for name in models),
             sizes=self.sizes,
             seeds=self.seeds,
             samples=self.samples,

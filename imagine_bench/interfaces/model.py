@@ -5,15 +5,17 @@ Shapes: ``N`` questions, ``K`` frames of history, ``D`` imagined depth, ``S`` im
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imagine_bench.arrays import Array, Arrays, Bools, Floats, Frame, Images, Ints
+from imagine_bench.arrays import Array, Arrays, Bools, Floats, Frame, Images, Ints, Pixels, State
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.episodes import Episodes
+from imagine_bench.rules import Outcomes
 
 Reals = NDArray[np.floating]
 UNCERTAINTIES = ("epistemic", "aleatoric", "modal")
@@ -179,6 +181,30 @@ def until_the_end(rewards: Reals, ends: Reals) -> tuple[Reals, Reals]:
     survived = np.cumprod(1.0 - ends, axis=2)
     before = np.pad(survived[:, :, :-1], ((0, 0), (0, 0), (1, 0)), constant_values=1.0)
     return before * rewards, 1.0 - survived
+
+
+def imagined_outcomes(found: Sequence[Sequence[Outcomes]], draw: Callable[[State], Pixels]) -> Imagined:
+    """Every outcome, with its probability, as pictures.
+
+    Args:
+        found: Of each question, the outcomes after each of its macro-actions. N of length D.
+        draw: Draws a macrostate, or whatever else a model's states are; each in one shape.
+    """
+    futures = max(len(outcomes) for steps in found for outcomes in steps)
+    shape = (len(found), futures, len(found[0]))
+    pictures = np.zeros((*shape, *draw(next(iter(found[0][0]))[0]).shape), dtype=np.uint8)
+    weights = np.zeros(shape)
+    rewards = np.zeros(shape)
+    ended = np.zeros(shape)
+    for row, steps in enumerate(found):
+        for step, outcomes in enumerate(steps):
+            for slot, ((state, over), (share, reward)) in enumerate(outcomes.items()):
+                place = (row, slot, step)
+                pictures[place] = draw(state)
+                weights[place] = share
+                rewards[place] = reward
+                ended[place] = over
+    return Imagined(pictures=pictures, probabilities=weights, rewards=rewards, p_ended=ended)
 
 
 def weights_of(imagined: Imagined) -> Floats:

@@ -213,6 +213,7 @@ def source_of(
         seeds=seeds,
         config_group=spec.config_group,
         overrides=entrant(name).settings,
+        argument=entrant(name).argument,
     )
     return ModelSource(name=name, make=entry.make, given=(context,), privileged=False, encoder=path)
 

@@ -31,7 +31,15 @@ from imagine_bench.protocols.data import (
     RunSpec,
     require_different,
 )
-from imagine_bench.registry import agent_entry, installed_of, own_settings, task, task_entry
+from imagine_bench.registry import (
+    AGENT_GROUP,
+    agent_entry,
+    installed_of,
+    own_settings,
+    spelled,
+    task,
+    task_entry,
+)
 from imagine_bench.registry import task_name as canonical
 from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import entrant
@@ -339,6 +347,8 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     if few and not {"seeds"} & {*own, *changes}:
         values["seeds"] = tuple(range(max(few.values())))
     values["execution"] = spec.execution(values.get("execution"))
+    if isinstance(values.get("agents"), list | tuple):  # any other type is refused below
+        values["agents"] = tuple(spelled(agent, AGENT_GROUP) for agent in values["agents"])
     values["after"] = tuple(map(canonical, values.get("after", ())))
     if values.get("split") is not None:
         values["split"] = split_of(spec.rules, values["split"]).identity
@@ -441,6 +451,7 @@ def context_of(spec: RunSpec[Protocol]) -> AgentContext:
         config_group=protocol.config_group,
         hyperparameters=protocol.hyperparameters,
         overrides=own_settings(spec.agent, dict(protocol.overrides)),
+        argument=entrant(spec.agent).argument,
         device=protocol.device,
         optimal_policy=optimal_policy_of(world) if entry.privileged else None,
         exact_world=ExactWorld.of(world, protocol.appearance) if entry.privileged else None,

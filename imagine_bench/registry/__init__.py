@@ -30,6 +30,7 @@ from imagine_bench.registry.entries import (
     LABEL_OF_OLD_AGENT,
     AgentEntry,
     EncoderEntry,
+    Entrant,
     RegressorEntry,
     TaskEntry,
     WorldModelEntry,
@@ -105,8 +106,8 @@ def tasks() -> dict[str, TaskEntry]:
 
 
 def agents() -> dict[str, AgentEntry]:
-    """All agents by name, also those of installed packages, without those that cannot be loaded."""
-    return {**AGENTS, **usable(AGENT_GROUP)}
+    """All agents by name, also those of installed packages, without those that cannot be loaded and prefixes."""
+    return {**AGENTS, **{name: entry for name, entry in usable(AGENT_GROUP).items() if not entry.argument}}
 
 
 def is_own(task: str) -> bool:
@@ -360,19 +361,55 @@ def agent_entry(name: str) -> AgentEntry:
 
     Raises:
         UnknownNameError: No such agent.
+        InvalidValueError: The name is a prefix without an argument, or an argument follows that is none.
         SetupError: As :func:`task_entry`.
     """
     return _entrant_entry(name, AGENTS, AGENT_GROUP)
 
 
 def _entrant_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
-    if not isinstance(name, str) or ":" not in name or name in offers(group):
-        return offered(name, own, group)
-    one = entrant(name)
-    entry = offered(one.agent, own, group)
+    one = entrant(name) if isinstance(name, str) and name not in offers(group) else Entrant(name, {})
+    entry = _named_entry(one, own, group)
     if not one.settings:
         return entry
     return dataclasses.replace(entry, title=f"{entry.title or one.agent.replace('_', ' ')} ({one.words})")
+
+
+def _named_entry(one: Entrant, own: Mapping[str, Any], group: str) -> Any:
+    """The entry of a name; of a prefix and an argument its title says both."""
+    known = {**own, **offers(group)}
+    prefix, colon, argument = one.agent.partition(":") if isinstance(one.agent, str) else (one.agent, "", "")
+    is_prefix = bool(getattr(known.get(prefix), "argument", ""))
+    if is_prefix and argument:
+        entry = known[prefix]
+        return dataclasses.replace(entry, title=f"{entry.title or prefix} {argument.partition('@')[0]}")
+    if is_prefix:
+        raise InvalidValueError(f"{prefix} alone is no name; give {prefix}:ARGUMENT. {known[prefix].description}")
+    if colon and prefix in known and not argument.isidentifier():
+        example = "controller.discount=0.9"
+        raise InvalidValueError(f"In {one.agent!r}, {argument!r} is not of the form name=value, such as {example}.")
+    is_absent = prefix not in known and guest_with(group, prefix) is not None
+    return offered(prefix if is_absent else one.agent, own, group)
+
+
+def spelled(name: str, group: str) -> str:
+    """The one spelling of a typed name: an argument is written as the package of its prefix writes it.
+
+    A package writes ``ARGUMENT@<12 hex digits>`` where content decides, such as that of a file: then a protocol with
+    this name holds for that content alone.
+
+    Raises:
+        InvalidValueError: The argument names nothing, or a text after ``@`` is not that of its content now.
+    """
+    if not isinstance(name, str) or ":" not in name:
+        return name
+    one = entrant(name)
+    prefix = one.agent.partition(":")[0]
+    target = getattr(offers(group).get(prefix), "argument", "")
+    if not target:
+        return name
+    with guests_faults(f"The argument of {name}", target):
+        return str(one._replace(agent=f"{prefix}:{load(target)(one.argument)}"))
 
 
 def setting_names(agent: str) -> frozenset[str]:
@@ -465,8 +502,8 @@ def regressor_entry(name: str) -> RegressorEntry:
 
 
 def world_models() -> dict[str, WorldModelEntry]:
-    """All world models by name, also those of installed packages, without those that cannot be loaded."""
-    return {**WORLD_MODELS, **usable(WORLD_MODEL_GROUP)}
+    """All world models by name, as :func:`agents`."""
+    return {**WORLD_MODELS, **{name: each for name, each in usable(WORLD_MODEL_GROUP).items() if not each.argument}}
 
 
 def world_model_entry(name: str) -> WorldModelEntry:

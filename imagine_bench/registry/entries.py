@@ -1,8 +1,9 @@
 """Registry entries; and entrants of a bench: an agent, ``dqn``, or ``dqn:controller.discount=0.99``.
 
 An agent that comes in variants has a registered name for each, such as ``factored:given``; settings follow after a
-comma: ``factored:given,planning.depth=1``. The text is an entrant's name in protocols, tables and files; one agent,
-regressor or world model may enter with several settings.
+comma: ``factored:given,planning.depth=1``. A package may offer a prefix, after which an argument follows, such as
+``program:FILE.py``. The text is an entrant's name in protocols, tables and files; one agent, regressor or world model
+may enter with several settings.
 """
 
 from __future__ import annotations
@@ -71,6 +72,9 @@ class AgentEntry:
     external_training_loop: bool = False
     #: CPU time of a run, relative to that of ``dqn``: a guess, by which the longest runs come first
     relative_cost: float = 1.0
+    #: Where agents are named ``NAME:ARGUMENT``: ``"module:attr"`` of a function that writes ARGUMENT in one way, see
+    #: :func:`imagine_bench.registry.spelled`. Empty: ``NAME`` is the agent.
+    argument: str = ""
     title: str = ""  #: For headings, legends and tables; by default the registered name in plain words
     description: str = "A registered agent."  #: One sentence for a reader who knows none of this
 
@@ -115,6 +119,7 @@ class WorldModelEntry:
     privileged: bool = False  #: Whether it is given the rules: an end of the scale, no model
     by_default: bool = True  #: Whether it is judged where no models are named; slow ones are not
     settings: str = ""  #: As of :class:`AgentEntry`, read from ``context.overrides``; empty: there are none to give
+    argument: str = ""  #: As of :class:`AgentEntry`
 
     @property
     def label(self) -> str:
@@ -125,7 +130,7 @@ class WorldModelEntry:
 class Entrant(NamedTuple):
     """An agent and the settings that it alone has in a bench."""
 
-    agent: str  #: registered name
+    agent: str  #: registered name, or a registered prefix, a colon and an argument
     settings: Mapping[str, Setting]  #: by dotted name, in the order of names
 
     def __str__(self) -> str:
@@ -134,6 +139,11 @@ class Entrant(NamedTuple):
             return self.agent
         settings = ",".join(f"{name}={_text(value)}" for name, value in self.settings.items())
         return f"{self.agent}{',' if ':' in self.agent else ':'}{settings}"
+
+    @property
+    def argument(self) -> str:
+        """The text after the colon of the name."""
+        return self.agent.partition(":")[2]
 
     @property
     def words(self) -> str:
@@ -147,7 +157,7 @@ def entrant(text: str) -> Entrant:
     """Undo ``str(entrant)``. Raises InvalidValueError: settings that are none, or one that is given twice."""
     agent, colon, rest = text.partition(":")
     words = _BETWEEN.split(rest) if colon else []
-    if words and words[0].isidentifier():
+    if words and words[0] and "=" not in words[0]:
         agent = f"{agent}:{words.pop(0)}"
     return Entrant(agent, dict(parse_settings(words, f"Agent {text!r}:")))
 

@@ -54,7 +54,7 @@ def describe(name: str) -> str:
     is_task = registry.has_task(registry.task_of_motion(name) or name) or name in registry.regressions()
     pages = [describe_task(name)] if is_task else []
     learners: dict[str, AgentEntry | RegressorEntry | WorldModelEntry] = {}
-    for known in (registry.world_models(), registry.regressors(), registry.agents()):
+    for known in (_world_models(), registry.regressors(), _agents()):
         if name in known:
             pages.append(_learner(name, known[name]))
         learners |= known
@@ -72,6 +72,7 @@ def describe(name: str) -> str:
 def _learner(name: str, entry: AgentEntry | RegressorEntry | WorldModelEntry) -> str:
     """An agent, a regressor or a world model: its description, its name in commands, and its settings."""
     command = "judge TASK --models" if isinstance(entry, WorldModelEntry) else "bench TASK --agents"
+    name += ":ARGUMENT" if getattr(entry, "argument", "") else ""
     page = _page(entry.title or name, entry.description, {"command": f"imagine-bench {command} {name}"})
     cases = OF_AGENTS
     if isinstance(entry, RegressorEntry):
@@ -140,12 +141,12 @@ def names() -> str:
     """
     groups: dict[str, Mapping[str, str]] = {
         "Control tasks, in which agents act (bench TASK)": _tasks(),
-        "Agents (bench TASK --agents)": _described(registry.agents()),
+        "Agents (bench TASK --agents)": _described(_agents()),
         "Presets of their benches (--preset)": _presets(task_types()["control"]),
         "Regression tasks, learned from data (bench TASK)": _regressions(),
         "Regressors (bench TASK --agents)": _described(registry.regressors()),
         "Presets of their benches (bench TASK --preset)": _presets(task_types()["regression"]),
-        "World models (judge TASK --models)": _described(registry.world_models()),
+        "World models (judge TASK --models)": _described(_world_models()),
         "Studies, and suites of experiments (sweep --name)": {
             name: grid.question if isinstance(grid, Study) else f"{len(grid.experiments)} experiments."
             for name, grid in all_grids().items()
@@ -167,6 +168,16 @@ def names() -> str:
         lines = [f"  {name:{width}}{' '.join(words.split())}" for name, words in members.items()]
         pages += ["\n".join([title, *lines])] if lines else []
     return "\n\n".join([*pages, *map(str, registry.refused_offers())])
+
+
+def _agents() -> dict[str, AgentEntry]:
+    """All agents by name, and prefixes of agents' names."""
+    return {**registry.agents(), **registry.usable(registry.AGENT_GROUP)}
+
+
+def _world_models() -> dict[str, WorldModelEntry]:
+    """All world models by name, and prefixes of their names."""
+    return {**registry.world_models(), **registry.usable(registry.WORLD_MODEL_GROUP)}
 
 
 def _described(entries: Mapping[str, AgentEntry | EncoderEntry | RegressorEntry | WorldModelEntry]) -> dict[str, str]:

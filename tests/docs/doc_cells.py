@@ -22,7 +22,7 @@ from imagine_bench.registry.entries import agent_label, label_today
 from imagine_bench.report.page import over_seeds
 from imagine_bench.running.bench import read_protocol
 from imagine_bench.store import encoders
-from imagine_bench.sweep.grid import STUDIES
+from imagine_bench.sweep.grid import LADDER, STUDIES
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"
@@ -425,6 +425,23 @@ def by_hand(task: str, level: str, column: str) -> str:
         "mean": f"{found.mean_s:.2f} [{found.mean_low_s:.2f}, {found.mean_high_s:.2f}]",
         "longest": f"{found.longest_s:.1f}",
         "chance": f"{found.random_solved} of {found.random_episodes:,}" if found.random_episodes else "–",
+    }
+    return columns[column]
+
+
+def written(experiment: str, column: str) -> str:
+    """A figure of the writer of laws in the worlds of an experiment of the benchmark suite."""
+    (levels,) = (each.levels for each in LADDER.experiments if each.name == experiment)
+    tasks = {level.task for level in levels}
+    rows = [row for row in _json("programs/written.json")["rows"] if row["task"] in tasks]
+    away = [row["total_variation"] for row in rows]
+    spent = [row["macro_actions"] for row in rows]
+    columns = {
+        "worlds": str(len({row["task"] for row in rows})),
+        "spent": f"{min(spent)}" if len({*spent}) == 1 else f"{min(spent)} to {max(spent)}",
+        "mean": f"{np.mean(away):.2f}",
+        "exact": f"{sum(each < 0.005 for each in away)} of {len(away)}",
+        "facts": f"{100 * sum(row['found'] for row in rows) / sum(row['facts'] for row in rows):.0f}",
     }
     return columns[column]
 

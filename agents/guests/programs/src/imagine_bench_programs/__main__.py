@@ -1,0 +1,135 @@
+"""Commands: ``python -m imagine_bench_programs experience | score | write``, each with ``--help``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench.exact.certificate import certificate
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.registry import task
+from imagine_bench.registry.machine import describe_environment
+
+from .experience import macro_actions_of, play, write_experience
+from .program import Program
+from .scores import Scores, efficiency, score
+from .writer import Writer
+
+_TIMES = 2.0
+"""Macro-actions of a writer, in units of the cautious learner's."""
+
+
+def main() -> None:
+    """Run the command that was given; an error that is written for users is one sentence and exit code 2."""
+    parser = argparse.ArgumentParser(prog="python -m imagine_bench_programs", description=__doc__)
+    commands = parser.add_subparsers(required=True)
+    _add_experience(commands.add_parser("experience", help="write the folder from which a program is to be written"))
+    _add_score(commands.add_parser("score", help="score a program against a task's rules, by enumeration"))
+    _add_write(commands.add_parser("write", help="let the writer without a language model explore tasks, and score it"))
+    given = parser.parse_args()
+    try:
+        given.run(given)
+    except ImagineBenchError as error:
+        sys.exit(f"{error}")
+
+
+def _add_experience(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("task")
+    parser.add_argument("folder", type=Path, help="an empty or new folder")
+    parser.add_argument("--macro-actions", type=int, default=200, help="how many are taken, at random")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.set_defaults(run=_experience)
+
+
+def _experience(given: argparse.Namespace) -> None:
+    write_experience(given.task, given.folder, macro_actions=given.macro_actions, seed=given.seed)
+    print(f"{given.macro_actions} macro-actions, and the tests of them: {given.folder}")
+
+
+def _add_score(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("task")
+    parser.add_argument("file", help="the program, a file of Python")
+    parser.add_argument("--experience", type=Path, help="the folder that it was written from; gives its efficiency")
+    parser.set_defaults(run=_score)
+
+
+def _score(given: argparse.Namespace) -> None:
+    spec = task(given.task)
+    program = Program(given.file, [len(values) for values in spec.macrostate_values], spec.n_actions)
+    macro_actions = None if given.experience is None else macro_actions_of(given.experience)
+    print(_words(spec, score(program, spec), macro_actions))
+
+
+def _words(spec: TaskSpec, found: Scores, macro_actions: int | None) -> str:
+    lines = [
+        f"total variation  {found.total_variation:.4f}",
+        f"facts            {found.found} of {found.facts}",
+        f"state ranking    {found.ranking:.4f}",
+        f"fidelity         {found.fidelity:.4f}",
+    ]
+    learner = _learner(spec)
+    if macro_actions is not None and learner is not None:
+        share = efficiency(learner, macro_actions)
+        lines.append(f"efficiency       {share:.2f}: {macro_actions} macro-actions, the cautious learner {learner:.0f}")
+    return "\n".join(lines)
+
+
+def _learner(spec: TaskSpec) -> float | None:
+    """Mean macro-actions of the cautious learner, where it ends."""
+    cost = certificate(spec).floor
+    return None if cost is None else cost.transitions
+
+
+def _add_write(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("tasks", nargs="+")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--times", type=float, default=_TIMES, help="macro-actions, times the cautious learner's")
+    parser.add_argument(
+        "--out", type=Path, help="a JSON file of all figures; the same command goes on where it stopped"
+    )
+    parser.set_defaults(run=_write)
+
+
+def _write(given: argparse.Namespace) -> None:
+    rows = json.loads(given.out.read_text())["rows"] if given.out is not None and given.out.exists() else []
+    done = {(row["task"], row["seed"]) for row in rows}
+    for name in given.tasks:
+        spec = task(name)
+        learner = _learner(spec)
+        if learner is None:
+            raise InvalidValueError(
+                f"The cautious learner does not end in {name}, so there is no budget; leave it out."
+            )
+        for seed in [seed for seed in given.seeds if (name, seed) not in done]:
+            rows.append({"task": name, "learner": learner, **written(spec, int(given.times * learner), seed)})
+            print(*(f"{value:.4g}" if isinstance(value, float) else value for value in rows[-1].values()), flush=True)
+            if given.out is not None:
+                given.out.write_text(json.dumps({"rows": rows, "environment": describe_environment()}, indent=1))
+
+
+def written(spec: TaskSpec, macro_actions: int, seed: int) -> dict[str, Any]:
+    """The scores of a writer that explored a task for so many macro-actions, and the laws that it found."""
+    begun_s = time.process_time()
+    starts, choices = (np.random.default_rng([seed, each]) for each in range(2))
+    writer = Writer([len(values) for values in spec.macrostate_values], spec.n_actions, choices)
+    for row, _ in play(spec, lambda symbols: writer.choose(symbols, explore=True), starts):
+        writer.learn(row)
+        if len(writer.rows) == macro_actions:
+            break
+    writer.write()
+    laws = writer.laws
+    cpu_s = time.process_time() - begun_s
+    found = asdict(score(laws, spec))
+    return {"seed": seed, "macro_actions": macro_actions, **found, "laws": laws.count, "cpu_s": round(cpu_s, 2)}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""Real macro-actions between symbols; and the folder of them from which a coding agent writes a program."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import State, TaskSpec
+from imagine_bench.registry import task
+
+from .laws import Row
+
+Choose = Callable[[State], int]
+_FILE = "experience.json"
+
+
+def play(spec: TaskSpec, choose: Choose, rng: np.random.Generator) -> Iterator[tuple[Row, bool]]:
+    """Macro-actions of one episode after another, without end, and whether each is the last of its episode.
+
+    A macro-action comes about as the task's rules say, which is the kinematic execution. Symbols are the macrostate
+    that the newest frame shows; of a coordinate that it hides, the value last seen in the episode, or -1.
+    """
+    rules = spec.rules
+    lag = 0 if spec.sight is None else spec.sight.lag
+    while True:
+        state = rules.start_states[int(rng.integers(len(rules.start_states)))]
+        taken = [_seen(spec, state, 0, rng)]
+        now = taken[0]
+        for step in range(1, spec.horizon + 1):
+            action = choose(now) if min(now) >= 0 else int(rng.integers(rules.n_actions))
+            outcomes = rules.outcomes(state, action)
+            outcome = outcomes[int(rng.choice(len(outcomes), p=[each.probability for each in outcomes]))]
+            state = outcome.macrostate
+            taken.append(_seen(spec, state, step, rng))
+            shown = taken[max(0, step - lag)]
+            then = tuple(old if new < 0 else new for new, old in zip(shown, now, strict=True))
+            last = outcome.terminated or step == spec.horizon
+            yield Row(now, action, then, outcome.reward, outcome.terminated), last
+            if last:
+                break
+            now = then
+
+
+def _seen(spec: TaskSpec, state: State, step: int, rng: np.random.Generator) -> State:
+    """The content of a frame, -1 for a hidden coordinate."""
+    if spec.sight is None:
+        return state
+    seen = spec.sight.seen(state, step)
+    return seen[int(rng.choice(len(seen), p=[share for share, _ in seen]))][1]
+
+
+def write_experience(task_name: str, folder: Path, *, macro_actions: int, seed: int) -> None:
+    """Write the folder of a coding agent: transitions of random macro-actions, tests made from them, and a page.
+
+    Raises:
+        InvalidValueError: There is something in the folder, or no macro-action is to be taken.
+    """
+    if macro_actions < 1 or (folder.exists() and any(folder.iterdir())):
+        raise InvalidValueError(f"{folder} gets {macro_actions} macro-actions; give an empty folder, and at least 1.")
+    spec = task(task_name)
+    rng = np.random.default_rng(seed)
+    rows = []
+    for row, last in play(spec, lambda _: int(rng.integers(spec.n_actions)), rng):
+        rows.append([list(row.now), row.action, list(row.then), row.reward, row.ended, last])
+        if len(rows) == macro_actions:
+            break
+    known = {
+        "factors": [len(values) for values in spec.macrostate_values],
+        "actions": spec.n_actions,
+        "macro_actions": macro_actions,
+        "columns": ["symbols", "action", "symbols after", "reward", "ended", "last of its episode"],
+        "transitions": rows,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / _FILE).write_text(json.dumps(known))
+    for name, template in (("test_program.py", "test_program.txt"), ("README.md", "README.md")):
+        text = resources.files(__package__).joinpath("folder", template).read_text()
+        (folder / name).write_text(text)
+
+
+def macro_actions_of(folder: Path) -> int:
+    """The macro-actions behind a folder of experience. Raises InvalidValueError: it is none."""
+    try:
+        return int(json.loads((folder / _FILE).read_text())["macro_actions"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InvalidValueError(f"{folder} holds no experience ({error}); give a folder of 'experience'.") from error

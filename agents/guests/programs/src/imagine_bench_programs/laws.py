@@ -1,0 +1,321 @@
+"""The shortest laws that explain transitions between symbols, found by enumeration, without a network.
+
+A program of laws has three parts, each the shortest that explains the data:
+
+- *Effects*: "if at most two conditions hold, the macro-action makes a factor f(its value)". All effects of a
+  macro-action come about together, with one probability; otherwise it changes nothing.
+- *Drifts*: whatever is done, a factor turns into another of its values with one probability, while the episode goes on.
+- *Ends*: a list of "if at most two conditions hold, this reward, and whether the episode ends", read from the top.
+
+Lengths are in nats. A law costs the logarithm of the number of laws of its form, data its negative log-likelihood. A
+probability is counted and then rounded: to one decimal, unless two decimals pay for themselves. The idea is that of
+OneLife (arXiv 2510.12088) and PoE-World (arXiv 2505.10819), whose laws a language model writes.
+
+Shapes: ``N`` transitions, ``P`` factors.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Outcome, State
+
+from .symbol_rules import SymbolRules
+
+_CONTRADICTED = 20.0
+"""Nats that a transition costs which no law explains."""
+_FORMS = 3
+"""Forms of a function of a value: a step round the circle of its values, a constant, a table."""
+_TESTS = 2
+"""Most conditions of a law."""
+
+
+class Row(NamedTuple):
+    """A transition between symbols."""
+
+    now: State
+    action: int
+    then: State
+    reward: float
+    ended: bool
+
+
+class Test(NamedTuple):
+    """A condition on a tuple: place ``place`` holds ``value`` or, if ``alike``, the same as place ``value``."""
+
+    place: int
+    value: int
+    alike: bool = False
+
+    def holds(self, values: State) -> bool:
+        """Whether it holds."""
+        return values[self.place] == (values[self.value] if self.alike else self.value)
+
+
+Tests = tuple[Test, ...]
+Bools = NDArray[np.bool_]
+
+
+class Effect(NamedTuple):
+    """If all tests on the symbols hold, a factor becomes ``becomes[its value]``."""
+
+    factor: int
+    tests: Tests
+    becomes: State
+
+
+class End(NamedTuple):
+    """If all tests on the symbols after, the action and the symbols before hold, this reward and end."""
+
+    tests: Tests
+    reward: float
+    ended: bool
+
+
+class Laws(SymbolRules):
+    """The laws of N transitions between symbols of so many values each, -1 for a value that was not seen."""
+
+    def __init__(self, sizes: Sequence[int], n_actions: int, rows: Sequence[Row] = ()) -> None:
+        super().__init__(n_actions)
+        self.sizes = tuple(sizes)
+        self._rows = [row for row in rows if min(*row.now, *row.then) >= 0]
+        self._of_action = [[row for row in self._rows if row.action == action] for action in range(n_actions)]
+        self._known: dict[tuple[State, int], tuple[Outcome, ...]] = {}
+        self.drifts = self._drifting()
+        """Probability with which each factor that drifts does so, by factor."""
+        steady = [factor for factor in range(len(sizes)) if factor not in self.drifts]
+        self.effects = [
+            [law for factor in steady for law in self._effects(each, factor)[0]] for each in self._of_action
+        ]
+        """The effects of each macro-action."""
+        self.happens = self._happening()
+        """Probability with which they come about, by macro-action."""
+        self.ends = ends_of(self._rows, self.sizes, n_actions)
+
+    @property
+    def count(self) -> int:
+        """How many laws there are."""
+        return sum(map(len, self.effects)) + len(self.drifts) + len(self.ends)
+
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
+        """The outcomes that the laws expect; none is called a success. Dynamics hold after an end, too."""
+        key = (macrostate, action)
+        if key not in self._known:
+            expected: defaultdict[tuple[State, float, bool], float] = defaultdict(float)
+            turned = self.turned(macrostate, action)
+            share = self.happens[action]
+            for then, chance in ((turned, share), (macrostate, 1.0 - share)):
+                for reached, part in self._drifted(macrostate, action, then):
+                    end = self.end(macrostate, action, reached)
+                    expected[reached, end.reward, end.ended] += chance * part
+            self._known[key] = tuple(
+                Outcome(chance, *end, success=False) for end, chance in expected.items() if chance > 0.0
+            )
+        return self._known[key]
+
+    def turned(self, state: State, action: int) -> State:
+        """The symbols after a macro-action whose effects come about, without drifts."""
+        then = list(state)
+        for law in reversed(self.effects[action]):  # of several that hold the first counts
+            if all(test.holds(state) for test in law.tests):
+                then[law.factor] = law.becomes[state[law.factor]]
+        return tuple(then)
+
+    def end(self, now: State, action: int, then: State) -> End:
+        """The first law for reward and end that holds."""
+        values = (*then, action, *now)
+        for law in self.ends:
+            if all(test.holds(values) for test in law.tests):
+                return law
+        return End((), 0.0, False)
+
+    def _drifted(self, now: State, action: int, then: State) -> list[tuple[State, float]]:
+        """The symbols after drifts, with probabilities; none drifts once the episode has ended."""
+        found = [(then, 1.0)]
+        if self.drifts and self.end(now, action, then).ended:
+            return found
+        for factor, chance in self.drifts.items():
+            others = self.sizes[factor] - 1
+            parts = [chance / others] * self.sizes[factor]
+            parts[then[factor]] = 1.0 - chance
+            found = [
+                ((*state[:factor], value, *state[factor + 1 :]), share * part)
+                for state, share in found
+                for value, part in enumerate(parts)
+            ]
+        return found
+
+    def _drifting(self) -> dict[int, float]:
+        """The factors whose changes a drift explains in fewer nats than effects do."""
+        found = {}
+        for factor, size in enumerate(self.sizes):
+            changed = sum(row.now[factor] != row.then[factor] for row in self._rows)
+            kept = sum(row.now[factor] == row.then[factor] and not row.ended for row in self._rows)
+            chance, nats = simplest(changed, kept)
+            nats += math.log(len(self.sizes)) + changed * math.log(max(1, size - 1))
+            if changed and nats < sum(self._effects(rows, factor)[1] for rows in self._of_action):
+                found[factor] = chance
+        return found
+
+    def _effects(self, rows: Sequence[Row], factor: int) -> tuple[list[Effect], float]:
+        """The effects of one macro-action on one factor, and their nats: one after another, each saves the most."""
+        laws: list[Effect] = []
+        spent = 0.0
+        left = list(rows)
+        while True:
+            staying = _CONTRADICTED * sum(row.now[factor] != row.then[factor] for row in left)
+            nats, law = self._best(left, factor)
+            if law is None:
+                return laws, spent + staying
+            laws.append(law)
+            rest = [row for row in left if not all(test.holds(row.now) for test in law.tests)]
+            spent += nats - _CONTRADICTED * sum(row.now[factor] != row.then[factor] for row in rest)
+            left = rest
+
+    def _best(self, rows: Sequence[Row], factor: int) -> tuple[float, Effect | None]:
+        """The law of the fewest nats on all ``rows``, by the number of conditions, as long as more may be shorter."""
+        now = np.array([row.now for row in rows], dtype=np.int64).reshape(-1, len(self.sizes))
+        then = np.array([row.then[factor] for row in rows], dtype=np.int64)
+        changed = now[:, factor] != then
+        best: tuple[float, Effect | None] = (_CONTRADICTED * float(changed.sum()), None)
+        size = self.sizes[factor]
+        tests = [Test(place, value) for place, values in enumerate(self.sizes) for value in range(values)]
+        holds = np.array([now[:, test.place] == test.value for test in tests])
+        for count in range(_TESTS + 1):
+            form = math.log(_FORMS) + count * math.log(len(tests))
+            if form >= best[0]:
+                break
+            for chosen in itertools.combinations(range(len(tests)), count):
+                inside = holds[list(chosen)].all(axis=0)
+                outside = _CONTRADICTED * float((changed & ~inside).sum())
+                if form + outside >= best[0]:
+                    continue
+                pairs = Counter(zip(now[inside, factor].tolist(), then[inside].tolist(), strict=True))
+                for length, becomes in _functions(pairs, size):
+                    nats = form + outside + length + _misfit(pairs, becomes)
+                    if nats < best[0]:
+                        best = (nats, Effect(factor, tuple(tests[place] for place in chosen), becomes))
+        return best
+
+    def _happening(self) -> list[float]:
+        """How often the effects of each macro-action come about: one probability for all, if that is shorter."""
+        counts = []
+        for action, rows in enumerate(self._of_action):
+            pairs = [(self._steady(self.turned(row.now, action), row.then), row) for row in rows]
+            moved = [(turned, row) for turned, row in pairs if turned != row.now]
+            came = sum(turned == self._steady(row.then, row.then) for turned, row in moved)
+            counts.append((came, sum(self._steady(row.now, row.then) == row.then for _, row in moved)))
+        each = [simplest(*pair) for pair in counts]
+        together = simplest(*(sum(column) for column in zip(*counts, strict=True)))
+        if together[1] <= sum(nats for _, nats in each):
+            return [together[0]] * self.n_actions
+        return [chance for chance, _ in each]
+
+    def _steady(self, state: State, then: State) -> State:
+        """Symbols with those that drift as in ``then``."""
+        return tuple(then[factor] if factor in self.drifts else value for factor, value in enumerate(state))
+
+
+def _functions(pairs: Counter[tuple[int, int]], size: int) -> Iterator[tuple[float, State]]:
+    """Functions of a factor's value that explain some of the pairs of values, and the nats of each."""
+    each = math.log(size)
+    for step in {(after - before) % size for before, after in pairs} - {0}:
+        yield each, tuple((value + step) % size for value in range(size))
+    for constant in {after for before, after in pairs if before != after}:
+        yield each, (constant,) * size
+    table = list(range(size))
+    for (before, after), _ in sorted(pairs.items(), key=lambda item: item[1]):  # the most frequent last
+        table[before] = after if after != before else table[before]
+    yield each * size, tuple(table)
+
+
+def _misfit(pairs: Counter[tuple[int, int]], becomes: State) -> float:
+    """The nats of pairs of values of a factor under a function."""
+    came = failed = contradicted = 0
+    for (before, after), times in pairs.items():
+        if after == becomes[before]:
+            came += times * (after != before)
+        elif after == before:
+            failed += times
+        else:
+            contradicted += times
+    return simplest(came, failed)[1] + _CONTRADICTED * contradicted
+
+
+def simplest(came: int, failed: int) -> tuple[float, float]:
+    """The probability that describes counts in the fewest nats, of 0, 1 and those with one or two decimals, and these.
+
+    Without counts it is 1.
+    """
+    if not came or not failed:
+        return float(came >= failed), 0.0
+    found = (1.0, math.inf)
+    for parts in (10, 100):
+        near = round(came / (came + failed) * parts)
+        for part in range(max(1, near - 5), min(parts - 1, near + 5) + 1):
+            chance = part / parts
+            nats = math.log(parts) - came * math.log(chance) - failed * math.log(1.0 - chance)
+            if nats < found[1]:
+                found = (chance, nats)
+    return found
+
+
+def ends_of(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> list[End]:
+    """A list of laws for reward and end: first the class that the shortest conditions tell from all others."""
+    if not rows:
+        return []
+    values = np.array([(*row.then, row.action, *row.now) for row in rows])
+    kinds = sorted({(row.reward, row.ended) for row in rows})
+    label = np.array([kinds.index((row.reward, row.ended)) for row in rows])
+    tests = _tests(sizes, n_actions)
+    holds = np.array([values[:, t.place] == (values[:, t.value] if t.alike else t.value) for t in tests])
+    laws: list[End] = []
+    while len(left := np.unique(label)) > 1:
+        claims = [(_cover(holds, label == kind), int(kind)) for kind in left]
+        conditions, kind = min(claims, key=lambda claim: sum(map(len, claim[0])) or math.inf)
+        if not conditions:
+            break
+        laws += [End(tuple(tests[place] for place in chosen), *kinds[kind]) for chosen in conditions]
+        holds, label = holds[:, label != kind], label[label != kind]
+    usual = Counter(label.tolist()).most_common(1)[0][0]
+    return [*laws, End((), *kinds[usual])]
+
+
+def _tests(sizes: Sequence[int], n_actions: int) -> list[Test]:
+    """Conditions on the symbols after, on the action and on the symbols before."""
+    tests = [Test(place, value) for place, size in enumerate((*sizes, n_actions, *sizes)) for value in range(size)]
+    pairs = itertools.combinations(range(len(sizes)), 2)
+    return tests + [Test(one, other, alike=True) for one, other in pairs if sizes[one] == sizes[other]]
+
+
+def _cover(holds: Bools, wanted: Bools) -> list[tuple[int, ...]]:
+    """Few sets of at most two conditions that hold wherever it is wanted, and nowhere else; none if there are none.
+
+    Args:
+        holds: Which condition holds in which of N transitions. Shape (conditions, N).
+        wanted: Shape (N,).
+    """
+    count = len(holds)
+    sets = [chosen for size in range(1, _TESTS + 1) for chosen in itertools.combinations(range(count), size)]
+    first, last = np.array([(chosen[0], chosen[-1]) for chosen in sets]).T
+    each = holds[first] & holds[last]
+    pure = np.flatnonzero(each.any(axis=1) & ~(each & ~wanted).any(axis=1))
+    each = each[pure]
+    shorter = np.array([1.0 / len(sets[place]) for place in pure])
+    found = []
+    missing = wanted
+    while missing.any():
+        gains = (each & missing).sum(axis=1) * shorter
+        if not gains.any():
+            return []
+        best = int(gains.argmax())
+        found.append(sets[pure[best]])
+        missing = missing & ~each[best]
+    return found

@@ -1,0 +1,106 @@
+"""The agent ``laws:given``: it writes a program of laws from its own transitions, and searches in it for plans.
+
+It explores with optimism: a macro-action whose result it does not know is worth the largest reward that it has seen
+(R-max, Brafman & Tennenholtz 2002). Known is a macro-action with each value of each factor under which it was tried,
+once if it changed anything, and reward and end wherever every two of the values reached were met together before.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from imagine_bench.interfaces import Outcome, State
+
+from .laws import Laws, Row
+
+_DEPTH = 20
+"""Macro-actions that are planned ahead."""
+_MOST = 400
+"""Symbols that one plan visits."""
+_DISCOUNT = 0.95
+_TRIES = 6
+"""Tries that changed nothing after which a macro-action is known to change nothing; it may have slipped."""
+_GROWTH = 1.1
+"""Laws are found anew once so many times the transitions of the last time were seen, or one was unexpected."""
+
+
+class Writer:
+    """A writer of laws between symbols of so many values each, -1 where one is not seen."""
+
+    def __init__(self, sizes: Sequence[int], n_actions: int, rng: np.random.Generator) -> None:
+        self.sizes = tuple(sizes)
+        self.n_actions = n_actions
+        self.rng = rng
+        self.rows: list[Row] = []
+        self.laws = Laws(self.sizes, n_actions)
+        """The newest laws, of the first ``_learned`` transitions."""
+        self._learned = 0
+        self._tried: Counter[tuple[int, int, int]] = Counter()
+        """How often each macro-action was tried with a value of a factor; one that changed anything is enough."""
+        self._met: set[tuple[tuple[int, int], ...]] = set()
+        """Values, with their places, that met in a transition: those of the law that held; if none, all pairs."""
+
+    def learn(self, row: Row) -> None:
+        """Take in a transition; one with a value that was not seen teaches nothing."""
+        self.rows.append(row)
+        if min(*row.now, *row.then) < 0:
+            return
+        for factor, value in enumerate(row.now):
+            self._tried[row.action, factor, value] += 1 if row.then == row.now else _TRIES
+        expected = max(self.laws.outcomes(row.now, row.action), key=lambda each: each.probability)
+        as_expected = (expected.macrostate, expected.reward, expected.terminated) == (row.then, row.reward, row.ended)
+        if not as_expected or len(self.rows) >= _GROWTH * self._learned:
+            self.write()
+        else:
+            self._met |= set(self._claims(row))
+
+    def write(self) -> None:
+        """Find the laws of all transitions so far."""
+        self.laws = Laws(self.sizes, self.n_actions, self.rows)
+        self._learned = len(self.rows)
+        self._met = {claim for row in self.rows for claim in self._claims(row)}
+
+    def _claims(self, row: Row) -> list[tuple[tuple[int, int], ...]]:
+        """The values whose meeting decides a transition's reward and end, as far as the laws say; else all pairs."""
+        tests = self.laws.end(row.now, row.action, row.then).tests
+        if not tests:
+            return list(itertools.combinations_with_replacement(enumerate(row.then), 2))
+        values = (*row.then, row.action, *row.now)
+        places = {place for test in tests for place in ((test.place, test.value) if test.alike else (test.place,))}
+        return [tuple((place, values[place]) for place in sorted(places))]
+
+    def _is_unknown(self, now: State, action: int, expected: Outcome) -> bool:
+        row = Row(now, action, expected.macrostate, expected.reward, expected.terminated)
+        tried = all(self._tried[action, factor, value] >= _TRIES for factor, value in enumerate(now))
+        return not tried or not self._met.issuperset(self._claims(row))
+
+    def choose(self, state: State, *, explore: bool) -> int:
+        """The first macro-action of the best plan from some symbols, along the likeliest outcomes."""
+        unknown = max((row.reward for row in self.rows), default=0.0)
+        unknown = max(unknown, 1.0) / (1.0 - _DISCOUNT)
+        values = np.full(self.n_actions, -np.inf)
+        paths: list[tuple[State, int | None, float]] = [(state, None, 0.0)]
+        met = {state}
+        for depth in range(_DEPTH):
+            weight = _DISCOUNT**depth
+            further: list[tuple[State, int | None, float]] = []
+            for (now, first, so_far), action in itertools.product(paths, range(self.n_actions)):
+                begun = action if first is None else first
+                likeliest = max(self.laws.outcomes(now, action), key=lambda each: each.probability)
+                then = likeliest.macrostate
+                earned = so_far + weight * likeliest.reward
+                if explore and self._is_unknown(now, action, likeliest):
+                    values[begun] = max(values[begun], so_far + weight * unknown)
+                elif likeliest.terminated or depth == _DEPTH - 1:
+                    values[begun] = max(values[begun], earned)
+                elif then not in met and len(met) < _MOST:
+                    met.add(then)
+                    further.append((then, begun, earned))
+            paths = further
+        if not explore:
+            return int(values.argmax())
+        return int(self.rng.choice(np.flatnonzero(values >= values.max() - 1e-9)))

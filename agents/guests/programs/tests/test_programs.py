@@ -1,0 +1,174 @@
+"""Programs in a file: what they may do, their exactness, their names, and benches and judgements of them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from imagine_bench_programs.experience import write_experience
+from imagine_bench_programs.model import make_program
+from imagine_bench_programs.program import Program, spelled
+from imagine_bench_programs.scores import efficiency, score
+
+from imagine_bench import bench, registry
+from imagine_bench.cli import exit_code as main
+from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench.interfaces import AgentContext
+from imagine_bench.protocols.control import context_of, protocol
+from imagine_bench.protocols.data import RunSpec
+from imagine_bench.running.isolation import Limits
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders
+
+ARROWS = Path(__file__).parents[1] / "examples" / "arrows.py"
+SIZES = (4, 4, 4, 3)
+STATE = (0, 1, 2, 0, 0)
+HOSTILE = {
+    "hangs": ("while True: pass", "it was stopped after 6 s, the limit of a call."),
+    "hangs when it is asked": ("def outcomes(s, a):\n while True: pass", "it was stopped after 6 s"),
+    "forks": ("import os\nos.fork()", "it calls os.fork; a program only computes."),
+    "starts a command": ("import sys\nsys.modules['subprocess'].run(['ls'])", "it calls subprocess.Popen"),
+    "calls the C library": ("import sys\nsys.modules['ctypes'].CDLL(None).fork()", "it calls ctypes.dlopen"),
+    "opens a socket": ("import sys\nsys.modules['socket'].socket()", "it calls socket.__new__"),
+    "reads a file": ("open('/etc/passwd')", "it opens '/etc/passwd'; a program reads and writes no files."),
+    "imports the rules": ("import imagine_bench.tasks.arrows.rules", "it imports imagine_bench.tasks"),
+    "prints": ("def outcomes(s, a):\n print('hello')\n return {s: 1.0}", "it prints 'hello"),
+    "exits": ("raise SystemExit(3)", "it raises SystemExit: 3"),
+    "ends its process": ("import os\nos._exit(4)", "its process ended itself with exit code 4."),
+    "fills the memory": ("x = bytearray(3 << 30)", "it raises MemoryError"),
+    "raises": ("def outcomes(s, a): raise KeyError('x')", "it raises KeyError: 'x'"),
+    "is no Python": ("def outcomes(:", "it raises SyntaxError"),
+    "has no function": ("x = 1", "it has no function outcomes(symbols, action)."),
+    "gives a list": ("def outcomes(s, a): return [s]", "give a dictionary of outcomes."),
+    "gives NaN": ("def outcomes(s, a): return {s: float('nan')}", "the probabilities nan; give numbers"),
+    "gives a half": ("def outcomes(s, a): return {s: 0.5}", "the probabilities 0.5; give numbers of at least 0"),
+    "gives less than 0": ("def outcomes(s, a): return {s: 1.5, (0, 0, 0, 0): -0.5}", "probabilities 1.5, -0.5"),
+    "gives other values": ("def outcomes(s, a): return {(9, 9, 9, 9): 1.0}", "symbols lie below (4, 4, 4, 3)."),
+    "gives fewer symbols": ("def outcomes(s, a): return {(0,): 1.0}", "give 4 symbols, or (symbols, reward"),
+}
+
+
+@pytest.mark.slow  # twenty processes, half a second of CPU each
+@pytest.mark.parametrize(("source", "said"), HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_program_gets_one_sentence(source: str, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "hostile.py"
+    file.write_text(source)
+    limits = Limits(call_s=6.0 if "while" in source else 60.0, memory=1 << 30)
+    with pytest.raises(InvalidValueError) as raised:
+        Program(str(file), SIZES, 6, limits).outcomes(STATE, 0)
+    sentence = str(raised.value)
+    assert sentence.startswith(f"Program {file}: ") and said in sentence and "\n" not in sentence
+
+
+@pytest.fixture(scope="module")
+def program() -> Program:
+    return Program(str(ARROWS), SIZES, 6)
+
+
+def test_the_example_is_exact(program: Program) -> None:
+    found = score(program, registry.task("arrow_puzzle"))
+    assert (found.total_variation, found.found, found.facts) == (0.0, 39, 39)
+    assert (found.ranking, found.fidelity) == (1.0, 1.0)
+    assert len(ARROWS.read_text().splitlines()) <= 25
+
+
+def test_a_deterministic_program_misses_slips_by_their_probability(program: Program) -> None:
+    found = score(program, registry.task("arrows:slip=0.2"))
+    assert found.total_variation == pytest.approx(0.2, abs=1e-12)
+    assert found.ranking == pytest.approx(0.8) and found.fidelity == pytest.approx(0.95)
+
+
+def test_efficiency_is_a_square_and_at_most_one() -> None:
+    assert efficiency(100.0, 200) == 0.25 and efficiency(100.0, 50) == 1.0
+
+
+def test_a_changed_file_is_another_agent_and_resumes_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(ARROWS.read_text())
+    name = f"program:{file}"
+    before = protocol("arrow_puzzle", "smoke", agents=(name,))
+    assert before.agents == (f"program:{spelled(str(file))}",)
+    file.write_text(ARROWS.read_text() + "# changed\n")
+    assert protocol("arrow_puzzle", "smoke", agents=(name,)).hash != before.hash
+    kept = RunSpec(protocol=before, agent=before.agents[0], seed=0, encoder=None)
+    with pytest.raises(InvalidValueError, match="was changed: its digest is"):
+        Program(context_of(kept).argument, SIZES, 6)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("program", "program alone is no name; give program:ARGUMENT"),
+        ("program:nowhere.py", "The program nowhere.py cannot be read"),
+        (f"program:{ARROWS},symbols=pixels", "pixels"),
+        (f"program:{ARROWS},symbol=codes", "symbol"),
+    ],
+)
+def test_a_name_that_is_none_gets_one_sentence(name: str, said: str) -> None:
+    with pytest.raises(ImagineBenchError, match=said):
+        registry.settings(protocol("arrow_puzzle", "smoke", agents=(name,)).agents[0], "fast", {}, "chapter_5")
+
+
+def test_titles_say_that_symbols_are_given() -> None:
+    assert registry.agent_entry("program:a/b.py@0123456789ab").title == "program (symbols given) a/b.py"
+    assert "program" not in registry.agents() and "program" not in registry.world_models()
+
+
+def test_what_is_remembered_goes_with_the_state(tmp_path: Path) -> None:
+    file = tmp_path / "counts.py"
+    file.write_text("def outcomes(s, a, m):\n n = (m or 0) + 1\n return {((n % 2,), 0.0, n > 1, n): 1.0}\n")
+    counts = Program(str(file), (2,), 1)
+    once = counts.follow(counts.start((0,)), 0, (1,))
+    assert not counts.outcomes(counts.start((0,)), 0)[0].terminated and counts.outcomes(once, 0)[0].terminated
+    assert counts.follow(once, 0, (1,)) == counts.start((1,)), "an unexpected symbol forgets"
+
+
+def test_a_program_without_rewards_is_judged_and_not_planned_in(tmp_path: Path) -> None:
+    file = tmp_path / "stays.py"
+    file.write_text("def outcomes(s, a):\n return {s: 1.0}\n")
+    spec = registry.task("arrow_puzzle")
+    context = AgentContext(
+        n_actions=spec.n_actions,
+        preprocessing=spec.preprocessing,
+        encoder=encoders.own(spec, "clean", "codes"),
+        seeds=SeedTree(0),
+        argument=str(file),
+    )
+    model = make_program(context)
+    frames = spec.render_macrostates(np.array([STATE[:4]]), "clean", np.random.default_rng(0))
+    imagined = model.imagine(frames[None], np.zeros((1, 1), dtype=np.int64), 1, np.random.default_rng(0))
+    assert imagined.rewards is None and imagined.pictures.shape[:3] == (1, 1, 1)
+    with pytest.raises(InvalidValueError, match="have no reward"):
+        model.rules.optimal_action(STATE)
+
+
+@pytest.mark.slow  # three processes
+def test_the_tests_of_experience_pass_for_the_truth_and_fall_for_a_wrong_program(tmp_path: Path) -> None:
+    folder = tmp_path / "experience"
+    write_experience("arrow_puzzle", folder, macro_actions=60, seed=0)
+    known = json.loads((folder / "experience.json").read_text())
+    assert len(known["transitions"]) == known["macro_actions"] == 60 and known["factors"] == list(SIZES)
+    assert "arrow" not in "".join(path.read_text() for path in folder.iterdir()), "the world has no names"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", "/dev/null", str(folder)]
+    for source, code in ((ARROWS.read_text(), 0), (ARROWS.read_text().replace("3 if", "2 if"), 1)):
+        (folder / "program.py").write_text(source)
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == code, done.stdout
+    with pytest.raises(InvalidValueError, match="give an empty folder"):
+        write_experience("arrow_puzzle", folder, macro_actions=60, seed=0)
+
+
+@pytest.mark.slow  # a judgement and a bench
+def test_a_program_is_judged_exact_and_benched_without_training(tmp_path: Path) -> None:
+    name = f"program:{ARROWS}"
+    judged = ["judge", "arrow_puzzle", "--models", name, "--sizes", "30", "--seeds", "0", "--workers", "1"]
+    assert main([*judged, "--out", str(tmp_path / "judged")]) == 0
+    (cell,) = (tmp_path / "judged").glob("*/program*.json")
+    assert json.loads(cell.read_text())["total_variation"] < 0.005
+    options = {"execution": "kinematic", "evaluation_episodes": 20, "launcher": "this_process"}
+    found = bench("arrow_puzzle", name, preset="smoke", out=tmp_path, **options)
+    assert {float(share) for share in found.frame()["success_rate"]} == {1.0}
