@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
+from imagine_bench.tasks.scenes.constants import TABLE_HEIGHT_M
 from imagine_bench_motion.cloning import Clone, Scale, Training, train
 from imagine_bench_motion.demonstrations import Demonstrations, collect
 from imagine_bench_motion.instruction import GO_BACK, words_vector
-from imagine_bench_motion.network import ChunkPolicy, Layout
-from imagine_bench_motion.trials import share_done, tries
+from imagine_bench_motion.network import ChunkPolicy, Layout, PointEye, new_network
+from imagine_bench_motion.skills import HAND_NUMBERS, HOME_COMMAND
+from imagine_bench_motion.trials import MOST_PERIODS, share_done, tries
 
-from imagine_bench.errors import ArtefactError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.registry import task
 
 VECTORS = "proprio,objects"
@@ -72,6 +75,60 @@ def test_a_chunk_stays_within_its_demonstration() -> None:
     assert (chunks[:, 0] == np.arange(len(chunks))).all()
     ends = np.flatnonzero(np.diff(data.episode))
     assert (chunks[ends] == ends[:, None]).all()
+
+
+def test_the_hand_is_down_and_the_fingers_are_closed_where_it_grips() -> None:
+    data = demonstrations()
+    grips = data.grips()
+    assert (data.episode[grips] == data.episode).all()
+    assert (data.commands[grips, -1] <= data.commands[:, -1]).all()
+    assert (data.numbers[grips][:, HAND_NUMBERS][:, 2] < TABLE_HEIGHT_M + 0.04).all()
+
+
+def test_a_point_moves_with_the_thing_that_it_marks() -> None:
+    """By one cell of the heat map for four pixels, whatever the weights; the instruction alone says where to look."""
+    generator = torch.Generator().manual_seed(0)
+    layout = Layout(cameras=("front",), numbers=1, commands=1, heat_maps=2)
+    eye = cast(PointEye, new_network(layout, 64, generator).eyes["front"])
+    images = torch.full((1, 3, 64, 64), 0.4)
+    moved = images.clone()
+    images[:, :, 20:30, 20:30] = 1.0
+    moved[:, :, 20:30, 24:34] = 1.0
+    with torch.inference_mode():
+        torch.testing.assert_close(eye.what(images)[..., 3:12, 3:11], eye.what(moved)[..., 3:12, 4:12])
+        words = torch.from_numpy(np.stack([words_vector("left"), words_vector("right")]))
+        left, right = eye(images.expand(2, -1, -1, -1), words)
+    assert not torch.equal(left, right)
+    assert left.abs().max() <= 1.0
+
+
+class Watching(Clone):
+    """Gives one command only, and keeps what it saw."""
+
+    def __init__(self) -> None:
+        self.about = {"observation": "front,proprio", "size_px": 32}
+        self.seen: list[Any] = []
+
+    def begin(self, instruction: str) -> None:
+        del instruction
+
+    def act(self, observation: Any) -> Any:
+        self.seen.append(observation)
+        return HOME_COMMAND
+
+
+def test_swapped_images_are_those_of_another_start() -> None:
+    """Of the start that the same seed gives first; proprioception is that of the start that is tried."""
+    watching = Watching()
+    for swapped in (False, True):
+        tries(watching, 1, seed=3, appearances=["clean"], swapped=swapped, placement=0.03)
+    assert len(watching.seen) == 2 * MOST_PERIODS
+    first, second = watching.seen[:MOST_PERIODS], watching.seen[MOST_PERIODS:]
+    for own, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(own["front"], other["front"])
+    assert np.abs(first[0]["proprio"] - second[0]["proprio"]).max() > 0.01
+    with pytest.raises(InvalidValueError, match="no images to swap"):
+        tries(clone(), 1, seed=3, swapped=True)
 
 
 def test_demonstrations_come_back_from_their_file(tmp_path: Path) -> None:

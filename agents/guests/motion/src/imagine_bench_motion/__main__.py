@@ -15,7 +15,7 @@ from imagine_bench.errors import ImagineBenchError
 from .cloning import Clone, Training, train
 from .demonstrations import Demonstrations, collect
 from .judge.command import add_judge
-from .skills import FAMILIES
+from .skills import FAMILIES, PLACEMENT_M
 from .trials import summary, tries
 
 APPEARANCES = ["clean", "mild"]
@@ -46,6 +46,9 @@ def _add_demonstrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--observation", default="hand,front,proprio", help="parts, as the environment takes them")
     parser.add_argument("--appearances", nargs="+", default=APPEARANCES)
     parser.add_argument("--family", choices=list(FAMILIES), default="arrows")
+    parser.add_argument(
+        "--placement", type=float, default=PLACEMENT_M, help="metres that objects start off their slots"
+    )
     parser.set_defaults(run=_demonstrate)
 
 
@@ -57,6 +60,7 @@ def _demonstrate(given: argparse.Namespace) -> None:
         observation=given.observation,
         appearances=given.appearances,
         family=given.family,
+        placement=given.placement,
     )
     data.save(given.file)
     cpu_s = time.process_time() - began_s
@@ -70,6 +74,7 @@ def _add_clone(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first", type=int, help="take only so many demonstrations")
     parser.add_argument("--updates", type=int, default=Training.updates, help="gradient steps")
     parser.add_argument("--chunk", type=int, default=16, help="commands that are predicted at once")
+    parser.add_argument("--heat-maps", type=int, default=4, help="points that are looked for in each image")
     parser.add_argument("--seed", type=int, default=0)
     parser.set_defaults(run=_clone)
 
@@ -83,7 +88,7 @@ def _clone(given: argparse.Namespace) -> None:
         seed=given.seed,
         observation=given.observation,
         settings=Training(updates=given.updates),
-        layout={"chunk": given.chunk},
+        layout={"chunk": given.chunk, "heat_maps": given.heat_maps},
         told=lambda update, loss: print(f"{update} updates, loss {loss:.4f}", flush=True),
     )
     clone.save(given.file)
@@ -96,6 +101,10 @@ def _add_try(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--appearances", nargs="+", default=APPEARANCES)
     parser.add_argument("--family", choices=list(FAMILIES), default="arrows")
+    parser.add_argument(
+        "--placement", type=float, default=PLACEMENT_M, help="metres that objects start off their slots"
+    )
+    parser.add_argument("--swapped", action="store_true", help="the policy sees the images of another start")
     parser.add_argument("--out", type=Path, help="a .json file for every try")
     parser.set_defaults(run=_try)
 
@@ -103,7 +112,15 @@ def _add_try(parser: argparse.ArgumentParser) -> None:
 def _try(given: argparse.Namespace) -> None:
     clone = Clone.load(given.file)
     began_s = time.process_time()
-    found = tries(clone, given.count, seed=given.seed, appearances=given.appearances, family=given.family)
+    found = tries(
+        clone,
+        given.count,
+        seed=given.seed,
+        appearances=given.appearances,
+        swapped=given.swapped,
+        family=given.family,
+        placement=given.placement,
+    )
     cpu_s = time.process_time() - began_s
     kept = summary(found)
     print(f"{kept['done']} of {kept['count']} done, {cpu_s:.0f} CPU s")
@@ -111,7 +128,8 @@ def _try(given: argparse.Namespace) -> None:
         print(*(f"  {key}: {done} of {count}" for key, (done, count) in kept[name].items()), sep="\n")
     print(*(f"  failed: {each}" for each in kept["failed"]), sep="\n")
     if given.out is not None:
-        given.out.write_text(json.dumps({"about": clone.about, "seed": given.seed, **kept}, indent=1) + "\n")
+        asked = {"seed": given.seed, "placement": given.placement, "swapped": given.swapped}
+        given.out.write_text(json.dumps({"about": clone.about, **asked, **kept}, indent=1) + "\n")
 
 
 def _add_flat(parser: argparse.ArgumentParser) -> None:

@@ -17,9 +17,9 @@ from torch import Tensor
 from imagine_bench.errors import ArtefactError
 
 from .demonstrations import Demonstrations
-from .instruction import words_vector
+from .instruction import GO_BACK, words_vector
 from .network import ChunkPolicy, Layout, new_network
-from .skills import Command, Observed, images_of, numbers_of
+from .skills import HAND_NUMBERS, Command, Observed, images_of, numbers_of
 
 _SMALLEST_DEVIATION = 1e-2
 """Of an input or a command that hardly varies: it is divided by this instead."""
@@ -31,11 +31,11 @@ class Training:
     """Settings of training."""
 
     updates: int = 6_000  #: gradient steps
-    batch: int = 64  #: periods a gradient step
-    learning_rate: float = 1e-3  #: at the start; it falls to 0 along a half cosine
+    batch: int = 48  #: periods a gradient step
+    learning_rate: float = 2e-3  #: the largest; it rises during the first 30 % of the steps, and falls to 0
     weight_decay: float = 1e-4
     number_noise: float = 0.05  #: standard deviation added to standardised inputs
-    shift_px: int = 2  #: images are moved by up to so many pixels along both axes; 0 leaves them
+    shift_px: int = 0  #: images are moved by up to so many pixels along both axes; 0 leaves them, and their geometry
     brightness: float = 0.1  #: images are made brighter or darker by up to this share
 
 
@@ -203,16 +203,22 @@ def _fit(
     chunks = torch.from_numpy(data.chunks(network.layout.chunk))
     known, which = np.unique(data.instructions, return_inverse=True)
     words = torch.from_numpy(np.stack([words_vector(str(each)) for each in known]))[torch.from_numpy(which)]
+    is_turning = data.instructions != GO_BACK
+    at_grip = data.numbers[data.grips()][:, HAND_NUMBERS]
+    grips = torch.from_numpy(Scale.of(at_grip[is_turning]).standardised(at_grip))
+    turning = torch.from_numpy(is_turning).float()
     optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.updates)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, settings.learning_rate, settings.updates)
     network.train()
     losses = []
     for update in range(1, settings.updates + 1):
         rows = torch.randint(len(numbers), (settings.batch,), generator=generator)
         noise = settings.number_noise * torch.randn(settings.batch, numbers.shape[1], generator=generator)
         images = {camera: _varied(image[rows.numpy()], settings, generator) for camera, image in data.images.items()}
-        predicted = network(images, numbers[rows] + noise, words[rows])
+        predicted, grip = network.with_grip(images, numbers[rows] + noise, words[rows])
         loss = (predicted - targets[chunks[rows]]).abs().mean()
+        if grip is not None:
+            loss = loss + ((grip - grips[rows]).abs().mean(dim=1) * turning[rows]).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

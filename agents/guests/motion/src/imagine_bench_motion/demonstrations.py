@@ -57,6 +57,14 @@ class Demonstrations:
         last = np.searchsorted(self.episode, self.episode, side="right") - 1
         return np.minimum(rows[:, None] + np.arange(length), last[:, None])
 
+    def grips(self) -> NDArray[np.int64]:
+        """For each period, the row of its demonstration in which the fingers are told to be closest. Shape (T,)."""
+        grip = self.commands[:, -1]
+        starts = np.flatnonzero(np.diff(self.episode, prepend=-1))
+        ends = [*starts[1:], len(grip)]
+        closest = [start + int(grip[start:end].argmin()) for start, end in zip(starts, ends, strict=True)]
+        return np.array(closest)[self.episode]
+
     def save(self, path: Path) -> None:
         """Write one ``.npz`` file."""
         arrays: dict[str, Any] = {f"image.{camera}": image for camera, image in self.images.items()}

@@ -11,6 +11,10 @@ from torch import Tensor, nn
 
 from .instruction import WIDTH
 
+_MEAN_BRIGHTNESS = 0.4
+_SHARPNESS = 5.0
+"""Heat maps are multiplied by it, so that points are learned soon."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
@@ -21,7 +25,8 @@ class Layout:
     commands: int  #: numbers of one command
     chunk: int = 16  #: commands that are predicted at once
     hidden: int = 256  #: units of the two hidden layers
-    features: int = 64  #: numbers that each camera's image becomes
+    features: int = 64  #: numbers that each camera's image becomes, without heat maps
+    heat_maps: int = 0  #: points that are looked for in each camera's image; 0: it becomes ``features`` instead
 
 
 class Eye(nn.Sequential):
@@ -40,8 +45,48 @@ class Eye(nn.Sequential):
         )
 
 
+class PointEye(nn.Module):
+    """Heat maps of one camera's image, and the mean point of each (spatial softmax; Finn et al. 2016).
+
+    A heat map is the sum of a convolutional network's answer, which is the same wherever a thing lies in the image, and
+    of an answer to the instruction alone, which says where to look: so few demonstrations suffice to find a thing.
+
+    Args:
+        size_px: Edge of the images; a multiple of 8.
+        heat_maps: How many.
+    """
+
+    def __init__(self, size_px: int, heat_maps: int) -> None:
+        super().__init__()
+        self._edge = size_px // 4
+        self._shape = (heat_maps, self._edge // 2, self._edge // 2)
+        self.what = nn.Sequential(
+            nn.Conv2d(3, 16, 8, stride=4, padding=2),
+            nn.ReLU(),
+            nn.Conv2d(16, 32, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(32, 32, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(32, heat_maps, 1),
+        )
+        self.where = nn.Linear(WIDTH, math.prod(self._shape))
+
+    def forward(self, images: Tensor, words: Tensor) -> Tensor:
+        """Points in [-1, 1], x and y of each heat map. Shapes (B, 3, S, S) and (B, 64) to (B, 2 heat_maps)."""
+        coarse = self.where(words).unflatten(1, self._shape)
+        edge = self._edge
+        where = nn.functional.interpolate(coarse, size=(edge, edge), mode="bilinear", align_corners=False)
+        what = self.what(images - _MEAN_BRIGHTNESS)
+        share = (_SHARPNESS * (what + where)).flatten(2).softmax(-1)  # [B, heat_maps, edge * edge]
+        places = torch.linspace(-1.0, 1.0, edge)
+        x, y = torch.meshgrid(places, places, indexing="xy")
+        return (share @ torch.stack([x.ravel(), y.ravel()], dim=1)).flatten(1)
+
+
 class ChunkPolicy(nn.Module):
     """A convolutional network a camera, and a multilayer perceptron over everything.
+
+    With heat maps the points of the first camera say where the hand will grip, and the perceptron is told so.
 
     Args:
         layout: Sizes of inputs and outputs.
@@ -51,8 +96,19 @@ class ChunkPolicy(nn.Module):
     def __init__(self, layout: Layout, size_px: int = 64) -> None:
         super().__init__()
         self.layout = layout
-        self.eyes = nn.ModuleDict({camera: Eye(size_px, layout.features) for camera in layout.cameras})
-        wide = layout.numbers + WIDTH + layout.features * len(layout.cameras)
+        points = layout.heat_maps
+        self.eyes = nn.ModuleDict(
+            {
+                camera: PointEye(size_px, points) if points else Eye(size_px, layout.features)
+                for camera in layout.cameras
+            }
+        )
+        each = 2 * points or layout.features
+        wide = layout.numbers + WIDTH + each * len(layout.cameras)
+        self.grip = nn.Sequential()
+        if points and layout.cameras:
+            self.grip = nn.Sequential(nn.Linear(each + WIDTH, 64), nn.ReLU(), nn.Linear(64, 3))
+            wide += 3
         self.body = nn.Sequential(
             nn.Linear(wide, layout.hidden),
             nn.ReLU(),
@@ -69,9 +125,21 @@ class ChunkPolicy(nn.Module):
             numbers: Standardised. Shape (B, numbers).
             words: As :func:`.instruction.words_vector` says. Shape (B, 64).
         """
-        seen = [self.eyes[camera](images[camera]) for camera in self.layout.cameras]
-        flat = self.body(torch.cat([numbers, words, *seen], dim=1))  # [B, chunk * commands]
-        return flat.unflatten(1, (self.layout.chunk, self.layout.commands))
+        return self.with_grip(images, numbers, words)[0]
+
+    def with_grip(self, images: Mapping[str, Tensor], numbers: Tensor, words: Tensor) -> tuple[Tensor, Tensor | None]:
+        """As :meth:`forward`, and where the hand will grip, standardised (B, 3); None without heat maps."""
+        grip = None
+        if self.layout.heat_maps:
+            seen = [self.eyes[camera](images[camera], words) for camera in self.layout.cameras]
+        else:
+            seen = [self.eyes[camera](images[camera]) for camera in self.layout.cameras]
+        told = []
+        if len(self.grip):
+            grip = self.grip(torch.cat([seen[0], words], dim=1))
+            told = [grip.detach()]
+        flat = self.body(torch.cat([numbers, words, *seen, *told], dim=1))  # [B, chunk * commands]
+        return flat.unflatten(1, (self.layout.chunk, self.layout.commands)), grip
 
 
 def new_network(layout: Layout, size_px: int, generator: torch.Generator) -> ChunkPolicy:

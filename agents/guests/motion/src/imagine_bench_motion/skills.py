@@ -21,6 +21,8 @@ CONTROL = "joint"
 """The control of all commands here: joints (rad) and the grip, absolute, as in ACT. Errors do not add up."""
 START_JOINTS_RAD = 0.08
 """The largest distance of each joint from the observation pose at a varied start: some 4 cm of the hand."""
+PLACEMENT_M = 0.03
+"""How far off their slots objects start by default, where policies are trained and tried."""
 START_PERIODS = 8
 """Control periods in which the arm goes from the observation pose to a varied start."""
 FAMILIES: Mapping[str, Callable[..., MotionEnv]] = {
@@ -31,6 +33,8 @@ HOME_COMMAND = np.array([*OBSERVATION_QPOS_RAD, 1.0], dtype=np.float32)
 """The command that keeps the arm at its observation pose, with open fingers."""
 HELD_GRIP = 0.5
 """Fingers that are told to be nearer together than this at a start hold something."""
+HAND_NUMBERS = slice(-7, -4)
+"""Where the hand's position (m) stands in :func:`numbers_of`, whose last part is ``proprio``."""
 Observed = Mapping[str, NDArray[Any]] | NDArray[Any]
 """Several parts by name, or one."""
 Command = NDArray[np.float32]

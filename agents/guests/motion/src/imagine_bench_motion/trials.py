@@ -7,9 +7,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from imagine_bench.tasks.continuous.env import MotionEnv
+from imagine_bench.tasks.rendering.cameras import FRAME_PX
+
+from imagine_bench.errors import InvalidValueError
 
 from .cloning import Clone
-from .skills import begin, skill_env
+from .skills import begin, images_of, skill_env
 
 MOST_PERIODS = 75
 """Periods that a try may last: 3 s. Planned, the event comes after 1.6 s."""
@@ -26,15 +30,25 @@ class Try:
     fault: str  #: the fault, or another event, or no event; empty where it was done
 
 
-def one_try(env: Any, clone: Clone, macro_action: int, rng: np.random.Generator) -> Try:
-    """One try from a start that is drawn."""
+def one_try(env: Any, clone: Clone, macro_action: int, rng: np.random.Generator, other: MotionEnv | None = None) -> Try:
+    """One try from a start that is drawn. The images are those of ``other``, if it is given.
+
+    The other environment has a start of its own, and its arm is given the same commands: only the objects differ.
+    """
+    if other is not None:
+        elsewhere = images_of(begin(other, macro_action, rng))
     observation = begin(env, macro_action, rng)
     clone.begin(env.task.action_names[macro_action])
     appearance = env.world.level.name
     period = 0
     over = False
     while period < MOST_PERIODS and not over:
-        observation, _, _, truncated, info = env.step(clone.act(observation))
+        if other is not None:
+            observation = {**observation, **elsewhere}
+        command = clone.act(observation)
+        observation, _, _, truncated, info = env.step(command)
+        if other is not None:
+            elsewhere = images_of(other.step(command)[0])
         period += 1
         over = bool(info["event"]) or truncated
     done = bool(info["event"]) and int(info["macro_action"]) == macro_action
@@ -43,15 +57,38 @@ def one_try(env: Any, clone: Clone, macro_action: int, rng: np.random.Generator)
 
 
 def tries(
-    clone: Clone, count: int, *, seed: int, appearances: Sequence[str] = ("clean", "mild"), **options: Any
+    clone: Clone,
+    count: int,
+    *,
+    seed: int,
+    appearances: Sequence[str] = ("clean", "mild"),
+    swapped: bool = False,
+    **options: Any,
 ) -> list[Try]:
-    """Tries over all macro-actions and appearances in turn, from starts that are drawn."""
+    """Tries over all macro-actions and appearances in turn, from starts that are drawn.
+
+    Args:
+        clone: The policy.
+        count: Of tries.
+        seed: Of everything random.
+        appearances: Levels, in turn.
+        swapped: Whether the policy sees images of another start: one that uses its images fails then.
+        **options: Of :func:`.skills.skill_env`, the size of images too.
+
+    Raises:
+        InvalidValueError: A policy without images, and ``swapped``.
+    """
+    if swapped and not {"hand", "front"} & set(clone.observation.split(",")):
+        raise InvalidValueError(f"The policy sees {clone.observation}, so there are no images to swap; leave it out.")
     rng = np.random.default_rng(seed)
-    envs = [skill_env(clone.observation, appearance, **options) for appearance in appearances]
+    options = {"size": clone.about.get("size_px", FRAME_PX), **options}
+    envs, others = ([skill_env(clone.observation, each, **options) for each in appearances] for _ in range(2))
     found = []
     for index in range(count):
-        env = envs[index % len(envs)]
-        found.append(one_try(env, clone, index // len(envs) % env.task.n_actions, rng))
+        which = index % len(envs)
+        env = envs[which]
+        other = others[which] if swapped else None
+        found.append(one_try(env, clone, index // len(envs) % env.task.n_actions, rng, other))
     return found
 
 
