@@ -68,12 +68,14 @@ def test_grasps_that_slip_are_the_cause_of_every_failure(tmp_path: Path) -> None
     """In contact physics, where the planner takes cubes to be elsewhere."""
     changes: dict[str, Any] = {"execution": "physics", "physics": (("plan_error_mm", 30.0),), "budgets": (1,)}
     row, found = asked(tmp_path, "sound", "arrows:cubes=2", evaluation_episodes=6, **changes)
-    assert set(found.causes.values()) == {"fault"} and row.faults > 0 and row.kept is not None
+    assert set(found.causes.values()) == {"execution"} and row.faults > 0 and row.kept is not None
+    rules = registry.task("arrows:cubes=2").rules
     with closing(gymnasium.make(registry.task("arrows:cubes=2").env_id, physics={"plan_error_mm": 30.0})) as env:
         agent = Sound(AgentContext(n_actions=4, preprocessing="", encoder=None, seeds=SeedTree(0)))
         for test, count in enumerate(row.kept.faults):
             seed = episode_seed("evaluation", 0, test)
-            assert sum(why.lived_again(env, agent, seed, row.kept.actions_of(test)).faults) == count
+            lived = why.lived_again(env, agent, rules, seed, row.kept.actions_of(test))
+            assert sum(lived.faults) == count
 
 
 def test_what_came_later_was_not_known_before(tmp_path: Path) -> None:
@@ -89,7 +91,7 @@ def test_a_course_is_what_was_seen_before_each_action(tmp_path: Path) -> None:
     with closing(gymnasium.make(spec.env_id, execution="kinematic")) as env:
         for test in range(row.test_episodes):
             seed = episode_seed("evaluation", 0, test)
-            episode = why.lived_again(env, agent, seed, row.kept.actions_of(test))
+            episode = why.lived_again(env, agent, spec.rules, seed, row.kept.actions_of(test))
             frame, info = env.reset(seed=seed)
             for action, state, misread in zip(episode.actions, episode.states, episode.misread, strict=False):
                 assert state == tuple(info["macrostate"].tolist())
