@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
 from imagine_bench_motion.judge.interface import Motions
 from imagine_bench_motion.judge.judgement import SIMULATOR, MotionJudgement, judge, judged
+from imagine_bench_motion.judge.labelled import Labelled
 from imagine_bench_motion.judge.no_change import NoChange
 from imagine_bench_motion.judge.questions import MotionQuestions, MotionSource, moved, moving_actions
 from imagine_bench_motion.judge.recurrent import MotionNetwork
@@ -173,3 +175,22 @@ def test_weights_follow_from_the_passed_generator_alone() -> None:
             network.draw_weights(torch.Generator().manual_seed(3))
         weights.append(torch.nn.utils.parameters_to_vector(network.parameters()))
     assert torch.equal(*weights)
+
+
+def test_a_labelled_model_with_a_smaller_image_gives_the_scenes_size() -> None:
+    """Each pixel of the small image fills a square of the large one."""
+    small = np.arange(2 * 4 * 4, dtype=np.uint8).reshape(2, 1, 1, 4, 4)
+
+    class Small:
+        """Imagines gray images of 4 by 4 pixels."""
+
+        def imagine(self, *_: object) -> SimpleNamespace:
+            """The same images every time."""
+            return SimpleNamespace(pictures=small)
+
+    smaller: Any = Small()
+    model = Labelled(smaller, n_actions=2)
+    frames = np.zeros((2, 8, 8, 3), dtype=np.uint8)
+    drawn = model.imagine_motion(frames, np.zeros((2, 1, 7), np.float32), np.ones(2, np.int64), np.zeros(2, np.int64))
+    assert drawn.shape == frames.shape and drawn.dtype == np.uint8
+    assert (drawn == small[:, 0, 0].repeat(2, axis=1).repeat(2, axis=2)[..., None]).all()

@@ -53,7 +53,9 @@ class Labelled:
         pictures = imagined.pictures[:, 0, 0]
         scale = 1 if pictures.dtype == np.uint8 else 255
         drawn: Frame = (scale * pictures).round().astype(np.uint8)
-        return drawn if drawn.ndim == 4 else np.repeat(drawn[..., None], 3, axis=-1)
+        colored = drawn if drawn.ndim == 4 else np.repeat(drawn[..., None], 3, axis=-1)
+        times = frames.shape[1] // drawn.shape[1]  # an encoder may see smaller images than the scene's
+        return colored.repeat(times, axis=1).repeat(times, axis=2)
 
     def parameters(self) -> int:
         """Those of the world model."""
