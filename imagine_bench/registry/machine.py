@@ -52,8 +52,8 @@ def command() -> str:
     call = CALL.get()
     if call is not None:
         return call
-    name = Path(sys.argv[0]).name
-    program = ["python", "-m", "imagine_bench"] if name == "__main__.py" else [name]
+    path = Path(sys.argv[0])
+    program = ["python", "-m", path.parent.name] if path.name == "__main__.py" else [path.name]
     return shlex.join([*program, *sys.argv[1:]])
 
 

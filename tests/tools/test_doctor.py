@@ -73,6 +73,8 @@ def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.
 def test_the_command_is_what_a_shell_takes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["/x/imagine_bench/__main__.py", "bench", "--task", "a b"])
     assert environment.command() == "python -m imagine_bench bench --task 'a b'"
+    monkeypatch.setattr("sys.argv", ["/x/imagine_bench_motion/__main__.py", "judge"])
+    assert environment.command() == "python -m imagine_bench_motion judge", "a plug-in's own command"
     monkeypatch.setattr("sys.argv", ["/x/bin/imagine-bench", "describe"])
     assert environment.command() == "imagine-bench describe"
 
