@@ -255,6 +255,14 @@ class MotionEnv(SceneEnv):
         fault = None if event is None else event.fault
         return reward, terminated, truncated, self._info(success=success, fault=fault)
 
+    def tell_servos(self, action: Motion) -> None:
+        """Set the servos' commands to those at the end of a period of an action; nothing is simulated.
+
+        Raises:
+            InvalidValueError: As :meth:`step`.
+        """
+        self.data.ctrl[self._columns.ctrl] = self._servo_commands(self.checked(action))[-1]
+
     def observe(self, envs: Sequence[MotionEnv]) -> list[Observed]:
         """The observations of :meth:`reset` and :meth:`step` for environments like this, by its cameras; once a
         moment.
@@ -328,16 +336,20 @@ class MotionEnv(SceneEnv):
         data = self.data
         servos = data.ctrl
         columns = self._columns.ctrl
-        before = servos[columns]
+        for ctrl in self._servo_commands(action):
+            servos[columns] = ctrl
+            mujoco.mj_step(model, data)
+
+    def _servo_commands(self, action: Floats) -> Floats:
+        """The servos' commands at each step of a period: joints (7,) and fingers, by equal steps."""
+        before = self.data.ctrl[self._columns.ctrl]
         n_arm = len(ARM_JOINTS)
         command = self.controls.command(action, before[:n_arm], float(before[-1]))
         after = np.empty_like(before)
         after[:n_arm] = command.joints_rad
         after[n_arm:] = command.opening_m
         self.episode.limited = command.limited
-        for ctrl in before + self._ramp * (after - before):
-            servos[columns] = ctrl
-            mujoco.mj_step(model, data)
+        return before + self._ramp * (after - before)
 
     def _judge(self) -> Event | None:
         """The event of the period that is over, with all that it changes in the scene."""

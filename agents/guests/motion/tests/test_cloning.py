@@ -11,7 +11,7 @@ import pytest
 import torch
 from imagine_bench.tasks.scenes.constants import TABLE_HEIGHT_M
 from imagine_bench_motion.cloning import Clone, Scale, Training, train
-from imagine_bench_motion.demonstrations import Demonstrations, collect
+from imagine_bench_motion.demonstrations import Demonstrations, collect, turn_of
 from imagine_bench_motion.instruction import GO_BACK, words_vector
 from imagine_bench_motion.network import ChunkPolicy, Layout, PointEye, new_network
 from imagine_bench_motion.skills import HAND_NUMBERS, HOME_COMMAND
@@ -60,6 +60,34 @@ def test_demonstrations_depend_on_the_seed_alone() -> None:
     np.testing.assert_array_equal(again.commands, demonstrations().commands)
     other = collect(1, seed=6, observation=VECTORS)
     assert not np.array_equal(other.numbers[0], again.numbers[0])
+
+
+@pytest.mark.parametrize("appearances", [1, 2, 3])
+def test_half_of_each_macro_actions_demonstrations_are_disturbed(appearances: int) -> None:
+    turns = [turn_of(index, appearances, 6) for index in range(4 * 6 * appearances)]
+    for cell in {turn[:2] for turn in turns}:
+        disturbed = [turn.disturbed for turn in turns if turn[:2] == cell]
+        assert disturbed in ([False, True] * 2, [True, False] * 2)
+    assert len({turn[:2] for turn in turns}) == 6 * appearances
+    if appearances == 2:
+        first = turns[:12]
+        assert [sum(turn.disturbed for turn in first if turn.macro_action == action) for action in range(6)] == [1] * 6
+
+
+def test_demonstrations_of_both_appearances_follow_the_turns() -> None:
+    data = demonstrations()
+    words = [str(data.instructions[data.episode == episode][0]) for episode in range(data.count)]
+    names = task("arrow_puzzle").action_names
+    assert words == [names[turn_of(index, 2, 6).macro_action] for index in range(data.count)]
+    assert [_is_noisy(data, episode) for episode in range(data.count)] == [False, True, False, True]
+
+
+def _is_noisy(data: Demonstrations, episode: int) -> bool:
+    """Whether the arm of a demonstration moves jerkily."""
+    rows = data.episode == episode
+    joints_rad = data.numbers[rows, -16:-9]
+    jerks_rad = np.diff(joints_rad, n=4, axis=0)
+    return bool(np.abs(jerks_rad).mean() > 0.0033)
 
 
 def test_demonstrations_start_at_different_poses_of_the_arm() -> None:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from imagine_bench_motion.__main__ import main
+from imagine_bench_motion.cloned_env import BUNDLED
 from imagine_bench_motion.flat import flat_env
 from imagine_bench_motion.levels import Level, environment, expects_nothing, learn, make_agent, oracle_success
 
+from imagine_bench.errors import UnknownNameError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 
 KEPT = Path(__file__).parents[4] / "docs" / "results" / "motion"
@@ -47,6 +52,34 @@ def test_the_planner_solves_what_the_rules_say_and_robot_time_adds_up() -> None:
     assert told == [point]
     assert 4 <= point.macro_actions <= 4 * stage.horizon
     assert point.robot_s == pytest.approx(point.macro_actions * macro_action_s, rel=0.2)
+
+
+def test_an_agents_own_settings_reach_it() -> None:
+    spec = environment("planner", cubes=1, slip=0.0).spec
+    usual: Any = make_agent("dqn", spec, 0)
+    other: Any = make_agent("dqn:controller.discount=0.5", spec, 0)
+    assert other.settings.controller.discount == 0.5 != usual.settings.controller.discount
+    with pytest.raises(UnknownNameError, match=r"controller\.discont"):
+        make_agent("dqn:controller.discont=0.5", spec, 0)
+
+
+def test_a_kept_file_names_its_clone_and_its_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "tries.json"
+    words = f"motion try {BUNDLED} --count 1 --seed 5 --appearances mild --placement 0 --out {out}"
+    monkeypatch.setattr(sys, "argv", words.split())
+    main()
+    kept = json.loads(out.read_text())
+    asked = {name: kept[name] for name in ("count", "seed", "appearances", "family", "placement", "swapped")}
+    assert asked == {
+        "count": 1,
+        "seed": 5,
+        "appearances": ["mild"],
+        "family": "arrows",
+        "placement": 0.0,
+        "swapped": False,
+    }
+    assert kept["clone"] == f"{BUNDLED.name}@{hashlib.sha256(BUNDLED.read_bytes()).hexdigest()[:12]}"
+    assert str(BUNDLED.parent) not in out.read_text()
 
 
 def test_the_flat_environment_is_one_vector_of_all_that_there_is_to_see() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import sys
 import time
@@ -122,14 +123,25 @@ def _try(given: argparse.Namespace) -> None:
         placement=given.placement,
     )
     cpu_s = time.process_time() - began_s
-    kept = summary(found)
-    print(f"{kept['done']} of {kept['count']} done, {cpu_s:.0f} CPU s")
+    counted = summary(found)
+    print(f"{counted['done']} of {counted['count']} done, {cpu_s:.0f} CPU s")
     for name in ("by_appearance", "by_macro_action"):
-        print(*(f"  {key}: {done} of {count}" for key, (done, count) in kept[name].items()), sep="\n")
-    print(*(f"  failed: {each}" for each in kept["failed"]), sep="\n")
+        print(*(f"  {key}: {done} of {count}" for key, (done, count) in counted[name].items()), sep="\n")
+    print(*(f"  failed: {each}" for each in counted["failed"]), sep="\n")
     if given.out is not None:
-        asked = {"seed": given.seed, "placement": given.placement, "swapped": given.swapped}
-        given.out.write_text(json.dumps({"about": clone.about, **asked, **kept}, indent=1) + "\n")
+        kept = {"about": clone.about, **_asked(given), "clone": kept_name(given.file), **counted}
+        given.out.write_text(json.dumps(kept, indent=1) + "\n")
+
+
+def _asked(given: argparse.Namespace) -> dict[str, Any]:
+    """The options of a command by name, without paths of this machine."""
+    left_out = ("run", "out", "file", "clone")
+    return {name: value for name, value in vars(given).items() if name not in left_out}
+
+
+def kept_name(file: Path) -> str:
+    """A file as kept results name it: its name, and the start of the SHA-256 of its content."""
+    return f"{file.name}@{hashlib.sha256(file.read_bytes()).hexdigest()[:12]}"
 
 
 def _add_flat(parser: argparse.ArgumentParser) -> None:
@@ -146,7 +158,7 @@ def _flat(given: argparse.Namespace) -> None:
     def told(point: Point) -> None:
         print(point, flush=True)
         curve.append(asdict(point))
-        kept = {"seed": given.seed, "reward": given.reward, "curve": curve}
+        kept = {**_asked(given), "curve": curve}
         given.out.write_text(json.dumps(kept, indent=1) + "\n")
 
     curve: list[dict[str, float]] = []
@@ -167,6 +179,7 @@ def _add_level(parser: argparse.ArgumentParser) -> None:
 
 
 def _level(given: argparse.Namespace) -> None:
+    from .cloned_env import BUNDLED  # noqa: PLC0415 - needs MuJoCo
     from .levels import Level, environment, learn, make_agent, oracle_success  # noqa: PLC0415 - needs MuJoCo
 
     def told(point: Level) -> None:
@@ -176,8 +189,9 @@ def _level(given: argparse.Namespace) -> None:
 
     world = {"cubes": given.cubes, "slip": given.slip, "clone": given.clone}
     env, test_env = (environment(given.execution, **world) for _ in range(2))
-    asked = {name: value for name, value in vars(given).items() if name not in ("run", "out", "clone")}
-    kept: dict[str, Any] = {**asked, "curve": []}
+    kept: dict[str, Any] = {**_asked(given), "curve": []}
+    if given.execution == "clone":
+        kept["clone"] = kept_name(given.clone or BUNDLED)
     rules, horizon = env.rules, env.horizon
     if given.agent == "oracle":
         successes, mean_s = oracle_success(test_env.env, rules, tests=given.tests, horizon=horizon)

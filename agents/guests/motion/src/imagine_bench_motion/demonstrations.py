@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from imagine_bench.tasks.continuous.expert import Expert
@@ -17,7 +17,7 @@ from .instruction import GO_BACK
 from .skills import HOME_COMMAND, begin, images_of, numbers_of, skill_env
 
 NOISE_RAD = 0.004
-"""Standard deviation of the noise that a joint command gets each period, in every second demonstration."""
+"""Standard deviation of the noise that a joint command gets each period, in every second demonstration of an action."""
 NOISE_KEPT = 0.8
 """Share of a period's noise that goes on in the next one."""
 
@@ -85,9 +85,9 @@ def collect(
 ) -> Demonstrations:
     """Let the expert demonstrate each macro-action in turn, the same number of times.
 
-    Arms start off their observation pose. In every second demonstration the commands are disturbed, and the expert's
-    own ones are kept: so there are ways back from small errors (Laskey et al. 2017). A demonstration
-    without the event that was wanted is not kept.
+    Arms start off their observation pose. In every second demonstration of each macro-action, at each appearance, the
+    commands are disturbed, and the expert's own ones are kept: so there are ways back from small errors (Laskey et al.
+    2017). A demonstration without the event that was wanted is not kept.
 
     Args:
         count: How many are kept.
@@ -105,9 +105,8 @@ def collect(
     for _ in range(MOST_TRIES * count):
         if len(kept) == count:
             break
-        stage = stages[len(kept) % len(stages)]
-        macro_action = len(kept) // len(stages) % stage.env.task.n_actions
-        found = stage.demonstrate(macro_action, rng, disturbed=len(kept) // 2 % 2 == 1)
+        turn = turn_of(len(kept), len(stages), stages[0].env.task.n_actions)
+        found = stages[turn.appearance].demonstrate(turn.macro_action, rng, disturbed=turn.disturbed)
         if found is not None:
             kept.append(found)
     if len(kept) < count:
@@ -122,6 +121,25 @@ def collect(
         commands=np.stack([row for each in kept for row in each.commands]),
         episode=np.repeat(np.arange(len(kept)), [len(each.commands) for each in kept]),
     )
+
+
+class Turn(NamedTuple):
+    """What is demonstrated next."""
+
+    appearance: int  #: its place among the appearances
+    macro_action: int
+    disturbed: bool
+
+
+def turn_of(index: int, appearances: int, n_actions: int) -> Turn:
+    """The turn of a demonstration, by its place among those that are kept.
+
+    Each macro-action at each appearance is disturbed every second time. Neighbouring appearances begin differently, so
+    that two of them have half of each macro-action's demonstrations disturbed after one round already.
+    """
+    place, appearance = divmod(index, appearances)
+    before, macro_action = divmod(place, n_actions)
+    return Turn(appearance, macro_action, (before + appearance) % 2 == 1)
 
 
 class _Episode:

@@ -5,22 +5,22 @@ It also asks an agent's world model how often a macro-action changes nothing, an
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 
-from imagine_bench.interfaces import AgentContext, Observation, TaskSpec, Transition
+from imagine_bench import registry
+from imagine_bench.interfaces import Agent, AgentContext, Observation, TaskSpec, Transition
 from imagine_bench.interfaces.capabilities import FrameReader, OutcomePredictor
-from imagine_bench.registry import agent_entry, task
+from imagine_bench.registry.entries import entrant
 from imagine_bench.rules import Rules
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders
 
 from .cloned_env import CloneExecutedEnv
 
@@ -63,7 +63,7 @@ def environment(execution: str, *, cubes: int, slip: float, clone: Path | None =
         slip: Probability that a grip slips. Rules and agents do not know of it.
         clone: A file; None is the bundled one.
     """
-    spec = task("arrow_puzzle" if cubes == PUZZLE_CUBES else f"arrows:cubes={cubes},horizon=10")
+    spec = registry.task("arrow_puzzle" if cubes == PUZZLE_CUBES else f"arrows:cubes={cubes},horizon=10")
     env: Env
     if execution == "clone":
         env = CloneExecutedEnv(clone=clone, cubes=cubes, slip=slip)
@@ -72,26 +72,32 @@ def environment(execution: str, *, cubes: int, slip: float, clone: Path | None =
     return Stage(env, spec, spec.rules, spec.horizon)
 
 
-def make_agent(name: str, spec: TaskSpec, seed: int, appearance: str = "clean") -> Any:
-    """An agent of macro-actions by its registered name, with the bundled encoder if it needs one."""
-    entry = agent_entry(name)
-    module, _, attribute = str(entry.make).partition(":")
-    suffix = "" if entry.encoder_kind == "latents" else f"-{entry.encoder_kind}"
-    bundled = files("imagine_bench.assets") / "encoders" / f"{spec.encoder}-{appearance}{suffix}.safetensors"
+def make_agent(name: str, spec: TaskSpec, seed: int, appearance: str = "clean") -> Agent:
+    """An agent of macro-actions by its registered name, with settings of its own if the name has some.
+
+    It sees through the task's own encoder if it needs one.
+
+    Raises:
+        UnknownNameError: No such agent or setting.
+        SetupError: It is in a package that is not installed or cannot be used.
+    """
+    entry = registry.agent_entry(name)
     context = AgentContext(
         n_actions=spec.n_actions,
         preprocessing=spec.preprocessing,
-        encoder=Path(str(bundled)) if entry.needs_encoder else None,
+        encoder=encoders.own(spec, appearance, entry.encoder_kind) if entry.needs_encoder else None,
         seeds=SeedTree(seed).child("agent"),
         config_group=spec.config_group,
+        overrides=registry.own_settings(name, {}),
+        argument=entrant(name).argument,
     )
-    return getattr(importlib.import_module(module), attribute)(context)
+    return registry.make_agent(name, context)
 
 
 def learn(
     env: Env,
     test_env: Env,
-    agent: Any,
+    agent: Agent,
     *,
     budgets: Sequence[int],
     tests: int,
@@ -142,7 +148,7 @@ class _Count:
     faults: int = 0
 
 
-def _train_episode(env: Env, agent: Any, episode: int, horizon: int, seed: int, count: _Count) -> None:
+def _train_episode(env: Env, agent: Agent, episode: int, horizon: int, seed: int, count: _Count) -> None:
     frame, info = env.reset(seed=seed)
     seen = Observation(frame=frame)
     for step in range(1, horizon + 1):
@@ -169,7 +175,7 @@ def _train_episode(env: Env, agent: Any, episode: int, horizon: int, seed: int, 
             return
 
 
-def test_episode(env: Env, agent: Any, horizon: int, seed: int) -> bool:
+def test_episode(env: Env, agent: Agent, horizon: int, seed: int) -> bool:
     """Whether a test episode without exploration succeeds."""
     frame, _ = env.reset(seed=seed)
     for _ in range(horizon):

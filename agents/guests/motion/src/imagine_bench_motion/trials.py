@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.rendering.cameras import FRAME_PX
+from imagine_bench.tasks.scenes.constants import CONTROL_CAMERAS
 
 from imagine_bench.errors import InvalidValueError
 
@@ -78,7 +79,7 @@ def tries(
     Raises:
         InvalidValueError: A policy without images, and ``swapped``.
     """
-    if swapped and not {"hand", "front"} & set(clone.observation.split(",")):
+    if swapped and not set(CONTROL_CAMERAS) & set(clone.observation.split(",")):
         raise InvalidValueError(f"The policy sees {clone.observation}, so there are no images to swap; leave it out.")
     rng = np.random.default_rng(seed)
     options = {"size": clone.about.get("size_px", FRAME_PX), **options}

@@ -11,6 +11,7 @@ from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
+from imagine_bench.tasks.scenes.constants import CONTROL_CAMERAS
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
@@ -21,7 +22,6 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.rules import ending
 from imagine_bench.tools import play
 
-CAMERAS = ("hand", "front")
 Command = NDArray[np.float32]
 SPEED = 0.25
 """Of the hand while a key is down, as a share of the largest twist: 0.25 m/s, 1.5 rad/s."""
@@ -131,7 +131,7 @@ class HandGame(gymnasium.Wrapper[Arrays, Command, Arrays, Command]):
         draw = ImageDraw.Draw(canvas)
         font = ImageFont.load_default(14)
         left = _WIDTH + 8
-        for name in CAMERAS:
+        for name in CONTROL_CAMERAS:
             draw.text((left, 8), f"{name} camera", "black", font)
             canvas.paste(
                 Image.fromarray(self._seen[name]).resize((_FRAME, _FRAME), Image.Resampling.NEAREST), (left, 30)

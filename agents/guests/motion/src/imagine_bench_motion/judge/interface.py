@@ -14,10 +14,10 @@ import numpy as np
 from imagine_bench import registry
 from imagine_bench.arrays import Floats32, Frame, Ints
 from imagine_bench.errors import InvalidValueError, require_known
+from imagine_bench.registry.entries import ENCODER_KINDS
 
 GROUP = "imagine_bench.motion_models"
 """Entry points in which packages offer models of motions, this one too."""
-ENCODER_KINDS = ("latents", "codes")
 LEVELS = ("commands", "macro-action")
 """What a model is told of a motion: all its commands, or the one macro-action that it was planned for."""
 

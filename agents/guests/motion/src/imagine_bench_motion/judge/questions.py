@@ -148,7 +148,9 @@ class MotionSource:
             self._env.reset(seed=int(rng.integers(2**31)), options={"macrostate": start})
             for each in rows:
                 actions = self._lasting(self._env.episode.macrostate)
-                each.append(self._go_on(actions[int(rng.integers(len(actions)))]))
+                action = actions[int(rng.integers(len(actions)))]
+                commands = _varied(self._planned(action), "planned", rng)
+                each.append(self._carried_out(commands, action, VARIANTS.index("planned")))
         return [_stacked(each) for each in rows]
 
     def _lasting(self, state: State) -> list[int]:
@@ -162,25 +164,24 @@ class MotionSource:
         return found
 
     def _one(self, state: State, action: int, variant: int, rng: np.random.Generator) -> _Row:
-        env = self._env
-        seed = int(rng.integers(2**31))
-        env.reset(seed=seed, options={"macrostate": state})
-        planned = self._go_on(action).actions[:-_CALM]
-        commands = _varied(planned, VARIANTS[variant], rng)
-        env.reset(seed=seed, options={"macrostate": state})
+        self._env.reset(seed=int(rng.integers(2**31)), options={"macrostate": state})
+        commands = _varied(self._planned(action), VARIANTS[variant], rng)
         return self._carried_out(commands, action, variant)
 
-    def _go_on(self, action: int) -> _Row:
-        """Plan a macro-action from where the scene stands, and carry it out."""
-        env = self._env
-        before = env.get_state()
+    def _planned(self, action: int) -> Floats32:
+        """The commands (T, A) of a macro-action from where the scene stands, which is not changed.
+
+        A command follows from the servos' commands before it alone, so nothing is simulated.
+        """
+        servos = self._env.data.ctrl
+        before = servos.copy()
         self._expert.begin(action)
         planned = []
         while not self._expert.is_done:
             planned.append(self._expert.act())
-            env.act(planned[-1])
-        env.set_state(before)
-        return self._carried_out(_varied(np.array(planned), "planned", np.random.default_rng(0)), action, 0)
+            self._env.tell_servos(planned[-1])
+        servos[:] = before
+        return np.array(planned)
 
     def _carried_out(self, commands: Floats32, action: int, variant: int) -> _Row:
         env = self._env
