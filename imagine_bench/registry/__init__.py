@@ -3,31 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Container, Mapping, Sequence
-from importlib.metadata import entry_points
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import gymnasium
-
-from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known, unprintable
+from imagine_bench.errors import InvalidValueError, brief, require_known, unprintable
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.interfaces.regression import RegressionSpec, Regressor, RegressorContext
-from imagine_bench.registry.builtin import (
-    AGENTS,
-    DEMONSTRATOR,
-    REGRESSIONS,
-    REGRESSORS,
-    TASKS,
-    WORLD_MODELS,
-    Guest,
-    guests,
-)
+from imagine_bench.registry.builtin import AGENTS, DEMONSTRATOR, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
 from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import (
-    LABEL_OF_OLD_AGENT,
     AgentEntry,
     EncoderEntry,
     Entrant,
@@ -38,66 +24,64 @@ from imagine_bench.registry.entries import (
     parse_options,
     read_mapping,
 )
-from imagine_bench.registry.loading import fault, guests_faults, load, refuse_while_loading
+from imagine_bench.registry.environments import motion_id, motion_name, register_env, vector_id
+from imagine_bench.registry.loading import guests_faults, load, refuse_while_loading
+from imagine_bench.registry.packages import (
+    AGENT_GROUP,
+    ENCODER_GROUP,
+    MOTION,
+    REGRESSION_GROUP,
+    REGRESSOR_GROUP,
+    STUDY_GROUP,
+    TASK_GROUP,
+    WORLD_MODEL_GROUP,
+    absent_guests,
+    guest_packages,
+    guest_with,
+    is_ours,
+    require_guest,
+)
+from imagine_bench.registry.plugins import describe_group, installed_of, offered, offers, refused_offers, usable
 from imagine_bench.values import Setting
 
 __all__ = [
     "AGENTS",
+    "AGENT_GROUP",
     "DEMONSTRATOR",
+    "ENCODER_GROUP",
+    "MOTION",
     "REGRESSIONS",
+    "REGRESSION_GROUP",
     "REGRESSORS",
+    "REGRESSOR_GROUP",
+    "STUDY_GROUP",
     "TASKS",
+    "TASK_GROUP",
     "WORLD_MODELS",
+    "WORLD_MODEL_GROUP",
     "AgentEntry",
     "EncoderEntry",
     "RegressorEntry",
     "TaskEntry",
     "WorldModelEntry",
+    "absent_guests",
+    "describe_group",
+    "guest_packages",
+    "guest_with",
+    "installed_of",
+    "is_ours",
     "load",
+    "motion_id",
+    "motion_name",
+    "offered",
+    "offers",
     "refuse_while_loading",
+    "refused_offers",
+    "register_env",
+    "require_guest",
+    "usable",
+    "vector_id",
 ]
-
-MOTION = "imagine-bench-motion"
-"""The plug-in of continuous control."""
-TASK_GROUP = "imagine_bench.tasks"
-AGENT_GROUP = "imagine_bench.agents"
-ENCODER_GROUP = "imagine_bench.encoders"
-REGRESSION_GROUP = "imagine_bench.regressions"
-REGRESSOR_GROUP = "imagine_bench.regressors"
-STUDY_GROUP = "imagine_bench.studies"
-WORLD_MODEL_GROUP = "imagine_bench.world_models"
-"""Entry points in which installed packages make their offers: each the ``"module:attr"`` of a TaskEntry, AgentEntry,
-EncoderEntry, RegressionSpec, RegressorEntry, Study or WorldModelEntry."""
-
-
-class _Group(NamedTuple):
-    """A group of entry points."""
-
-    what: str  #: one of it, in words
-    kind: type  #: the class of its objects
-    own: Sequence[Container[str]]  #: where the names are that are this suite's
-
-
-_GROUPS = {
-    TASK_GROUP: _Group("task", TaskEntry, (TASKS, REGRESSIONS)),
-    AGENT_GROUP: _Group("agent", AgentEntry, (AGENTS, REGRESSORS)),
-    ENCODER_GROUP: _Group("encoder", EncoderEntry, ()),
-    REGRESSION_GROUP: _Group("regression task", RegressionSpec, (TASKS, REGRESSIONS)),
-    REGRESSOR_GROUP: _Group("regressor", RegressorEntry, (AGENTS, REGRESSORS)),
-    WORLD_MODEL_GROUP: _Group("world model", WorldModelEntry, (WORLD_MODELS,)),
-}
-
-
-def describe_group(group: str, *, what: str, kind: type, own: Container[str]) -> None:
-    """Say what packages offer in a group; a room above the registry says it of its own group when it is imported.
-
-    Args:
-        group: Name of the group of entry points.
-        what: One of its objects, in a word.
-        kind: The class of its objects.
-        own: The names that are this suite's.
-    """
-    _GROUPS[group] = _Group(what, kind, (own,))
 
 
 def tasks() -> dict[str, TaskEntry]:
@@ -124,126 +108,6 @@ def regressions() -> dict[str, str | RegressionSpec]:
 def regressors() -> dict[str, RegressorEntry]:
     """All regressors by name, likewise."""
     return {**REGRESSORS, **usable(REGRESSOR_GROUP)}
-
-
-def usable(group: str) -> dict[str, Any]:
-    """The usable offers of installed packages in a group of entry points, by name."""
-    return {name: entry for name, entry in offers(group).items() if not isinstance(entry, SetupError)}
-
-
-def refused_offers() -> list[SetupError]:
-    """The reasons why some offers of installed packages cannot be used."""
-    return [entry for group in _GROUPS for entry in offers(group).values() if isinstance(entry, SetupError)]
-
-
-@functools.cache
-def offers(group: str) -> Mapping[str, Any]:
-    """The offers of installed packages in a group of entry points, by name: an object, or the error why it is none.
-
-    A name of this suite's own stays this suite's.
-    """
-    found: dict[str, Any] = {}
-    for point in entry_points(group=group):
-        what, kind, own = _GROUPS[group]
-        package = point.dist.name if point.dist else point.module
-        offer = f"The package {package} offers {point.value} as {what} {point.name}"
-        guest = guest_with(group, point.name)
-        is_guests = guest is not None and guest.package != package
-        if point.name in found or is_guests or any(point.name in names for names in own):
-            found.setdefault(f"{package}:{point.name}", SetupError(f"{offer}, a name that is taken; give it another."))
-            continue
-        try:
-            entry = load(f"{point.module}:{point.attr or ''}")
-        except Exception as error:  # whatever a package does wrong, it is one sentence and costs nobody else anything
-            entry = SetupError(f"{offer}, which cannot be loaded ({fault(error)}); mend or uninstall the package.")
-        if not isinstance(entry, kind | SetupError):
-            entry = SetupError(
-                f"{offer}, which is {brief(entry)} and no {kind.__name__}; mend or uninstall the package."
-            )
-        if any(map(unprintable, vars(entry).values())):
-            entry = SetupError(f"{offer}, whose texts have control characters; mend or uninstall the package.")
-        found[point.name] = entry
-    return found
-
-
-def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
-    """The object of a name in a group: this suite's own, or a package's. Raises as :func:`task_entry`."""
-    if isinstance(name, str) and name in own:
-        return own[name]
-    what = _GROUPS[group].what
-    there = offers(group)
-    guest = guest_with(group, name)
-    if guest is not None and name not in there:
-        raise SetupError(
-            f"The {what} {name} is in the package {guest.package}, which is not installed. "
-            f"Install it with: {guest.install}"
-        )
-    if group == AGENT_GROUP and name in LABEL_OF_OLD_AGENT and name not in there:
-        raise InvalidValueError(f"Agent {name!r} is now called {LABEL_OF_OLD_AGENT[name]!r}; give that name.")
-    entry = there[require_known(what, name, {**own, **there})]
-    if isinstance(entry, SetupError):
-        raise entry
-    return entry
-
-
-def guest_with(group: str, name: str) -> Guest | None:
-    """The guest of this suite that offers a name in a group, installed or not; None where none does."""
-    return next((guest for guest in guests() if name in guest.names.get(group, ())), None)
-
-
-def installed_of(names: Sequence[str], group: str = AGENT_GROUP) -> tuple[tuple[str, ...], str]:
-    """The names of a default, without those of this suite's guests that are not installed, and a sentence about these.
-
-    Of the names of an entrant, its agent counts. The sentence is empty where nothing is left out.
-    """
-    absent = {}
-    for name in names:
-        guest = guest_with(group, entrant(name).agent)
-        if guest is not None and entrant(name).agent not in offers(group):
-            absent[name] = guest
-    installs = "; ".join(dict.fromkeys(guest.install for guest in absent.values()))
-    note = f"Left out, as not installed: {', '.join(absent)}. To install: {installs}" if absent else ""
-    return tuple(name for name in names if name not in absent), note
-
-
-def is_ours(target: str | CodeByValue) -> bool:
-    """Whether code is this suite's: the core's, or that of a guest of its own that needs no library of others."""
-    top = str(target).partition(":")[0].partition(".")[0]
-    return top in {"imagine_bench", *(guest.module for guest in guests() if guest.is_ours_alone)}
-
-
-def absent_guests() -> list[Guest]:
-    """The guests of this suite that are not installed here."""
-    installed = guest_packages()
-    return [guest for guest in guests() if guest.package not in installed]
-
-
-def require_guest(package: str, doing: str) -> None:
-    """Raise SetupError, with the line that installs it, where a plug-in of this suite is missing that does something.
-
-    Args:
-        package: The plug-in, as pip knows it.
-        doing: The work that needs it, as the beginning of a sentence.
-    """
-    for guest in absent_guests():
-        if guest.package == package:
-            raise SetupError(
-                f"{doing} needs the package {package}, which is not installed. Install it with: {guest.install}"
-            )
-
-
-def guest_packages() -> dict[str, set[str]]:
-    """The installed packages that offer anything, by name, and where their entries lie: names of top modules.
-
-    None of them is imported.
-    """
-    found: dict[str, set[str]] = {}
-    everything = entry_points()
-    for group in {*_GROUPS, STUDY_GROUP}:
-        for point in everything.select(group=group):
-            if point.dist:
-                found.setdefault(point.dist.name, set()).add(point.module.partition(".")[0])
-    return dict(sorted(found.items()))
 
 
 def task_entry(name: str) -> TaskEntry:
@@ -295,49 +159,6 @@ def has_task(name: str) -> bool:
     return name in tasks() or name.partition(":")[0] in tasks()
 
 
-def register_env(entry: TaskEntry) -> None:
-    """Register a task's environment with Gymnasium, unless its id is known already; a suite's own also as a vector."""
-    if entry.env_id in gymnasium.registry:
-        return
-    gymnasium.register(
-        entry.env_id,
-        entry.env,
-        reward_threshold=entry.reward_threshold,
-        max_episode_steps=entry.horizon,
-        kwargs=dict(entry.options),
-    )
-    own = entry.env.startswith("imagine_bench.")
-    if own:
-        _register_vector(entry.env_id, entry.env, entry, entry.horizon)
-    if entry.motion:
-        env_id = motion_id(entry.env_id)
-        threshold = entry.reward_threshold
-        gymnasium.register(env_id, entry.motion, reward_threshold=threshold, kwargs=dict(entry.options))
-        if own:
-            _register_vector(env_id, entry.motion, entry, None)
-
-
-def _register_vector(env_id: str, env: str, entry: TaskEntry, horizon: int | None) -> None:
-    gymnasium.register(
-        vector_id(env_id),
-        vector_entry_point="imagine_bench.tasks.vector_env:make",
-        reward_threshold=entry.reward_threshold,
-        max_episode_steps=horizon,
-        kwargs={"env": env, **entry.options},
-    )
-
-
-def motion_id(env_id: str) -> str:
-    """The id of a task's environment of continuous control, by that of its macro-actions."""
-    name, _, version = env_id.rpartition("-v")
-    return f"{name}Motion-v{version}"
-
-
-def motion_name(env_id: str) -> str:
-    """The name of an environment of continuous control on a command line: ``ArrowPuzzleMotion``."""
-    return env_id.rpartition("/")[2].partition("-v")[0]
-
-
 def task_of_motion(name: str) -> str | None:
     """The task whose environment of continuous control has a name, such as ``ArrowPuzzleMotion``, or that id.
 
@@ -348,12 +169,6 @@ def task_of_motion(name: str) -> str | None:
         if entry.motion and motion_name(motion_id(entry.env_id)) == motion_name(base):
             return f"{task}{colon}{said}"
     return None
-
-
-def vector_id(env_id: str) -> str:
-    """The id of an environment's own vector environment; that of the single one keeps Gymnasium's default, sync."""
-    name, _, version = env_id.rpartition("-v")
-    return f"{name}-vector-v{version}"
 
 
 def agent_entry(name: str) -> AgentEntry:

@@ -1,0 +1,136 @@
+"""The objects that installed packages offer by entry points, and the reasons why some of them cannot be used."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Container, Mapping, Sequence
+from importlib.metadata import entry_points
+from typing import Any, NamedTuple
+
+from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known, unprintable
+from imagine_bench.interfaces.regression import RegressionSpec
+from imagine_bench.registry.builtin import AGENTS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
+from imagine_bench.registry.entries import (
+    LABEL_OF_OLD_AGENT,
+    AgentEntry,
+    EncoderEntry,
+    RegressorEntry,
+    TaskEntry,
+    WorldModelEntry,
+    entrant,
+)
+from imagine_bench.registry.loading import fault, load
+from imagine_bench.registry.packages import (
+    AGENT_GROUP,
+    ENCODER_GROUP,
+    REGRESSION_GROUP,
+    REGRESSOR_GROUP,
+    TASK_GROUP,
+    WORLD_MODEL_GROUP,
+    guest_with,
+)
+
+
+class _Group(NamedTuple):
+    """A group of entry points."""
+
+    what: str  #: one of it, in words
+    kind: type  #: the class of its objects
+    own: Sequence[Container[str]]  #: where the names are that are this suite's
+
+
+_GROUPS = {
+    TASK_GROUP: _Group("task", TaskEntry, (TASKS, REGRESSIONS)),
+    AGENT_GROUP: _Group("agent", AgentEntry, (AGENTS, REGRESSORS)),
+    ENCODER_GROUP: _Group("encoder", EncoderEntry, ()),
+    REGRESSION_GROUP: _Group("regression task", RegressionSpec, (TASKS, REGRESSIONS)),
+    REGRESSOR_GROUP: _Group("regressor", RegressorEntry, (AGENTS, REGRESSORS)),
+    WORLD_MODEL_GROUP: _Group("world model", WorldModelEntry, (WORLD_MODELS,)),
+}
+
+
+def describe_group(group: str, *, what: str, kind: type, own: Container[str]) -> None:
+    """Say what packages offer in a group; a room above the registry says it of its own group when it is imported.
+
+    Args:
+        group: Name of the group of entry points.
+        what: One of its objects, in a word.
+        kind: The class of its objects.
+        own: The names that are this suite's.
+    """
+    _GROUPS[group] = _Group(what, kind, (own,))
+
+
+def usable(group: str) -> dict[str, Any]:
+    """The usable offers of installed packages in a group of entry points, by name."""
+    return {name: entry for name, entry in offers(group).items() if not isinstance(entry, SetupError)}
+
+
+def refused_offers() -> list[SetupError]:
+    """The reasons why some offers of installed packages cannot be used."""
+    return [entry for group in _GROUPS for entry in offers(group).values() if isinstance(entry, SetupError)]
+
+
+@functools.cache
+def offers(group: str) -> Mapping[str, Any]:
+    """The offers of installed packages in a group of entry points, by name: an object, or the error why it is none.
+
+    A name of this suite's own stays this suite's.
+    """
+    found: dict[str, Any] = {}
+    for point in entry_points(group=group):
+        what, kind, own = _GROUPS[group]
+        package = point.dist.name if point.dist else point.module
+        offer = f"The package {package} offers {point.value} as {what} {point.name}"
+        guest = guest_with(group, point.name)
+        is_guests = guest is not None and guest.package != package
+        if point.name in found or is_guests or any(point.name in names for names in own):
+            found.setdefault(f"{package}:{point.name}", SetupError(f"{offer}, a name that is taken; give it another."))
+            continue
+        try:
+            entry = load(f"{point.module}:{point.attr or ''}")
+        except Exception as error:  # whatever a package does wrong, it is one sentence and costs nobody else anything
+            entry = SetupError(f"{offer}, which cannot be loaded ({fault(error)}); mend or uninstall the package.")
+        if not isinstance(entry, kind | SetupError):
+            entry = SetupError(
+                f"{offer}, which is {brief(entry)} and no {kind.__name__}; mend or uninstall the package."
+            )
+        if any(map(unprintable, vars(entry).values())):
+            entry = SetupError(f"{offer}, whose texts have control characters; mend or uninstall the package.")
+        found[point.name] = entry
+    return found
+
+
+def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
+    """The object of a name in a group: this suite's own, or a package's. Raises as :func:`task_entry`."""
+    if isinstance(name, str) and name in own:
+        return own[name]
+    what = _GROUPS[group].what
+    there = offers(group)
+    guest = guest_with(group, name)
+    if guest is not None and name not in there:
+        raise SetupError(
+            f"The {what} {name} is in the package {guest.package}, which is not installed. "
+            f"Install it with: {guest.install}"
+        )
+    if group == AGENT_GROUP and name in LABEL_OF_OLD_AGENT and name not in there:
+        raise InvalidValueError(f"Agent {name!r} is now called {LABEL_OF_OLD_AGENT[name]!r}; give that name.")
+    entry = there[require_known(what, name, {**own, **there})]
+    if isinstance(entry, SetupError):
+        raise entry
+    return entry
+
+
+def installed_of(names: Sequence[str], group: str = AGENT_GROUP) -> tuple[tuple[str, ...], str]:
+    """The names of a default, without those of this suite's guests that are not installed, and a sentence about these.
+
+    Of the names of an entrant, its agent counts. The sentence is empty where nothing is left out.
+    """
+    absent = {}
+    for name in names:
+        guest = guest_with(group, entrant(name).agent)
+        if guest is not None and entrant(name).agent not in offers(group):
+            absent[name] = guest
+    installs = "; ".join(dict.fromkeys(guest.install for guest in absent.values()))
+    note = f"Left out, as not installed: {', '.join(absent)}. To install: {installs}" if absent else ""
+    return tuple(name for name in names if name not in absent), note
