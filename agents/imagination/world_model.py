@@ -142,10 +142,14 @@ class EnvironmentModel(TrainedModule):
             if self.settings.gradient_clip is not None:
                 nn.utils.clip_grad_norm_(part.parameters(), self.settings.gradient_clip)
         self.optimiser.step()
-        for network in self.networks:
-            if self.settings.max_norm is not None:
-                clip_unit_norms(network, self.settings.max_norm)
+        if self.settings.max_norm is not None:
+            self.limit_norms(self.settings.max_norm)
         return losses
+
+    def limit_norms(self, limit: float) -> None:
+        """Scale weights down to the max-norm constraint: the incoming weights of each unit have at most this norm."""
+        for network in self.networks:
+            clip_unit_norms(network, limit)
 
     def _mixture(self, z: Tensor, action: Tensor, masks: Sequence[Tensor] | None) -> Mixture:
         """``p(z' | z, a)`` of N rows by every member, with leading axes (E, N)."""

@@ -146,3 +146,11 @@ MDN_RNN = WorldModelEntry(
     description="The ensemble on a recurrent network's memory of all frames of the history.",
     by_default=False,
 )
+MDN_WHOLE_LAYER = WorldModelEntry(
+    make="imagine_bench_controls.whole_layer:make",
+    title="VAE + MDN, thesis' settings, whole layers",
+    encoder_kind="latents",
+    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    description="mdn_thesis with the norm of each whole layer limited to 3, not that of each unit's weights.",
+    by_default=False,
+)

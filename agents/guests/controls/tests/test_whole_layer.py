@@ -1,0 +1,50 @@
+"""The max-norm of a whole layer: its bound holds after an update, and it is tighter than that of each unit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
+from imagine_bench.agents.imagination.world_model import EnvironmentModel
+from imagine_bench.agents.replay import Batch
+from imagine_bench_controls.whole_layer import WholeLayerModel, limit_layer_norm
+
+LIMIT = 0.5
+
+
+def test_a_layer_within_the_limit_stays_as_it_is_and_a_larger_one_keeps_its_direction():
+    small = torch.tensor([[[0.3, 0.0], [0.0, 0.3]]])
+    large = 10 * small
+    limit_layer_norm(small, LIMIT)
+    limit_layer_norm(large, LIMIT)
+    assert torch.equal(small, torch.tensor([[[0.3, 0.0], [0.0, 0.3]]]))
+    expected = LIMIT / 2**0.5  # two equal weights
+    assert torch.allclose(large, expected * torch.eye(2).unsqueeze(0))
+
+
+def test_members_are_limited_apart():
+    weights = torch.stack([torch.eye(2), 100 * torch.eye(2)])
+    limit_layer_norm(weights, 2.0)
+    assert torch.equal(weights[0], torch.eye(2))
+    assert torch.allclose(weights[1].norm(), torch.tensor(2.0))
+
+
+def test_after_an_update_every_layer_is_within_the_limit_where_units_alone_are_not():
+    settings = HYPERPARAMETERS.resolve("published", {"model.max_norm": LIMIT}, "chapter_5").model
+    settings = replace(settings, dynamics_hidden=(32, 32), reward_hidden=(32,), termination_hidden=(32,))
+    draws = torch.Generator().manual_seed(0)
+    batch = Batch(
+        z=torch.randn(16, 4, generator=draws),
+        action=torch.randint(3, (16,), generator=draws),
+        reward=torch.randn(16, generator=draws),
+        next_z=torch.randn(16, 4, generator=draws),
+        terminated=torch.zeros(16),
+    )
+    norms = {}
+    for kind in (EnvironmentModel, WholeLayerModel):
+        model = kind(4, 3, settings, torch.Generator().manual_seed(1))
+        model.update(batch, torch.Generator().manual_seed(2))
+        norms[kind] = [float(layer.detach().norm()) for network in model.networks for layer in network.weights]
+    assert all(norm <= LIMIT * 1.0001 for norm in norms[WholeLayerModel])
+    assert any(norm > 2 * LIMIT for norm in norms[EnvironmentModel])
