@@ -25,6 +25,7 @@ from small_runs import do
 import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import ELSEWHERE, Bench, parsed
+from imagine_bench.protocols.control import PRESETS
 from imagine_bench.registry import AGENTS, has_task, regressions, task_of_motion
 
 WRITTEN = [*PAGES, ROOT / "CHANGELOG.md"]
@@ -224,6 +225,27 @@ def test_pages_of_environments_say_what_their_rules_say(page: Path) -> None:
     for fact, values in said.items():
         assert all(round(true[fact], len(value.partition(".")[2])) == float(value) for value in values), (fact, values)
     assert sum(map(len, said.values())) >= (0 if page.stem == "arrows" else 3)
+
+
+@pytest.mark.parametrize(
+    ("page", "sentence"),
+    [
+        (
+            "README.md",
+            "`dqn_more_updates` {dqn_more_updates}, `imagination` {imagination}, `dqn` {dqn}, "
+            "each other agent {random}",
+        ),
+        (
+            "docs/reference/agents.md",
+            "{dqn_more_updates} seeds of `dqn_more_updates`, {imagination} of `imagination`, {dqn} of `dqn`, "
+            "{random} of each other agent",
+        ),
+    ],
+)
+def test_pages_say_how_many_seeds_the_default_bench_has(page: str, sentence: str) -> None:
+    words = {2: "two", 6: "six", 7: "seven", 15: "fifteen"}
+    seeds = {agent: words[number] for agent, number in PRESETS["quick"]["few_seeds"].items()}
+    assert sentence.format(**seeds) in (ROOT / page).read_text()
 
 
 def test_the_front_page_has_the_links_of_its_address() -> None:
