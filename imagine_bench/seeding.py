@@ -26,6 +26,7 @@ Purpose = Literal[
     "earlier_training",
     "feedback",
     "dataset",
+    "board",
 ]
 _PURPOSES: tuple[str, ...] = get_args(Purpose)
 _SEED_BITS = 24

@@ -64,6 +64,7 @@ FOLDERS = (
     "imagine_bench/adapters",
     "imagine_bench/testing",
     "imagine_bench/tools",
+    "imagine_bench/board",
     "imagine_bench/cli",
     PACKAGE,
 )

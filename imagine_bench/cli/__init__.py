@@ -18,6 +18,7 @@ from tyro.conf import subcommand
 
 from imagine_bench import registry
 from imagine_bench.cli.benches import Bench, Plan, Report, Sweep
+from imagine_bench.cli.board import Board, Daily, Submit
 from imagine_bench.cli.judging import Judge, Verify
 from imagine_bench.cli.options import require_values
 from imagine_bench.cli.tools import (
@@ -62,6 +63,9 @@ Command = (
     | Describe
     | Annotated[CheckCommand, subcommand("check")]
     | New
+    | Submit
+    | Board
+    | Daily
     | Doctor
 )
 COMMANDS = tuple(

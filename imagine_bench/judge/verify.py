@@ -327,8 +327,10 @@ def _settings(protocol: Protocol, runs: Mapping[str, RunResult]) -> list[str]:
 # Episodes ----------------------------------------------------------------------------------------------------------
 
 
-def verify_tests(row: Checkpoint, protocol: Protocol, purpose: Purpose, replays: Replays, *, env_steps: int) -> int:
-    """Play the tests of a budget again. Returns their number.
+def verify_tests(
+    row: Checkpoint, protocol: Protocol, purpose: Purpose, replays: Replays, *, env_steps: int, starts: int = 0
+) -> int:
+    """Play the tests of a budget again, at the starts of the seed ``starts``. Returns their number.
 
     Raises ArtefactError: the row, or a test, does not follow from the macro-actions, or from training in ``env_steps``.
     """
@@ -338,7 +340,7 @@ def verify_tests(row: Checkpoint, protocol: Protocol, purpose: Purpose, replays:
     if kept is None:
         raise ArtefactError("it keeps no test episodes, as no run of before 2026-11-24 does.")
     for test in range(protocol.evaluation_episodes):
-        played, ends = replays.test(episode_seed(purpose, 0, test), kept.actions_of(test))
+        played, ends = replays.test(episode_seed(purpose, starts, test), kept.actions_of(test))
         require(ends, f"{where}, test {test}: its actions do not end an episode, or go on after its end.")
         again.add(played)
     _compare(kept, again.kept(), f"{where}, test")

@@ -1,0 +1,140 @@
+"""The check of a leaderboard: every row is read, its episodes are played again, and its numbers are computed anew."""
+
+from __future__ import annotations
+
+import functools
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from imagine_bench import registry
+from imagine_bench.board import rounds
+from imagine_bench.board.rows import CARD, ROWS, Row, read_row, require_whole
+from imagine_bench.errors import ArtefactError, require
+from imagine_bench.judge.verify import Replays, has_own_failures, verify_tests
+from imagine_bench.running.bench import counted
+from imagine_bench.running.retraining import Verdict, judged, part_digest
+from imagine_bench.running.run_state import environments
+from imagine_bench.seeding import Purpose, evaluation_split
+
+OPEN = "open starts"
+"""Of tests whose starts everybody could know while training."""
+NOT_VOUCHED = ("the player", "the seeds", "the price", "what was seen beforehand")
+"""Claims of every row that no replay shows."""
+NEVER_SHOWN = (
+    "A replay shows that these macro-actions, from these starts, in this world, have these outcomes. It can never show "
+    "who chose them: an oracle's or another agent's episodes play again as well. It shows no training, so neither real "
+    "episodes and macro-actions, nor CPU seconds, nor frames and tasks seen beforehand, nor the runs that were left "
+    "out because they failed. The starts of a round were unknown until its agents were filed, so nothing could be "
+    "trained for them; but that the filed agents played is shown only by whoever trains them again: imagine-bench "
+    "verify --train 1, with the commit and the command that the card names."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checked:
+    """A row and what was found."""
+
+    name: str
+    verdict: Verdict
+    row: Row | None = None  #: None where it was refused
+
+    @property
+    def starts(self) -> str:
+        """The kind of starts of its tests."""
+        return f"round {self.row.round}" if self.row is not None and self.row.round else OPEN
+
+    def __str__(self) -> str:
+        if self.row is None:
+            return f"{self.name}: refused: {self.verdict.complaint}"
+        claims = ", ".join(self.verdict.unshown)
+        played = f"{self.verdict.episodes:,} episodes played again"
+        return f"{self.name}: holds, {self.starts}; {played}; not vouched: {claims}"
+
+
+def row_folders(board: Path) -> list[Path]:
+    """The folders of a board's rows, or of the one row that the path is. Raises ArtefactError: there is none."""
+    if (board / CARD).exists():
+        return [board]
+    found = sorted((board / ROWS).iterdir()) if (board / ROWS).is_dir() else []
+    if not found:
+        raise ArtefactError(f"{board} holds no rows; 'imagine-bench submit RUN --out {board / ROWS}' writes one.")
+    return found
+
+
+def check(board: Path) -> list[Checked]:
+    """Check every row of a board, or one row. Raises ArtefactError: there is none."""
+    folders = row_folders(board)
+    with ExitStack() as scope:
+        court = _Court(scope)
+        return [court.checked(folder) for folder in counted(folders, "rows", total=len(folders))]
+
+
+class _Court:
+    """Plays the rows of a board again; rows of one world share its environment, and each episode is played once."""
+
+    def __init__(self, scope: ExitStack) -> None:
+        self._scope = scope
+        self._worlds: dict[str, Replays] = {}
+        self._owners: dict[str, str] = {}
+
+    def checked(self, folder: Path) -> Checked:
+        """The verdict on one row."""
+        read: list[Row] = []
+        verdict = judged(folder.name, functools.partial(self._check, folder, read))
+        return Checked(name=folder.name, verdict=verdict, row=None if verdict.complaint else read[0])
+
+    def _check(self, folder: Path, read: list[Row]) -> Verdict:
+        row = read_row(folder)
+        read.append(row)
+        require_whole(row, registry.task(row.protocol.task))
+        starts = self._starts(folder, row)
+        episodes = 0
+        for place, figures in enumerate(row.vouched):
+            purpose: Purpose = evaluation_split(figures.seed) if starts is None else "board"
+            tested = row.checkpoint(place)
+            seed = 0 if starts is None else starts
+            where = f"seed {figures.seed}"
+            try:
+                episodes += verify_tests(
+                    tested, row.protocol, purpose, self._replays(row), env_steps=tested.env_steps, starts=seed
+                )
+            except ArtefactError as error:
+                raise ArtefactError(f"{where}, {error}") from error
+        self._require_own(row)
+        return Verdict(what=row.name, episodes=episodes, unshown=NOT_VOUCHED)
+
+    def _replays(self, row: Row) -> Replays:
+        """The environments of a row's world, made once."""
+        if row.world not in self._worlds:
+            unseen = {"observation": "state"} if registry.is_own(row.protocol.task) else {}
+            self._worlds[row.world] = Replays(*self._scope.enter_context(environments(row.protocol, **unseen)))
+        return self._worlds[row.world]
+
+    def _starts(self, folder: Path, row: Row) -> int | None:
+        """The seed of the row's round, None without one. Raises ArtefactError: the row is not of that round."""
+        if not row.round:
+            return None
+        round_folder = folder.absolute().parents[1] / rounds.ROUNDS / row.round
+        seed, filed = rounds.revealed_seed(round_folder, row.name)
+        agents = {
+            str(figures.seed): price.agent_sha256
+            for figures, price in zip(row.vouched, row.claimed.prices, strict=True)
+        }
+        require(agents == filed, f"its agents are not those that were filed in the round {row.round}.")
+        tests = rounds.read_round(round_folder).tests
+        wanted = f"it has {row.protocol.evaluation_episodes} tests, and the round {row.round} has {tests}."
+        require(row.protocol.evaluation_episodes == tests, wanted)
+        require(len(row.protocol.budgets) == 1, "a row of a round has the tests of one budget, the last.")
+        return seed
+
+    def _require_own(self, row: Row) -> None:
+        """Raise ArtefactError where two runs, of this board's rows, failed in the same tests in the same ways."""
+        for place, figures in enumerate(row.vouched):
+            kept = row.kept(place)
+            mine = f"{row.name}, seed {figures.seed}"
+            if has_own_failures(kept, row.protocol):
+                mark = part_digest([kept.fingerprints, kept.actions])
+                owner = self._owners.setdefault(mark, mine)
+                shared = f"its tests of seed {figures.seed} are those of {owner}, failures included; two learners "
+                require(owner == mine, f"{shared}do not share them, and the history of files shows the first.")

@@ -1,0 +1,224 @@
+"""A row of a leaderboard: a folder with a card and the test episodes, so that a stranger can play them again.
+
+``card.json`` keeps two kinds of statements apart: ``vouched`` holds the numbers that follow from the episodes, and
+``claimed`` those for which the author's word is all that there is. ``episodes.json`` holds the tests of each run and
+budget, in the card's order. No file of a row is an archive or is ever carried out, and none holds a path.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from imagine_bench.errors import InvalidValueError, brief, require, unprintable
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.data import require_types
+from imagine_bench.running.evaluation import EpisodeLog
+from imagine_bench.store.files import make_folder, read_json, reading, write_bytes, write_json
+from imagine_bench.store.results import Checkpoint, KeptEpisodes
+from imagine_bench.values import Json, unpack
+
+FORMAT = "imagine_bench board row 1"
+CARD = "card.json"
+EPISODES = "episodes.json"
+ROWS = "rows"
+"""The folder of a board that holds its rows."""
+LARGEST = {CARD: 1 << 18, EPISODES: 1 << 23}
+"""The files of a row, and the most bytes that each may have."""
+NAME = re.compile(r"[a-z0-9][a-z0-9_.,=-]{0,79}")
+"""Names of rows and rounds: what every file system and every address on the web takes as it is."""
+_LONGEST = 300
+"""Characters of a claim."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures:
+    """The tests of one run after a budget, in numbers that follow from the episodes."""
+
+    seed: int  #: The run
+    episodes: int  #: The budget
+    test_episodes: int
+    successes: int
+    mean_return: float  #: Undiscounted
+    mean_length: float  #: Macro-actions
+    faults: int  #: Macro-actions whose physics disagreed with the rules
+
+
+@dataclass(frozen=True, kw_only=True)
+class Price:
+    """The cost of one run until a budget, as its author says it."""
+
+    env_steps: int  #: Real training macro-actions
+    train_cpu_s: float  #: CPU seconds of training
+    agent_sha256: str = ""  #: Digest of the agent's weights at the end of its run; empty where it has none
+
+    def __post_init__(self) -> None:
+        require_types(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Claims:
+    """Statements that no replay shows."""
+
+    agent: str  #: The player, as commands name it
+    author: str = ""  #: Who files the row
+    commit: str = ""  #: Version of the code
+    command: str = ""  #: The command that made the bench
+    machine: str = ""  #: Processor
+    seen_beforehand: str = ""  #: Encoders, datasets, demonstrations and earlier tasks before the first episode
+    frames_beforehand: int | None = None  #: Frames in that; None where nobody knows
+    prices: tuple[Price, ...] = ()  #: One for each of the row's figures
+
+    def __post_init__(self) -> None:
+        require_types(self)
+        for name, value in vars(self).items():
+            if isinstance(value, str) and (len(value) > _LONGEST or unprintable(value) or "\n" in value):
+                raise InvalidValueError(
+                    f"The claim {name!r} is {brief(value)}; give at most {_LONGEST} printable characters in one line."
+                )
+        if self.frames_beforehand is not None and self.frames_beforehand < 0:
+            raise InvalidValueError(f"frames_beforehand is {brief(self.frames_beforehand)}; give at least 0.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A row."""
+
+    name: str  #: That of its folder
+    protocol: Protocol  #: World, seeds, budgets and number of tests of this row's player alone
+    round: str = ""  #: The round whose starts its tests have; empty for starts that everybody knows
+    vouched: tuple[Figures, ...]  #: One for each seed and budget
+    claimed: Claims
+    logs: tuple[EpisodeLog, ...] = field(repr=False)  #: The tests, likewise
+
+    def checkpoint(self, place: int) -> Checkpoint:
+        """The figures and tests of a place, in the form in which runs keep them."""
+        figures = dataclasses.asdict(self.vouched[place])
+        figures.pop("seed")
+        price = self.claimed.prices[place]
+        return Checkpoint(
+            **figures,
+            solved=self.logs[place].solved,
+            env_steps=price.env_steps,
+            train_cpu_s=price.train_cpu_s,
+            eval_cpu_s=0.0,
+            kept=self.kept(place),
+        )
+
+    def kept(self, place: int) -> KeptEpisodes:
+        """The tests of a place."""
+        return self.logs[place].kept()
+
+    @property
+    def world(self) -> str:
+        """The world of its tests in words; rows of equal words stand in one table."""
+        return world_words(self.protocol)
+
+
+def world_words(protocol: Protocol) -> str:
+    """All that decides how hard the tests of a protocol are: task, execution, physics, looks and starts."""
+    words = [protocol.task, protocol.execution, protocol.looks]
+    words += [f"{name}={value}" for name, value in protocol.physics]
+    if protocol.split is not None:
+        words.append(f"starts split by {protocol.split}")
+    return ", ".join(words)
+
+
+def write_row(folder: Path, row: Row) -> Path:
+    """Write a row below ``folder``, under its name. Raises InvalidValueError: there is one of this name."""
+    if not NAME.fullmatch(row.name):
+        raise InvalidValueError(f"A row cannot be called {brief(row.name)}; give up to 80 of a-z, 0-9, and _.,=-")
+    where = folder / row.name
+    if where.exists():
+        raise InvalidValueError(f"{where} exists; remove it, or give another folder to --out.")
+    episodes = json.dumps([_columns(log) for log in row.logs], separators=(",", ":")).encode()
+    card: dict[str, Json] = {
+        "format": FORMAT,
+        "protocol": row.protocol.as_dict(),
+        "round": row.round,
+        "vouched": [dataclasses.asdict(each) for each in row.vouched],
+        "claimed": dataclasses.asdict(row.claimed),
+        "episodes_sha256": hashlib.sha256(episodes).hexdigest(),
+    }
+    make_folder(where)
+    write_bytes(where / EPISODES, episodes)
+    write_json(where / CARD, card)
+    return where
+
+
+def _columns(log: EpisodeLog) -> dict[str, Json]:
+    """Episodes as the file has them: the macro-actions of each in a list of their own, and no lengths."""
+    columns = dict(vars(log))
+    ends = [sum(columns["lengths"][:place]) for place in range(log.episodes + 1)]
+    columns["actions"] = [log.actions[begin:end] for begin, end in itertools.pairwise(ends)]
+    del columns["lengths"]
+    return columns
+
+
+def _log(columns: Mapping[str, Any]) -> EpisodeLog:
+    """The inverse of :func:`_columns`."""
+    actions = columns["actions"]
+    flat = [action for each in actions for action in each]
+    return EpisodeLog(**{**columns, "actions": flat, "lengths": [len(each) for each in actions]})
+
+
+def require_files(folder: Path, largest: Mapping[str, int]) -> None:
+    """Raise ArtefactError, before anything is read, for another name, a link, a file too many or too large a one."""
+    require(bool(NAME.fullmatch(folder.name)), f"a row cannot be called {brief(folder.name)}.")
+    require(folder.is_dir() and not folder.is_symlink(), "it is no folder.")
+    for path in folder.iterdir():
+        most = largest.get(path.name, 0)
+        require(most > 0, f"it also holds {brief(path.name)}; a row holds {' and '.join(largest)} alone.")
+        require(path.is_file() and not path.is_symlink(), f"{path.name} is no plain file.")
+        size = path.stat().st_size
+        require(size <= most, f"{path.name} has {size:,} bytes; at most {most:,} are read.")
+
+
+def read_row(folder: Path) -> Row:
+    """Read a row; nothing is played. Raises ArtefactError: it is damaged, or not what a row may hold."""
+    require_files(folder, LARGEST)
+    card = read_json(folder / CARD, "the card of a row")
+    with reading(folder / CARD, f"a card of the format {FORMAT!r}"):
+        require(card["format"] == FORMAT, f"its format is {brief(card['format'])}, and {FORMAT!r} is read.")
+        require("@" not in str(card["protocol"]["task"]), "its task names a file; write the world out in one line.")
+        protocol = Protocol.from_dict(card["protocol"])
+        claimed: Claims = unpack(Claims, card["claimed"], {})
+        vouched = tuple(Figures(**each) for each in card["vouched"])
+        for each in vouched:
+            require_types(each)
+        round_name = str(card["round"])
+        require(not round_name or bool(NAME.fullmatch(round_name)), f"its round is {brief(round_name)}.")
+    content = (folder / EPISODES).read_bytes()
+    found = hashlib.sha256(content).hexdigest()
+    require(found == card["episodes_sha256"], f"{EPISODES} has the digest {found}, and its card says another.")
+    with reading(folder / EPISODES, "the episodes of a row"):
+        logs = tuple(map(_log, json.loads(content)))
+    return Row(name=folder.name, protocol=protocol, round=round_name, vouched=vouched, claimed=claimed, logs=logs)
+
+
+def require_whole(row: Row, task: TaskSpec) -> None:
+    """Raise ArtefactError where figures, prices and tests are not those of each seed and budget, or are no numbers."""
+    protocol = row.protocol
+    wanted = [(seed, budget) for seed in protocol.seeds for budget in protocol.budgets]
+    found = [(each.seed, each.episodes) for each in row.vouched]
+    require(protocol.agents == (row.claimed.agent,), f"its protocol is of {brief(protocol.agents)}.")
+    require(found == wanted, f"it has tests of (seed, budget) {brief(found)}, and its protocol has {brief(wanted)}.")
+    both = (len(row.logs), len(row.claimed.prices))
+    require(both == (len(found), len(found)), f"it has {both[0]} sets of tests and {both[1]} prices for {len(found)}.")
+    for log in row.logs:
+        tests = protocol.evaluation_episodes
+        require(log.episodes == tests, f"it has {log.episodes} tests, and its protocol {tests}.")
+    for figures, price in zip(row.vouched, row.claimed.prices, strict=True):
+        steps = price.env_steps
+        is_possible = steps == 0 or figures.episodes <= steps <= figures.episodes * task.horizon
+        require(is_possible, f"{steps:,} macro-actions cannot be those of {figures.episodes:,} training episodes.")
+        require(0.0 <= price.train_cpu_s < math.inf, f"its CPU seconds are {brief(price.train_cpu_s)}.")

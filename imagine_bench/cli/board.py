@@ -1,0 +1,145 @@
+"""The commands of the leaderboard: submit, board and daily."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from imagine_bench.cli.benches import Bench, Budget, Learner, Tests, WorldOptions
+from imagine_bench.cli.options import EncoderWord, File, Launch, Word, Words, one_of, require_with
+from imagine_bench.errors import CheckFailedError, InvalidValueError, require_known
+from imagine_bench.judge.verify import cost
+
+_ACTIONS = ("check", "page", "open", "file", "reveal")
+_ROUND_NEEDED = "'board {}' needs {}; give it too."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Submit:
+    """Write rows for the leaderboard: a run's, or a bench's, test episodes, and a card with its claims."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """A run's folder, whose agent is submitted with all its seeds, or a bench's, of which each agent is."""
+    out: Path = Path("rows")
+    """Folder in which a folder for each row is made; never overwritten."""
+    author: str = ""
+    """Your name, as the table shows it."""
+    round: File = None
+    """Folder of a round whose seed is published: the agents that were filed play its tests now."""
+    encoder: EncoderWord = None
+    """With --round: the encoder the runs saw through, where it is not bundled."""
+
+    def __call__(self) -> None:
+        """Write."""
+        from imagine_bench.board.submit import submit  # noqa: PLC0415 - matplotlib loads slowly
+
+        if self.round is None:
+            require_with("--round", self, "encoder")
+        for folder in submit(self.run, self.out, author=self.author, round_folder=self.round, encoder=self.encoder):
+            print(folder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """The leaderboard: check its rows, write its page, and its rounds: open, file, reveal.
+
+    check FOLDER plays every episode of a board, or of one row, again. page FOLDER does so too, and writes a page.
+    open ROUND promises secret starts. file RUN files trained agents for them. reveal ROUND publishes the starts.
+    """
+
+    action: Annotated[str, tyro.conf.Positional, one_of(*_ACTIONS)]
+    """The part of the board's work."""
+    path: Annotated[Path, tyro.conf.Positional]
+    """A board's folder such as docs/board, or that of a row, a round or a run, as the action needs."""
+    out: Path = Path("build/board")
+    """With page: the folder of the page."""
+    closes: Word = None
+    """With open: the day from which nothing more is filed, such as 2026-12-24."""
+    tests: int = 100
+    """With open: test episodes of each run."""
+    secret: Path = Path("secret.json")
+    """With open and reveal: the file that holds seed and salt until they are published."""
+    round: File = None
+    """With file: the round's folder."""
+
+    def __call__(self) -> None:
+        """Do it."""
+        {"check": self._check, "page": self._page, "open": self._open, "file": self._file, "reveal": self._reveal}[
+            require_known("action", self.action, _ACTIONS)
+        ]()
+
+    def _check(self, page: bool = False) -> None:
+        from imagine_bench.board.check import NEVER_SHOWN, check  # noqa: PLC0415 - likewise
+
+        begun_s = time.process_time()
+        found = check(self.path)
+        verdicts = [each.verdict for each in found]
+        print(*found, NEVER_SHOWN, cost(verdicts, time.process_time() - begun_s), sep="\n")
+        if page:
+            from imagine_bench.board.page import write_board  # noqa: PLC0415 - likewise
+
+            print(f"Page: {write_board(found, self.out)}")
+        refused = sum(bool(each.complaint) for each in verdicts)
+        if refused:
+            raise CheckFailedError(f"{refused} of {len(verdicts)} rows are refused; see above.")
+
+    def _page(self) -> None:
+        self._check(page=True)
+
+    def _open(self) -> None:
+        from imagine_bench.board.rounds import open_round  # noqa: PLC0415 - likewise
+
+        if self.closes is None:
+            raise InvalidValueError(_ROUND_NEEDED.format("open", "--closes, a day such as 2026-12-24"))
+        print(open_round(self.path, closes=self.closes, tests=self.tests, secret=self.secret))
+
+    def _file(self) -> None:
+        from imagine_bench.board.submit import file_agents  # noqa: PLC0415 - likewise
+
+        if self.round is None:
+            raise InvalidValueError(_ROUND_NEEDED.format("file", "--round, the folder of a round"))
+        print(*file_agents(self.path, self.round), sep="\n")
+
+    def _reveal(self) -> None:
+        from imagine_bench.board.rounds import reveal  # noqa: PLC0415 - likewise
+
+        print(reveal(self.path, self.secret))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Daily:
+    """Name the world of a day, with its exact facts, and run agents on it: a world that nobody has trained on."""
+
+    date: Word = None
+    """The day, such as 2026-12-24; by default today, in UTC."""
+    secret: str = ""
+    """A word that makes the world unknown before the day; publish the printed hash before, and the word on the day."""
+    agents: Words = None
+    """Agents that are trained and tested on it; without any, the world is only named."""
+    seeds: tuple[int, ...] = (0,)
+    """With --agents: seeds of their runs."""
+    budgets: tuple[int, ...] = (50,)
+    """With --agents: real training episodes at which they are tested."""
+    launch: Launch
+
+    def __call__(self) -> None:
+        """Draw, describe, run."""
+        from imagine_bench.board.daily import world_of_day  # noqa: PLC0415 - likewise
+
+        world = world_of_day(self.date, self.secret)
+        print(world)
+        if self.agents is None:
+            require_with("--agents", self, "seeds", "budgets")
+            return
+        Bench(
+            task=world.task,
+            world=WorldOptions(execution="kinematic"),
+            learner=Learner(agents=self.agents),
+            budget=Budget(seeds=self.seeds, budgets=self.budgets),
+            tests=Tests(),
+            launch=self.launch,
+        )()
