@@ -19,7 +19,7 @@ from imagine_bench.seeding import Purpose, evaluation_split
 
 OPEN = "open starts"
 """Of tests whose starts everybody could know while training."""
-NOT_VOUCHED = ("the player", "the seeds", "the price", "what was seen beforehand")
+NOT_VOUCHED = ("the player", "which seeds and how many tests", "the price", "what was seen beforehand")
 """Claims of every row that no replay shows."""
 NEVER_SHOWN = (
     "A replay shows that these macro-actions, from these starts, in this world, have these outcomes. It can never show "
@@ -49,7 +49,7 @@ class Checked:
             return f"{self.name}: refused: {self.verdict.complaint}"
         claims = ", ".join(self.verdict.unshown)
         played = f"{self.verdict.episodes:,} episodes played again"
-        return f"{self.name}: holds, {self.starts}; {played}; not vouched: {claims}"
+        return f"{self.name}: holds in {self.row.world}; {self.starts}; {played}; not vouched: {claims}"
 
 
 def row_folders(board: Path) -> list[Path]:

@@ -1,0 +1,77 @@
+"""Forged rows of a leaderboard are refused, or the forged claim is marked as not vouched."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from board_forging import BoardForger, honest_board
+from board_kinds import KINDS
+
+from imagine_bench.board.check import Checked, check
+
+VARIANTS = 23
+"""Of each kind, in the slow test: 529 forgeries."""
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return honest_board(tmp_path_factory.mktemp("honest"))
+
+
+def verdict(honest: Path, root: Path, kind: str, variant: int) -> Checked:
+    """The finding about a forged row, in the board that holds it."""
+    rng = np.random.default_rng([list(KINDS).index(kind), variant])
+    forger = BoardForger(honest, root, rng)
+    row = KINDS[kind][0](forger)
+    (found,) = [each for each in check(forger.board) if each.name == row.folder.name]
+    shutil.rmtree(root)
+    return found
+
+
+WORLD = "arrow_puzzle, kinematic, clean"
+
+
+def is_never_silent(found: Checked, claim: str) -> bool:
+    """Refused; or held in the table of another world, or where the forged claim is not vouched."""
+    if found.row is None:
+        return bool(found.verdict.complaint) and "\n" not in str(found)
+    if f"holds in {WORLD}; " not in str(found):
+        return found.row.world != WORLD and found.row.world in str(found)
+    return claim in found.verdict.unshown and f"not vouched: {', '.join(found.verdict.unshown)}" in str(found)
+
+
+def test_honest_rows_hold(honest: Path) -> None:
+    found = check(honest)
+    assert [each.verdict.complaint for each in found] == [""] * 8
+    assert Counter(each.starts for each in found) == {"open starts": 4, "round winter": 4}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_forged_row_is_refused_or_marked(honest: Path, tmp_path: Path, kind: str) -> None:
+    for variant in (0, 1):
+        found = verdict(honest, tmp_path / str(variant), kind, variant)
+        assert is_never_silent(found, KINDS[kind][1]), (kind, str(found))
+
+
+@pytest.mark.slow
+def test_all_forged_rows_are_refused_or_marked(
+    honest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Printed: how many of each kind are refused, how many are held with the claim marked."""
+    lines = []
+    silent = []
+    for kind, (_, claim) in KINDS.items():
+        refused = 0
+        for variant in range(VARIANTS):
+            found = verdict(honest, tmp_path / "forged", kind, variant)
+            refused += found.row is None
+            if not is_never_silent(found, claim):
+                silent.append((kind, variant, str(found)))
+        lines.append(f"{kind:32} refused {refused:2}  marked {VARIANTS - refused:2}  {claim}")
+    with capsys.disabled():
+        print(f"\n{VARIANTS * len(KINDS)} forgeries", *lines, sep="\n")
+    assert not silent
