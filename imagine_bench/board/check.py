@@ -76,7 +76,7 @@ class _Court:
     def __init__(self, scope: ExitStack) -> None:
         self._scope = scope
         self._worlds: dict[str, Replays] = {}
-        self._owners: dict[str, str] = {}
+        self._owners: dict[str, tuple[str, int]] = {}
 
     def checked(self, folder: Path) -> Checked:
         """The verdict on one row."""
@@ -93,16 +93,12 @@ class _Court:
         for place, figures in enumerate(row.vouched):
             purpose: Purpose = evaluation_split(figures.seed) if starts is None else "board"
             tested = row.checkpoint(place)
-            seed = 0 if starts is None else starts
-            where = f"seed {figures.seed}"
+            both = {"env_steps": tested.env_steps, "starts": starts or 0}
             try:
-                episodes += verify_tests(
-                    tested, row.protocol, purpose, self._replays(row), env_steps=tested.env_steps, starts=seed
-                )
+                episodes += verify_tests(tested, row.protocol, purpose, self._replays(row), **both)
             except ArtefactError as error:
-                raise ArtefactError(f"{where}, {error}") from error
-        self._require_own(row)
-        return Verdict(what=row.name, episodes=episodes, unshown=NOT_VOUCHED)
+                raise ArtefactError(f"seed {figures.seed}, {error}") from error
+        return Verdict(what=row.name, episodes=episodes, unshown=(*NOT_VOUCHED, *self._alike(row)))
 
     def _replays(self, row: Row) -> Replays:
         """The environments of a row's world, made once."""
@@ -128,13 +124,19 @@ class _Court:
         require(len(row.protocol.budgets) == 1, "a row of a round has the tests of one budget, the last.")
         return seed
 
-    def _require_own(self, row: Row) -> None:
-        """Raise ArtefactError where two runs, of this board's rows, failed in the same tests in the same ways."""
+    def _alike(self, row: Row) -> tuple[str, ...]:
+        """Runs of other rows that failed in the same tests in the same ways as this row's run of the same seed.
+
+        Learners of one seed that have not yet diverged do so honestly. Raises ArtefactError: two seeds did.
+        """
+        alike = dict[str, None]()
         for place, figures in enumerate(row.vouched):
             kept = row.kept(place)
-            mine = f"{row.name}, seed {figures.seed}"
-            if has_own_failures(kept, row.protocol):
-                mark = part_digest([kept.fingerprints, kept.actions])
-                owner = self._owners.setdefault(mark, mine)
-                shared = f"its tests of seed {figures.seed} are those of {owner}, failures included; two learners "
-                require(owner == mine, f"{shared}do not share them, and the history of files shows the first.")
+            if not has_own_failures(kept, row.protocol):
+                continue
+            name, seed = self._owners.setdefault(part_digest(kept), (row.name, figures.seed))
+            shared = f"its tests of seed {figures.seed} are those of seed {seed} of {name}, failures included"
+            require(seed == figures.seed, f"{shared}, and no two seeds share them.")
+            if name != row.name:
+                alike[f"whether its seed {seed} is another player than that of {name}"] = None
+        return tuple(alike)

@@ -70,16 +70,16 @@ def _cells(each: Checked, row: Row) -> dict[str, str]:
     solved = over_seeds(_success(row, budget), percent, trials=tests, share=True)
     mean_return = decimals(float(np.mean(_at(row, budget, "mean_return"))))
     return {
-        "claimed: player": claimed.agent,
+        "player (claimed)": claimed.agent,
         "solved, %": _linked(row, budget, solved),
         "return": _linked(row, budget, mean_return),
         "tests": f"{len(row.protocol.seeds)} x {tests:,}",
         "starts": each.starts,
-        "claimed: real episodes": f"{budget:,}",
-        "macro-actions": count(float(np.mean(_at(row, budget, "env_steps")))),
-        "frames beforehand": count(frames),
-        "CPU s": seconds(float(np.mean(_at(row, budget, "train_cpu_s")))),
-        "seen beforehand": claimed.seen_beforehand,
+        "real episodes (claimed)": f"{budget:,}",
+        "macro-actions (claimed)": count(float(np.mean(_at(row, budget, "env_steps")))),
+        "frames beforehand (claimed)": count(frames),
+        "CPU s (claimed)": seconds(float(np.mean(_at(row, budget, "train_cpu_s")))),
+        "seen beforehand (claimed)": claimed.seen_beforehand,
     }
 
 
@@ -99,7 +99,7 @@ def _section(world: str, found: Sequence[tuple[Checked, Row]]) -> Section:
     best_first = sorted(found, key=lambda pair: -float(np.mean(_success(pair[1], pair[1].protocol.budgets[-1]))))
     cells = [_cells(each, row) for each, row in best_first]
     if not any(row.claimed.agent.startswith(_PERSON) for _, row in found):
-        cells.append({**dict.fromkeys(cells[0], DASH), "claimed: player": f"{_PERSON}: {_NOBODY}"})
+        cells.append({**dict.fromkeys(cells[0], DASH), "player (claimed)": f"{_PERSON}: {_NOBODY}"})
     protocol = found[0][1].protocol
     facts = registry.task(protocol.task).facts()
     words = [
@@ -114,16 +114,6 @@ def _section(world: str, found: Sequence[tuple[Checked, Row]]) -> Section:
     return Section(world, words, images=[image], tables=[table])
 
 
-def _refused(checked: Sequence[Checked]) -> list[Section]:
-    """The rows that were refused, each with the first claim that does not hold."""
-    rows = [[each.name, each.verdict.complaint] for each in checked if each.row is None]
-    if not rows:
-        return []
-    return [
-        Section("Refused", ["These rows are in no table."], tables=[Table("refused", ["row", "why"], rows, prose=True)])
-    ]
-
-
 def board_page(checked: Sequence[Checked]) -> Page:
     """The page of a board that was checked."""
     worlds: dict[str, list[tuple[Checked, Row]]] = {}
@@ -132,10 +122,9 @@ def board_page(checked: Sequence[Checked]) -> Page:
             worlds.setdefault(each.row.world, []).append((each, each.row))
     sections = [_section(world, found) for world, found in worlds.items()]
     held = sum(each.row is not None for each in checked)
-    answer = f"{held} of {len(checked)} rows hold: every test episode was played again, to equal results."
+    answer = f"{held} of {len(checked)} rows hold: each of their test episodes was played again, to equal results."
     verdicts = [[each.name, str(each)] for each in checked]
     sections += [
-        *_refused(checked),
         Section("What a replay can never show", [NEVER_SHOWN], answers=[answer]),
         Section("Verdicts", tables=[Table("verdicts", ["row", "verdict"], verdicts, prose=True)]),
     ]

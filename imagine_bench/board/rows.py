@@ -135,8 +135,6 @@ def world_words(protocol: Protocol) -> str:
 
 def write_row(folder: Path, row: Row) -> Path:
     """Write a row below ``folder``, under its name. Raises InvalidValueError: there is one of this name."""
-    if not NAME.fullmatch(row.name):
-        raise InvalidValueError(f"A row cannot be called {brief(row.name)}; give up to 80 of a-z, 0-9, and _.,=-")
     where = folder / row.name
     if where.exists():
         raise InvalidValueError(f"{where} exists; remove it, or give another folder to --out.")
@@ -171,13 +169,13 @@ def _log(columns: Mapping[str, Any]) -> EpisodeLog:
     return EpisodeLog(**{**columns, "actions": flat, "lengths": [len(each) for each in actions]})
 
 
-def require_files(folder: Path, largest: Mapping[str, int]) -> None:
+def require_files(folder: Path) -> None:
     """Raise ArtefactError, before anything is read, for another name, a link, a file too many or too large a one."""
     require(bool(NAME.fullmatch(folder.name)), f"a row cannot be called {brief(folder.name)}.")
     require(folder.is_dir() and not folder.is_symlink(), "it is no folder.")
     for path in folder.iterdir():
-        most = largest.get(path.name, 0)
-        require(most > 0, f"it also holds {brief(path.name)}; a row holds {' and '.join(largest)} alone.")
+        most = LARGEST.get(path.name, 0)
+        require(most > 0, f"it also holds {brief(path.name)}; a row holds {' and '.join(LARGEST)} alone.")
         require(path.is_file() and not path.is_symlink(), f"{path.name} is no plain file.")
         size = path.stat().st_size
         require(size <= most, f"{path.name} has {size:,} bytes; at most {most:,} are read.")
@@ -185,7 +183,7 @@ def require_files(folder: Path, largest: Mapping[str, int]) -> None:
 
 def read_row(folder: Path) -> Row:
     """Read a row; nothing is played. Raises ArtefactError: it is damaged, or not what a row may hold."""
-    require_files(folder, LARGEST)
+    require_files(folder)
     card = read_json(folder / CARD, "the card of a row")
     with reading(folder / CARD, f"a card of the format {FORMAT!r}"):
         require(card["format"] == FORMAT, f"its format is {brief(card['format'])}, and {FORMAT!r} is read.")

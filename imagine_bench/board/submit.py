@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_type_hints
 
 from imagine_bench.board import rounds
 from imagine_bench.board.rows import Claims, Figures, Price, Row, write_row
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, require
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report.data import known_agent
@@ -22,68 +23,44 @@ from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, is_archive, read_control
 from imagine_bench.store.results import Checkpoint
 
+T = TypeVar("T")
 
-@dataclasses.dataclass(frozen=True)
+
 class Submitter:
     """An agent of a finished bench, with all of its seeds.
 
     Args:
         bench: The bench's folder.
         agent: The agent.
+
+    Raises:
+        ArtefactError: A run is not finished.
     """
 
-    bench: Path
-    agent: str
-
-    @property
-    def protocol(self) -> Protocol:
-        """The bench's protocol, of this agent alone."""
-        whole = read_control(self.bench)
-        seeds = whole.seeds_of(self.agent)
-        return dataclasses.replace(whole, agents=(self.agent,), seeds=seeds, headlines=(), few_seeds=())
-
-    @property
-    def name(self) -> str:
-        """The name of its rows: that of the agent, and of the bench's protocol."""
-        whole = read_control(self.bench)
-        safe = re.sub("[^a-z0-9_.,=-]", "-", file_name(self.agent).lower())
-        return f"{safe[:60]}-{whole.hash}"
-
-    def run_folders(self) -> dict[int, Path]:
-        """Its runs by seed. Raises ArtefactError: one is not finished."""
-        store = BenchStore(self.bench, self.protocol)
-        found = {seed: store.run_folder(self.agent, seed) for seed in self.protocol.seeds}
-        for folder in found.values():
-            if not run_folder.is_done(folder):
-                raise ArtefactError(f"{folder} is not finished; run its bench again.")
-        return found
+    def __init__(self, bench: Path, agent: str) -> None:
+        whole = read_control(bench)
+        seeds = whole.seeds_of(agent)
+        safe = re.sub("[^a-z0-9_.,=-]", "-", file_name(agent).lower())
+        self.bench = bench
+        self.name = f"{safe[:60]}-{whole.hash}"
+        self.protocol = dataclasses.replace(whole, agents=(agent,), seeds=seeds, headlines=(), few_seeds=())
+        self.agent = agent
+        self.runs = {seed: BenchStore(bench, whole).run_folder(agent, seed) for seed in seeds}
+        for folder in self.runs.values():
+            require(run_folder.is_done(folder), f"{folder} is not finished; run its bench again.")
 
     def digests(self) -> dict[int, str]:
         """The digest of the trained agent of each seed; empty where it has no weights."""
-        return {seed: _weights(folder) for seed, folder in self.run_folders().items()}
-
-    def claims(self, prices: tuple[Price, ...], author: str) -> Claims:
-        """The statements beside its tests."""
-        environment = bench_facts(self.bench)["environment"]
-        beforehand, frames = _seen_beforehand(self.protocol, self.agent)
-        return Claims(
-            agent=self.agent,
-            author=author,
-            commit=str(environment.get("commit")),
-            command=str(environment["command"]),
-            machine=str(environment.get("machine", {}).get("cpu")),
-            seen_beforehand=beforehand,
-            frames_beforehand=frames,
-            prices=prices,
-        )
+        found = {}
+        for seed, folder in self.runs.items():
+            snapshot = run_folder.load_newest(folder / run_folder.CHECKPOINTS)
+            found[seed] = part_digest(snapshot.agent) if snapshot is not None and snapshot.agent.arrays else ""
+        return found
 
     def row(self, author: str) -> Row:
         """The row of the tests that the bench kept. Raises ArtefactError: it kept none."""
-        parts = []
-        for seed, folder in self.run_folders().items():
-            weights = _weights(folder)
-            parts += [(seed, each, weights) for each in run_folder.load_run(folder).checkpoints]
-        return self._row(self.protocol, parts, author)
+        found = {seed: run_folder.load_run(folder).checkpoints for seed, folder in self.runs.items()}
+        return self._row(self.protocol, found, author)
 
     def row_of_round(self, folder: Path, author: str, encoder: str | None) -> Row:
         """The row of new tests at the published starts of a round, played by the agents that were filed.
@@ -95,72 +72,82 @@ class Submitter:
         if known_agent(self.agent).external_training_loop:
             raise InvalidValueError(f"{self.agent} cannot be taken up again; submit the tests of its bench.")
         name = f"{self.name}-{folder.name}"
-        seed, filed = rounds.revealed_seed(folder, name)
-        if filed != {str(number): weights for number, weights in self.digests().items()}:
-            raise ArtefactError(f"The agents of {self.bench} are not those that were filed as {name}.")
+        start_seed, filed = rounds.revealed_seed(folder, name)
+        digests = {str(seed): weights for seed, weights in self.digests().items()}
+        require(digests == filed, f"The agents of {self.bench} are not those that were filed as {name}.")
         tests = rounds.read_round(folder).tests
         protocol = dataclasses.replace(self.protocol, budgets=self.protocol.budgets[-1:], evaluation_episodes=tests)
-        parts = []
-        for number, run in self.run_folders().items():
+        found = {}
+        for seed, run in self.runs.items():
+            log = _played(run, protocol, start_seed, encoder)
             last = run_folder.load_run(run).checkpoints[-1]
-            log = _played(run, protocol, seed, encoder)
-            again = dataclasses.replace(last, kept=log.kept(), **log.figures())
-            parts.append((number, again, _weights(run)))
-        row = self._row(protocol, parts, author)
-        return dataclasses.replace(row, name=name, round=folder.name)
+            found[seed] = (dataclasses.replace(last, kept=log.kept(), **log.figures()),)
+        return dataclasses.replace(self._row(protocol, found, author), name=name, round=folder.name)
 
-    def _row(self, protocol: Protocol, parts: list[tuple[int, Checkpoint, str]], author: str) -> Row:
+    def _row(self, protocol: Protocol, found: Mapping[int, Sequence[Checkpoint]], author: str) -> Row:
+        digests = self.digests()
         figures = []
         prices = []
         logs = []
-        for seed, each, weights in parts:
-            if each.kept is None:
-                raise ArtefactError(f"{self.bench} kept no test episodes; run the bench anew.")
-            names = {field.name for field in dataclasses.fields(Figures)} - {"seed"}
-            numbers: dict[str, Any] = {name: getattr(each, name) for name in names}
-            figures.append(Figures(seed=seed, **numbers))
-            prices.append(Price(env_steps=each.env_steps, train_cpu_s=each.train_cpu_s, agent_sha256=weights))
-            logs.append(EpisodeLog.of(each.kept))
-        claimed = self.claims(tuple(prices), author)
+        for seed, checkpoints in found.items():
+            for each in checkpoints:
+                if each.kept is None:
+                    raise ArtefactError(f"{self.bench} kept no test episodes; run the bench anew.")
+                values = {**vars(each), "seed": seed, "agent_sha256": digests[seed]}
+                figures.append(_some(Figures, values))
+                prices.append(_some(Price, values))
+                logs.append(EpisodeLog.of(each.kept))
+        environment = bench_facts(self.bench)["environment"]
+        claimed = Claims(
+            agent=self.agent,
+            author=author,
+            commit=str(environment.get("commit")),
+            command=str(environment["command"]),
+            machine=str(environment.get("machine", {}).get("cpu")),
+            seen_beforehand=_seen_beforehand(protocol, self.agent),
+            frames_beforehand=_frames_beforehand(protocol, self.agent),
+            prices=tuple(prices),
+        )
         return Row(name=self.name, protocol=protocol, vouched=tuple(figures), claimed=claimed, logs=tuple(logs))
 
 
-def _weights(run: Path) -> str:
-    """The digest of a run's trained agent; empty where it has no weights."""
-    snapshot = run_folder.load_newest(run / run_folder.CHECKPOINTS)
-    return part_digest(snapshot.agent) if snapshot is not None and snapshot.agent.arrays else ""
+def _some(kind: type[T], values: Mapping[str, Any]) -> T:
+    """A dataclass from those of the values that are its fields."""
+    return kind(**{name: values[name] for name in get_type_hints(kind)})
 
 
-def _seen_beforehand(protocol: Protocol, agent: str) -> tuple[str, int | None]:
-    """The data that an agent had before its first episode, in words, and the number of frames in it."""
+def _seen_beforehand(protocol: Protocol, agent: str) -> str:
+    """The data that an agent had before its first episode, in words."""
     entry = known_agent(agent)
-    words = []
-    frames: int | None = 0 if entry.make else None
-    if entry.make and entry.needs_encoder:
-        used = protocol.encoder_of(entry.encoder_kind)
-        card = encoders.card(used)
-        words.append(f"encoder {used}")
-        frames = None if card is None or card.get("offer") else int(card["recipe"]["frames"])
-    if entry.learns:
-        words += [f"dataset {protocol.dataset}"] if protocol.dataset else []
-        words += [f"{protocol.demonstrations} demonstrations"] if protocol.demonstrations else []
-        words += [f"{protocol.after_episodes} episodes of {task}" for task in protocol.after]
-        words += [f"{protocol.queries} queries an episode"] if protocol.queries else []
-        words += ["a teacher's feedback"] if protocol.feedback else []
-    if entry.privileged:
-        words.append("privileged: true macrostates")
-    return "; ".join(words) or "nothing", frames
+    words = {
+        f"encoder {protocol.encoder_of(entry.encoder_kind)}": entry.make and entry.needs_encoder,
+        f"dataset {protocol.dataset}": entry.learns and protocol.dataset,
+        f"{protocol.demonstrations} demonstrations": entry.learns and protocol.demonstrations,
+        f"{protocol.episodes_before} episodes of {', '.join(protocol.after)}": entry.learns and protocol.after,
+        f"{protocol.queries} oracle queries an episode": entry.learns and protocol.queries,
+        "a teacher's feedback": entry.learns and protocol.feedback,
+        "privileged: true macrostates": entry.privileged,
+    }
+    return "; ".join(word for word, is_seen in words.items() if is_seen) or "nothing"
+
+
+def _frames_beforehand(protocol: Protocol, agent: str) -> int | None:
+    """The frames that an agent's encoder was trained on; None where nobody knows."""
+    entry = known_agent(agent)
+    if not entry.make or not entry.needs_encoder:
+        return 0 if entry.make else None
+    card = encoders.card(protocol.encoder_of(entry.encoder_kind))
+    return None if card is None or card.get("offer") else int(card["recipe"]["frames"])
 
 
 def _played(run: Path, protocol: Protocol, seed: int, encoder: str | None) -> EvaluationCounts:
     """Greedy tests of a run's trained agent, at the starts of a round's seed."""
     agent = load_trained(run, encoder=encoder).agent
+    privileged = known_agent(protocol.agents[0]).privileged
     log = EvaluationCounts()
     with environments(protocol) as (_, env):
         for test in range(protocol.evaluation_episodes):
-            start = episode_seed("board", seed, test)
-            privileged = known_agent(protocol.agents[0]).privileged
-            log.add(play_test_episode(env, agent, seed=start, privileged=privileged))
+            log.add(play_test_episode(env, agent, seed=episode_seed("board", seed, test), privileged=privileged))
     return log
 
 
@@ -191,7 +178,7 @@ def submit(path: Path, out: Path, *, author: str, round_folder: Path | None, enc
 
 def file_agents(path: Path, round_folder: Path) -> list[Path]:
     """File the agents of a run or a bench in a round. Errors as of :func:`.rounds.file_agents`."""
-    filed = []
-    for each in submitters(path):
-        filed.append(rounds.file_agents(round_folder, f"{each.name}-{round_folder.name}", each.digests()))
-    return filed
+    return [
+        rounds.file_agents(round_folder, f"{each.name}-{round_folder.name}", each.digests())
+        for each in submitters(path)
+    ]

@@ -1,4 +1,4 @@
-"""An honest leaderboard, and the tools of somebody who forges its rows: every copy of a number is brought up to date."""
+"""An honest leaderboard, and the tools of a forger of its rows, who brings every copy of a number up to date."""
 
 from __future__ import annotations
 
