@@ -17,8 +17,6 @@ from imagine_bench.running.retraining import Verdict, judged, part_digest
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, evaluation_split
 
-OPEN = "open starts"
-"""Of tests whose starts everybody could know while training."""
 NOT_VOUCHED = ("the player", "which seeds and how many tests", "the price", "what was seen beforehand")
 """Claims of every row that no replay shows."""
 NEVER_SHOWN = (
@@ -35,21 +33,15 @@ NEVER_SHOWN = (
 class Checked:
     """A row and what was found."""
 
-    name: str
     verdict: Verdict
     row: Row | None = None  #: None where it was refused
 
-    @property
-    def starts(self) -> str:
-        """The kind of starts of its tests."""
-        return f"round {self.row.round}" if self.row is not None and self.row.round else OPEN
-
     def __str__(self) -> str:
         if self.row is None:
-            return f"{self.name}: refused: {self.verdict.complaint}"
+            return f"{self.verdict.what}: refused: {self.verdict.complaint}"
         claims = ", ".join(self.verdict.unshown)
         played = f"{self.verdict.episodes:,} episodes played again"
-        return f"{self.name}: holds in {self.row.world}; {self.starts}; {played}; not vouched: {claims}"
+        return f"{self.row.name}: holds in {self.row.world}; {self.row.starts}; {played}; not vouched: {claims}"
 
 
 def row_folders(board: Path) -> list[Path]:
@@ -82,7 +74,7 @@ class _Court:
         """The verdict on one row."""
         read: list[Row] = []
         verdict = judged(folder.name, functools.partial(self._check, folder, read))
-        return Checked(name=folder.name, verdict=verdict, row=None if verdict.complaint else read[0])
+        return Checked(verdict=verdict, row=None if verdict.complaint else read[0])
 
     def _check(self, folder: Path, read: list[Row]) -> Verdict:
         row = read_row(folder)

@@ -61,7 +61,7 @@ def _success(row: Row, budget: int) -> list[float]:
     return shares
 
 
-def _cells(each: Checked, row: Row) -> dict[str, str]:
+def _cells(row: Row) -> dict[str, str]:
     """The cells of a row at its last budget."""
     budget = row.protocol.budgets[-1]
     tests = row.protocol.evaluation_episodes
@@ -74,7 +74,7 @@ def _cells(each: Checked, row: Row) -> dict[str, str]:
         "solved, %": _linked(row, budget, solved),
         "return": _linked(row, budget, mean_return),
         "tests": f"{len(row.protocol.seeds)} x {tests:,}",
-        "starts": each.starts,
+        "starts": row.starts,
         "real episodes (claimed)": f"{budget:,}",
         "macro-actions (claimed)": count(float(np.mean(_at(row, budget, "env_steps")))),
         "frames beforehand (claimed)": count(frames),
@@ -94,64 +94,61 @@ def _curves(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _section(world: str, found: Sequence[tuple[Checked, Row]]) -> Section:
+def _section(world: str, rows: Sequence[Row]) -> Section:
     """The table and the curve of a world."""
-    best_first = sorted(found, key=lambda pair: -float(np.mean(_success(pair[1], pair[1].protocol.budgets[-1]))))
-    cells = [_cells(each, row) for each, row in best_first]
-    if not any(row.claimed.agent.startswith(_PERSON) for _, row in found):
+    best_first = sorted(rows, key=lambda row: -float(np.mean(_success(row, row.protocol.budgets[-1]))))
+    cells = [_cells(row) for row in best_first]
+    if not any(row.claimed.agent.startswith(_PERSON) for row in rows):
         cells.append({**dict.fromkeys(cells[0], DASH), "player (claimed)": f"{_PERSON}: {_NOBODY}"})
-    protocol = found[0][1].protocol
-    facts = registry.task(protocol.task).facts()
+    facts = registry.task(rows[0].protocol.task).facts()
     words = [
         f"Chance solves {percent(facts.chance_level)} % of its episodes and an optimal player "
         f"{percent(facts.optimum)} %. Solved, return and tests follow from the episodes that a number leads to. The "
-        "player, and all columns from real episodes on, are claims."
+        "columns that are marked so are claimed."
     ]
     name = file_name(world)
-    rows = [row for _, row in found]
     image = figures.image(f"curve-{name}", lambda: _curves(rows), "Solved tests by claimed real training episodes.")
-    table = Table.of(f"table-{name}", cells, "Solved: mean over seeds [95 % interval].", "nobody, or not said")
+    table = Table.of(
+        f"table-{name}", cells, "Solved: mean over seeds (lowest to highest) or [95 % interval].", "nobody, or not said"
+    )
     return Section(world, words, images=[image], tables=[table])
 
 
 def board_page(checked: Sequence[Checked]) -> Page:
     """The page of a board that was checked."""
-    worlds: dict[str, list[tuple[Checked, Row]]] = {}
+    worlds: dict[str, list[Row]] = {}
     for each in checked:
         if each.row is not None:
-            worlds.setdefault(each.row.world, []).append((each, each.row))
-    sections = [_section(world, found) for world, found in worlds.items()]
+            worlds.setdefault(each.row.world, []).append(each.row)
+    sections = [_section(world, rows) for world, rows in worlds.items()]
     held = sum(each.row is not None for each in checked)
     answer = f"{held} of {len(checked)} rows hold: each of their test episodes was played again, to equal results."
-    verdicts = [[each.name, str(each)] for each in checked]
+    verdicts = Table("verdicts", ["row", "verdict"], [[each.verdict.what, str(each)] for each in checked], prose=True)
     sections += [
         Section("What a replay can never show", [NEVER_SHOWN], answers=[answer]),
-        Section("Verdicts", tables=[Table("verdicts", ["row", "verdict"], verdicts, prose=True)]),
+        Section("Verdicts", tables=[verdicts]),
     ]
     environment = describe_environment()
     return Page(
         title="Leaderboard",
         subtitle="Rows that anyone can check: imagine-bench board check",
         question="Which agents solve unseen tests, and at what price?",
-        table=Table("held", ["row", "starts"], [[each.name, each.starts] for each in checked]),
+        table=verdicts,
         sections=sections,
-        files={"board.csv": table_text([cells for world, found in worlds.items() for cells in _csv(world, found)])},
+        files={"board.csv": table_text([cells for rows in worlds.values() for row in rows for cells in _csv(row)])},
         facts={"command": environment["command"], "commit": environment["commit"]},
     )
 
 
-def _csv(world: str, found: Sequence[tuple[Checked, Row]]) -> list[Mapping[str, float | str]]:
+def _csv(row: Row) -> list[Mapping[str, float | str]]:
     """A row a seed and budget, with everything that the page shows."""
-    rows: list[Mapping[str, float | str]] = []
-    for each, row in found:
-        for tested, price in zip(row.vouched, row.claimed.prices, strict=True):
-            named = {"world": world, "row": row.name, "player": row.claimed.agent, "starts": each.starts}
-            rows.append({**named, **vars(tested), **vars(price)})
-    return rows
+    named = {"world": row.world, "row": row.name, "player": row.claimed.agent, "starts": row.starts}
+    both = zip(row.vouched, row.claimed.prices, strict=True)
+    return [{**named, **vars(tested), **vars(price)} for tested, price in both]
 
 
-def row_page(row: Row) -> Page:
-    """The page of a row: its claims, and each test episode."""
+def row_page(row: Row, verdict: str) -> Page:
+    """The page of a row: its verdict, each test episode, and its claims."""
     sections = []
     for place, tested in enumerate(row.vouched):
         kept = row.kept(place)
@@ -172,13 +169,12 @@ def row_page(row: Row) -> Page:
         sections.append(Section(title, tables=[table]))
     names = registry.task(row.protocol.task).action_names
     legend = "; ".join(f"{number}: {name}" for number, name in enumerate(names))
-    words = [f"Macro-actions: {legend}.", f"imagine-bench board check plays all of them again: {row.name}."]
     return Page(
         title=row.name,
         subtitle=row.world,
-        question=NEVER_SHOWN,
+        question="Do these macro-actions, from these starts, have these outcomes?",
         table=Table("claims", ["claim", "value"], []),
-        sections=[Section("The tests", words), *sections],
+        sections=[Section("The tests", [f"Macro-actions: {legend}."], answers=[verdict]), *sections],
         files={},
         facts={"claimed": asdict(row.claimed), "protocol": row.protocol.as_dict(), "round": row.round or "none"},
     )
@@ -186,7 +182,9 @@ def row_page(row: Row) -> Page:
 
 def write_board(checked: Sequence[Checked], out: Path) -> Path:
     """Write the page of a board and the pages of its rows; returns the path of the first."""
-    pages = {"": board_page(checked)} | {each.row.name: row_page(each.row) for each in checked if each.row is not None}
+    pages = {"": board_page(checked)} | {
+        each.row.name: row_page(each.row, str(each)) for each in checked if each.row is not None
+    }
     make_folder(out)
     for name, page in pages.items():
         files = texts(page)

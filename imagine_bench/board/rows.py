@@ -30,6 +30,8 @@ from imagine_bench.values import Json, unpack
 FORMAT = "imagine_bench board row 1"
 CARD = "card.json"
 EPISODES = "episodes.json"
+OPEN = "open starts"
+"""Of tests whose starts everybody could know while training."""
 ROWS = "rows"
 """The folder of a board that holds its rows."""
 LARGEST = {CARD: 1 << 18, EPISODES: 1 << 23}
@@ -117,6 +119,11 @@ class Row:
     def kept(self, place: int) -> KeptEpisodes:
         """The tests of a place."""
         return self.logs[place].kept()
+
+    @property
+    def starts(self) -> str:
+        """The kind of starts of its tests."""
+        return f"round {self.round}" if self.round else OPEN
 
     @property
     def world(self) -> str:

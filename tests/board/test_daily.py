@@ -1,0 +1,57 @@
+"""A world a day: its date decides it, its facts are exact, and no two days share one."""
+
+from __future__ import annotations
+
+import hashlib
+from datetime import date, timedelta
+from pathlib import Path
+
+import pytest
+from board_forging import on
+
+from imagine_bench import registry
+from imagine_bench.board.daily import world_of_day
+from imagine_bench.cli import exit_code
+from imagine_bench.errors import InvalidValueError
+
+DAYS = [str(date(2026, 12, 1) + timedelta(days=number)) for number in range(8)]
+
+
+def test_a_day_has_one_world_and_other_days_have_others() -> None:
+    worlds = [world_of_day(day) for day in DAYS]
+    assert [world.task for world in worlds] == [world_of_day(day).task for day in DAYS]
+    assert len({world.task for world in worlds}) == len(DAYS)
+    for world in worlds:
+        assert world.facts.chance_level <= 0.15 and world.facts.optimum >= 0.9
+        assert registry.task(world.task).facts() == world.facts
+
+
+def test_a_secret_hides_the_world_and_the_digest_binds_it() -> None:
+    open_world = world_of_day(DAYS[0])
+    hidden = world_of_day(DAYS[0], "a word")
+    assert hidden.task != open_world.task
+    assert hidden.digest == hashlib.sha256(f"{DAYS[0]}:{hidden.task}:a word".encode()).hexdigest()
+
+
+def test_today_is_the_day_by_default() -> None:
+    with on(date(2026, 12, 3)):
+        assert world_of_day() == world_of_day("2026-12-03")
+
+
+def test_no_day_is_said() -> None:
+    with pytest.raises(InvalidValueError, match=r"'2026-13-01' is no day; write it as 2026-12-24\."):
+        world_of_day("2026-13-01")
+
+
+def test_an_agent_is_run_on_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = f"daily --date 2026-12-01 --agents oracle random --budgets 2 --launcher this_process --out {tmp_path}"
+    assert exit_code(words.split()) == 0
+    said = capsys.readouterr().out
+    world = world_of_day("2026-12-01")
+    assert world.task in said and world.digest in said and "oracle" in said
+    assert list(tmp_path.glob("*/*/oracle/seed_0/DONE"))
+
+
+def test_options_of_runs_go_with_agents(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("daily --date 2026-12-01 --budgets 3".split()) == 2
+    assert "--budgets goes with --agents; leave it out" in capsys.readouterr().err

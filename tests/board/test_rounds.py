@@ -1,0 +1,112 @@
+"""Rounds: a promised seed, agents that are filed before it is published, and tests that they play at its starts."""
+
+from __future__ import annotations
+
+import json
+from datetime import date
+from pathlib import Path
+
+import bench_fakes  # noqa: F401 - registers its agents
+import pytest
+from board_forging import AFTER, BEFORE, CLOSES, ROUND, TESTS, on, with_round
+from small_runs import Inline, small
+
+from imagine_bench.board import rounds
+from imagine_bench.board.check import check
+from imagine_bench.board.rows import read_row
+from imagine_bench.board.submit import file_agents, submit
+from imagine_bench.cli import exit_code
+from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.running.bench import bench
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    wanted = small(agents=("table",), seeds=(0, 1))
+    return bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline()).folder
+
+
+def opened(tmp_path: Path, closes: str = CLOSES) -> tuple[Path, Path]:
+    folder = tmp_path / "board" / "rounds" / ROUND
+    secret = tmp_path / "secret.json"
+    with on(BEFORE):
+        rounds.open_round(folder, closes=closes, tests=TESTS, secret=secret)
+    return folder, secret
+
+
+def test_a_round_from_promise_to_rows(finished: Path, tmp_path: Path) -> None:
+    board = tmp_path / "board"
+    with_round(finished, board, tmp_path / "secret.json")
+    (found,) = check(board)
+    assert found.verdict.complaint == "" and "; round winter; " in str(found)
+    assert found.verdict.episodes == 2 * TESTS
+    seed = json.loads((tmp_path / "secret.json").read_text())["seed"]
+    assert json.loads((board / "rounds/winter/revealed.json").read_text())["seed"] == seed
+    (other,) = submit(finished, tmp_path / "open", author="", round_folder=None, encoder=None)
+    own = read_row(next((board / "rows").iterdir()))
+    fingerprints = own.kept(0).fingerprints.tolist()
+    assert not set(fingerprints) & set(read_row(other).kept(1).fingerprints.tolist())
+
+
+def test_the_promise_does_not_show_the_seed(tmp_path: Path) -> None:
+    folder, secret = opened(tmp_path)
+    promised = json.loads((folder / "round.json").read_text())
+    values = json.loads(secret.read_text())
+    assert promised == {"closes": CLOSES, "tests": TESTS, "sha256": rounds.promise(**values)}
+    assert len(values["salt"]) == 64  # 256 bits, so that nobody can try all seeds
+    assert rounds.promise(values["seed"], "0" * 64) != promised["sha256"]
+
+
+def test_days_decide_what_may_be_done(finished: Path, tmp_path: Path) -> None:
+    folder, secret = opened(tmp_path)
+    with on(BEFORE), pytest.raises(InvalidValueError, match="closes on 2026-12-24; reveal its seed from then on"):
+        rounds.reveal(folder, secret)
+    with on(AFTER), pytest.raises(InvalidValueError, match="closed on 2026-12-24; file in a later one"):
+        file_agents(finished, folder)
+    with on(date(2026, 12, 23)):
+        file_agents(finished, folder)
+        with pytest.raises(InvalidValueError, match="these agents are filed already"):
+            file_agents(finished, folder)
+    with pytest.raises(ArtefactError, match=r"There is no .*revealed\.json"):
+        submit(finished, tmp_path / "rows", author="", round_folder=folder, encoder=None)
+
+
+def test_agents_that_were_not_filed_play_no_round(finished: Path, tmp_path: Path) -> None:
+    folder, secret = opened(tmp_path)
+    with on(AFTER):
+        rounds.reveal(folder, secret)
+    with pytest.raises(ArtefactError, match="was not filed in the round winter before its seed was published"):
+        submit(finished, tmp_path / "rows", author="", round_folder=folder, encoder=None)
+
+
+def test_a_secret_of_another_round_is_refused(tmp_path: Path) -> None:
+    folder, secret = opened(tmp_path)
+    values = json.loads(secret.read_text())
+    secret.write_text(json.dumps({**values, "seed": (values["seed"] + 1) % 2**24}))
+    with on(AFTER), pytest.raises(ArtefactError, match=r"secret.json is not of winter"):
+        rounds.reveal(folder, secret)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("open HERE/winter", "'board open' needs --closes, a day such as 2026-12-24; give it too."),
+        ("open HERE/winter --closes 2020-01-01", "2020-01-01 is not after today"),
+        ("open HERE/winter --closes soon", "'soon' is no day; write it as 2026-12-24."),
+        ("open HERE/Winter --closes 2999-01-01", "A round cannot be called 'Winter'"),
+        ("open HERE --closes 2999-01-01", "exists; give another."),
+        ("open HERE/winter --closes 2999-01-01 --tests 0", "tests is 0; give 1 to 10,000,000."),
+        ("file HERE", "'board file' needs --round, the folder of a round; give it too."),
+        ("look HERE", "No action 'look'. Known: check, page, open, file, reveal."),
+        ("reveal HERE", "There is no HERE/round.json, a round of a board."),
+        ("check HERE", "HERE holds no rows"),
+    ],
+)
+def test_wrong_words_get_one_line(
+    words: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert exit_code(["board", *words.replace("HERE", str(tmp_path)).split()]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("imagine-bench: ") and sentence.replace("HERE", str(tmp_path)) in line
+    assert not (tmp_path / "winter").exists()
