@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.board.rounds import day_of, today
+from imagine_bench.board import rounds
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.rules import RuleFacts
 from imagine_bench.values import Setting
@@ -52,7 +52,7 @@ def world_of_day(day: str | None = None, secret: str = "") -> DailyWorld:
     Raises:
         InvalidValueError: It is no day.
     """
-    date = today() if day is None else day_of(day)
+    date = rounds.today() if day is None else rounds.day_of(day)
     root = hashlib.sha256(f"world of the day:{date}:{secret}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(root))
     for _ in range(_ATTEMPTS):

@@ -43,6 +43,7 @@ def test_no_day_is_said() -> None:
         world_of_day("2026-13-01")
 
 
+@pytest.mark.slow
 def test_an_agent_is_run_on_the_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = f"daily --date 2026-12-01 --agents oracle random --budgets 2 --launcher this_process --out {tmp_path}"
     assert exit_code(words.split()) == 0
