@@ -42,7 +42,7 @@ endif
 options = $(strip $(foreach name,$(filter-out ARGS,$(takes_$@)),$(if $($(name)),--$(shell echo $(name) | tr A-Z_ a-z-) $($(name)))) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help ready setup bench peers plan judge verify why study suite view report data encoder film doctor test test-slow storm mutants lint docs build lock speed clean
+.PHONY: help ready setup bench peers plan judge verify why study suite view report data encoder film doctor test test-slow storm mutants lint docs browser build lock speed clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -115,6 +115,9 @@ lint: ready  ## Check style, format and types
 	@cd build/installed && for guest in controls factored motion peers programs regression; do ln -s ../../agents/guests/$$guest/src/imagine_bench_$$guest .; done
 	@cd build/installed/imagine_bench && ln -s ../../../imagine_bench/* ../../../agents ../../../tasks ../../../assets .
 	@MYPYPATH=build/installed $(BIN)/mypy --cache-dir .mypy_cache/guests -p imagine_bench_controls -p imagine_bench_factored -p imagine_bench_motion -p imagine_bench_peers -p imagine_bench_programs -p imagine_bench_regression
+
+browser: ready  ## Build the page that plays the puzzle in a browser, into build/browser/play; needs npm once
+	@OMP_NUM_THREADS=1 $(BIN)/python docs/browser/make.py
 
 docs: ready  ## Build the site into build/docs; warnings are errors
 	@$(BIN)/python -m sphinx -W -q -b html docs build/docs $(ARGS)

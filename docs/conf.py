@@ -12,7 +12,7 @@ release = metadata.version("imagine-bench")
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 4
-exclude_patterns = ["results/**/report"]
+exclude_patterns = ["results/**/report", "browser/**"]
 nb_execution_mode = "off"  # the notebook shows the outputs that its last run left in it
 nb_output_stderr = "remove"
 
@@ -30,5 +30,7 @@ html_title = "imagine_bench"
 html_static_path = ["_static"]
 html_search_scorer = str(Path(__file__).parent / "_static" / "scorer.js")
 html_css_files = ["site.css"]
+_played = Path(__file__).parents[1] / "build" / "browser"
+html_extra_path = [str(_played)] if _played.is_dir() else []  # the page in the browser, where make browser has built it
 html_copy_source = False
 html_show_sourcelink = False

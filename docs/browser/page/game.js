@@ -1,0 +1,102 @@
+// One episode after another in a world: who may do what, what it led to, and how it ended. No page, no drawing.
+
+/**
+ * Numbers in [0, 1) that repeat with their seed (Mulberry32).
+ * @param {number} seed
+ * @returns {() => number}
+ */
+export function generator(seed) {
+  let state = seed >>> 0;
+  return () => {
+    state = (state + 0x6d2b79f5) >>> 0;
+    let word = Math.imul(state ^ (state >>> 15), state | 1);
+    word ^= word + Math.imul(word ^ (word >>> 7), word | 61);
+    return ((word ^ (word >>> 14)) >>> 0) / 4294967296;
+  };
+}
+
+/** The game in a world. */
+export class Game {
+  /**
+   * @param {import('./rules.js').Rules} rules
+   * @param {() => number} random
+   */
+  constructor(rules, random) {
+    this.rules = rules;
+    this.random = random;
+    this.played = 0;
+    this.solved = 0;
+    this.reset();
+  }
+
+  /**
+   * Begin an episode.
+   * @param {import('./rules.js').State} [start] drawn if it is left out
+   */
+  reset(start) {
+    const { starts } = this.rules;
+    this.state = start ?? this.rules.stateOf(starts[Math.floor(this.random() * starts.length)]);
+    this.left = this.rules.horizon;
+    this.steps = 0;
+    this.over = false;
+    this.shown = this.#showsGesture();
+  }
+
+  /** @returns {boolean} whether the hand is in view */
+  #showsGesture() {
+    const { gesture } = this.rules.world;
+    if (gesture === 'always') return true;
+    if (gesture === 'first') return this.steps === 0;
+    return this.random() < gesture;
+  }
+
+  /**
+   * What a macro-action shall lead to.
+   * @param {number} action
+   * @returns {{outcome: import('./rules.js').Outcome, slips: boolean}}
+   */
+  intend(action) {
+    const outcome = this.rules.draw(this.state, action, this.random());
+    return { outcome, slips: this.slips(action, outcome.macrostate) };
+  }
+
+  /**
+   * Whether the fingers open too early on the way to a macrostate.
+   * @param {number} action
+   * @param {import('./rules.js').State} reached
+   * @returns {boolean}
+   */
+  slips(action, reached) {
+    const { cube } = this.rules.turns[action][0];
+    return reached[cube] === this.state[cube];
+  }
+
+  /**
+   * Take in the macrostate that was read from the scene.
+   * @param {import('./rules.js').State} reached
+   * @returns {import('./rules.js').Outcome}
+   */
+  reach(reached) {
+    const outcome = this.rules.judge(reached);
+    this.state = reached;
+    this.steps += 1;
+    this.left -= 1;
+    this.over = outcome.terminated || this.left === 0;
+    this.shown = this.#showsGesture();
+    if (this.over) {
+      this.played += 1;
+      this.solved += Number(outcome.success);
+    }
+    return outcome;
+  }
+
+  /**
+   * The macro-action that turns a cube, alone or with the next one.
+   * @param {number} cube
+   * @param {boolean} clockwise
+   * @returns {number}
+   */
+  actionOf(cube, clockwise) {
+    return this.rules.turns.findIndex(([own]) => own.cube === cube && own.clockwise === clockwise);
+  }
+}

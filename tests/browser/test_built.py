@@ -1,0 +1,127 @@
+"""The built page: its size, its physics in Node.js, and a visit by a headless Chromium. ``make browser`` builds it."""
+
+from __future__ import annotations
+
+import functools
+import gzip
+import http.server
+import json
+import os
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imagine_bench import registry
+
+ROOT = Path(__file__).parents[2]
+PLAY = ROOT / "build" / "browser" / "play"
+NODE = shutil.which("node")
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+MODULES = os.environ.get("PLAYWRIGHT_CORE", "")
+"""A folder whose node_modules hold playwright-core 1.65."""
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        not (PLAY / "mujoco").is_dir(), reason="the page is not built: run make browser, which needs npm"
+    ),
+    pytest.mark.skipif(NODE is None, reason="Node.js is not installed: the page's modules cannot run"),
+]
+needs_browser = pytest.mark.skipif(
+    not (CHROMIUM and MODULES), reason="PLAYWRIGHT_CORE names no folder with playwright-core, or Chromium is missing"
+)
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture(scope="module", name="address")
+def _address() -> Iterator[str]:
+    handler = functools.partial(_Quiet, directory=str(PLAY))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def node(script: str, *arguments: object) -> Any:
+    """The JSON that a script beside this file prints."""
+    command = [str(NODE), str(Path(__file__).with_name(script)), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_the_page_is_small() -> None:
+    files = [path.read_bytes() for path in PLAY.rglob("*") if path.is_file()]
+    assert sum(map(len, files)) <= 16_000_000
+    assert sum(len(gzip.compress(content, 6)) for content in files) <= 8_000_000
+
+
+def test_macro_actions_in_the_pages_physics_end_as_ruled() -> None:
+    found = node("physics.mjs", PLAY, 50, 400)
+    assert [each["cubes"] for each in found] == [1, 2, 3, 4, 5, 6]
+    for each in found:
+        assert each["as_ruled"] == each["played"] == 50, each
+        assert each["faults"] == 0, each
+        assert 0 < each["slipped"] < 50, each
+
+
+def _keys(line: str, start: list[int]) -> str:
+    """Keys of a shortest solution."""
+    rules = registry.task(line).rules
+    state = tuple(start)
+    pressed = []
+    while not rules.is_terminal(state):
+        action = rules.optimal_action(state)
+        (turn,) = rules.world.turns[action]
+        pressed.append(f"{turn.cube + 1} {'ArrowRight' if turn.clockwise else 'ArrowLeft'}")
+        state = rules.turned(state, action)
+    return " ".join(pressed)
+
+
+@needs_browser
+@pytest.mark.parametrize("width", [1200, 400])
+def test_a_visitor_solves_the_puzzle_by_keys(address: str, width: int, tmp_path: Path) -> None:
+    looked = node("visit.mjs", MODULES, CHROMIUM, address, width, tmp_path / "a.png", "world=arrow_puzzle&seed=400", "")
+    keys = _keys("arrow_puzzle", [int(each) for each in looked["state"].split(",")])
+    seen = node("visit.mjs", MODULES, CHROMIUM, address, width, tmp_path / "b.png", "world=arrow_puzzle&seed=400", keys)
+    assert seen["end"] == "solved"
+    assert "Solved in" in seen["happened"]
+    assert (seen["errors"], seen["outside"], seen["overflow"]) == ([], [], 0)
+    assert seen["dream"] == "yes"
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    "query",
+    [
+        "world=%3Cimg%20src%3Dx%20onerror%3Dalert(1)%3E",
+        "world=arrows:cubes=99999999999",
+        "world=__proto__",
+        "row=../../index",
+        "row=https://example.org/row",
+        "row=%3Cscript%3E",
+        "row=nobody",
+        "world=" + "a" * 5000,
+    ],
+)
+def test_hostile_addresses_are_refused(address: str, query: str, tmp_path: Path) -> None:
+    seen = node("visit.mjs", MODULES, CHROMIUM, address, 400, tmp_path / "a.png", query, "")
+    assert seen["ready"] == "refused"
+    assert 10 < len(seen["loading"]) < 300
+    assert (seen["errors"], seen["outside"], seen["overflow"]) == ([], [], 0)
+
+
+def test_rows_are_those_of_the_board() -> None:
+    names = {path.name for path in (ROOT / "docs" / "board" / "rows").glob("*")}
+    index = json.loads((PLAY / "data" / "rows" / "index.json").read_text())
+    assert {name for name, _ in index} <= names
+    assert np.all([(PLAY / "data" / "rows" / f"{name}.json").is_file() for name, _ in index])

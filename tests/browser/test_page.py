@@ -1,0 +1,253 @@
+"""The page of the puzzle in a browser: its rules, facts, rows and model are those of the package.
+
+They run in Node.js, which needs no network. The arm and the page itself are in test_built.py.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from imagine_bench import registry
+
+ROOT = Path(__file__).parents[2]
+BROWSER = ROOT / "docs" / "browser"
+PAGE = BROWSER / "page"
+ANSWERS = Path(__file__).with_name("answers.mjs")
+NODE = shutil.which("node")
+needs_node = pytest.mark.skipif(NODE is None, reason="Node.js is not installed: the page's modules cannot run")
+WORLDS = (
+    "arrow_puzzle",
+    "arrow_puzzle_hard",
+    "arrow_puzzle_toward",
+    "arrow_puzzle_clockwise",
+    "arrow_puzzle_easy",
+    "arrow_puzzle:slip=0.1",
+    "arrows:cubes=4,slip=0.1",
+    "arrows:cubes=4,forbid=none,goal=0123",
+    "arrows:cubes=2,goal=all,forbid=none",
+    "arrows:coupling=neighbour,forbid=none",
+    "arrows:shuffle=7",
+    "arrows:shuffle=4294967295,cubes=4",
+    "arrows:fickle=0.3,slip=0.25",
+    "arrows:goal_change=1.0,cubes=2,forbid=none",
+    "arrows:forbid=neighbours+agent,cubes=5",
+    "arrows:horizon=3,gesture=first",
+)
+ASKED = 2_000
+
+
+def ask(questions: list[dict[str, object]]) -> list[Any]:
+    """Answers of the page's modules."""
+    assert NODE is not None
+    command = [NODE, str(ANSWERS), str(PAGE)]
+    done = subprocess.run(command, input=json.dumps(questions), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    answers: list[Any] = json.loads(done.stdout)
+    return answers
+
+
+@pytest.fixture(name="made")
+def _made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scripts that make the page can be imported."""
+    monkeypatch.syspath_prepend(str(BROWSER))
+
+
+@pytest.mark.usefixtures("made")
+def test_constants_are_those_of_the_rules() -> None:
+    import constants
+
+    assert constants.OUT.read_text() == constants.text(), "run python docs/browser/constants.py"
+
+
+@needs_node
+def test_2000_macro_actions_have_pythons_outcomes() -> None:
+    rng = np.random.default_rng(400)
+    questions: list[dict[str, object]] = []
+    expected = []
+    for line in WORLDS:
+        rules = registry.task(line).rules
+        states = rules.states
+        asked = [
+            (states[int(rng.integers(len(states)))], int(rng.integers(rules.n_actions)))
+            for _ in range(ASKED // len(WORLDS))
+        ]
+        questions.append({"kind": "outcomes", "line": line, "asked": asked})
+        expected.append([rules.outcomes(state, action) for state, action in asked])
+    assert sum(map(len, expected)) == ASKED
+    for line, found, wanted in zip(WORLDS, ask(questions), expected, strict=True):
+        for mine, truth in zip(found, wanted, strict=True):
+            assert [tuple(each["macrostate"]) for each in mine] == [each.macrostate for each in truth], line
+            assert [each["probability"] for each in mine] == pytest.approx([each.probability for each in truth])
+            for name in ("reward", "terminated", "success"):
+                assert [each[name] for each in mine] == [getattr(each, name) for each in truth], line
+
+
+@needs_node
+def test_worlds_have_pythons_turns_starts_and_horizon() -> None:
+    for line, found in zip(WORLDS, ask([{"kind": "world", "line": line} for line in WORLDS]), strict=True):
+        spec = registry.task(line)
+        assert found["horizon"] == spec.horizon, line
+        assert [tuple(state) for state in found["starts"]] == list(spec.rules.start_states), line
+        turns = [[(turn["cube"], turn["clockwise"]) for turn in each] for each in found["turns"]]
+        assert turns == [[(turn.cube, turn.clockwise) for turn in each] for each in spec.rules.world.turns], line
+
+
+@needs_node
+def test_chance_and_optimum_are_pythons() -> None:
+    lines = [line for line in WORLDS if "cubes=5" not in line]
+    for line, found in zip(lines, ask([{"kind": "facts", "line": line} for line in lines]), strict=True):
+        facts = registry.task(line).facts()
+        assert found["chance"] == pytest.approx(facts.chance_level, abs=1e-12), line
+        assert found["optimum"] == pytest.approx(facts.optimum, abs=1e-12), line
+
+
+@needs_node
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("", "There is no world"),
+        ("<img src=x onerror=alert(1)>", "There is no world"),
+        ("__proto__", "There is no world"),
+        ("constructor:cubes=3", "There is no world"),
+        ("pick_place", "There is no world"),
+        ("arrows:", "sets no parameter"),
+        ("arrows:toString=1", "sets no parameter"),
+        ("arrows:cubes=7", 'cubes is "7"; give an integer from 1 to 6.'),
+        ("arrows:cubes=1e0", "give an integer from 1 to 6."),
+        ("arrows:cubes=3.0", "give an integer from 1 to 6."),
+        ("arrows:slip=NaN", "give a number from 0 to 0.99."),
+        ("arrows:slip=Infinity", "give a number from 0 to 0.99."),
+        ("arrows:slip=1", "give a number from 0 to 0.99."),
+        ("arrows:horizon=1001", "give an integer from 1 to 1000."),
+        ("arrows:cubes=2,cubes=3", "cubes is given twice"),
+        ("arrows:goal_change=0.1,fickle=0.1", "goal_change is given twice"),
+        ("arrows:goal=__proto__", "goal is"),
+        ("arrows:goal=01", "or 3 digits from 0 to 3."),
+        ("arrows:goal=000", "cannot be reached from anywhere"),
+        ("arrows:forbid=none+equal", "contradicts itself"),
+        ("arrows:cubes=4,forbid=equal", "give at most 3 cubes."),
+        ("arrows:cubes=1,coupling=neighbour", "give at least 2 cubes."),
+        ("arrows:gesture=never", "gesture is"),
+        ("arrows:" + "slip=0.1," * 5_000, "has 45007 characters; give at most 200."),
+    ],
+)
+def test_hostile_worlds_are_refused_in_one_sentence(line: str, sentence: str) -> None:
+    (found,) = ask([{"kind": "world", "line": line}])
+    assert sentence in found["refused"]
+    assert len(found["refused"]) < 400
+    with pytest.raises(Exception, match=r".+"):  # Python refuses each of them, too, but for a line's length
+        registry.task(line if line != "pick_place" else "pick_places")
+
+
+ROW: dict[str, Any] = {
+    "title": "somebody",
+    "world": "arrow_puzzle",
+    "episodes": [{"start": [3, 1, 2, 0], "actions": [0], "states": [[0, 1, 2, 0]], "success": True}],
+}
+
+
+@needs_node
+def test_rows_are_checked_against_the_rules() -> None:
+    assert ask([{"kind": "row", "row": ROW}]) == [1]
+    for change, sentence in (
+        ({"start": [3, 1, 2, 3]}, "starts in no macrostate"),
+        ({"start": [3, 1, 2]}, "starts in no macrostate"),
+        ({"start": "3120"}, "starts in no macrostate"),
+        ({"actions": [6]}, "has macro-actions of no such world"),
+        ({"actions": [0] * 11}, "has macro-actions of no such world"),
+        ({"actions": [0, 0], "states": [[0, 1, 2, 0], [1, 1, 2, 0]]}, "goes on after its end"),
+        ({"states": []}, "does not say where each macro-action led"),
+        ({"states": [[0, 1, 2, "<b>"]]}, "reaches no macrostate"),
+        ({"states": [[2, 1, 3, 0]], "success": False}, "the rules do not allow"),
+        ({"success": False}, "claims another end"),
+    ):
+        forged = {**ROW, "episodes": [{**ROW["episodes"][0], **change}]}
+        (found,) = ask([{"kind": "row", "row": forged}])
+        assert sentence in found["refused"], change
+    for forged in (None, [], {}, {**ROW, "world": "nowhere"}, {**ROW, "title": 3}, {**ROW, "episodes": []}):
+        (found,) = ask([{"kind": "row", "row": forged}])
+        assert "refused" in found, forged
+
+
+@needs_node
+def test_names_of_rows_lead_out_of_no_folder() -> None:
+    names = (
+        "../secret",
+        "..",
+        "a/../b",
+        "/etc/passwd",
+        "https://example.org/x",
+        "a\nb",
+        "A",
+        "",
+        "x" * 81,
+        "a%2f",
+        "a..b",
+    )
+    for name, found in zip(names, ask([{"kind": "rowFile", "name": name} for name in names]), strict=True):
+        assert "There is no row" in found["refused"], name
+    assert ask([{"kind": "rowFile", "name": "dqn-f2c3"}]) == ["data/rows/dqn-f2c3.json"]
+
+
+@pytest.mark.usefixtures("made")
+def test_rows_of_the_board_are_converted(tmp_path: Path) -> None:
+    import rows
+
+    log = {"starts": [[3, 1, 2, 0], [3, 1, 2, 0]], "actions": [[0], [1, 1]], "solved": "10"}
+    card = {
+        "protocol": {"task": "arrow_puzzle"},
+        "claimed": {"agent": "dqn"},
+        "vouched": [
+            {"seed": 400, "episodes": 100, "successes": 0, "test_episodes": 2},
+            {"seed": 400, "episodes": 250, "successes": 1, "test_episodes": 2},
+            {"seed": 401, "episodes": 500, "successes": 2, "test_episodes": 2},
+        ],
+    }
+    (tmp_path / "board" / "dqn-1").mkdir(parents=True)
+    (tmp_path / "board" / "dqn-1" / "card.json").write_text(json.dumps(card))
+    (tmp_path / "board" / "dqn-1" / "episodes.json").write_text(json.dumps([{}, log, {}]))
+    rows.write(tmp_path / "out", tmp_path / "board")
+    found = json.loads((tmp_path / "out" / "dqn-1.json").read_text())
+    assert found["title"] == "dqn, 250 episodes: 1 of 2 solved"
+    assert found["episodes"][0] == {"start": [3, 1, 2, 0], "actions": [0], "states": [[0, 1, 2, 0]], "success": True}
+    assert found["episodes"][1]["states"] == [[2, 1, 2, 0], [1, 1, 2, 0]]
+    assert json.loads((tmp_path / "out" / "index.json").read_text()) == [["dqn-1", found["title"]]]
+    card["protocol"] = {"task": "arrow_puzzle:slip=0.1"}
+    assert rows.converted(card, [{}, log, {}]) is None
+
+
+@needs_node
+@pytest.mark.slow  # torch, an encoder and MuJoCo's renderer load
+@pytest.mark.usefixtures("made")
+def test_the_model_gives_torchs_numbers(tmp_path: Path) -> None:
+    import world_model
+
+    model = world_model.rounded(world_model.untrained(400))
+    (tmp_path / "model.bin").write_bytes(world_model.packed(model))
+    assert (tmp_path / "model.bin").stat().st_size <= 3_000_000
+    frames = world_model.frames()
+    rng = np.random.default_rng(400)
+    asked = [(int(rng.integers(len(frames))), int(rng.integers(6))) for _ in range(24)]
+    opaque = np.full((64, 64, 1), 255, dtype=np.uint8)
+    questions = [
+        {
+            "kind": "model", "path": str(tmp_path / "model.bin"), "action": action,
+            "rgba": np.concatenate([frames[row], opaque], axis=-1).ravel().tolist(),
+        }
+        for row, action in asked
+    ]  # fmt: skip
+    for found, (row, action) in zip(ask(questions), asked, strict=True):
+        wanted = world_model.expected(model, frames[row], action)
+        for name in ("latents", "next", "disagreement", "reward", "ends"):
+            np.testing.assert_allclose(found[name], wanted[name], atol=1e-3, rtol=0, err_msg=name)
+        image = np.asarray(wanted["image"]).ravel()
+        np.testing.assert_allclose(found["image"], image, atol=1e-3, rtol=0)
+    assert sys.float_info.epsilon < float(np.ptp([each["reward"] for each in ask(questions[:2])])), "all answers equal"
