@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from imagine_bench import registry
+from imagine_bench.errors import ImagineBenchError
 
 ROOT = Path(__file__).parents[2]
 BROWSER = ROOT / "docs" / "browser"
@@ -109,42 +110,44 @@ def test_chance_and_optimum_are_pythons() -> None:
         assert found["optimum"] == pytest.approx(facts.optimum, abs=1e-12), line
 
 
-@needs_node
-@pytest.mark.parametrize(
-    ("line", "sentence"),
-    [
-        ("", "There is no world"),
-        ("<img src=x onerror=alert(1)>", "There is no world"),
-        ("__proto__", "There is no world"),
-        ("constructor:cubes=3", "There is no world"),
-        ("pick_place", "There is no world"),
-        ("arrows:", "sets no parameter"),
-        ("arrows:toString=1", "sets no parameter"),
-        ("arrows:cubes=7", 'cubes is "7"; give an integer from 1 to 6.'),
-        ("arrows:cubes=1e0", "give an integer from 1 to 6."),
-        ("arrows:cubes=3.0", "give an integer from 1 to 6."),
-        ("arrows:slip=NaN", "give a number from 0 to 0.99."),
-        ("arrows:slip=Infinity", "give a number from 0 to 0.99."),
-        ("arrows:slip=1", "give a number from 0 to 0.99."),
-        ("arrows:horizon=1001", "give an integer from 1 to 1000."),
-        ("arrows:cubes=2,cubes=3", "cubes is given twice"),
-        ("arrows:goal_change=0.1,fickle=0.1", "goal_change is given twice"),
-        ("arrows:goal=__proto__", "goal is"),
-        ("arrows:goal=01", "or 3 digits from 0 to 3."),
-        ("arrows:goal=000", "cannot be reached from anywhere"),
-        ("arrows:forbid=none+equal", "contradicts itself"),
-        ("arrows:cubes=4,forbid=equal", "give at most 3 cubes."),
-        ("arrows:cubes=1,coupling=neighbour", "give at least 2 cubes."),
-        ("arrows:gesture=never", "gesture is"),
-        ("arrows:" + "slip=0.1," * 5_000, "has 45007 characters; give at most 200."),
-    ],
+HOSTILE = (
+    ("", "There is no world"),
+    ("<img src=x onerror=alert(1)>", "There is no world"),
+    ("__proto__", "There is no world"),
+    ("constructor:cubes=3", "There is no world"),
+    ("pick_place", "There is no world"),
+    ("arrows:", "sets no parameter"),
+    ("arrows:toString=1", "sets no parameter"),
+    ("arrows:cubes=7", 'cubes is "7"; give an integer from 1 to 6.'),
+    ("arrows:cubes=1e0", "give an integer from 1 to 6."),
+    ("arrows:cubes=3.0", "give an integer from 1 to 6."),
+    ("arrows:slip=NaN", "give a number from 0 to 0.99."),
+    ("arrows:slip=Infinity", "give a number from 0 to 0.99."),
+    ("arrows:slip=1", "give a number from 0 to 0.99."),
+    ("arrows:horizon=1001", "give an integer from 1 to 1000."),
+    ("arrows:cubes=2,cubes=3", "cubes is given twice"),
+    ("arrows:goal_change=0.1,fickle=0.1", "goal_change is given twice"),
+    ("arrows:goal=__proto__", "goal is"),
+    ("arrows:goal=01", "or 3 digits from 0 to 3."),
+    ("arrows:goal=000", "cannot be reached from anywhere"),
+    ("arrows:forbid=none+equal", "contradicts itself"),
+    ("arrows:cubes=4,forbid=equal", "give at most 3 cubes."),
+    ("arrows:cubes=1,coupling=neighbour", "give at least 2 cubes."),
+    ("arrows:gesture=never", "gesture is"),
+    ("arrows:" + "slip=0.1," * 5_000, "has 45007 characters; give at most 200."),
 )
-def test_hostile_worlds_are_refused_in_one_sentence(line: str, sentence: str) -> None:
-    (found,) = ask([{"kind": "world", "line": line}])
-    assert sentence in found["refused"]
-    assert len(found["refused"]) < 400
-    with pytest.raises(Exception, match=r".+"):  # Python refuses each of them, too, but for a line's length
-        registry.task(line if line != "pick_place" else "pick_places")
+"""Lines of worlds that are none, and a part of the sentence that refuses each."""
+
+
+@needs_node
+def test_hostile_worlds_are_refused_in_one_sentence() -> None:
+    found = ask([{"kind": "world", "line": line} for line, _ in HOSTILE])
+    for (line, sentence), answer in zip(HOSTILE, found, strict=True):
+        assert sentence in answer["refused"], line
+        assert len(answer["refused"]) < 400
+        if line != "pick_place":  # a world, but none that the page has
+            with pytest.raises(ImagineBenchError):
+                registry.task(line)
 
 
 ROW: dict[str, Any] = {
@@ -157,6 +160,8 @@ ROW: dict[str, Any] = {
 @needs_node
 def test_rows_are_checked_against_the_rules() -> None:
     assert ask([{"kind": "row", "row": ROW}]) == [1]
+    asked: list[dict[str, object]] = []
+    sentences = []
     for change, sentence in (
         ({"start": [3, 1, 2, 3]}, "starts in no macrostate"),
         ({"start": [3, 1, 2]}, "starts in no macrostate"),
@@ -170,11 +175,13 @@ def test_rows_are_checked_against_the_rules() -> None:
         ({"success": False}, "claims another end"),
     ):
         forged = {**ROW, "episodes": [{**ROW["episodes"][0], **change}]}
-        (found,) = ask([{"kind": "row", "row": forged}])
-        assert sentence in found["refused"], change
+        asked.append({"kind": "row", "row": forged})
+        sentences.append(sentence)
     for forged in (None, [], {}, {**ROW, "world": "nowhere"}, {**ROW, "title": 3}, {**ROW, "episodes": []}):
-        (found,) = ask([{"kind": "row", "row": forged}])
-        assert "refused" in found, forged
+        asked.append({"kind": "row", "row": forged})
+        sentences.append("")
+    for question, sentence, found in zip(asked, sentences, ask(asked), strict=True):
+        assert sentence in found["refused"], question
 
 
 @needs_node

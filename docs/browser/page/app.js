@@ -330,6 +330,7 @@ class Page {
   /** @param {number} first the episode that is shown, from 1 */
   #offerEpisodes(first) {
     find('watching').hidden = false;
+    find('player').textContent = 'The agent, here';
     find('episode').replaceChildren(...this.row.episodes.map((episode, index) => {
       const option = document.createElement('option');
       option.value = String(index);

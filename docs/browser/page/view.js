@@ -163,7 +163,7 @@ export class View {
 
   /** The place that the camera looks from. */
   get eye() {
-    const narrow = Math.max(1, 1.25 / this.aspect);
+    const narrow = Math.max(1, 0.9 / this.aspect);
     const away = 1.24 * this.distance * narrow;
     return [
       MIDDLE[0] + away * Math.sin(this.turn) * Math.cos(this.height),
