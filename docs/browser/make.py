@@ -43,7 +43,7 @@ def fetch(folder: Path) -> None:
             "The page needs MuJoCo's WebAssembly build from npm, and npm is not installed; install Node.js."
         )
     with tempfile.TemporaryDirectory() as scratch:
-        done = subprocess.run([npm, "pack", "--silent", PACKAGE], cwd=scratch, check=False)
+        done = subprocess.run([npm, "pack", "--silent", PACKAGE], cwd=scratch, check=False, stdout=subprocess.DEVNULL)
         archives = list(Path(scratch).glob("*.tgz"))
         if done.returncode or len(archives) != 1:
             raise SystemExit(f"npm could not fetch {PACKAGE}; see its message above, and run make browser again.")
@@ -74,7 +74,9 @@ def main() -> None:
     size = sum(path.stat().st_size for path in OUT.rglob("*") if path.is_file())
     if size > LARGEST:
         raise SystemExit(f"The page has {size:,} bytes; give at most {LARGEST:,}.")
-    sys.stdout.write(f"{OUT.relative_to(ROOT)}: {size / 1e6:.1f} MB. Serve it: python -m http.server -d {OUT.parent}\n")
+    sys.stdout.write(
+        f"{OUT.relative_to(ROOT)}: {size / 1e6:.1f} MB. Serve it: python -m http.server -d {OUT.parent.relative_to(ROOT)}\n"
+    )
 
 
 if __name__ == "__main__":
