@@ -74,9 +74,8 @@ def main() -> None:
     size = sum(path.stat().st_size for path in OUT.rglob("*") if path.is_file())
     if size > LARGEST:
         raise SystemExit(f"The page has {size:,} bytes; give at most {LARGEST:,}.")
-    sys.stdout.write(
-        f"{OUT.relative_to(ROOT)}: {size / 1e6:.1f} MB. Serve it: python -m http.server -d {OUT.parent.relative_to(ROOT)}\n"
-    )
+    served = OUT.parent.relative_to(ROOT)
+    sys.stdout.write(f"{served}/{OUT.name}: {size / 1e6:.1f} MB. Serve it: python -m http.server -d {served}\n")
 
 
 if __name__ == "__main__":

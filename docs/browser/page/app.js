@@ -319,6 +319,7 @@ class Page {
 
   async #offerRows() {
     const names = await fetched('data/rows/index.json').then((answer) => answer.json(), () => []);
+    find('agents').hidden = names.length === 0;
     find('rows').replaceChildren(...names.map(([name, title]) => {
       const link = document.createElement('a');
       link.href = `?row=${encodeURIComponent(name)}`;
