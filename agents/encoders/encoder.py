@@ -121,6 +121,12 @@ class Encoder:
         _, height, width = image_shape(self.card.preprocessing)
         return view(self.network.decode(latents, height, width).cpu().numpy(), self.card.preprocessing)
 
+    @torch.no_grad()
+    def round_trip(self, latents: Tensor) -> Tensor:
+        """Latents (N, Z), decoded to images and encoded again. Shape (N, Z)."""
+        _, height, width = image_shape(self.card.preprocessing)
+        return self.network.posterior(self.network.decode(latents.to(self.device), height, width))[0]
+
     def read_macrostate(self, latents: Tensor) -> Ints:
         """The evaluation-only probe's reading of ``latents`` (N, Z); agents must not use it. Shape (N, M)."""
         return self.probe.read(latents.to(self.device))

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from imagine_bench.arrays import Bools, Floats, Ints, State
 from imagine_bench.rules import Dynamics, Rules, every_outcome
 
-_TIE = 1e-9
+TIE = 1e-9
+"""Values that differ by no more are equal: rounding alone may part them."""
 NEVER = -1e6
 """Reward of a macro-action that was never tried, for an agent that has nothing but its experience."""
 
@@ -92,7 +93,7 @@ def values_of_planning(truth: Model, model: Model, horizon: int, allowed: Bools 
     ``allowed`` is as in :func:`action_values`.
     """
     planned = action_values(model, horizon, allowed)
-    plan = (planned >= planned.max(axis=2, keepdims=True) - _TIE).argmax(axis=2)
+    plan = (planned >= planned.max(axis=2, keepdims=True) - TIE).argmax(axis=2)
     every = np.arange(len(truth.reward))
     values = np.zeros(len(every) + 1)
     for actions in plan:

@@ -113,22 +113,19 @@ def require_imagined(imagined: object, *, name: str, rows: int, depth: int, samp
     return imagined
 
 
-def require_graph(learned: object, *, name: str, rows: int, n_actions: int | None = None) -> LearnedGraph:
-    """The graph of a model, checked; ``n_actions`` None leaves that number open.
+def require_graph(learned: LearnedGraph, *, name: str, rows: int, n_actions: int) -> LearnedGraph:
+    """The graph of a model, checked.
 
     Raises:
-        InvalidValueError: A wrong type or shape.
+        InvalidValueError: Arrays of a wrong type or shape.
     """
     said = f"World model {name}: factor_graph()"
-    if not isinstance(learned, LearnedGraph):
-        raise InvalidValueError(f"{said} gave {type(learned).__name__}; give a LearnedGraph or None.")
     values = np.asarray(learned.values)
     edges = np.asarray(learned.edges)
     if values.dtype.kind not in "iu" or edges.dtype.kind != "b":
         raise InvalidValueError(f"{said} gave values of {values.dtype} and edges of {edges.dtype}; give int and bool.")
     factors = values.shape[-1] if values.ndim else 0
-    actions = edges.shape[:1] if n_actions is None else (n_actions,)
-    wanted = ((rows, factors), (*actions, factors, factors))
+    wanted = ((rows, factors), (n_actions, factors, factors))
     if (values.shape, edges.shape) != wanted or not values.size:
         given = f"values of shape {values.shape} and edges of {edges.shape}"
         raise InvalidValueError(f"{said} gave {given}; give (N, P) of {rows} frames and (A, P, P), P at least 1.")

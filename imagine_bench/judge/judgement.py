@@ -29,8 +29,10 @@ from imagine_bench.judge.predictions import Predictions, ask_together, call, eva
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.reading import READER_FILE, ImageReader, RenderedFrameIndex, making, reader_in
 from imagine_bench.judge.scores import (
+    acceptance_scores,
     after_the_end_scores,
     by_depth,
+    light_scores,
     one_step_scores,
     policy_scores,
     ranking_scores,
@@ -62,7 +64,7 @@ from imagine_bench.values import Json
 
 SIZES = (100, 300, 1_000, 3_000, 10_000)
 SAMPLES = 8
-_FORMAT = 4  # 3 asked every model in the order of the macrostates
+_FORMAT = 5  # 4 asked no pairs that differ in the light alone
 _AFTER = 6  # transitions after the end whose images are kept
 Costs = dict[str, str | float]
 
@@ -159,11 +161,12 @@ class AskedWorld:
     index: RenderedFrameIndex
     reader: ImageReader
     reader_digest: str  # of the reader's file
-    asked: dict[str, EvalSet]  # "one_step", "rollouts", "ranked" and, where there is such, "after" the end
+    asked: dict[str, EvalSet]  # "one_step", "rollouts", "ranked" and, where there are such, "after", "light"
     counterfactuals: tuple[EvalSet, ...]
     streams: dict[str, Streams] | None  # None where not all of the world is asked about
     policies: PolicyWorld | None  # likewise
     whole: WorldQuestions | None  # likewise
+    light: WorldQuestions | None  # None where frames do not vary in the light
 
     @functools.cached_property
     def digest(self) -> str:
@@ -300,6 +303,8 @@ def _judged(
     scores = one_step_scores(world.spec, asked["one_step"], answers["one_step"], seen)
     one_step = (asked["one_step"], answers["one_step"])
     ranks, film = policy_scores(world.policies, *one_step, world.spec.rules, table, seeds.child("exploit"))
+    policy = judgement.policy if judged.visited is None else ""
+    accepts = acceptance_scores(world.policies, policy, *one_step, seeds.child("conformal"))
     futures = [answers["rollouts"].distribution(0, step) for step in range(questions.DEPTH)]
     cpu_s = sum(each.cpu_s for each in answers.values())
     found = {
@@ -310,9 +315,11 @@ def _judged(
         **ranking_scores(world.spec, asked["ranked"], answers["ranked"]),
         **after_the_end_scores(asked.get("after"), answers.get("after"), answers["one_step"]),
         **change_detection_delay(world.streams, answers["one_step"]),
-        "worlds": whole_world_scores(cell.model, judged.model, asked["one_step"], answers["one_step"], world.whole),
+        "worlds": whole_world_scores(cell.model, judged.model, *one_step, world.whole)
+        | light_scores(asked.get("light"), answers.get("light"), world.light),
         "counterfactual": counterfactual_error(world.counterfactuals, again),
         **ranks,
+        **accepts,
         "film": None if film is None else film.told(world.spec),
         "futures": {
             "real": [_named(world.spec, shares(outcomes)) for outcomes in asked["rollouts"].truth[0]],
@@ -382,6 +389,7 @@ def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
     spec = registry.task(judgement.task)
     index = RenderedFrameIndex(spec, judgement.appearance)
     asked = {name: make(spec, index.render) for name, make in questions.SETS.items()}
+    asked["light"] = questions.light_alone(spec, functools.partial(index.render, appearance=questions.LIGHT))
     there = {name: each for name, each in asked.items() if each is not None}
     again = questions.counterfactuals(spec, index.render)
     reader = reader_in(spec, judgement.appearance, folder)
@@ -391,7 +399,8 @@ def prepare(judgement: Judgement, folder: Path) -> AskedWorld:
     policies = policy_world(spec, single.macrostates)
     streams = streams_of(spec, single)
     whole = None if streams is None else questions.about_whole_world(spec, single)
-    return AskedWorld(spec, index, reader, digest, there, again, streams, policies, whole)
+    light = questions.about_light(spec, there["light"]) if "light" in there else None
+    return AskedWorld(spec, index, reader, digest, there, again, streams, policies, whole, light)
 
 
 def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], rng: np.random.Generator) -> Arrays:

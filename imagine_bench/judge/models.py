@@ -27,7 +27,6 @@ from imagine_bench.interfaces.model import (
     LearnedGraph,
     Untaught,
     WorldModel,
-    require_graph,
     until_the_end,
 )
 from imagine_bench.judge.predictions import call, imagined_by
@@ -99,9 +98,9 @@ class ServedModel:
         return {name: np.ascontiguousarray(array) for name, array in offered.items() if array is not None}
 
     def factor_graph(self, frames: Frame) -> Arrays:
-        """The fields of the model's :class:`LearnedGraph`, by name; none where it offers none."""
+        """The fields of the model's :class:`LearnedGraph`, by name, unchecked; none where it offers none."""
         learned = graph_of(self.model, self.name, frames)
-        return {} if learned is None else {"values": learned.values, "edges": learned.edges}
+        return {} if learned is None else {name: np.asarray(array) for name, array in vars(learned).items()}
 
     def parameters(self) -> Arrays:
         """Their number."""
@@ -133,11 +132,18 @@ class IsolatedModel:
 
 
 def graph_of(model: WorldModel, name: str, frames: Frame) -> LearnedGraph | None:
-    """The factor graph of a model; None where it offers none. Raises InvalidValueError: it fails, or gives no graph."""
+    """The factor graph of a model, whose arrays are not checked; None where it offers none.
+
+    Raises:
+        InvalidValueError: It fails, or gives something else.
+    """
     if not isinstance(model, GraphLearner):
         return None
-    learned = call(name, "factor_graph", model.factor_graph, frames)
-    return None if learned is None else require_graph(learned, name=name, rows=len(frames))
+    learned: object = call(name, "factor_graph", model.factor_graph, frames)
+    if learned is not None and not isinstance(learned, LearnedGraph):
+        given = type(learned).__name__
+        raise InvalidValueError(f"World model {name}: factor_graph() gave {given}; give a LearnedGraph or None.")
+    return learned
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,8 +13,9 @@ from typing import TypeVar
 import numpy as np
 
 from imagine_bench.arrays import Frame, Ints, State
+from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Rules, TaskSpec
-from imagine_bench.judge.worlds.making import WorldQuestions, whole_world
+from imagine_bench.judge.worlds.making import PAIRS, WorldQuestions, light_pairs, whole_world
 from imagine_bench.rules import Outcomes, advance, outcomes_by_depth, states_of, states_of_play
 from imagine_bench.seeding import SeedTree
 
@@ -27,6 +28,8 @@ ROLLOUTS = 64
 RANKED = 5  # sequences that are ranked from each start
 RANKED_DEPTH = 5  # macro-actions of each of them
 COUNTERFACTUALS = 48  # macrostates in which every macro-action is imagined with the same draws
+LIGHT = "light=1.0"
+"""The appearance of pairs of frames that differ in the light alone."""
 
 Render = Callable[[Sequence[State], np.random.Generator], Frame]
 """Draws a frame (64, 64, 3) of each of N macrostates."""
@@ -121,6 +124,26 @@ def about_whole_world(spec: TaskSpec, single: EvalSet) -> WorldQuestions:
     of_one = single.frames.reshape(-1, FRAMES, *single.frames.shape[1:])
     looks = bool((of_one[:, 0] != of_one[:, -1]).any())
     return whole_world(spec, single.macrostates, FRAMES, looks=looks)
+
+
+def light_alone(spec: TaskSpec, render: Render) -> EvalSet | None:
+    """One macro-action in each of some macrostates, from :data:`FRAMES` frames that differ in the light alone.
+
+    ``render`` varies the light. None where it does not, or where the task's frames cannot be varied so.
+    """
+    rng = _generator(spec, "light")
+    states = _some(_going_on(spec.rules, rng), PAIRS, rng)
+    asked = [((state,), (int(rng.integers(spec.n_actions)),)) for state in states]
+    try:
+        found = _eval_set(spec, render, [each for each in asked for _ in range(FRAMES)], rng)
+    except (ImagineBenchError, LookupError, ValueError):  # of a task of another package that knows other appearances
+        return None
+    return found if (found.frames[0] != found.frames[1]).any() else None
+
+
+def about_light(spec: TaskSpec, light: EvalSet) -> WorldQuestions:
+    """The pairs of :func:`light_alone`: the outcome of a macro-action, shown in two lights."""
+    return light_pairs(spec.rules, light.macrostates, light.asked[::FRAMES, 0], _generator(spec, "light answers"))
 
 
 SETS = {"one_step": one_step, "rollouts": rollouts, "ranked": ranked, "after": after_the_end}

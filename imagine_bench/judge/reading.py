@@ -81,9 +81,12 @@ class RenderedFrameIndex:
         self._shows: dict[bytes, State] = {}
         self._frames: dict[State, Frame] = {}
 
-    def render(self, states: Sequence[State], rng: np.random.Generator) -> Frame:
-        """A new frame of each of N macrostates, which is remembered. Shape (N, 64, 64, 3)."""
-        frames = self._spec.render_macrostates(np.array(states, dtype=np.int64), self._appearance, rng)
+    def render(self, states: Sequence[State], rng: np.random.Generator, appearance: str | None = None) -> Frame:
+        """A new frame of each of N macrostates, which is remembered. Shape (N, 64, 64, 3).
+
+        ``appearance`` is another than that of the judgement.
+        """
+        frames = self._spec.render_macrostates(np.array(states, dtype=np.int64), appearance or self._appearance, rng)
         for frame, state in zip(frames, states, strict=True):
             self._shows[_key(frame)] = state
         return frames

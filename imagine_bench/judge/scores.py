@@ -17,11 +17,14 @@ from typing import Any
 import numpy as np
 
 from imagine_bench.arrays import Bools, Floats, State
-from imagine_bench.exact.values import Model, rows_of, true_model, values_of_planning
+from imagine_bench.exact.values import TIE, Model, rows_of, true_model, values_of_planning
 from imagine_bench.interfaces import Rules, TaskSpec
 from imagine_bench.interfaces.model import WorldModel, require_graph
 from imagine_bench.judge.models import graph_of
+from imagine_bench.judge.policies import acceptance
+from imagine_bench.judge.policies.agreement import dense
 from imagine_bench.judge.policies.exploit import Exploit
+from imagine_bench.judge.policies.fidelity import fidelity
 from imagine_bench.judge.policies.film import Expected, Film, course
 from imagine_bench.judge.policies.levels import SCORES, level_scores
 from imagine_bench.judge.policies.policy_set import PolicyWorld
@@ -48,7 +51,6 @@ _BINS = 10
 _MOST = 0.5  # share of a transition's frames in which a filter keeps it; probability from which an episode goes on
 _AVOIDED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # shares of the transitions, those that a model knows least of
 _WRONG = 0.5  # total variation from which a transition counts as imagined wrongly
-_TIE = 1e-9
 Scores = dict[str, float]
 Pairs = Sequence[tuple[Mapping[Value, float], Mapping[Value, float]]]
 """Exact and imagined probabilities of each question."""
@@ -78,8 +80,8 @@ def one_step_scores(
     spec: TaskSpec, questions: EvalSet, predictions: Predictions, visited: set[tuple[State, int]]
 ) -> dict[str, Any]:
     """Every score of single transitions. ``visited`` are the (macrostate, action) pairs in the model's data."""
-    pairs = [(shares(steps[0]), predictions.distribution(row, 0)) for row, steps in enumerate(questions.truth)]
-    away = np.array([total_variation(*pair) for pair in pairs])
+    pairs = _distributions(questions, predictions)
+    away = _away(pairs)
     seen = np.array([pair in visited for pair in questions.pairs])
     distances = by_depth(questions, predictions)
     return {
@@ -96,6 +98,16 @@ def one_step_scores(
         **_uncertainty_scores(pairs, predictions, away, seen),
         "worst": np.argsort(-away, kind="stable")[:10].tolist(),
     }
+
+
+def _distributions(questions: EvalSet, predictions: Predictions) -> Pairs[State]:
+    """Exact and imagined probabilities of the macrostates after each first macro-action."""
+    return [(shares(steps[0]), predictions.distribution(row, 0)) for row, steps in enumerate(questions.truth)]
+
+
+def _away(pairs: Pairs[State]) -> Floats:
+    """Total variation of each pair."""
+    return np.array([total_variation(*pair) for pair in pairs])
 
 
 def after_the_end_scores(asked: EvalSet | None, predictions: Predictions | None, before: Predictions) -> Scores:
@@ -126,7 +138,7 @@ def ranking_scores(spec: TaskSpec, questions: EvalSet, predictions: Predictions)
 
     def regret(rewards: Floats) -> float:
         imagined = (predictions.weights * rewards).sum(axis=(1, 2)).reshape(-1, RANKED)
-        first = (imagined >= imagined.max(axis=1, keepdims=True) - _TIE).argmax(axis=1)
+        first = (imagined >= imagined.max(axis=1, keepdims=True) - TIE).argmax(axis=1)
         return float((exact.max(axis=1) - exact[np.arange(len(exact)), first]).mean())
 
     own = predictions.offered.get("rewards")
@@ -255,15 +267,38 @@ def policy_scores(
         table: The counts of the data that the model learned from.
         seeds: Has a generator for each search.
     """
-    found = {f"{name}{kind}": math.nan for name in SCORES for kind in ("", "_ruled")}
+    found = {f"{name}{kind}": math.nan for name in SCORES for kind in ("", "_ruled")} | {"fidelity": math.nan}
     if world is None:
         return found, None
-    film = None
-    for kind, model in imagined_models(questions, predictions, rules).items():  # "ruled" comes first
-        scores, exploit = level_scores(world, model, table, seeds.child(kind).generator())
+    models = imagined_models(questions, predictions, rules)
+    exploits = {}
+    for kind, model in models.items():
+        scores, exploits[kind] = level_scores(world, model, table, seeds.child(kind).generator())
         found |= {f"{name}{'_ruled' if kind == 'ruled' else ''}": value for name, value in scores.items()}
-        film = _film(world, exploit, _likeliest_imagined(world, predictions, model), rules)
-    return found, film
+    found["fidelity"] = fidelity(world, dense(models["ruled"]))
+    shown = "own" if "own" in models else "ruled"
+    return found, _film(world, exploits[shown], _likeliest_imagined(world, predictions, models[shown]), rules)
+
+
+def acceptance_scores(
+    world: PolicyWorld | None, policy: str, questions: EvalSet, predictions: Predictions, seeds: SeedTree
+) -> Scores:
+    """The scores of :mod:`.policies.acceptance`, by the epistemic uncertainty.
+
+    NaN where none is offered, not all of the world is asked about, or the data's distribution is not known. It is
+    known of the policies ``random`` and ``uniform``.
+    """
+    found = {f"conformal_{name}": math.nan for name in acceptance.SCORES}
+    epistemic = predictions.of_one_step("epistemic")
+    if world is None or epistemic is None or policy not in ("random", "uniform"):
+        return found
+    uniform = world.policies.tables[:1]
+    data = np.full_like(uniform, 1.0 / uniform.size)
+    if policy == "random":
+        data = acceptance.occupancies(world, uniform)
+    wrong = _away(_distributions(questions, predictions)) > _WRONG
+    scores = acceptance.acceptance_scores(world, data[0], epistemic, wrong, seeds.generator())
+    return {f"conformal_{name}": value for name, value in scores.items()}
 
 
 def _film(
@@ -277,7 +312,7 @@ def _film(
 
     gaps = np.where(world.starts > 0.0, exploit.believed - exploit.real, -np.inf)
     row = int(gaps.argmax())
-    if gaps[row] <= _TIE:
+    if gaps[row] <= TIE:
         return None
     start = world.states[row]
     return Film(
@@ -372,7 +407,20 @@ def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Flo
         offered = predictions.of_one_step(uncertainty)
         found[f"auroc_{name}"] = math.nan if offered is None else auroc(offered, truth)
     epistemic = predictions.of_one_step("epistemic")
+    found["risk_coverage"] = math.nan if epistemic is None else risk_coverage(epistemic, wrong)
     return found | filter_scores(epistemic, predictions.of_one_step("accepted"), away)
+
+
+def risk_coverage(uncertainty: Floats, wrong: Bools) -> float:
+    """The share of wrong ones among the k most certain of N answers, the mean over k = 1 to N; the less, the better.
+
+    It is the area under the risk-coverage curve. Answers that are equally certain stand in any order: each counts as
+    their mean.
+    """
+    _, places, often = np.unique(uncertainty, return_inverse=True, return_counts=True)
+    level = np.bincount(places, weights=wrong) / often
+    so_far = level.repeat(often).cumsum()
+    return float((so_far / np.arange(1, len(wrong) + 1)).mean())
 
 
 def filter_scores(epistemic: Floats | None, kept: Any, away: Floats) -> Scores:
@@ -399,6 +447,16 @@ def filter_scores(epistemic: Floats | None, kept: Any, away: Floats) -> Scores:
         of_wrong, of_right = (np.bincount(places[rows], minlength=len(levels)) / rows.sum() for rows in (wrong, ~wrong))
         found["best_skill"] = float(max(0.0, (of_right - of_wrong).cumsum().max()))
     return found
+
+
+def light_scores(
+    asked: EvalSet | None, predictions: Predictions | None, pairs: WorldQuestions | None
+) -> dict[str, FamilyScores]:
+    """The scores of the pairs that differ in the light alone, by cause; nothing where there are none."""
+    if asked is None or predictions is None or pairs is None:
+        return {}
+    found = world_scores(pairs, transition_table(asked, predictions, pairs.states))
+    return {name: scores for name, scores in found.items() if name not in {each.name for each in pairs.families}}
 
 
 def whole_world_scores(

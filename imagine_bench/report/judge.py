@@ -20,6 +20,7 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.change import FALSE_ALARMS, LENGTH
 from imagine_bench.judge.judgement import Judgement, kept, shown
 from imagine_bench.judge.models import model_entry, runs_of
+from imagine_bench.judge.policies.acceptance import ALPHA
 from imagine_bench.recording.filmstrips import TileRow, png, transition_sheet
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report.levels import LEVELS, claims_table, film_image
@@ -62,6 +63,12 @@ QUESTIONS = {
         "filter_keeps": "its filter keeps",
         "filter_error": "error of that", "filter_skill": "skill of its filter", "best_skill": "of the best threshold",
         "worth_of_refusing": "worth of refusing", "worth_of_filter": "worth of its filter",
+        "risk_coverage": "risk–coverage area",
+    },
+    "Does a guarantee hold?": {
+        "conformal_accepts": "accepted", "conformal_wrong_on_data": "accepted though wrong, on its data",
+        "conformal_wrong_rare": "where its data is rare", "conformal_wrong_policies": "under other policies",
+        "conformal_wrong_worst_policy": "under the worst policy",
     },
     "Does it notice?": {
         "notice_slip": "transitions until a slip", "notice_coupling": "until a coupling",
@@ -70,7 +77,7 @@ QUESTIONS = {
     "Which policies does it overrate?": {
         "policy_r": "policies, r", "policy_tau": "policies, τ", "policy_error": "policies, error", "lift": "lift",
         "exploit": "exploit", "exploit_bound": "exploit, at most",
-        "policy_r_ruled": "r, rules' rewards", "policy_tau_ruled": "τ, rules' rewards",
+        "fidelity": "fidelity", "policy_r_ruled": "r, rules' rewards", "policy_tau_ruled": "τ, rules' rewards",
         "policy_error_ruled": "error, rules' rewards", "lift_ruled": "lift, rules' rewards",
         "exploit_ruled": "exploit, rules' rewards", "exploit_bound_ruled": "at most, rules' rewards",
     },
@@ -105,7 +112,12 @@ _WORDS = {
     "the share of wrong ones that a filter discards, less that of right ones; the best threshold of the epistemic "
     "uncertainty is chosen with the truth, and a filter may read more. Worth: reward a start that planning gains "
     "without the macro-actions it knows least of (the best share, chosen with the truth), and without those that its "
-    "own filter discards.",
+    "own filter discards. Risk–coverage area: the share of wrong ones among the k most certain, the mean over all k.",
+    "Does a guarantee hold?": f"A transition is accepted if its epistemic uncertainty is below a threshold that is "
+    f"chosen on transitions from the data's distribution, so that at most {ALPHA:.0%} are accepted though wrong, in "
+    "the mean (conformal risk control). The true shares are enumerated: on the data's distribution, for which this "
+    "is proved; for every macro-action in the quarter of the macrostates that the data's policy reaches least; and "
+    "for the transitions of about 40 other policies, in the mean and for the worst. For them nothing is promised.",
     "Does it notice?": f"Random transitions until a detector of surprise says that every macro-action slips with "
     f"probability {SLIP}, or that one also has another's effect, at false alarms in {FALSE_ALARMS:.0%} of "
     f"unchanged streams of {LENGTH}; {LENGTH}: never. Counterfactuals: its imagination of two macro-actions with the "
@@ -117,8 +129,10 @@ _WORDS = {
     "model, less that of the plan that is optimal in a table that counts the same transitions, and knows their "
     "macrostates; above 0 the model is of use. Exploit: how far the model overrates the policy that it overrates most, "
     "found by a search from many starts, or, below 0, that it underrates all; no policy is overrated by more than “at "
-    "most”, which is proved. All returns are means over starts, in units of reward. Only the model's "
-    "own futures are sampled, and nothing of the truth.",
+    "most”, which is proved. Fidelity: the part of the optimal policy's gain over random macro-actions that "
+    "is left if it sees the model's frames instead of real ones, after the first; chance in the world and in the model "
+    "is independent. All returns are means over starts, in units of reward. Only the model's own futures are sampled, "
+    "and nothing of the truth.",
     "What does it cost?": "CPU seconds are those of one core: of fitting, and of imagining 1,000 macro-actions. Frames "
     "beforehand are those on which the model's encoder had been trained before.",
 }
@@ -130,7 +144,8 @@ _SHARES = {
     *("total_variation", "tv_3", "tv_5", "tv_10", "perfect_sampler", "perfect_10", "after_the_end", "nothing"),
     *("outcome_ece", "reward_ece", "end_error", "end_ece"),
     *("filter_keeps", "filter_error", "best_skill", "counterfactual"),
-    *(name for name in COLUMNS if name.startswith("auroc")),
+    *(name for name in COLUMNS if name.startswith(("auroc", "conformal"))),
+    "risk_coverage",
 }
 _WHY_DASH = "not offered by the model, nothing to tell apart, or judged before this score existed"
 _BY_DEPTH = {"tv": "tv_by_depth", "perfect": "perfect_by_depth", "unbiased": "unbiased_by_depth"}

@@ -259,6 +259,6 @@ def test_the_hamming_distance_counts_edges_whatever_factors_are_called() -> None
     more = LearnedGraph(values=np.column_stack([renamed, np.ones(len(states), dtype=np.int64)]), edges=wide)
     assert hamming_distance(more, edges, states) == 1
     assert require_graph(learned, name="it", rows=len(states), n_actions=rules.n_actions) is learned
-    for wrong in (None, dataclasses.replace(learned, edges=wide), dataclasses.replace(learned, values=states[:3])):
+    for wrong in (dataclasses.replace(learned, edges=wide), dataclasses.replace(learned, values=states[:3])):
         with pytest.raises(InvalidValueError, match=r"World model it: factor_graph\(\) gave .*; give "):
             require_graph(wrong, name="it", rows=len(states), n_actions=rules.n_actions)

@@ -11,10 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from imagine_bench.arrays import Floats
-from imagine_bench.exact.values import Model
-
-TIE = 1e-9
-"""Values that differ by no more are equal: rounding alone may part them."""
+from imagine_bench.exact.values import TIE, Model
 
 
 class DenseModel(NamedTuple):

@@ -10,9 +10,9 @@ import numpy as np
 
 from imagine_bench.arrays import Floats, Ints, State, content_hash
 from imagine_bench.exact.changed_rules import one_change_each
-from imagine_bench.exact.values import Branches, Model, action_values, branches, model_of
+from imagine_bench.exact.values import TIE, Branches, Model, action_values, branches, model_of
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.policies.agreement import TIE, DenseModel, dense, values_of
+from imagine_bench.judge.policies.agreement import DenseModel, dense, values_of
 from imagine_bench.seeding import SeedTree
 
 BUDGETS = (30, 100, 300, 1_000)

@@ -18,14 +18,14 @@ from imagine_bench.arrays import Floats, Ints
 from imagine_bench.judge.worlds.tables import (
     Transitions,
     TransitionTable,
-    coupled,
     fewest,
     likelihood,
     normalised,
     other_action,
     reaching,
-    slipping,
     usual,
+    with_coupling,
+    with_slips,
 )
 
 STREAM = 5  # transitions of a stream
@@ -129,7 +129,7 @@ class TwoWorlds(_OfStream):
 
     def answer(self, table: TransitionTable) -> Floats:
         """By Bayes' rule."""
-        worlds = [likelihood(table, self.shown, world).prod(axis=1) for world in (usual, slipping)]
+        worlds = [likelihood(table, self.shown, world).prod(axis=1) for world in (usual, with_slips)]
         return self.by_rule(*worlds)
 
 
@@ -143,7 +143,7 @@ class ChangedRule(_OfStream):
     def answer(self, table: TransitionTable) -> Floats:
         """By Bayes' rule."""
         before = likelihood(table, self.shown)
-        after = likelihood(table, self.shown, coupled(*self.pair))
+        after = likelihood(table, self.shown, with_coupling(*self.pair))
         changes = range(STREAM + 1)
         return self.by_rule(*(before[:, :at].prod(axis=1) * after[:, at:].prod(axis=1) for at in changes))
 
@@ -156,7 +156,7 @@ class LuckAlone(_OfStream):
 
     def answer(self, table: TransitionTable) -> Floats:
         """By Bayes' rule."""
-        luck = likelihood(table, self.shown, slipping)
+        luck = likelihood(table, self.shown, with_slips)
         meddled = likelihood(table, self.shown, other_action)
         once = [meddled[:, at] * np.delete(luck, at, axis=1).prod(axis=1) for at in range(STREAM)]
         return self.by_rule(np.mean(once, axis=0), luck.prod(axis=1))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imagine_bench.arrays import Bools, Floats, Ints, State
-from imagine_bench.interfaces import TaskSpec
+from imagine_bench.interfaces import Rules, TaskSpec
 from imagine_bench.judge.worlds.families import (
     NO,
     STREAM,
@@ -30,15 +30,15 @@ from imagine_bench.judge.worlds.tables import (
     ChangedWorld,
     Transitions,
     TransitionTable,
-    coupled,
     coupled_pair,
     drawn_from,
     exact_table,
     fewest,
     other_action,
     reaching,
-    slipping,
     usual,
+    with_coupling,
+    with_slips,
 )
 from imagine_bench.seeding import SeedTree
 
@@ -190,12 +190,12 @@ def _streams(world: _World) -> list[Family]:
     steps = np.arange(STREAM)
 
     asked = world.transitions(*shape)
-    shown = _where(yes, world.drawn(asked, slipping), world.drawn(asked))
+    shown = _where(yes, world.drawn(asked, with_slips), world.drawn(asked))
     two = TwoWorlds(shown=shown, options=world.shuffled((NO, YES), QUERIES))
 
     asked = world.transitions(*shape)
     meddled = ~yes & (steps == rng.integers(STREAM, size=(QUERIES, 1)))
-    shown = _where(meddled, world.drawn(asked, other_action), world.drawn(asked, slipping))
+    shown = _where(meddled, world.drawn(asked, other_action), world.drawn(asked, with_slips))
     luck = LuckAlone(shown=shown, options=world.shuffled((NO, YES), QUERIES))
 
     one, other = coupled_pair(world.truth)
@@ -207,7 +207,7 @@ def _streams(world: _World) -> list[Family]:
             asked, states=np.where(often, states, asked.states), actions=np.where(often, one, asked.actions)
         )
     changed = steps >= rng.permutation(QUERIES)[:, None] % (STREAM + 1)
-    shown = _where(changed, world.drawn(asked, coupled(one, other)), world.drawn(asked))
+    shown = _where(changed, world.drawn(asked, with_coupling(one, other)), world.drawn(asked))
     options = world.shuffled(range(STREAM + 1), QUERIES)
     return [ChangedRule(shown=shown, pair=(one, other), options=options), two, luck]
 
@@ -236,7 +236,29 @@ def _single_causes(world: _World, names: Sequence[str], *, looks: bool) -> list[
         asked.frames[-PAIRS:] = (0, 1)
     options = np.array([_outcomes(world, of_pair) for of_pair in usual(world.truth, asked)])
     pairs = SingleCausePairs(shown=asked, causes=tuple(np.repeat(causes, PAIRS).tolist()), options=options)
-    return [pairs, _factors_changed(world, pairs)]
+    return [_factors_changed(world, pairs), pairs]
+
+
+def light_pairs(rules: Rules, states: tuple[State, ...], actions: Ints, rng: np.random.Generator) -> WorldQuestions:
+    """Pairs of frames of one macrostate in two lights, and a macro-action: which macrostate follows?
+
+    Args:
+        rules: The rules.
+        states: The macrostate of each pair. Length P.
+        actions: The macro-action of each pair, the only one that the tables of these questions hold. Shape (P,).
+        rng: Draws the possible answers.
+    """
+    every, table = exact_table(rules, states, 2)
+    rows = np.arange(len(states))
+    truth = TransitionTable(by_frame=table.by_frame[rows, actions, None], drawn=table.drawn[rows, actions, None])
+    world = _World(np.array(every, dtype=np.int64), truth, rng)
+    both = np.repeat(rows[:, None], 2, axis=1)
+    frame = np.tile([0, 1], (len(rows), 1))
+    shown = Transitions(states=both, actions=np.zeros_like(both), frames=frame, reached=both)
+    options = np.array([_outcomes(world, of_pair) for of_pair in usual(truth, shown)])
+    pairs = SingleCausePairs(shown=shown, causes=("light",) * len(states), options=options)
+    no_edges = np.zeros((0, 0, 0), dtype=bool)
+    return WorldQuestions(states=every, truth=truth, families=(pairs,), edges=no_edges)
 
 
 def _outcomes(world: _World, shares: Floats) -> list[list[int]]:

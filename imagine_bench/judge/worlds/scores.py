@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from imagine_bench.arrays import Bools, Floats, Ints
+from imagine_bench.exact.values import TIE
 from imagine_bench.interfaces.model import LearnedGraph
 from imagine_bench.judge.worlds.families import SingleCausePairs
 from imagine_bench.judge.worlds.graph import hamming_distance
@@ -20,7 +21,6 @@ from imagine_bench.judge.worlds.tables import TransitionTable, copying_table
 
 GRAPH = "factor graph"
 MARGIN = 0.02  # by which copying must be above chance to be said so
-_TIE = 1e-9
 FamilyScores = dict[str, float]
 """``right``, the mean score, and ``brier``, the mean squared distance of the probabilities from the exact ones; and
 beside them ``chance``, ``copy`` and ``exact``, the mean scores of guessing, of saying that nothing changes and of the
@@ -30,7 +30,7 @@ rules.
 
 def scores_right(exact: Floats, held: Floats) -> Floats:
     """The score of each question, of probabilities (..., C). Shape (...)."""
-    best = held >= held.max(axis=-1, keepdims=True) - _TIE
+    best = held >= held.max(axis=-1, keepdims=True) - TIE
     return (exact * best).sum(axis=-1) / best.sum(axis=-1)
 
 

@@ -17,10 +17,10 @@ import numpy as np
 
 from imagine_bench.arrays import Floats, Ints, State
 from imagine_bench.exact.changed_rules import SLIP
+from imagine_bench.exact.values import TIE
 from imagine_bench.rules import Rules, every_outcome
 
 LIKELY = 0.5  # probability from which something counts as reached
-_TIE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ def usual(table: TransitionTable, asked: Transitions) -> Floats:
     return table.by_frame[asked.states, asked.actions, asked.frames]
 
 
-def slipping(table: TransitionTable, asked: Transitions) -> Floats:
+def with_slips(table: TransitionTable, asked: Transitions) -> Floats:
     """Every macro-action does nothing with probability :data:`.exact.changed_rules.SLIP`."""
     found = (1.0 - SLIP) * usual(table, asked)
     np.put_along_axis(found, asked.states[..., None], SLIP + _at(found, asked.states)[..., None], axis=-1)
@@ -104,7 +104,7 @@ def other_action(table: TransitionTable, asked: Transitions) -> Floats:
     return (every.sum(axis=-2) - named) / (every.shape[-2] - 1)
 
 
-def coupled(one: int, other: int) -> ChangedWorld:
+def with_coupling(one: int, other: int) -> ChangedWorld:
     """Macro-action ``one`` also has the effect of ``other``, unless it ends the episode."""
 
     def outcomes(table: TransitionTable, asked: Transitions) -> Floats:
@@ -182,7 +182,7 @@ def reaching(table: TransitionTable, goals: Ints, depth: int) -> Floats:
 
 def fewest(reached: Floats) -> Ints:
     """The fewest macro-actions, of (D, ...) probabilities, after which one is likely; 0 where none is. Shape (...)."""
-    likely = reached >= LIKELY - _TIE
+    likely = reached >= LIKELY - TIE
     return np.where(likely.any(axis=0), 1 + likely.argmax(axis=0), 0)
 
 

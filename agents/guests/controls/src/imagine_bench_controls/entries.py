@@ -154,3 +154,28 @@ MDN_WHOLE_LAYER = WorldModelEntry(
     description="mdn_thesis with the norm of each whole layer limited to 3, not that of each unit's weights.",
     by_default=False,
 )
+_SIGNAL = "The networks of mdn_ensemble, with another uncertainty:"
+INFOPROP = WorldModelEntry(
+    make="imagine_bench_controls.signals:make_infoprop",
+    title="ensemble, Infoprop",
+    encoder_kind="latents",
+    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    description=f"{_SIGNAL} lost information, which also stops its rollouts (Infoprop).",
+    by_default=False,
+)
+ROUND_TRIP = WorldModelEntry(
+    make="imagine_bench_controls.signals:make_round_trip",
+    title="ensemble, round trip",
+    encoder_kind="latents",
+    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    description=f"{_SIGNAL} how far an imagined latent moves if it is decoded and encoded again.",
+    by_default=False,
+)
+SPREAD = WorldModelEntry(
+    make="imagine_bench_controls.signals:make_spread",
+    title="ensemble, spread of futures",
+    encoder_kind="latents",
+    settings="imagine_bench.agents.imagination.settings:HYPERPARAMETERS",
+    description=f"{_SIGNAL} the variance of imagined latents over futures.",
+    by_default=False,
+)

@@ -1,0 +1,201 @@
+"""Conformal acceptance keeps its promise where it promises something; fidelity is that of enumeration."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+from judged import STILL, judged_world
+
+from imagine_bench.arrays import Floats
+from imagine_bench.interfaces import State
+from imagine_bench.judge import questions
+from imagine_bench.judge.policies.acceptance import ALPHA, acceptance_scores, conformal_threshold, occupancies
+from imagine_bench.judge.policies.agreement import DenseModel, dense
+from imagine_bench.judge.policies.fidelity import fidelity, value_in_its_frames
+from imagine_bench.judge.policies.policy_set import PolicyWorld, policy_world
+from imagine_bench.judge.reading import RenderedFrameIndex
+from imagine_bench.judge.scores import imagined_models, light_scores, risk_coverage
+
+ARROWS = "arrows:cubes=2"
+
+
+def world_of(task: str) -> PolicyWorld:
+    found = policy_world(judged_world(task).spec, judged_world(task).one_step.macrostates)
+    assert found is not None
+    return found
+
+
+# Conformal acceptance ----------------------------------------------------------------------------------------------
+
+
+def test_the_threshold_is_that_by_hand() -> None:
+    uncertainty = np.arange(39.0)
+    wrong = np.zeros(39, dtype=bool)
+    wrong[[3, 7, 20]] = True
+    assert conformal_threshold(uncertainty, wrong, 0.05) == 7.0  # floor(0.05 * 40) - 1 = 1 wrong one may be before it
+    assert conformal_threshold(uncertainty[:38], wrong[:38], 0.05) == 3.0  # floor(1.95) - 1 = 0
+    assert conformal_threshold(uncertainty[:18], wrong[:18], 0.05) == -math.inf, "too few to promise anything"
+    assert conformal_threshold(uncertainty, np.zeros(39, dtype=bool), 0.05) == math.inf
+
+
+@pytest.mark.parametrize("levels", [3, 1_000], ids=["with ties", "hardly a tie"])
+@pytest.mark.parametrize("useful", [True, False])
+def test_exchangeable_transitions_are_accepted_though_wrong_as_seldom_as_promised(*, levels: int, useful: bool) -> None:
+    rng = np.random.default_rng(0)
+    failures = 0
+    rounds = 4_000
+    for _ in range(rounds):
+        wrong = rng.random(60) < 0.3
+        uncertainty = rng.integers(levels, size=60) + (levels // 2 * wrong if useful else 0)
+        below = uncertainty[-1] < conformal_threshold(uncertainty[:-1], wrong[:-1], 0.1)
+        failures += int(below and wrong[-1])
+    promised = math.floor(0.1 * 60) / 60
+    noise = 3.0 * math.sqrt(promised / rounds)
+    assert failures / rounds <= promised + noise
+    if levels == 1_000:
+        assert failures / rounds >= promised - noise, "without ties it is not stricter than it need be"
+
+
+def test_occupancies_are_those_of_episodes_that_are_played() -> None:
+    world = world_of("arrows:cubes=2,slip=0.2")
+    found = occupancies(world, world.policies.tables[:1])[0]
+    rng = np.random.default_rng(0)
+    counts = np.zeros_like(found)
+    for _ in range(400):
+        state = int(rng.choice(len(world.starts), p=world.starts))
+        for _ in range(world.horizon):
+            action = int(rng.integers(counts.shape[1]))
+            counts[state, action] += 1
+            after = world.dense_truth.onward[state, action]
+            state = int(rng.choice(len(after) + 1, p=np.append(after, max(0.0, 1.0 - after.sum()))))
+            if state == len(after):
+                break
+    counts /= counts.sum()
+    assert found.sum() == pytest.approx(1.0)
+    assert 0.5 * np.abs(counts.sum(axis=1) - found.sum(axis=1)).sum() < 0.12
+
+
+def planted(world: PolicyWorld, wrong_states: Floats, knows: float) -> dict[str, float]:
+    """The scores of a model that is wrong in some macrostates; ``knows`` 1 says just that."""
+    frames = 2
+    size = world.truth.reward.size * frames
+    wrong = np.repeat(wrong_states, size // len(wrong_states)) > 0.0
+    uncertainty = knows * wrong + np.random.default_rng(1).random(size) * 0.5
+    data = occupancies(world, world.policies.tables[:1])[0]
+    return acceptance_scores(world, data, uncertainty, wrong, np.random.default_rng(0))
+
+
+def test_an_exact_model_is_accepted_and_one_that_knows_its_errors_never_accepts_one() -> None:
+    world = world_of(ARROWS)
+    rng = np.random.default_rng(2)
+    exact = planted(world, np.zeros(len(world.states)), knows=0.0)
+    assert exact["accepts"] == pytest.approx(1.0)
+    assert exact["wrong_on_data"] == exact["wrong_worst_policy"] == 0.0
+    wrong = (rng.random(len(world.states)) < 0.3).astype(float)
+    known = planted(world, wrong, knows=1.0)
+    assert known["accepts"] > 0.5
+    assert known["wrong_on_data"] <= ALPHA
+    assert known["wrong_worst_policy"] < 0.2 < planted(world, wrong, knows=0.0)["wrong_worst_policy"] + 0.2
+
+
+def test_the_guarantee_holds_on_the_data_and_breaks_where_the_data_is_rare() -> None:
+    world = world_of("arrows:cubes=2,goal=clockwise")
+    often = occupancies(world, world.policies.tables[:1])[0].sum(axis=1)
+    rare = (often <= np.quantile(often, 0.25)).astype(float)
+    found = planted(world, rare, knows=-1.0)  # it is surest where it is wrong
+    assert often[rare > 0].sum() < 0.2
+    assert found["wrong_on_data"] <= ALPHA < found["wrong_worst_policy"]
+
+
+def test_the_risk_coverage_area_is_that_by_hand() -> None:
+    wrong = np.array([False, True, False, True])
+    assert risk_coverage(np.array([0.0, 1.0, 2.0, 3.0]), wrong) == pytest.approx((0 + 1 / 2 + 1 / 3 + 1 / 2) / 4)
+    assert risk_coverage(np.zeros(4), wrong) == pytest.approx(0.5), "who knows nothing has the share of wrong ones"
+    best = risk_coverage(wrong.astype(float), wrong)
+    assert best == pytest.approx((0 + 0 + 1 / 3 + 1 / 2) / 4)
+
+
+# Fidelity ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_exact_model_keeps_all_and_a_copy_what_one_macro_action_again_and_again_earns() -> None:
+    world = world_of(ARROWS)
+    judged = judged_world(ARROWS)
+    rules = judged.spec.rules
+    held = imagined_models(judged.one_step, judged.predictions(judged.exact, judged.one_step), rules)
+    assert fidelity(world, dense(held["ruled"])) == pytest.approx(1.0)
+    still = imagined_models(judged.one_step, judged.predictions(STILL, judged.one_step), rules)["ruled"]
+    names = dict(zip(world.policies.names, world.policies.tables, strict=True))
+    chosen = names["optimal"].argmax(axis=1)
+
+    def again(state: State, action: int, left: int) -> float:
+        found = 0.0
+        for o in rules.outcomes(state, action):
+            onward = 0.0 if o.terminated or left == 1 else again(o.macrostate, action, left - 1)
+            found += o.probability * (o.reward + onward)
+        return found
+
+    earned = [again(s, int(chosen[world.states.index(s)]), world.horizon) for s in rules.start_states]
+    real = dict(zip(world.policies.names, world.real, strict=True))
+    part = (np.mean(earned) - real["uniform"]) / (real["optimal"] - real["uniform"])
+    assert fidelity(world, dense(still)) == pytest.approx(part)
+    assert part < 1.0
+
+
+def test_returns_in_imagined_frames_are_those_of_every_pair_of_courses() -> None:
+    rng = np.random.default_rng(0)
+    truth, model = (DenseModel(rng.dirichlet(np.ones(3), size=(2, 2))[..., :2], rng.normal(size=(2, 2))) for _ in "ab")
+    policy = rng.dirichlet(np.ones(2), size=2)
+
+    def of(state: int, seen: int, left: int) -> float:
+        if left == 0:
+            return 0.0
+        found = 0.0
+        for action in range(2):
+            share = policy[seen, action] if seen < 2 else 0.5
+            imagined = [0.0, 0.0, 1.0]
+            if seen < 2:
+                imagined = [*model.onward[seen, action], 1.0 - model.onward[seen, action].sum()]
+            found += share * float(truth.reward[state, action])
+            for after, then in itertools.product(range(2), range(3)):
+                both = truth.onward[state, action, after] * imagined[then]
+                found += share * both * of(after, then, left - 1)
+        return found
+
+    found = value_in_its_frames(truth, model, policy, 4)
+    assert found == pytest.approx([of(state, state, 4) for state in range(2)])
+
+
+# Light -------------------------------------------------------------------------------------------------------------
+
+
+def test_pairs_in_another_light_show_one_macrostate_and_are_all_right_in_the_rules() -> None:
+    judged = judged_world(ARROWS)
+    asked = questions.light_alone(judged.spec, judged.index.render)
+    assert asked is not None
+    assert asked.states[::2] == asked.states[1::2]
+    assert (asked.actions[::2] == asked.actions[1::2]).all()
+    pairs = questions.about_light(judged.spec, asked)
+    exact = light_scores(asked, judged.predictions(judged.exact, asked), pairs)["only the light"]
+    assert exact["right"] == exact["exact"] == 1.0
+    copied = light_scores(asked, judged.predictions(STILL, asked), pairs)["only the light"]
+    assert copied["right"] == pytest.approx(copied["copy"])
+    assert copied["right"] < 0.3
+    dark = dataclasses.replace(judged.spec, render_macrostates=lambda states, *_: np.zeros((len(states), 64, 64, 3)))
+    assert questions.light_alone(dark, RenderedFrameIndex(dark, "clean").render) is None
+
+
+def test_a_model_that_is_right_in_one_light_only_is_right_in_no_pair() -> None:
+    judged = judged_world(ARROWS)
+    asked = questions.light_alone(judged.spec, judged.index.render)
+    assert asked is not None
+    right = judged.predictions(judged.exact, asked)
+    states = right.states.copy()
+    states[1::2] = np.array(asked.states[1::2])[:, None, None]  # in the second light nothing changes
+    blind = dataclasses.replace(right, states=states)
+    found = light_scores(asked, blind, questions.about_light(judged.spec, asked))["only the light"]
+    assert found["right"] < 0.5
