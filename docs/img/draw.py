@@ -400,6 +400,34 @@ def evidence() -> None:
     plot.savefig(HERE / "evidence.png", dpi=100)
 
 
+def promise() -> None:
+    """Shares that are accepted though wrong, by uncertainty and distribution; a mark is a fit."""
+    with (RESULTS / "arrow_puzzle-signals-judge" / "scores.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    where = {
+        "on_data": "on its data (promised: at most 5 %)",
+        "rare": "where its data is rare",
+        "policies": "under other policies, mean",
+        "worst_policy": "under the worst policy",
+    }
+    models = list(dict.fromkeys(row["model"] for row in rows))
+    plot, axes = plt.subplots(figsize=(8, 3.8), layout="constrained")
+    for place, (name, label) in enumerate(where.items()):
+        across = [models.index(row["model"]) + 0.16 * (place - 1.5) for row in rows]
+        shares = [100.0 * float(row[f"conformal_wrong_{name}"]) for row in rows]
+        style = {"color": figures.COLORS[place % 8], "marker": figures.MARKERS[place % 7]}
+        axes.scatter(across, shares, s=36, alpha=0.8, label=label, **style)
+    axes.axhline(5.0, color="gray", linewidth=1, linestyle=":")
+    axes.set_xticks(range(len(models)), [registry.world_model_entry(model).label for model in models], fontsize=8)
+    axes.set_ylabel("accepted though wrong (%)")
+    axes.grid(axis="y", alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper left")
+    top = max(100.0 * float(row["conformal_wrong_worst_policy"]) for row in rows)
+    axes.set_ylim(0.0, 1.35 * top)
+    plot.savefig(HERE / "promise.png", dpi=100)
+
+
 def strips(rows: Mapping[str, list[np.ndarray]], titles: Sequence[str]) -> np.ndarray:
     """Named rows of frames below one another, with titles above the first row."""
     drawn = []
@@ -426,7 +454,7 @@ def tasks() -> None:
     runpy.run_path(str(HERE / "draw_tasks.py"))["tasks"]()
 
 
-FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, evidence, parameters, tasks)
+FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, evidence, promise, parameters, tasks)
 PICTURES = {each.__name__: each for each in FIGURES}
 
 if __name__ == "__main__":

@@ -356,8 +356,9 @@ def judged(folder: str, model: str, transitions: str, score: str) -> str:
     values = [float(row[score]) for row in rows if row[score]]
     if not values:
         return "–"
-    share = score.startswith(("auroc", "total", "tv", "after", "counter", "best"))
-    digits = 2 if share or "skill" in score or "unbiased" in score or score.startswith("policy") else 1
+    shares = ("auroc", "total", "tv", "after", "counter", "best", "conformal", "risk", "outcome", "nothing")
+    share = score.startswith(shares)
+    digits = 2 if share or "skill" in score or "unbiased" in score or score.startswith(("policy", "fidelity")) else 1
     few = f"; {len(values)} of {len(rows)}" if len(values) < len(rows) else ""
     return over_seeds(values, lambda number: f"{number:.{digits}f}".replace("-", "−"), share=share) + few
 

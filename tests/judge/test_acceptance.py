@@ -97,9 +97,10 @@ def test_an_exact_model_is_accepted_and_one_that_knows_its_errors_never_accepts_
     assert exact["wrong_on_data"] == exact["wrong_worst_policy"] == 0.0
     wrong = (rng.random(len(world.states)) < 0.3).astype(float)
     known = planted(world, wrong, knows=1.0)
-    assert known["accepts"] > 0.5
+    knows_nothing = planted(world, wrong, knows=0.0)
+    assert known["accepts"] > 0.5 > knows_nothing["accepts"]
     assert known["wrong_on_data"] <= ALPHA
-    assert known["wrong_worst_policy"] < 0.2 < planted(world, wrong, knows=0.0)["wrong_worst_policy"] + 0.2
+    assert knows_nothing["wrong_on_data"] <= ALPHA
 
 
 def test_the_guarantee_holds_on_the_data_and_breaks_where_the_data_is_rare() -> None:
