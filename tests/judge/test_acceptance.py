@@ -106,10 +106,11 @@ def test_an_exact_model_is_accepted_and_one_that_knows_its_errors_never_accepts_
 def test_the_guarantee_holds_on_the_data_and_breaks_where_the_data_is_rare() -> None:
     world = world_of("arrows:cubes=2,goal=clockwise")
     often = occupancies(world, world.policies.tables[:1])[0].sum(axis=1)
-    rare = (often <= np.quantile(often, 0.25)).astype(float)
+    rare = np.zeros(len(often))
+    rare[np.argsort(often, kind="stable")[: math.ceil(len(often) / 4)]] = 1.0
     found = planted(world, rare, knows=-1.0)  # it is surest where it is wrong
     assert often[rare > 0].sum() < 0.2
-    assert found["wrong_on_data"] <= ALPHA < found["wrong_worst_policy"]
+    assert found["wrong_on_data"] <= ALPHA < min(found["wrong_rare"], found["wrong_worst_policy"])
 
 
 def test_the_risk_coverage_area_is_that_by_hand() -> None:

@@ -384,6 +384,7 @@ def _few(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(questions, "STATES", 10)
     monkeypatch.setattr(questions, "AFTER_THE_END", 10)
     monkeypatch.setattr(questions, "ROLLOUTS", 4)
+    monkeypatch.setattr(questions, "PAIRS", 4)
     judgement.prepare.cache_clear()
     yield
     judgement.prepare.cache_clear()
