@@ -359,6 +359,7 @@ def judged(folder: str, model: str, transitions: str, score: str) -> str:
     shares = ("auroc", "total", "tv", "after", "counter", "best", "conformal", "risk", "outcome", "nothing")
     share = score.startswith(shares)
     digits = 2 if share or "skill" in score or "unbiased" in score or score.startswith(("policy", "fidelity")) else 1
+    digits = 3 if score.startswith("conformal_wrong") else digits
     few = f"; {len(values)} of {len(rows)}" if len(values) < len(rows) else ""
     return over_seeds(values, lambda number: f"{number:.{digits}f}".replace("-", "−"), share=share) + few
 
