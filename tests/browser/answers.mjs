@@ -10,6 +10,7 @@ const { Rules } = await from('rules');
 const { factsOf } = await from('facts');
 const { readRow, rowFile } = await from('rows');
 const { WorldModel } = await from('model');
+const { percent } = await from('words');
 
 /** The answer, or the sentence by which it is refused. */
 function tried(ask) {
@@ -32,6 +33,7 @@ const kinds = {
     return asked.map(([state, action]) => rules.outcomes(state, action));
   },
   facts: ({ line }) => factsOf(new Rules(readWorld(line))),
+  percent: ({ share }) => percent(share),
   rowFile: ({ name }) => rowFile(name),
   row: ({ row }) => readRow(row).episodes.length,
   model: ({ path, rgba, action }) => {

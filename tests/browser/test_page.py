@@ -110,6 +110,12 @@ def test_chance_and_optimum_are_pythons() -> None:
         assert found["optimum"] == pytest.approx(facts.optimum, abs=1e-12), line
 
 
+@needs_node
+def test_a_share_below_1_is_never_shown_as_100_percent() -> None:
+    shares = {1.0: "100.00 %", 1.0 - 1e-13: "100.00 %", 0.99999: "99.99 %", 0.04602: "4.60 %", 0.0: "0.00 %"}
+    assert ask([{"kind": "percent", "share": share} for share in shares]) == list(shares.values())
+
+
 HOSTILE = (
     ("", "There is no world"),
     ("<img src=x onerror=alert(1)>", "There is no world"),

@@ -6,7 +6,7 @@ import { readRow, rowFile } from './rows.js';
 import { Rules } from './rules.js';
 import { Motions, Scene } from './scene.js';
 import { View } from './view.js';
-import { ARROWS, goalOf, happened, oddities } from './words.js';
+import { ARROWS, goalOf, happened, oddities, percent } from './words.js';
 import { readWorld, WorldError } from './world.js';
 
 const EXAMPLES = [
@@ -120,7 +120,6 @@ class Page {
 
   #askForFacts() {
     const worker = new Worker(new URL('facts_worker.js', import.meta.url), { type: 'module' });
-    const percent = (share) => `${(100 * share).toFixed(2)} %`;
     worker.onmessage = ({ data }) => {
       find('chance').textContent = percent(data.chance);
       find('optimum').textContent = percent(data.optimum);

@@ -5,6 +5,15 @@ import { FAMILY } from './constants.js';
 export const ARROWS = ['↑', '→', '↓', '←'];
 
 /**
+ * A share in percent, rounded down, so that 99.999 % is never shown as 100 %.
+ * @param {number} share
+ * @returns {string}
+ */
+export function percent(share) {
+  return `${(Math.floor(1e4 * share + 1e-7) / 100).toFixed(2)} %`;
+}
+
+/**
  * The goal in one sentence, and what is forbidden.
  * @param {import('./rules.js').Rules} rules
  * @returns {string}
@@ -28,12 +37,12 @@ export function goalOf(rules) {
  */
 export function oddities(world) {
   const said = [];
-  const percent = (share) => `${Math.round(1000 * share) / 10} %`;
-  if (world.slip > 0) said.push(`The fingers slip in ${percent(world.slip)} of the turns.`);
-  if (world.goal_change > 0) said.push(`The hand moves on after ${percent(world.goal_change)} of the turns.`);
+  const often = (share) => `${Number((100 * share).toPrecision(4))} %`;
+  if (world.slip > 0) said.push(`The fingers slip in ${often(world.slip)} of the turns.`);
+  if (world.goal_change > 0) said.push(`The hand moves on after ${often(world.goal_change)} of the turns.`);
   if (world.coupling === 'neighbour') said.push('The next cube to the right turns along.');
   if (world.gesture === 'first') said.push('The hand is shown at the start alone.');
-  else if (world.gesture !== 'always') said.push(`The hand is shown ${percent(world.gesture)} of the time.`);
+  else if (world.gesture !== 'always') said.push(`The hand is shown ${often(world.gesture)} of the time.`);
   if (world.lag > 0) said.push('An agent sees frames that are late; you see the table as it is.');
   if (world.distractors > 0) said.push('An agent also sees moving distractors, which this page leaves out.');
   return said.join(' ');
