@@ -90,6 +90,15 @@ COUNT_TABLE_OWN = AgentEntry(
     title="count table, own eyes",
     description="A control: like count table, directed, but it learns to see from its own frames as factored.",
 )
+ELIMINATION = AgentEntry(
+    make="imagine_bench_controls.elimination:make",
+    settings=_COUNT_TABLE_SETTINGS,
+    needs_encoder=False,
+    privileged=True,
+    title="elimination (true state)",
+    description="A control: R-max whose model is learned by elimination, a table for each object and a cause of few "
+    f"values for each unusual reward; {_TRUE_STATE}",
+)
 POSTERIOR_SAMPLING = AgentEntry(
     make="imagine_bench_controls.tabular.posterior_sampling:make",
     settings=_POSTERIOR_SETTINGS,
