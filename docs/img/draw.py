@@ -20,7 +20,7 @@ from imagine_bench.judge.causes import CAUSES, FORMER_CAUSES
 from imagine_bench.recording.filmstrips import Tile, sheet
 from imagine_bench.registry.entries import label_today
 from imagine_bench.report import figures
-from imagine_bench.report.data import ReportData, collect, frames_before
+from imagine_bench.report.data import collect
 from imagine_bench.store.loading import load_so_far
 
 mpl.use("agg")
@@ -72,6 +72,12 @@ PEERS = (
     "arrow_puzzle-peers", "arrow_puzzle-dreamer_latents",
 )  # fmt: skip
 """Kept benches with the same tests after 100, 250 and 500 episodes; an agent of two is that of the first."""
+LABEL_GAP = 4.5
+"""Points of success between the names beside the curves, at least."""
+LAST_EPISODE = 500
+"""Where the curves end."""
+RIGHT = 2_300
+"""Macro-actions at the right edge, where the names stand."""
 SETTINGS = {"replay_ratio": " tuned", "discount": " defaults"}
 """The words behind a name that has settings, by one that only those have."""
 
@@ -101,58 +107,57 @@ def name_of_row(agent: str) -> str:
     return label + settings
 
 
-def kept_rows() -> list[tuple[ReportData, dict[str, Any]]]:
-    """Each agent of PEERS once, by its area under the curve to 500 episodes, ascending."""
-    rows: list[tuple[ReportData, dict[str, Any]]] = []
+def kept_curves() -> dict[str, tuple[list[float], list[float]]]:
+    """Of each agent of PEERS, by budget: the macro-actions so far (mean) and the success (interquartile mean, in %)."""
+    found: dict[str, tuple[list[float], list[float]]] = {}
     for kept in PEERS:
         data = collect(load_so_far(RESULTS / kept))
-        known = {record["agent"] for _, record in rows}
-        last = [record for record in data.records if record["episodes"] == 500 and "area" in record]
-        rows += [(data, record) for record in last if record["agent"] not in known]
-    return sorted(rows, key=lambda row: row[1]["area"])
-
-
-def draw_row(axes: plt.Axes, height: int, data: ReportData, record: dict[str, Any]) -> None:
-    """An agent's interquartile mean (bar) and its seeds (markers)."""
-    agent = record["agent"]
-    _, color, marker = family(agent)
-    protocol = data.result.protocol
-    rates_by_seed = data.result.success_rates(agent)
-    shares = statistics.running_means(protocol.budgets, rates_by_seed, data.facts.chance_level)
-    seeds = 100 * shares[:, protocol.budgets.index(500)]
-    axes.plot(seeds, [height] * len(seeds), marker, color=color, markersize=4)
-    axes.plot([100 * record["area"]], [height], "|", color=color, markersize=13, markeredgewidth=2.5)
+        for agent in dict.fromkeys(record["agent"] for record in data.records):
+            if agent in found or not registry.agent_entry(agent).learns:
+                continue
+            rows = [row for row in data.records if row["agent"] == agent and row["episodes"] <= LAST_EPISODE]
+            steps = {row["episodes"]: row["env_steps"] for row in rows}
+            solved = dict(zip(data.result.protocol.budgets, data.result.success_rates(agent).T, strict=True))
+            success = [100 * statistics.iqm(solved[budget]) for budget in sorted(steps)]
+            found[agent] = ([steps[budget] for budget in sorted(steps)], success)
+    return dict(sorted(found.items(), key=lambda each: -each[1][1][-1]))
 
 
 def peers() -> None:
-    """Area under the success curve to 500 episodes of our agents and of libraries', and its price."""
-    rows = kept_rows()
-    executions = " and ".join(sorted({data.result.protocol.execution for data, _ in rows}))
-    figure, axes = plt.subplots(figsize=(9.4, 1.7 + 0.28 * len(rows)), layout="constrained")
-    columns = {1.14: "frames seen\nbefore", 1.27: "gradient\nupdates", 1.40: "training\nCPU s"}
-    for height, (data, record) in enumerate(rows):
-        draw_row(axes, height, data, record)
-        prices = (frames_before(data, record["agent"]), record["gradient_updates"], record["train_cpu_s"])
-        for place, value in zip(columns, prices, strict=True):
-            said = "?" if np.isnan(value) else f"{value:,.0f}"
-            axes.text(place, height, said, transform=axes.get_yaxis_transform(), ha="right", va="center")
-    for place, name in columns.items():
-        axes.text(place, 1.0, name, transform=axes.transAxes, ha="right", va="bottom")
-    axes.axvline(100 * rows[0][0].facts.chance_level, color="#777777", linestyle=":", linewidth=1)
-    axes.set_yticks(range(len(rows)), [name_of_row(record["agent"]) for _, record in rows])
-    axes.set(xlim=(0, 100), ylim=(-0.6, len(rows) - 0.4))
-    axes.set_xlabel(
-        "test episodes solved (%), averaged over training episodes 0 to 500 (area under\n"
-        "the learning curve divided by 500); a marker a seed, bar: their interquartile mean, dotted: chance"
-    )
-    axes.grid(axis="x", alpha=0.3)
+    """Success curves of our agents and of libraries' against real macro-actions."""
+    figure, axes = plt.subplots(figsize=(9.4, 5.6), layout="constrained")
+    ends: list[float] = []
+    for agent, (steps, success) in kept_curves().items():
+        _, color, marker = family(agent)
+        axes.plot(steps, success, marker=marker, color=color, markersize=4, linewidth=1.4, alpha=0.8)
+        height = success[-1]
+        while any(abs(height - other) < LABEL_GAP for other in ends):
+            height -= LABEL_GAP / 4
+        ends.append(height)
+        axes.annotate(
+            name_of_row(agent),
+            (steps[-1], success[-1]),
+            (RIGHT, height),
+            fontsize=8,
+            va="center",
+            arrowprops={"arrowstyle": "-", "color": color, "alpha": 0.35, "linewidth": 0.7, "relpos": (0, 0.5)},
+        )
+    chance = 100 * certificate(registry.task("arrow_puzzle")).chance_level
+    axes.axhline(chance, color="#777777", linestyle=":", linewidth=1)
+    axes.set_xscale("log")
+    ticks = [100, 200, 500, 1_000, 2_000]
+    axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+    axes.minorticks_off()
+    axes.set(xlim=(100, RIGHT), ylim=(-18, 104), yticks=range(0, 101, 20))
+    axes.set_xlabel("real macro-actions of training (logarithmic); dotted: chance")
+    axes.set_ylabel("test episodes solved (%)")
+    axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.set_title(
-        f"arrow puzzle, execution: {executions}\n(the outcome is set; the arm does not move)", fontsize=10, loc="left"
-    )
+    title = "arrow puzzle, kinematic: interquartile means of five seeds; each line ends after 500 episodes"
+    axes.set_title(title, fontsize=10, loc="left")
     for said, color, marker in FAMILIES.values():
-        axes.plot([], [], marker, color=color, label=said)
-    axes.legend(loc="lower right", frameon=False)
+        axes.plot([], [], marker=marker, color=color, label=said)
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.8), frameon=False, fontsize=8)
     figure.savefig(HERE / "peers.png", dpi=120, facecolor="white", bbox_inches="tight")
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from imagine_bench.exact.beliefs import BeliefRules
+from imagine_bench.exact.bound import SHARE, lower_bound
 from imagine_bench.exact.factors import FactorGraph, Machine, Scope, factor_graph, machine
 from imagine_bench.exact.learner import LearnerRun, learn
 from imagine_bench.exact.memoryless import best_without_memory
@@ -59,6 +60,7 @@ class Certificate:
     width: int  #: the most coordinates that decide one factor or condition
     facts: int  #: local entries and conditions that there are to know
     floor: LearningCost | None  #: None where no start can be solved, or a learner is not done after learner.MOST
+    lower_bound: int | None = None  #: transitions that any learner needs (:mod:`.bound`); None in older certificates
 
 
 def certificate(spec: TaskSpec) -> Certificate:
@@ -103,6 +105,7 @@ def certificate(spec: TaskSpec) -> Certificate:
         width=graph.width,
         facts=graph.facts,
         floor=_floor(full, graph, spec.horizon) if seen_optimum > 0.0 else None,
+        lower_bound=lower_bound(full, graph, spec.horizon) if seen_optimum > 0.0 else None,
     )
 
 
@@ -141,10 +144,15 @@ def certificate_rows(found: Certificate) -> dict[str, str]:
     rows["factor graph"] = "; ".join(f"{c} from {p} ({n} actions)" for (c, p), n in moves.items())
     rows["reward and end"] = "; ".join(f"{what} by [{scopes}]" for what, scopes in found.outcomes)
     rows["facts"] = f"{found.facts} local entries and conditions, of at most {found.width} coordinates each"
+    if found.lower_bound:
+        rows["lower bound"] = (
+            f"{found.lower_bound} transitions, before which no learner solves {100 * SHARE:.0f} % of what the best "
+            "policy solves, on average over the worlds that differ by the names of their actions"
+        )
     if found.floor is not None:
         floor = found.floor
         part = " (of the certain part alone)" if found.random else ""
-        rows["information"] = (
+        rows["cautious learner"] = (
             f"{floor.transitions:.0f} ± {floor.standard_error:.0f} transitions, {floor.episodes:.0f} episodes, until a "
             f"learner with ideal codes and this graph knows an optimal policy{part}"
         )

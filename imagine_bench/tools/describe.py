@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections import Counter
 from collections.abc import Mapping
+from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -112,12 +114,25 @@ def describe_task(name: str) -> str:
         "optimum": f"{100 * facts.optimum:.1f} %, with a return of {facts.optimal_return:.2f}",
         "plan lengths": f"{_plan_lengths(spec)}; mean {facts.mean_plan_length:.2f}",
         **certificate_rows(exact),
+        **_best_known(spec.id),
         "encoders": _encoders(spec),
     }
     hand = _by_hand(spec)
     if registry.task_of_motion(name):
         return _page(spec.title, spec.description, hand | {"rules": "those of its macro-actions:"} | rows)
     return _page(spec.title, spec.description, rows | dict(list(hand.items())[1:2]))
+
+
+def _best_known(task: str) -> dict[str, str]:
+    """The fewest macro-actions that any agent was measured to need; nothing where none was measured."""
+    found = json.loads(resources.files("imagine_bench.exact").joinpath("best_known.json").read_text())
+    if task not in found:
+        return {}
+    best = found[task]
+    text = (
+        f"{best['macro_actions']} macro-actions until 95 % of tests are solved: {best['agent']}, {best['seeds']} seeds"
+    )
+    return {"best known": text}
 
 
 def _by_hand(spec: TaskSpec) -> dict[str, str]:
