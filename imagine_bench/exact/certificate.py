@@ -152,7 +152,7 @@ def certificate_rows(found: Certificate) -> dict[str, str]:
     if found.floor is not None:
         floor = found.floor
         part = " (of the certain part alone)" if found.random else ""
-        rows["cautious learner"] = (
+        rows["cautious"] = (
             f"{floor.transitions:.0f} ± {floor.standard_error:.0f} transitions, {floor.episodes:.0f} episodes, until a "
             f"learner with ideal codes and this graph knows an optimal policy{part}"
         )

@@ -79,7 +79,7 @@ def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pyt
             do(tmp_path / "run", agent, 0.0)
     resumed = do(tmp_path / "run", agent, 0.0)
     assert measured(whole) == measured(resumed)
-    tables = agent in ("factored", "count_table_own") or registry.agents()[agent].encoder_kind == "codes"
+    tables = agent in ("factored", "count_table_own", "elimination") or registry.agents()[agent].encoder_kind == "codes"
     assert tables or any(name.startswith("loss/") for name in whole.checkpoints[-1].diagnostics)
     assert same(final_state(tmp_path / "whole"), final_state(tmp_path / "run"))
     for one, other in zip(whole.imagined, resumed.imagined, strict=True):

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+import information_cells
 import numpy as np
 import speed_cells
 
@@ -474,7 +475,7 @@ def certified(world: str, field: str) -> str:
 
 CELLS: dict[str, Callable[..., str | list[Compared]]] = {
     name: function
-    for name, function in {**vars(speed_cells), **globals()}.items()
+    for name, function in {**vars(speed_cells), **vars(information_cells), **globals()}.items()
     if isinstance(function, FunctionType)
 }
-"""The words of comments: every function above and of :mod:`speed_cells`."""
+"""The words of comments: every function above and of the two modules."""

@@ -1,0 +1,54 @@
+"""Cells of the tables on the experience that a task needs."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from imagine_bench import registry
+from imagine_bench.exact.certificate import Certificate, certificate
+
+_FLOORS = Path(__file__).parents[2] / "docs" / "results" / "floors" / "floors.json"
+
+
+@cache
+def _certificate(task: str) -> Certificate:
+    return certificate(registry.task(task))
+
+
+def task_of(where: str) -> str:
+    """The task of a kept bench, which begins with it."""
+    return where.partition("-")[0]
+
+
+def needed_by_any(where: str) -> str:
+    """The lower bound of any learner, in macro-actions."""
+    return f"{_certificate(task_of(where)).lower_bound}"
+
+
+def needed_by_cautious(where: str, what: str) -> str:
+    """The mean transitions or episodes of the cautious learner."""
+    floor = _certificate(task_of(where)).floor
+    assert floor is not None
+    return f"{getattr(floor, what):.0f}"
+
+
+def worlds_learned(what: str) -> str:
+    """How far ``factored`` came in the worlds of the benchmark suite, of five seeds each."""
+    rows = json.loads(_FLOORS.read_text())
+    every = [run for row in rows for run in row["transitions"]]
+    never = [all(run is None for run in row["transitions"]) for row in rows]
+    ratios = []
+    for row in rows:
+        needed = [math.inf if run is None else run for run in row["transitions"]]
+        ratios.append(np.median(needed) / row["floor"] if row["floor"] else math.nan)
+    columns = {
+        "runs that never": f"{sum(run is None for run in every)} of {len(every)}",
+        "worlds in no run": f"{sum(never)}",
+        "median": f"{np.median(ratios):.2f}",
+    }
+    return columns[what]
