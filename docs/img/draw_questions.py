@@ -9,7 +9,7 @@ from imagine_bench.arrays import Pixels, State
 from imagine_bench.judge.worlds.making import whole_world
 from imagine_bench.recording.filmstrips import png, sheet
 from imagine_bench.rules import states_of_play
-from imagine_bench.tools.quiz import rows_of, words_of
+from imagine_bench.tools.quiz import rows_of
 
 ROWS = {"masked frame": 3, "shortest plan": 120, "luck alone": 1, "single-cause pairs": 0}
 """The question of each family that is drawn."""
@@ -27,7 +27,7 @@ def main() -> None:
     rows = []
     for family in asked.families:
         if family.name in ROWS:
-            for words in words_of(spec, asked, family, ROWS[family.name]):
+            for words in family.words(asked.named, ROWS[family.name]):
                 rows += rows_of(words, render, family.name)
                 print(family.name, words.text, *words.answers, sep="\n  ")
     (Path(__file__).parent / "questions.png").write_bytes(png(sheet(rows)))

@@ -6,7 +6,6 @@ import csv
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,25 +13,13 @@ from imagine_bench import registry
 from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Floats, Pixels, State
 from imagine_bench.errors import InvalidValueError, require_integer
-from imagine_bench.exact.changed_rules import SLIP
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.questions import FRAMES, STATES
-from imagine_bench.judge.worlds.families import (
-    STREAM,
-    YES,
-    ChangedRule,
-    FactorsChanged,
-    Family,
-    LuckAlone,
-    MaskedFrames,
-    Reachability,
-    ShortestPlans,
-    SingleCausePairs,
-    TwoWorlds,
-)
+from imagine_bench.judge.worlds.families import Family
 from imagine_bench.judge.worlds.making import WorldQuestions, whole_world
 from imagine_bench.judge.worlds.scores import scores_right
 from imagine_bench.judge.worlds.tables import copying_table
+from imagine_bench.judge.worlds.words import Words
 from imagine_bench.recording.filmstrips import Tile, png, sheet
 from imagine_bench.report.page import DASH, Table, percent
 from imagine_bench.rules import states_of_play
@@ -41,17 +28,6 @@ from imagine_bench.store.files import make_folder, read_json, write_bytes
 
 JUDGED = Path("runs/judge")
 IMAGES = Path("runs/quiz")
-Shown = tuple[str, State | None]
-"""The words above an image, and the macrostate that it shows; None for a hidden one."""
-
-
-class Words(NamedTuple):
-    """A question for a person."""
-
-    text: str
-    images: Sequence[Shown]
-    answers: Sequence[str] = ()
-    answer_images: Sequence[State] = ()  # macrostates whose images are the answers, where these are no words
 
 
 def quiz(
@@ -98,7 +74,7 @@ def quiz(
         row = int(rng.integers(len(family.options)))
         file = place / f"question_{number + 1}.png"
         try:
-            chosen = _answers(spec, asked, family, row, file, ask, partial(_image, spec, look, rng))
+            chosen = _answers(asked, family, row, file, ask, partial(_image, spec, look, rng))
         except EOFError:
             break
         found.setdefault(family.name, []).append(_scores(asked, family, row, chosen))
@@ -110,7 +86,6 @@ def _image(spec: TaskSpec, look: str, rng: np.random.Generator, state: State) ->
 
 
 def _answers(
-    spec: TaskSpec,
     asked: WorldQuestions,
     family: Family,
     row: int,
@@ -120,7 +95,7 @@ def _answers(
 ) -> list[int]:
     """The options that a person chooses, one for each member of a question."""
     chosen = []
-    for words in words_of(spec, asked, family, row):
+    for words in family.words(asked.named, row):
         write_bytes(file, png(sheet(rows_of(words, render, "question"))))
         lines = [f"\n{family.name.capitalize()}. {words.text} (Images: {file})"]
         lines += [f"  {i}  {answer}" for i, answer in enumerate(words.answers, 1)]
@@ -140,74 +115,6 @@ def rows_of(words: Words, render: Callable[[State], Pixels], name: str) -> list[
     if words.answer_images:
         rows.append(("answers", [Tile(render(state), str(i)) for i, state in enumerate(words.answer_images, 1)]))
     return rows
-
-
-def words_of(spec: TaskSpec, asked: WorldQuestions, family: Family, row: int) -> list[Words]:
-    """A question in words and images; of a pair there are two."""
-    states = asked.states
-    names = spec.action_names
-    options = family.options[row].tolist()
-    if isinstance(family, MaskedFrames):
-        first = names[family.first.actions[row]]
-        then = names[family.actions[row]]
-        images: list[Shown] = [
-            ("start", states[family.first.states[row]]),
-            (f"1. {first}", None),
-            (f"2. {then}", states[family.reached[row]]),
-        ]
-        text = f"First “{first}”, then “{then}”. Which image belongs between the two that are shown?"
-        return [Words(text, images, answer_images=[states[option] for option in options])]
-    if isinstance(family, ShortestPlans | Reachability):
-        images = [("start", states[family.starts[row]]), ("goal", states[family.goals[row]])]
-        if isinstance(family, ShortestPlans):
-            text = "How many macro-actions, the best ones, does it take until the goal has probably come up?"
-            return [Words(text, images, list(map(str, options)))]
-        text = f"Does the goal come up within {family.within[row]} macro-actions, if they are the best ones?"
-        return [Words(text, images, _yes_and_no(options))]
-    if isinstance(family, SingleCausePairs):
-        shown = family.shown
-        action = names[shown.actions[row, 0]]
-        text = f"Two starts differ only in the {family.causes[row]}. What follows “{action}” from the"
-        members = zip(("first", "second"), shown.states[row].tolist(), options, strict=True)
-        return [
-            Words(f"{text} {which} one?", [("start", states[start])], answer_images=[states[each] for each in mine])
-            for which, start, mine in members
-        ]
-    if isinstance(family, FactorsChanged):
-        pair = family.rows[row]
-        starts = family.pairs.shown.states[pair]
-        action = names[family.pairs.shown.actions[pair, 0]]
-        factor = spec.macrostate_names[family.factors[row]]
-        text = f"Two starts differ only in the {family.pairs.causes[pair]}. After “{action}”: does the {factor} differ?"
-        return [Words(text, [("one start", states[starts[0]]), ("other", states[starts[1]])], _yes_and_no(options))]
-    return [_of_stream(spec, asked, family, row)]
-
-
-def _of_stream(spec: TaskSpec, asked: WorldQuestions, family: Family, row: int) -> Words:
-    """A question about transitions that do not follow one another."""
-    assert isinstance(family, TwoWorlds | LuckAlone | ChangedRule)
-    shown = family.shown
-    images: list[Shown] = []
-    for step in range(STREAM):
-        name = spec.action_names[shown.actions[row, step]]
-        images.append((f"{step + 1}. before", asked.states[shown.states[row, step]]))
-        images.append((f"after: {name}", asked.states[shown.reached[row, step]]))
-    options = family.options[row].tolist()
-    said = f"{STREAM} separate macro-actions, each before and after."
-    if isinstance(family, TwoWorlds):
-        slips = f"the world in which a macro-action does nothing with probability {SLIP}"
-        answers = [slips if option == YES else "the usual world" for option in options]
-        return Words(f"{said} Which world are they from?", images, answers)
-    if isinstance(family, LuckAlone):
-        text = f"{said} Each does nothing with probability {SLIP}. Does that explain all of them (yes), or was one in"
-        return Words(f"{text} truth another macro-action (no)?", images, _yes_and_no(options))
-    one, other = (spec.action_names[action] for action in family.pair)
-    text = f"{said} From some moment on “{one}” also has the effect of “{other}”. After how many of them?"
-    return Words(text, images, ["never" if option == STREAM else str(option) for option in options])
-
-
-def _yes_and_no(options: Sequence[int]) -> list[str]:
-    return ["yes" if option == YES else "no" for option in options]
 
 
 # Scores ------------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.judge.worlds.making import whole_world
 from imagine_bench.rules import states_of_play
-from imagine_bench.tools.quiz import quiz, words_of
+from imagine_bench.tools.quiz import quiz
 
 EASY = "arrow_puzzle_easy"
 
@@ -39,7 +39,7 @@ def test_every_family_has_words_and_an_answer_for_each_option(task: str) -> None
     asked = whole_world(spec, states_of_play(spec.rules), 2, looks=True)
     for family in asked.families:
         options = np.atleast_2d(family.options[0])
-        found = words_of(spec, asked, family, 0)
+        found = family.words(asked.named, 0)
         assert len(found) == len(options)
         for words, mine in zip(found, options, strict=True):
             assert words.text and words.images

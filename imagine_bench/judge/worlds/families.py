@@ -15,6 +15,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from imagine_bench.arrays import Floats, Ints
+from imagine_bench.exact.changed_rules import SLIP
 from imagine_bench.judge.worlds.tables import (
     Transitions,
     TransitionTable,
@@ -27,10 +28,10 @@ from imagine_bench.judge.worlds.tables import (
     with_coupling,
     with_slips,
 )
+from imagine_bench.judge.worlds.words import YES, Named, Words, yes_and_no
 
 STREAM = 5  # transitions of a stream
-YES = 1
-NO = 0
+_OF_STREAM = f"{STREAM} separate macro-actions, each before and after."
 
 
 class Family(Protocol):
@@ -44,6 +45,9 @@ class Family(Protocol):
 
     def answer(self, table: TransitionTable) -> Floats:
         """The probability of each answer by a table. Shape (N, C)."""
+
+    def words(self, world: Named, row: int) -> list[Words]:
+        """A question for a person; of a pair there are two."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +68,18 @@ class MaskedFrames:
             weights[:, column] = likelihood(table, replace(self.first, reached=middle)) * likelihood(table, second)
         return normalised(weights)
 
+    def words(self, world: Named, row: int) -> list[Words]:
+        """The frame between is to be chosen."""
+        first = world.actions[self.first.actions[row]]
+        then = world.actions[self.actions[row]]
+        images = [
+            ("start", world.states[self.first.states[row]]),
+            (f"1. {first}", None),
+            (f"2. {then}", world.states[self.reached[row]]),
+        ]
+        text = f"First “{first}”, then “{then}”. Which image belongs between the two that are shown?"
+        return [Words(text, images, answer_images=world.chosen(self.options[row]))]
+
 
 @dataclass(frozen=True, kw_only=True)
 class ShortestPlans:
@@ -78,6 +94,12 @@ class ShortestPlans:
         """The fewest after which the goal has come up with a probability of at least one half."""
         reached = _reached(table, self.starts, self.goals, int(self.options.max()))
         return normalised((fewest(reached)[:, None] == self.options).astype(np.float64))
+
+    def words(self, world: Named, row: int) -> list[Words]:
+        """The number is to be chosen."""
+        images = [("start", world.states[self.starts[row]]), ("goal", world.states[self.goals[row]])]
+        text = "How many macro-actions, the best ones, does it take until the goal has probably come up?"
+        return [Words(text, images, list(map(str, self.options[row])))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +116,12 @@ class Reachability:
         """The best policy's probability, and the rest to 1."""
         reached = _reached(table, self.starts, self.goals, int(self.within.max()))
         return _yes_or_no(reached[self.within - 1, np.arange(len(self.within))], self.options)
+
+    def words(self, world: Named, row: int) -> list[Words]:
+        """Yes or no."""
+        images = [("start", world.states[self.starts[row]]), ("goal", world.states[self.goals[row]])]
+        text = f"Does the goal come up within {self.within[row]} macro-actions, if they are the best ones?"
+        return [Words(text, images, yes_and_no(self.options[row]))]
 
 
 def _reached(table: TransitionTable, starts: Ints, goals: Ints, depth: int) -> Floats:
@@ -132,6 +160,13 @@ class TwoWorlds(_OfStream):
         worlds = [likelihood(table, self.shown, world).prod(axis=1) for world in (usual, with_slips)]
         return self.by_rule(*worlds)
 
+    def words(self, world: Named, row: int) -> list[Words]:
+        """The world is to be chosen."""
+        slips = f"the world in which a macro-action does nothing with probability {SLIP}"
+        answers = [slips if option == YES else "the usual world" for option in self.options[row]]
+        text = f"{_OF_STREAM} Which world are they from?"
+        return [Words(text, world.of_stream(self.shown, row), answers)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class ChangedRule(_OfStream):
@@ -147,6 +182,13 @@ class ChangedRule(_OfStream):
         changes = range(STREAM + 1)
         return self.by_rule(*(before[:, :at].prod(axis=1) * after[:, at:].prod(axis=1) for at in changes))
 
+    def words(self, world: Named, row: int) -> list[Words]:
+        """The moment is to be chosen."""
+        one, other = (world.actions[action] for action in self.pair)
+        text = f"From some moment on “{one}” also has the effect of “{other}”. After how many of them?"
+        answers = ["never" if option == STREAM else str(option) for option in self.options[row]]
+        return [Words(f"{_OF_STREAM} {text}", world.of_stream(self.shown, row), answers)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class LuckAlone(_OfStream):
@@ -160,6 +202,12 @@ class LuckAlone(_OfStream):
         meddled = likelihood(table, self.shown, other_action)
         once = [meddled[:, at] * np.delete(luck, at, axis=1).prod(axis=1) for at in range(STREAM)]
         return self.by_rule(np.mean(once, axis=0), luck.prod(axis=1))
+
+    def words(self, world: Named, row: int) -> list[Words]:
+        """Yes or no."""
+        luck = f"Each does nothing with probability {SLIP}. Does that explain all of them (yes), or was one in truth"
+        text = f"{_OF_STREAM} {luck} another macro-action (no)?"
+        return [Words(text, world.of_stream(self.shown, row), yes_and_no(self.options[row]))]
 
 
 # Single causes -----------------------------------------------------------------------------------------------------
@@ -181,6 +229,16 @@ class SingleCausePairs:
         """The probability of each option, given that it is one of them. Shape (P, 2, C)."""
         return normalised(np.take_along_axis(usual(table, self.shown), self.options, axis=2))
 
+    def words(self, world: Named, row: int) -> list[Words]:
+        """One question for each of the two starts."""
+        action = world.actions[self.shown.actions[row, 0]]
+        text = f"Two starts differ only in the {self.causes[row]}. What follows “{action}” from the"
+        members = zip(("first", "second"), self.shown.states[row], self.options[row], strict=True)
+        return [
+            Words(f"{text} {which} one?", [("start", world.states[start])], answer_images=world.chosen(mine))
+            for which, start, mine in members
+        ]
+
 
 @dataclass(frozen=True, kw_only=True)
 class FactorsChanged:
@@ -200,6 +258,16 @@ class FactorsChanged:
     def answer(self, table: TransitionTable) -> Floats:
         """The total variation, and the rest to 1."""
         return _yes_or_no(self.distances(table), self.options)
+
+    def words(self, world: Named, row: int) -> list[Words]:
+        """Yes or no."""
+        pair = self.rows[row]
+        one, other = world.chosen(self.pairs.shown.states[pair])
+        action = world.actions[self.pairs.shown.actions[pair, 0]]
+        factor = world.factors[self.factors[row]]
+        cause = self.pairs.causes[pair]
+        text = f"Two starts differ only in the {cause}. After “{action}”: does the {factor} differ?"
+        return [Words(text, [("one start", one), ("other", other)], yes_and_no(self.options[row]))]
 
     def distances(self, table: TransitionTable) -> Floats:
         """Total variation of the two distributions of each question's factor. Shape (N,)."""

@@ -11,9 +11,7 @@ import numpy as np
 from imagine_bench.arrays import Bools, Floats, Ints, State
 from imagine_bench.interfaces import Rules, TaskSpec
 from imagine_bench.judge.worlds.families import (
-    NO,
     STREAM,
-    YES,
     ChangedRule,
     FactorsChanged,
     Family,
@@ -40,6 +38,7 @@ from imagine_bench.judge.worlds.tables import (
     with_coupling,
     with_slips,
 )
+from imagine_bench.judge.worlds.words import NO, YES, Named
 from imagine_bench.seeding import SeedTree
 
 QUERIES = 160  # questions of each family
@@ -60,6 +59,7 @@ class WorldQuestions:
     truth: TransitionTable
     families: tuple[Family, ...]
     edges: Bools  #: of the rules' factor graph, as :func:`.graph.edges_of_rules`
+    named: Named  #: the world's names, for a person
 
 
 def whole_world(spec: TaskSpec, states: Sequence[State], frames: int, *, looks: bool) -> WorldQuestions:
@@ -84,7 +84,9 @@ def world_questions(
     world = _World(np.array(every, dtype=np.int64), truth, rng)
     families = [*_masked_frames(world), *_plans(world, min(spec.horizon, LONGEST)), *_streams(world)]
     families += _single_causes(world, spec.macrostate_names, looks=looks)
-    return WorldQuestions(states=every, truth=truth, families=tuple(families), edges=edges_of_rules(spec.rules))
+    named = Named(every, spec.action_names, spec.macrostate_names)
+    edges = edges_of_rules(spec.rules)
+    return WorldQuestions(states=every, truth=truth, families=tuple(families), edges=edges, named=named)
 
 
 @dataclass(frozen=True)
