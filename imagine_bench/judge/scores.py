@@ -408,7 +408,9 @@ def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Flo
         found[f"auroc_{name}"] = math.nan if offered is None else auroc(offered, truth)
     epistemic = predictions.of_one_step("epistemic")
     found["risk_coverage"] = math.nan if epistemic is None else risk_coverage(epistemic, wrong)
-    return found | filter_scores(epistemic, predictions.of_one_step("accepted"), away)
+    accepted = predictions.of_one_step("accepted")
+    kept = None if accepted is None else accepted.astype(np.bool_)
+    return found | filter_scores(epistemic, kept, away)
 
 
 def risk_coverage(uncertainty: Floats, wrong: Bools) -> float:
@@ -423,7 +425,7 @@ def risk_coverage(uncertainty: Floats, wrong: Bools) -> float:
     return float((so_far / np.arange(1, len(wrong) + 1)).mean())
 
 
-def filter_scores(epistemic: Floats | None, kept: Any, away: Floats) -> Scores:
+def filter_scores(epistemic: Floats | None, kept: Bools | None, away: Floats) -> Scores:
     """The share of N answers that a model's own filter keeps, and how well it chooses.
 
     ``filter_skill`` is the share of wrong answers that it discards less that of right ones, ``best_skill`` the largest

@@ -122,7 +122,7 @@ def small_multiples(count: int, columns: int, *, width: float, height: float) ->
     return figure, every[:count]
 
 
-def curve(axes: Axes, values: Mapping[Any, float | Estimate], **style: Any) -> None:
+def curve(axes: Axes, values: Mapping[int, float | Estimate], **style: Any) -> None:
     """A line through values at their places on the x axis, and a band of their intervals where they are estimates."""
     ends = [each[:3] if isinstance(each, Estimate) else (each, each, each) for each in values.values()]
     middle, low, high = np.array(ends, dtype=float).reshape(-1, 3).T
@@ -131,7 +131,7 @@ def curve(axes: Axes, values: Mapping[Any, float | Estimate], **style: Any) -> N
 
 
 def lines(
-    panels: Mapping[str, Mapping[str, Mapping[Any, float | Estimate]]], styles: Mapping[str, LineStyle], xlabel: str
+    panels: Mapping[str, Mapping[str, Mapping[int, float | Estimate]]], styles: Mapping[str, LineStyle], xlabel: str
 ) -> Figure:
     """A curve a name in each panel, three panels a row; names have the same style everywhere and stand above."""
     columns = min(3, len(panels))

@@ -7,7 +7,7 @@ nothing. Speeds, joint ranges and the workspace hold for every action; the servo
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gymnasium
 import mujoco
@@ -84,7 +84,7 @@ class HandControl:
         self._low = self.space.low.astype(np.float64)
         self._high = self.space.high.astype(np.float64)
 
-    def _space(self) -> gymnasium.spaces.Box[Any]:
+    def _space(self) -> gymnasium.spaces.Box[np.float32]:
         if self.control == "joint":
             low, high = self._ik.lower_rad, self._ik.upper_rad
         elif self.control == "pose":
