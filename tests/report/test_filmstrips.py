@@ -72,6 +72,13 @@ def test_a_strip_marks_cut_error_and_end() -> None:
     assert narrow.shape[1] < whole.shape[1] and narrow.shape[0] == whole.shape[0]
 
 
+def test_a_row_shows_its_name_beside_its_images() -> None:
+    tile = filmstrips.Tile(np.zeros((64, 64, 3), dtype=np.uint8), "")
+    one, other = (filmstrips.sheet([(name, [tile])])[:CELL_PX, :LABELS_PX] for name in ("real", "imagined"))
+    assert (one != 255).any() and (other != 255).any(), "ink"
+    assert (one != other).any()
+
+
 def test_real_frames_are_shown_unaltered_and_upright() -> None:
     compared = compared_rollout(np.random.default_rng(0), cut=None)
     strip = filmstrips.filmstrip(compared, tuple("abcdef"))
