@@ -41,7 +41,7 @@ from imagine_bench.running.headlines import until_decided
 from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.results import BenchResult
-from imagine_bench.sweep.grid import SUITE, SUITE_AGENTS, Study, Suite, grid_named
+from imagine_bench.sweep.grid import SUITE, Study, Suite, grid_named
 from imagine_bench.sweep.run import run_study, run_suite
 
 if TYPE_CHECKING:
@@ -86,6 +86,8 @@ class Learner:
     """Tasks of the same world to be trained on before, in this order; the model of the world is carried over."""
     after_episodes: Count = None
     """Real training episodes on each of them; 100 by default."""
+    unannounced: bool = False
+    """With --after: learners are not told when the next task begins, so the rules change within one run."""
     demonstrations: Count = None
     """First training episodes, 0 by default, that the oracle plays and learners watch; budgets count them."""
     dataset: File = None
@@ -304,7 +306,7 @@ class Sweep:
         launcher = self.launch.chosen()
         agents = self.agents
         if agents is None:
-            agents, note = registry.installed_of(SUITE_AGENTS)
+            agents, note = registry.installed_of(suite.agents)
             if note:
                 print(note)
         result = run_suite(suite, agents, root=self.launch.out, launcher=launcher)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imagine_bench.arrays import Floats, Ints
 from imagine_bench.interfaces import Rules, Sight, State
 
 _Seen = tuple[tuple[State, ...], State]
@@ -40,6 +41,18 @@ class _Layer:
     most: dict[_Seen, float]  # the largest probability that it can be given; at the start the only one
     links: dict[tuple[_Seen, int], list[tuple[float, _Seen]]]  # by (situation, action): where the episode goes on
     wins: dict[tuple[_Seen, int], float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Table:
+    """A layer as arrays: N situations, A actions, at most W continuations of each."""
+
+    first: Floats  # the largest probabilities. Shape (N,)
+    shown: Ints  # the number of what each situation shows. Shape (N,)
+    then: Ints  # where the episode goes on. Shape (N, A, W)
+    share: Floats  # with these probabilities, 0 for places that are not used. Shape (N, A, W)
+    wins: Floats  # Shape (N, A)
+    following: int  # situations of the next layer
 
 
 def _layers(rules: Rules, sight: Sight, horizon: int) -> Iterator[_Layer]:
@@ -104,17 +117,25 @@ def best_without_memory(rules: Rules, sight: Sight, horizon: int, *, bound: floa
 
 def _climb(layers: list[_Layer], choices: dict[tuple[State, int], int], policy: dict[State, int]) -> float:
     """Change a policy, one action at a time, while that helps; its value then."""
-    policy = {**{shown: action for shown, action in reversed(choices)}, **policy}
-    value = _value(layers, policy)
+    numbers = {shown: number for number, shown in enumerate(dict.fromkeys(shown for shown, _ in choices))}
+    usual = {shown: action for shown, action in reversed(choices)}
+    chosen = np.array([policy.get(shown, usual[shown]) for shown in numbers])
+    tables = _tables(layers, numbers)
+    value = _value(tables, chosen)
     better = True
     while better:
         better = False
         for shown, action in choices:
-            other = policy | {shown: action}
-            if action != policy[shown] and (found := _value(layers, other)) > value + _GAIN:
-                policy = other
+            before = chosen[numbers[shown]]
+            if action == before:
+                continue
+            chosen[numbers[shown]] = action
+            found = _value(tables, chosen)
+            if found > value + _GAIN:
                 value = found
                 better = True
+            else:
+                chosen[numbers[shown]] = before
     return value
 
 
@@ -178,16 +199,36 @@ def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int]) -> tuple
     return policy, bound
 
 
-def _value(layers: list[_Layer], policy: dict[State, int]) -> float:
-    """The success probability of a policy, exactly."""
-    now = layers[0].most
+def _tables(layers: list[_Layer], numbers: dict[State, int]) -> list[_Table]:
+    """The layers as arrays; ``numbers`` are those of what frames show."""
+    found = []
+    following = [*layers[1:], None]
+    for layer, after in zip(layers, following, strict=True):
+        rows = {now: row for row, now in enumerate(layer.most)}
+        columns = {} if after is None else {now: column for column, now in enumerate(after.most)}
+        actions = 1 + max(action for _, action in layer.links)
+        width = max(map(len, layer.links.values()))
+        then = np.zeros((len(rows), actions, width), dtype=np.int64)
+        share = np.zeros(then.shape)
+        wins = np.zeros(then.shape[:2])
+        for (now, action), links in layer.links.items():
+            wins[rows[now], action] = layer.wins[now, action]
+            for place, (chance, reached) in enumerate(links if columns else ()):
+                then[rows[now], action, place] = columns[reached]
+                share[rows[now], action, place] = chance
+        shown = np.array([numbers[now[1]] for now in layer.most])
+        first = np.array([*layer.most.values()])
+        found.append(_Table(first=first, shown=shown, then=then, share=share, wins=wins, following=len(columns)))
+    return found
+
+
+def _value(tables: list[_Table], policy: Ints) -> float:
+    """The success probability of a policy (O,), exactly."""
+    now = tables[0].first
     won = 0.0
-    for layer in layers:
-        after: dict[_Seen, float] = defaultdict(float)
-        for here, weight in now.items():
-            pair = here, policy[here[1]]
-            won += weight * layer.wins[pair]
-            for share, then in layer.links[pair]:
-                after[then] += weight * share
-        now = after
+    for table in tables:
+        pair = np.arange(len(now)), policy[table.shown]
+        won += float(now @ table.wins[pair])
+        weights = now[:, None] * table.share[pair]
+        now = np.bincount(table.then[pair].ravel(), weights.ravel(), minlength=max(1, table.following))
     return won

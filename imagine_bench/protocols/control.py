@@ -146,6 +146,9 @@ class BudgetSection:
     #: carried over, rewards are learned anew. Budgets count episodes of ``task`` alone.
     after: tuple[str, ...] = ()
     after_episodes: int = _AFTER_EPISODES  #: Real training episodes on each of them
+    #: Whether learners are not told that another task begins: the rules change within one run, and episodes are counted
+    #: on. No knowledge is carried over on purpose, so any learner takes it.
+    unannounced: bool = field(default=False, metadata=LATER)
     #: Training episodes, the first ones, that the bench's demonstrator plays while learners merely observe; they are
     #: real episodes as any, and budgets count them.
     demonstrations: int = 0
@@ -173,10 +176,9 @@ class BudgetSection:
             )
         if self.dataset is not None and self.demonstrations:
             raise InvalidValueError("Both a dataset and demonstrations would come first; give one of them.")
-        if not self.after and self.after_episodes != _AFTER_EPISODES:
-            raise InvalidValueError(
-                f"after_episodes is {self.after_episodes}, but no task comes before; give it in after."
-            )
+        for name, usual in (("after_episodes", _AFTER_EPISODES), ("unannounced", False)):
+            if not self.after and getattr(self, name) != usual:
+                raise InvalidValueError(f"{name} is {getattr(self, name)}, but no task comes before; give it in after.")
 
     @property
     def episodes_before(self) -> int:

@@ -161,7 +161,10 @@ def require_able(agent: object, name: str, protocol: Protocol) -> None:
     reasons = {
         "demonstrations": own_loop if external else "",
         "dataset": own_loop if external else "is shown true macrostates" if privileged else "",
-        "after": "" if isinstance(agent, TransferLearner) else "has no model of the world to carry over",
+        "after": ""
+        if isinstance(agent, TransferLearner) or (protocol.unannounced and not external)
+        else "has no model of the world to carry over",
+        "unannounced": own_loop if external else "",
         "queries": "" if isinstance(agent, QueryingAgent) else "cannot query an oracle",
         "feedback": own_loop if external else "",
     }

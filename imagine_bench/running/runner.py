@@ -140,20 +140,25 @@ def _row(run: Run, budget: int, observers: Sequence[RunObserver]) -> Checkpoint:
 
 
 def transfer(run: Run) -> None:
-    """Train on the tasks that come before; after the last episode of each, the agent takes its model to the next."""
+    """Train on the tasks that come before; after the last episode of each, the agent takes its model to the next.
+
+    In a run of unannounced changes it is told nothing, and its episodes are counted on.
+    """
     counters = run.counters
     each = run.protocol.after_episodes
+    untold = run.protocol.unannounced
     for index, task in enumerate(run.protocol.after):
-        if counters.before >= (index + 1) * each or not isinstance(run.agent, TransferLearner):
+        carries = isinstance(run.agent, TransferLearner)
+        if counters.before >= (index + 1) * each or not (carries or untold):
             continue
         with closing(make_env(run.protocol, task)) as env:
             while counters.before < (index + 1) * each:
                 with run.training_time():
                     seed = episode_seed("earlier_training", run.spec.seed, counters.before)
                     for transition, _ in play(env, run.agent, seed=seed, explore=True, privileged=False):
-                        run.agent.observe(transition, episode=counters.before % each)
+                        run.agent.observe(transition, episode=counters.before if untold else counters.before % each)
                     counters.before += 1
-                    if counters.before % each == 0:
+                    if counters.before % each == 0 and isinstance(run.agent, TransferLearner) and not untold:
                         run.agent.reset_for_new_task()
                 run.made_progress("training")
 
@@ -201,9 +206,10 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
     )
     length = 0
     success = False
+    number = counters.episode + (run.protocol.episodes_before if run.protocol.unannounced else 0)
     for lived, info in episode:
         transition = lived if teacher is None else teacher.told(lived)
-        run.agent.observe(transition if run.entry.privileged else as_seen(transition), episode=counters.episode)
+        run.agent.observe(transition if run.entry.privileged else as_seen(transition), episode=number)
         length = length + 1
         success = bool(info["is_success"])
     counters.add_episode(success, length, queries=queries.asked)

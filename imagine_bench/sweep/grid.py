@@ -128,6 +128,7 @@ class Suite:
     evaluation_episodes: int = 100
     execution: str = "kinematic"
     hyperparameters: str = "fast"
+    agents: tuple[str, ...] = SUITE_AGENTS  #: Those that are compared unless others are named
 
     def __post_init__(self) -> None:
         require_types(self)
@@ -137,8 +138,10 @@ class Suite:
 
     @property
     def hash(self) -> str:
-        """12 hex digits that change when anything in any level does; seeds and tests count, too."""
-        return digest(dataclasses.asdict(self))
+        """12 hex digits that change when anything in any level does; seeds and tests count, too, but not agents."""
+        fields = dataclasses.asdict(self)
+        del fields["agents"]
+        return digest(fields)
 
     def only(self, names: Sequence[str]) -> Suite:
         """The suite with some of its experiments, or all if none are named. Raises UnknownNameError."""
@@ -202,8 +205,9 @@ SUITE = "suite"
 """Name of the benchmark suite."""
 GRIDS = {path.stem: read_grid(path) for path in sorted((Path(__file__).parent / "grids").glob("*.toml"))}
 """The grids in ``sweep/grids``, by name."""
-(LADDER,) = (grid for grid in GRIDS.values() if isinstance(grid, Suite))
-"""The suite of ``make suite``; two cores are meant to finish it within the hour."""
+LADDER, SEPARATING = (grid for grid in (GRIDS[SUITE], GRIDS["separating"]) if isinstance(grid, Suite))
+"""The suite of ``make suite``, which two cores are meant to finish within the hour; and a world that separates families
+of agents, with open challenges."""
 STUDIES = {name: grid for name, grid in GRIDS.items() if isinstance(grid, Study)}
 registry.describe_group(registry.STUDY_GROUP, what="study", kind=Study, own=GRIDS)
 

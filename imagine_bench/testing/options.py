@@ -80,6 +80,10 @@ OPTION_ROWS: Mapping[str, OptionRow] = {
         episodes=6,
     ),
     "transfer": OptionRow(fields=("after", "after_episodes"), changes={"after": (_TASK,), "after_episodes": 1}),
+    "unannounced": OptionRow(
+        fields=("unannounced",),
+        changes={"after": (_TASK,), "after_episodes": 2, "unannounced": True},
+    ),
     "split": OptionRow(fields=("split",), changes={"split": "plan_length=1"}, shown=True),
     "physics": OptionRow(
         fields=("physics", "execution"),
