@@ -294,7 +294,7 @@ def margins() -> None:
     figure.savefig(HERE / "margins.png", dpi=110)
 
 
-CAUSE_COLORS = ("#0072b2", "#7cc8f2", "#f0b400", "#d55e00", "#7a1f6b", "#9a9a9a", "#202020")
+CAUSE_COLORS = ("#009e73", "#0072b2", "#7cc8f2", "#f0b400", "#d55e00", "#7a1f6b", "#9a9a9a", "#202020")
 
 
 def why() -> None:

@@ -1,7 +1,8 @@
 """Why an agent failed a test episode: truth is swapped in, one stage at a time, until the episode is solved.
 
 An episode that no optimal policy would have solved with the same draws of chance was bad luck. Of all else, the agent's
-perception is made right first, then its plan, then its model of transitions that it never experienced, then all of its
+memory is made right first: where a frame hid something, it acts as it does on a frame that shows all. Then its
+perception is made right, then its plan, then its model of transitions that it never experienced, then all of its
 model, then the execution of its macro-actions. Each stage keeps the truth of those before it, and the first that solves
 the episode names its cause; the last is the optimal policy, which does. So every failure has exactly one cause. A
 policy cannot be learned anew in a model that was made right; so the plan comes before the model: where perfect planning
@@ -44,6 +45,7 @@ from imagine_bench.store import run_folder
 from imagine_bench.store.results import PolicyTable
 
 CAUSES = {
+    "forgotten": "it did not remember a part of the first frame that later ones hide",
     "misread": "a frame was misread",
     "unexperienced": "a transition that it needed was never experienced",
     "model": "its model was wrong, though it was experienced",
@@ -70,6 +72,7 @@ class FailedEpisode:
     terminated: bool  # whether it ended in a terminal macrostate
     faults: Sequence[bool]  # motor failures: whether the result is no outcome of that macro-action. Length L.
     misread: Sequence[bool]  # whether the agent misread the frame before each macro-action. Length L.
+    hidden: Sequence[bool] = ()  # whether that frame hid a part of the macrostate; length L, or empty: none did
     seed: int  # of the uniform numbers
 
 
@@ -91,11 +94,14 @@ def frames_to_ask_with(agent: Agent, spec: TaskSpec, *, appearance: str, purpose
 
 
 def misread(agent: Agent, frames: Frame, states: Ints) -> Bools:
-    """Which frames (N, 64, 64, 3) of macrostates (N, M) an agent misreads; none of one that cannot say. Shape (N,)."""
+    """Which frames (N, 64, 64, 3) of macrostates (N, M) an agent misreads; none of one that cannot say. Shape (N,).
+
+    A coordinate that is hidden, -1, cannot be misread.
+    """
     if not isinstance(agent, FrameReader):
         return np.zeros(len(frames), dtype=bool)
     begin_episode(agent)
-    return (agent.read_frames(frames) != states).any(axis=1)
+    return ((agent.read_frames(frames) != states) & (states >= 0)).any(axis=1)
 
 
 def beliefs(agent: Agent, rules: Rules, frames: Frame, rng: np.random.Generator, *, privileged: bool) -> PolicyTable:
@@ -141,9 +147,11 @@ class Attribution:
         if model is None:
             own = Model(truth.following, truth.p_continues * known[..., None], np.where(known, truth.reward, NEVER))
         else:
-            expected = Model(rows_of(model.macrostates, states), model.p_continues, model.reward)
+            following = _remembered(model.macrostates, spec, states)
+            expected = Model(rows_of(following, states), model.p_continues, model.reward)
             own = _mixed(readable[:, None], expected, truth)
         self._best = self._plan(truth)
+        self._any = np.ones_like(self._best)
         self._stages = (
             ("misread", self._best | readable[:, None]),
             ("planning" if model else "values", self._plan(own)),
@@ -156,6 +164,8 @@ class Attribution:
         drawn = self._drawn(episode)
         if not self._solves(episode, drawn, self._best, faults=False):
             return "unlucky"
+        if any(episode.hidden) and self._solves(episode, drawn, self._any, faults=True, remembers=True):
+            return "forgotten"
         for name, plan in self._stages[0 if any(episode.misread) else 1 :]:
             if self._solves(episode, drawn, plan, faults=True):
                 return name
@@ -177,18 +187,25 @@ class Attribution:
         best = values.max(axis=2, keepdims=True)
         return values >= best - _TIE * np.maximum(1.0, np.abs(best))
 
-    def _solves(self, episode: FailedEpisode, drawn: Sequence[float], plan: Bools, *, faults: bool) -> bool:
+    def _solves(
+        self, episode: FailedEpisode, drawn: Sequence[float], plan: Bools, *, faults: bool, remembers: bool = False
+    ) -> bool:
         """Whether the episode succeeds where frames are read right and a plan is followed.
 
-        If the agent's action is among equally good ones of the plan, it is the plan's.
+        If the agent's action is among equally good ones of the plan, it is the plan's. If it only ``remembers``, what
+        it misread stays misread.
         """
+        replaced = episode.misread
+        if remembers:
+            pairs = zip(episode.hidden, episode.misread, strict=True)
+            replaced = [hidden and not wrong for hidden, wrong in pairs]
         state = episode.states[0]
         for step in range(self._horizon):
             row = self._rows.get(state)
             if row is None:
                 return False
             lived = step < len(episode.actions) and state == episode.states[step]
-            action = int(episode.actions[step] if lived and not episode.misread[step] else self._action[row])
+            action = int(episode.actions[step] if lived and not replaced[step] else self._action[row])
             if not plan[self._horizon - step - 1, row, action]:
                 action = int(plan[self._horizon - step - 1, row].argmax())
             if lived and action == episode.actions[step] and (faults or not episode.faults[step]):
@@ -201,6 +218,33 @@ class Attribution:
                 return outcome.success
             state = outcome.macrostate
         return False
+
+
+def _remembered(macrostates: Ints, spec: TaskSpec, states: Sequence[State]) -> Ints:
+    """Macrostates (S, A, B, M) that a model expects; what it expects to be hidden is as in the macrostate before."""
+    values = np.array([len(each) for each in spec.macrostate_values])
+    before = np.array(states)[:, None, None]
+    hidden = (macrostates < 0) | (macrostates >= values)
+    return np.where(hidden, before, macrostates) if spec.sight is not None else macrostates
+
+
+def memory_suffices(spec: TaskSpec) -> bool:
+    """Whether all is known to an agent that remembers an episode's first frame.
+
+    Then no frame is late, the first one shows everything, and what later ones hide does not change.
+    """
+    sight = spec.sight
+    if sight is None:
+        return True
+    if sight.lag or any(sight.seen(state, 0) != ((1.0, state),) for state in spec.rules.start_states):
+        return False
+    for state, action in itertools.product(states_of(spec.rules), range(spec.n_actions)):
+        after = [each.macrostate for each in spec.rules.outcomes(state, action) if not each.terminated]
+        for _, seen in sight.seen(state, 1):
+            kept = [(old, place) for place, (old, new) in enumerate(zip(state, seen, strict=True)) if new < 0]
+            if any(then[place] != old for then in after for old, place in kept):
+                return False
+    return True
 
 
 def drawn_by(number: float, outcomes: Sequence[Outcome]) -> Outcome:
@@ -271,10 +315,11 @@ def causes_of(trained: Trained) -> tuple[Tested, ...]:
     """
     protocol = trained.spec.protocol
     spec = trained.task
-    if spec.sight is not None:
+    if not memory_suffices(spec):
         raise InvalidValueError(
-            f"Frames of {spec.id} hide something, or are old. The right action there depends on all "
-            "that it saw before, so its failures have no one cause; ask about a world without gesture and lag."
+            f"Frames of {spec.id} are old, or hide something that changes. The right action there depends on all "
+            "that it saw before, so its failures have no one cause; ask about a world without lag whose gesture is "
+            "always shown, or gesture=first without goal_change."
         )
     if protocol.dataset or protocol.after:
         raise InvalidValueError(
@@ -325,6 +370,7 @@ def lived_again(env: Env, agent: Agent, rules: Rules, seed: int, actions: Sequen
         frame, _, terminated, _, info = env.step(action)
         infos.append(info)
     states = np.array([info["macrostate"] for info in infos], dtype=np.int64)
+    shown = np.array([info.get("shown", info["macrostate"]) for info in infos], dtype=np.int64)
     visited = [tuple(state) for state in states.tolist()]
     known = set(states_of(rules))
     faults = []
@@ -335,6 +381,7 @@ def lived_again(env: Env, agent: Agent, rules: Rules, seed: int, actions: Sequen
         actions=actions,
         terminated=bool(terminated),
         faults=faults,
-        misread=misread(agent, np.array(frames), states[:-1]).tolist(),
+        misread=misread(agent, np.array(frames), shown[:-1]).tolist(),
+        hidden=(shown[:-1] < 0).any(axis=1).tolist(),
         seed=seed,
     )

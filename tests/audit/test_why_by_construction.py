@@ -104,7 +104,8 @@ def test_a_course_is_what_was_seen_before_each_action(tmp_path: Path) -> None:
 
 def test_what_cannot_be_asked_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cases: tuple[tuple[str, dict[str, Any], str], ...] = (
-        ("arrows:cubes=2,gesture=first", {}, "hide something, or are old"),
+        ("arrows:cubes=2,gesture=0.5", {}, "are old, or hide something that changes"),
+        ("arrows:cubes=2,lag=1", {}, "are old, or hide something that changes"),
         ("arrow_puzzle", {"dataset": "some-1@0123456789ab"}, "in a dataset or an earlier task"),
         ("arrow_puzzle", {"after": ("arrow_puzzle_hard",)}, "in a dataset or an earlier task"),
         ("arrow_puzzle", {"observation": "state", "agents": ("random",)}, "saw more than frames"),

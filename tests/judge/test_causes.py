@@ -14,7 +14,7 @@ from imagine_bench import registry
 from imagine_bench.exact.values import true_model
 from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
-from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, drawn_by, place
+from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, drawn_by, memory_suffices, place
 from imagine_bench.rules import fewest_actions, states_of
 from imagine_bench.store.results import PolicyTable
 
@@ -164,3 +164,47 @@ def test_a_number_finds_the_outcome_that_it_stands_for() -> None:
 def test_a_scene_that_was_no_macrostate_is_no_experience() -> None:
     odd = Attribution(SPEC, does(OPTIMAL, None), np.array([[9, 9, 9, 9, 0]]), EVERY)
     assert odd.cause(episode(FAR[0], [ILLEGAL[FAR[0]]])) == "unexperienced"
+
+
+MEMORY = registry.task("arrows:horizon=5,gesture=first")
+
+
+def test_an_agent_that_forgets_the_gesture_is_charged_with_that_alone() -> None:
+    """It does the best on a frame that shows all; on later ones it takes the hidden cube to be another."""
+    asked = does(OPTIMAL, model_of(MEMORY))
+    start = next(state for state in FAR if fewest_actions(RULES, state) == 2)
+    first = OPTIMAL[start]
+    (then,) = RULES.outcomes(start, first)
+    failed = episode(start, [first, ILLEGAL[then.macrostate]], hidden=[False, True])
+    assert cause(asked, ALL, failed, MEMORY) == "forgotten"
+    assert cause(asked, ALL, dataclasses.replace(failed, hidden=[False, False]), MEMORY) == "planning"
+    also_misread = dataclasses.replace(failed, misread=[False, True])
+    assert cause(asked, ALL, also_misread, MEMORY) == "misread", "a frame that was misread is not forgotten"
+
+
+def test_a_model_that_expects_the_gesture_to_be_hidden_is_not_wrong() -> None:
+    whole = model_of(MEMORY)
+    hiding = whole.macrostates.copy()
+    hiding[..., -1] = RULES.world.cubes  # the probe's class of a hidden gesture
+    start = FAR[0]
+    failed = episode(start, [ILLEGAL[start]])
+    found = [
+        cause(does(ILLEGAL, dataclasses.replace(whole, macrostates=each)), ALL, failed, MEMORY)
+        for each in (whole.macrostates, hiding)
+    ]
+    assert found == ["planning", "planning"]
+
+
+@pytest.mark.parametrize(
+    ("name", "suffices"),
+    [
+        ("arrow_puzzle", True),
+        ("arrows:gesture=first", True),
+        ("arrows:gesture=0.5", False),
+        ("arrows:lag=1", False),
+        ("arrows:gesture=first,goal_change=0.1", False),
+        ("pick_place:gesture=first", False),
+    ],
+)
+def test_memory_suffices_where_the_first_frame_shows_all_that_stays(name: str, suffices: bool) -> None:
+    assert memory_suffices(registry.task(name)) is suffices

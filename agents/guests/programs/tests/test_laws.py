@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import written
-from imagine_bench_programs.laws import Laws, Row, ends_of, simplest
+from imagine_bench_programs.delay import Row, changes, too_early
+from imagine_bench_programs.laws import Laws, ends_of, simplest
 from imagine_bench_programs.writer import Writer
 
 from imagine_bench import registry
@@ -74,12 +77,78 @@ def test_unseen_values_teach_nothing() -> None:
     assert writer.laws.count == 0
 
 
+def late(delay: int, episodes: int = 30) -> list[Row]:
+    """Of two macro-actions, which turn a dial of five values, with symbols that are late; turning to 0 ends it."""
+    rng = np.random.default_rng(3)
+    rows = []
+    for _ in range(episodes):
+        states = [int(rng.integers(1, 5))]
+        for step in range(8):
+            action = int(rng.integers(2))
+            states.append((states[-1] + (1, 3)[action]) % 5)
+            shown = [states[max(0, each - delay)] for each in (step, step + 1)]
+            done = states[-1] == 0
+            rows.append(Row((shown[0],), action, (shown[1],), float(done), done, step))
+            if done:
+                break
+    return rows
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2, 3])
+def test_late_symbols_give_the_laws_of_those_that_are_not(delay: int) -> None:
+    rows = late(delay)
+    laws = Laws((5,), 2, rows)
+    assert laws.delay == delay and not laws.drifts
+    assert [[laws.turned((value,), action)[0] for value in range(5)] for action in range(2)] == [
+        [1, 2, 3, 4, 0],
+        [3, 4, 0, 1, 2],
+    ]
+    assert all(
+        laws.end(each.now, each.action, each.then)[1:] == (each.reward, each.ended) for each in laws.present(rows)
+    )
+    assert {laws.end((value,), 0, laws.turned((value,), 0)).ended for value in range(4)} == {False}
+    assert laws.end((4,), 0, (0,)).ended, "the reward that came at once belongs to symbols that are not seen yet"
+
+
+def test_changes_belong_to_the_macro_action_of_before() -> None:
+    first, second, third = (Row((value,), value, (value + 1,), 0.0, False, value) for value in range(3))
+    assert changes([first, second, third], 1) == [second._replace(action=0), third._replace(action=1)]
+    still = first._replace(then=(0,))
+    assert changes([still, second], 1) == [second._replace(action=0)], "a repetition is of no macro-action"
+    assert (too_early([first, second], 1), too_early([still, second], 1)) == (1, 0)
+
+
+def test_a_plan_begins_after_the_macro_actions_that_are_not_seen_yet() -> None:
+    writer = Writer((5,), 2, np.random.default_rng(0))
+    for each in late(1, episodes=40):
+        writer.learn(each)
+    writer.begin_episode()
+    first = writer.choose((3,), explore=False)
+    assert first == 1 or writer.laws.turned((3,), 0) == (4,)
+    (now,) = writer.laws.after((3,), [first])
+    again = writer.choose((3,), explore=False)  # the frame still shows the start
+    assert writer.laws.turned((now,), again) == (0,), "it knows where the first macro-action led"
+    writer.begin_episode()
+    assert writer.choose((3,), explore=False) == first
+
+
+def test_more_macro_actions_are_another_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands, "_learner", lambda spec: 20.0)
+    out = tmp_path / "written.json"
+    for times in ("1", "2", "1"):
+        words = ["programs", "write", "arrow_puzzle_easy", "--seeds", "1", "--times", times, "--out", str(out)]
+        monkeypatch.setattr(sys, "argv", words)
+        commands.main()
+    assert [each["macro_actions"] for each in json.loads(out.read_text())["rows"]] == [20, 40]
+
+
 @pytest.mark.parametrize(
     "name",
     [
         "arrow_puzzle",
         pytest.param("arrows:slip=0.2", marks=pytest.mark.slow),
         pytest.param("arrows:horizon=5,gesture=first", marks=pytest.mark.slow),
+        pytest.param("arrows:horizon=6,lag=2", marks=pytest.mark.slow),
     ],
 )
 def test_the_writer_is_exact_after_twice_the_cautious_learners_experience(name: str) -> None:

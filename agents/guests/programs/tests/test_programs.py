@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.experience import write_experience
 from imagine_bench_programs.model import make_program
 from imagine_bench_programs.program import Program, spelled
@@ -27,18 +28,25 @@ from imagine_bench.store import encoders
 ARROWS = Path(__file__).parents[1] / "examples" / "arrows.py"
 SIZES = (4, 4, 4, 3)
 STATE = (0, 1, 2, 0, 0)
+REACHES = "import collections\ncollections._sys.modules"
+"""Loaded modules, past the checked import: what they do is refused by the audit hook."""
 HOSTILE = {
     "hangs": ("while True: pass", "it was stopped after 6 s, the limit of a call."),
     "hangs when it is asked": ("def outcomes(s, a):\n while True: pass", "it was stopped after 6 s"),
-    "forks": ("import os\nos.fork()", "it calls os.fork; a program only computes."),
-    "starts a command": ("import sys\nsys.modules['subprocess'].run(['ls'])", "it calls subprocess.Popen"),
-    "calls the C library": ("import sys\nsys.modules['ctypes'].CDLL(None).fork()", "it calls ctypes.dlopen"),
-    "opens a socket": ("import sys\nsys.modules['socket'].socket()", "it calls socket.__new__"),
+    "forks": (f"{REACHES}['os'].fork()", "it calls os.fork; a program only computes."),
+    "starts a command": (f"{REACHES}['subprocess'].run(['ls'])", "it calls subprocess.Popen"),
+    "calls the C library": (f"{REACHES}['ctypes'].CDLL(None).fork()", "it calls ctypes.dlopen"),
+    "opens a socket": (f"{REACHES}['socket'].socket()", "it calls socket.__new__"),
+    "imports a module that is loaded": ("import os", "it imports os; a program may import bisect, "),
+    "imports a part of one": ("from os import path", "it imports os; a program may"),
+    "imports when it is asked": ("def outcomes(s, a):\n from time import time", "it imports time; a program may"),
+    "imports by a function": ("__import__('random')", "it imports random; a program may"),
+    "imports from its own package": ("from . import guest", "it imports .; a program may"),
     "reads a file": ("open('/etc/passwd')", "it opens '/etc/passwd'; a program reads and writes no files."),
     "imports the rules": ("import imagine_bench.tasks.arrows.rules", "it imports imagine_bench.tasks"),
     "prints": ("def outcomes(s, a):\n print('hello')\n return {s: 1.0}", "it prints 'hello"),
     "exits": ("raise SystemExit(3)", "it raises SystemExit: 3"),
-    "ends its process": ("import os\nos._exit(4)", "its process ended itself with exit code 4."),
+    "ends its process": (f"{REACHES}['os']._exit(4)", "its process ended itself with exit code 4."),
     "fills the memory": ("x = bytearray(3 << 30)", "it raises MemoryError"),
     "raises": ("def outcomes(s, a): raise KeyError('x')", "it raises KeyError: 'x'"),
     "is no Python": ("def outcomes(:", "it raises SyntaxError"),
@@ -111,6 +119,37 @@ def test_a_changed_file_is_another_agent_and_resumes_nothing(tmp_path: Path) -> 
 def test_a_name_that_is_none_gets_one_sentence(name: str, said: str) -> None:
     with pytest.raises(ImagineBenchError, match=said):
         registry.settings(protocol("arrow_puzzle", "smoke", agents=(name,)).agents[0], "fast", {}, "chapter_5")
+
+
+def test_a_path_may_hold_an_at_sign(tmp_path: Path) -> None:
+    folder = tmp_path / "me@home"
+    folder.mkdir()
+    file = folder / "arrows.py"
+    file.write_text(ARROWS.read_text())
+    name = spelled(str(file))
+    assert name == f"{file}@{spelled(str(ARROWS))[-12:]}" and spelled(name) == name
+    assert Program(name, SIZES, 6).name == str(file)
+    assert registry.agent_entry(f"program:{name}").title == f"program (symbols given) {file}"
+
+
+def test_an_error_of_a_command_ends_with_its_own_exit_code(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["programs", "score", "nosuchtask", str(ARROWS)])
+    with pytest.raises(SystemExit) as ended:
+        commands.main()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith("No task 'nosuchtask'.")
+
+
+def test_allowed_modules_and_their_parts_are_imported(tmp_path: Path) -> None:
+    file = tmp_path / "imports.py"
+    file.write_text(
+        "import numpy.linalg\nfrom collections import abc\nfrom numpy import random\n"
+        "def outcomes(s, a):\n import math\n return {s: math.cos(0.0)}\n"
+    )
+    (only,) = Program(str(file), SIZES, 6).outcomes(STATE, 0)
+    assert only.probability == 1.0
 
 
 def test_titles_say_that_symbols_are_given() -> None:

@@ -28,7 +28,7 @@ _TIMES = 2.0
 
 
 def main() -> None:
-    """Run the command that was given; an error that is written for users is one sentence and exit code 2."""
+    """Run the command that was given; an error that is written for users is one sentence, with its own exit code."""
     parser = argparse.ArgumentParser(prog="python -m imagine_bench_programs", description=__doc__)
     commands = parser.add_subparsers(required=True)
     _add_experience(commands.add_parser("experience", help="write the folder from which a program is to be written"))
@@ -38,7 +38,8 @@ def main() -> None:
     try:
         given.run(given)
     except ImagineBenchError as error:
-        sys.exit(f"{error}")
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)
 
 
 def _add_experience(parser: argparse.ArgumentParser) -> None:
@@ -100,7 +101,7 @@ def _add_write(parser: argparse.ArgumentParser) -> None:
 
 def _write(given: argparse.Namespace) -> None:
     rows = json.loads(given.out.read_text())["rows"] if given.out is not None and given.out.exists() else []
-    done = {(row["task"], row["seed"]) for row in rows}
+    done = {(row["task"], row["seed"], row["macro_actions"]) for row in rows}
     for name in given.tasks:
         spec = task(name)
         learner = _learner(spec)
@@ -108,8 +109,9 @@ def _write(given: argparse.Namespace) -> None:
             raise InvalidValueError(
                 f"The cautious learner does not end in {name}, so there is no budget; leave it out."
             )
-        for seed in [seed for seed in given.seeds if (name, seed) not in done]:
-            rows.append({"task": name, "learner": learner, **written(spec, int(given.times * learner), seed)})
+        budget = int(given.times * learner)
+        for seed in [seed for seed in given.seeds if (name, seed, budget) not in done]:
+            rows.append({"task": name, "learner": learner, **written(spec, budget, seed)})
             print(*(f"{value:.4g}" if isinstance(value, float) else value for value in rows[-1].values()), flush=True)
             if given.out is not None:
                 given.out.write_text(json.dumps({"rows": rows, "environment": describe_environment()}, indent=1))
@@ -120,8 +122,10 @@ def written(spec: TaskSpec, macro_actions: int, seed: int) -> dict[str, Any]:
     begun_s = time.process_time()
     starts, choices = (np.random.default_rng([seed, each]) for each in range(2))
     writer = Writer([len(values) for values in spec.macrostate_values], spec.n_actions, choices)
-    for row, _ in play(spec, lambda symbols: writer.choose(symbols, explore=True), starts):
+    for row, last in play(spec, lambda symbols: writer.choose(symbols, explore=True), starts):
         writer.learn(row)
+        if last:
+            writer.begin_episode()
         if len(writer.rows) == macro_actions:
             break
     writer.write()

@@ -8,13 +8,20 @@ from imagine_bench.agents.meters import Meters
 
 from imagine_bench.interfaces import AgentContext, AgentState, Arrays, Observation, State, Transition
 
-from .laws import Row
+from .delay import Row
 from .program import Program
 from .settings import HYPERPARAMETERS
 from .symbols import Symbols
 from .writer import Writer
 
-_TYPES = {"now": np.int64, "action": np.int64, "then": np.int64, "reward": np.float64, "ended": np.bool_}
+_TYPES = {
+    "now": np.int64,
+    "action": np.int64,
+    "then": np.int64,
+    "reward": np.float64,
+    "ended": np.bool_,
+    "step": np.int64,
+}
 
 
 class ProgramAgent:
@@ -63,6 +70,13 @@ class LawsAgent:
         self.meters = Meters()
         self._rng = context.seeds.child("exploration").generator()
         self.writer = Writer(symbols.sizes, context.n_actions, self._rng)
+        self._step = 0
+        """Macro-actions of this episode that it learned from."""
+
+    def begin_episode(self) -> None:
+        """Forget the macro-actions of the episode so far, whose effects late frames may not show yet."""
+        self._step = 0
+        self.writer.begin_episode()
 
     def act(self, observation: Observation, *, explore: bool) -> int:
         """The first macro-action of the best plan, or, exploring, of the best plan that may be."""
@@ -73,7 +87,8 @@ class LawsAgent:
         """Learn from the transition."""
         with self.meters.cpu_time("time/model_s"):
             now, then = self.symbols.read(np.stack([transition.observation.frame, transition.next_observation.frame]))
-            self.writer.learn(Row(now, transition.action, then, transition.reward, transition.terminated))
+            self.writer.learn(Row(now, transition.action, then, transition.reward, transition.terminated, self._step))
+            self._step += 1
         self.meters.count("time/model_s")
 
     def diagnostics(self) -> dict[str, float]:
@@ -102,8 +117,8 @@ class LawsAgent:
         arrays = snapshot.below("replay", state.arrays)
         self.writer = Writer(self.symbols.sizes, self.writer.n_actions, self._rng)
         columns = (arrays[name].tolist() for name in _TYPES)
-        for now, action, then, reward, ended in zip(*columns, strict=True):
-            self.writer.learn(Row(tuple(now), action, tuple(then), reward, ended))
+        for now, action, then, reward, ended, step in zip(*columns, strict=True):
+            self.writer.learn(Row(tuple(now), action, tuple(then), reward, ended, step))
         self.meters.restore(state.values["meters"])
         self._rng.bit_generator.state = state.values["exploration"]
 

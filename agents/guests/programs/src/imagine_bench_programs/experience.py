@@ -13,7 +13,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.registry import task
 
-from .laws import Row
+from .delay import Row
 
 Choose = Callable[[State], int]
 _FILE = "experience.json"
@@ -32,7 +32,7 @@ def play(spec: TaskSpec, choose: Choose, rng: np.random.Generator) -> Iterator[t
         taken = [_seen(spec, state, 0, rng)]
         now = taken[0]
         for step in range(1, spec.horizon + 1):
-            action = choose(now) if min(now) >= 0 else int(rng.integers(rules.n_actions))
+            action = choose(now)
             outcomes = rules.outcomes(state, action)
             outcome = outcomes[int(rng.choice(len(outcomes), p=[each.probability for each in outcomes]))]
             state = outcome.macrostate
@@ -40,7 +40,7 @@ def play(spec: TaskSpec, choose: Choose, rng: np.random.Generator) -> Iterator[t
             shown = taken[max(0, step - lag)]
             then = tuple(old if new < 0 else new for new, old in zip(shown, now, strict=True))
             last = outcome.terminated or step == spec.horizon
-            yield Row(now, action, then, outcome.reward, outcome.terminated), last
+            yield Row(now, action, then, outcome.reward, outcome.terminated, step - 1), last
             if last:
                 break
             now = then

@@ -1,18 +1,20 @@
 """The process of a program: the file is carried out here, and its function is asked.
 
-A program may compute, and import the modules of :data:`ALLOWED`. An audit hook, which code cannot take away again,
-refuses it files, processes, threads, sockets, the C library and any other import.
+A program may compute, and import the modules of :data:`ALLOWED`. Its ``import`` is a checked one. An audit hook,
+which code cannot take away again, refuses it files, processes, threads, sockets, the C library and modules that are
+not loaded yet.
 """
 
 from __future__ import annotations
 
+import builtins
 import contextlib
 import importlib
 import inspect
 import io
 import math
 import sys
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from importlib.abc import InspectLoader
 from types import ModuleType
 from typing import Any
@@ -27,7 +29,9 @@ ALLOWED = (
     "itertools", "math", "numpy", "operator", "re", "statistics", "string", "typing",
 )  # fmt: skip
 """Modules that a program may import."""
+_PARTS = ("numpy.linalg", "numpy.random")
 _REFUSED = ("_thread.", "ctypes.", "fcntl.", "mmap.", "os.", "pty.", "shutil.", "signal.", "socket.", "subprocess.")
+_REFUSED_IMPORT = f"it imports {{name}}; a program may import {', '.join(ALLOWED)}."
 FUNCTION = "outcomes"
 """The name of a program's function."""
 
@@ -53,10 +57,11 @@ class Served:
     """
 
     def __init__(self, source: str) -> None:
-        for name in (*ALLOWED, "numpy.linalg", "numpy.random"):
+        for name in (*ALLOWED, *_PARTS):
             importlib.import_module(name)
         sys.addaudithook(_refuse)
         module = sys.modules["program"] = ModuleType("program")
+        module.__dict__["__builtins__"] = {**vars(builtins), "__import__": _import}
         with _silent():
             _Text(source).exec_module(module)
         self._function = getattr(module, FUNCTION, None)
@@ -65,6 +70,7 @@ class Served:
         self._remembers = len(inspect.signature(self._function).parameters) > 2
         self._memories: list[Hashable] = [None]
         """What the program wants to be remembered, by number; a new episode begins with number 0."""
+        self._numbers: dict[Hashable, int] = {None: 0}
 
     def facts(self) -> Arrays:
         """Whether it remembers anything."""
@@ -106,10 +112,20 @@ class Served:
                 f"it gives the outcome {brief(given)}; give {factors} symbols, or (symbols, reward, ended, memory)."
             )
         reward, ended, memory = (*more, None, None, None)[:3]
-        if memory not in self._memories:
-            self._memories.append(memory)
         values = tuple(int(symbol) for symbol in symbols)
-        return values, math.nan if reward is None else float(reward), bool(ended), self._memories.index(memory)
+        return values, math.nan if reward is None else float(reward), bool(ended), self._number(memory)
+
+    def _number(self, memory: Hashable) -> int:
+        """The number of something that is remembered. Raises InvalidValueError: it can be changed."""
+        try:
+            number = self._numbers.setdefault(memory, len(self._memories))
+        except TypeError as error:
+            raise InvalidValueError(
+                f"it remembers {brief(memory)}, which can be changed; give None, a number, a text or a tuple of them."
+            ) from error
+        if number == len(self._memories):
+            self._memories.append(memory)
+        return number
 
 
 @contextlib.contextmanager
@@ -121,10 +137,27 @@ def _silent() -> Iterator[None]:
         raise InvalidValueError(f"it prints {brief(printed.getvalue())}; a program only returns outcomes.")
 
 
+def _import(
+    name: str,
+    global_names: Mapping[str, object] | None = None,
+    local_names: Mapping[str, object] | None = None,
+    names: Sequence[str] = (),
+    level: int = 0,
+) -> ModuleType:
+    """``import`` in a program. Many modules are loaded already, so that no audit event tells of them.
+
+    Raises:
+        InvalidValueError: The module is none of :data:`ALLOWED`.
+    """
+    if level or name not in (*ALLOWED, *_PARTS):
+        raise InvalidValueError(_REFUSED_IMPORT.format(name="." * level + name))
+    return builtins.__import__(name, global_names, local_names, names)
+
+
 def _refuse(event: str, given: tuple[object, ...]) -> None:
     """Raise InvalidValueError for an event that a program may not cause."""
     if event == "import" and given[0] not in ALLOWED:
-        raise InvalidValueError(f"it imports {given[0]}; a program may import {', '.join(ALLOWED)}.")
+        raise InvalidValueError(_REFUSED_IMPORT.format(name=given[0]))
     if event == "open":
         raise InvalidValueError(f"it opens {brief(given[0])}; a program reads and writes no files.")
     if event.startswith(_REFUSED):

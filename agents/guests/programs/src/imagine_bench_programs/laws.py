@@ -1,6 +1,7 @@
 """The shortest laws that explain transitions between symbols, found by enumeration, without a network.
 
-A program of laws has three parts, each the shortest that explains the data:
+A program of laws has three parts, each the shortest that explains the data. Symbols may be some macro-actions late
+(:mod:`.delay`); laws are about those that are not.
 
 - *Effects*: "if at most two conditions hold, the macro-action makes a factor f(its value)". All effects of a
   macro-action come about together, with one probability; otherwise it changes nothing.
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Outcome, State
 
+from .delay import MOST_DELAY, Row, changes, complete, too_early
 from .symbol_rules import SymbolRules
 
 _CONTRADICTED = 20.0
@@ -35,16 +37,6 @@ _FORMS = 3
 """Forms of a function of a value: a step round the circle of its values, a constant, a table."""
 _TESTS = 2
 """Most conditions of a law."""
-
-
-class Row(NamedTuple):
-    """A transition between symbols."""
-
-    now: State
-    action: int
-    then: State
-    reward: float
-    ended: bool
 
 
 class Test(NamedTuple):
@@ -85,19 +77,23 @@ class Laws(SymbolRules):
     def __init__(self, sizes: Sequence[int], n_actions: int, rows: Sequence[Row] = ()) -> None:
         super().__init__(n_actions)
         self.sizes = tuple(sizes)
-        self._rows = [row for row in rows if min(*row.now, *row.then) >= 0]
-        self._of_action = [[row for row in self._rows if row.action == action] for action in range(n_actions)]
         self._known: dict[tuple[State, int], tuple[Outcome, ...]] = {}
-        self.drifts = self._drifting()
+        found = _Dynamics(self.sizes, n_actions, complete(changes(rows, 0)))
+        self.delay = 0
+        """How many macro-actions symbols are late."""
+        for delay in range(1, MOST_DELAY + 1 if found.is_odd else 1):
+            late = _Dynamics(self.sizes, n_actions, complete(changes(rows, delay)))
+            late.nats += _CONTRADICTED * too_early(rows, delay)
+            if late.nats < found.nats:
+                found = late
+                self.delay = delay
+        self.drifts = found.drifts
         """Probability with which each factor that drifts does so, by factor."""
-        steady = [factor for factor in range(len(sizes)) if factor not in self.drifts]
-        self.effects = [
-            [law for factor in steady for law in self._effects(each, factor)[0]] for each in self._of_action
-        ]
+        self.effects = found.effects
         """The effects of each macro-action."""
-        self.happens = self._happening()
+        self.happens = found.happening()
         """Probability with which they come about, by macro-action."""
-        self.ends = ends_of(self._rows, self.sizes, n_actions)
+        self.ends = ends_of(complete(self.present(rows)), self.sizes, n_actions)
 
     @property
     def count(self) -> int:
@@ -122,11 +118,28 @@ class Laws(SymbolRules):
 
     def turned(self, state: State, action: int) -> State:
         """The symbols after a macro-action whose effects come about, without drifts."""
-        then = list(state)
-        for law in reversed(self.effects[action]):  # of several that hold the first counts
-            if all(test.holds(state) for test in law.tests):
-                then[law.factor] = law.becomes[state[law.factor]]
-        return tuple(then)
+        return _turned(self.effects, state, action)
+
+    def after(self, state: State, actions: Sequence[int]) -> State:
+        """The symbols after the last ``delay`` of some macro-actions, whose effects are not seen yet."""
+        for action in actions[max(0, len(actions) - self.delay) :]:
+            state = self.turned(state, action) if min(state) >= 0 else state
+        return state
+
+    def present(self, rows: Sequence[Row]) -> list[Row]:
+        """Transitions between the symbols that were not seen yet, with the rewards that came at once.
+
+        Each transition of an episode is to follow the one before it.
+        """
+        if not self.delay:
+            return list(rows)
+        found = []
+        for place, row in enumerate(rows):
+            before = [each.action for each in rows[place - row.step : place]]
+            now = self.after(row.now, before)
+            then = self.turned(now, row.action) if min(now) >= 0 else now
+            found.append(row._replace(now=now, then=then))
+        return found
 
     def end(self, now: State, action: int, then: State) -> End:
         """The first law for reward and end that holds."""
@@ -152,17 +165,50 @@ class Laws(SymbolRules):
             ]
         return found
 
-    def _drifting(self) -> dict[int, float]:
-        """The factors whose changes a drift explains in fewer nats than effects do."""
-        found = {}
-        for factor, size in enumerate(self.sizes):
-            changed = sum(row.now[factor] != row.then[factor] for row in self._rows)
-            kept = sum(row.now[factor] == row.then[factor] and not row.ended for row in self._rows)
-            chance, nats = simplest(changed, kept)
-            nats += math.log(len(self.sizes)) + changed * math.log(max(1, size - 1))
-            if changed and nats < sum(self._effects(rows, factor)[1] for rows in self._of_action):
-                found[factor] = chance
-        return found
+
+def _turned(effects: Sequence[Sequence[Effect]], state: State, action: int) -> State:
+    then = list(state)
+    for law in reversed(effects[action]):  # of several that hold the first counts
+        if all(test.holds(state) for test in law.tests):
+            then[law.factor] = law.becomes[state[law.factor]]
+    return tuple(then)
+
+
+class _Dynamics:
+    """Drifts and effects of N transitions in which every value was seen, and the nats of all of them."""
+
+    def __init__(self, sizes: Sequence[int], n_actions: int, rows: Sequence[Row]) -> None:
+        self.sizes = tuple(sizes)
+        self.n_actions = n_actions
+        self._rows = rows
+        self._of_action = [[row for row in rows if row.action == action] for action in range(n_actions)]
+        self.drifts: dict[int, float] = {}
+        self.effects: list[list[Effect]] = [[] for _ in range(n_actions)]
+        self.nats = 0.0
+        for factor in range(len(sizes)):
+            self._explain(factor)
+
+    @property
+    def is_odd(self) -> bool:
+        """Whether something changed that no effect explains, which may be an earlier macro-action's."""
+        return bool(self.drifts) or any(
+            row.then not in (row.now, _turned(self.effects, row.now, row.action)) for row in self._rows
+        )
+
+    def _explain(self, factor: int) -> None:
+        """Explain the changes of a factor by effects, or by a drift if that takes fewer nats."""
+        changed = sum(row.now[factor] != row.then[factor] for row in self._rows)
+        kept = sum(row.now[factor] == row.then[factor] and not row.ended for row in self._rows)
+        chance, nats = simplest(changed, kept)
+        nats += math.log(len(self.sizes)) + changed * math.log(max(1, self.sizes[factor] - 1))
+        found = [self._effects(rows, factor) for rows in self._of_action]
+        of_effects = sum(spent for _, spent in found)
+        self.nats += min(nats, of_effects) if changed else of_effects
+        if changed and nats < of_effects:
+            self.drifts[factor] = chance
+            return
+        for laws, (more, _) in zip(self.effects, found, strict=True):
+            laws.extend(more)
 
     def _effects(self, rows: Sequence[Row], factor: int) -> tuple[list[Effect], float]:
         """The effects of one macro-action on one factor, and their nats: one after another, each saves the most."""
@@ -204,11 +250,11 @@ class Laws(SymbolRules):
                         best = (nats, Effect(factor, tuple(tests[place] for place in chosen), becomes))
         return best
 
-    def _happening(self) -> list[float]:
+    def happening(self) -> list[float]:
         """How often the effects of each macro-action come about: one probability for all, if that is shorter."""
         counts = []
         for action, rows in enumerate(self._of_action):
-            pairs = [(self._steady(self.turned(row.now, action), row.then), row) for row in rows]
+            pairs = [(self._steady(_turned(self.effects, row.now, action), row.then), row) for row in rows]
             moved = [(turned, row) for turned, row in pairs if turned != row.now]
             came = sum(turned == self._steady(row.then, row.then) for turned, row in moved)
             counts.append((came, sum(self._steady(row.now, row.then) == row.then for _, row in moved)))

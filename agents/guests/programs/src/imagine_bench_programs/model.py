@@ -13,7 +13,8 @@ from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, imagined_outcomes
 from imagine_bench.rules import Outcomes, outcomes_by_depth
 
-from .laws import Laws, Row
+from .delay import Row
+from .laws import Laws
 from .program import Program
 from .settings import HYPERPARAMETERS
 from .symbol_rules import SymbolRules
@@ -64,9 +65,10 @@ class WrittenModel(SymbolModel):
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Find the shortest laws; nothing is random."""
         symbols = self.symbols.read(dataset.frames)
-        columns = (dataset.rows[0], dataset.actions, dataset.rewards, dataset.terminated)
+        steps = np.concatenate([np.arange(length) for length in dataset.lengths])
+        columns = (dataset.rows[0], dataset.actions, dataset.rewards, dataset.terminated, steps)
         rows = zip(*(column.tolist() for column in columns), strict=True)
-        found = [Row(symbols[at], action, symbols[at + 1], reward, ended) for at, action, reward, ended in rows]
+        found = [Row(symbols[at], action, symbols[at + 1], *more) for at, action, *more in rows]
         self.rules = Laws(self.symbols.sizes, self.rules.n_actions, found)
 
     def parameters(self) -> int:

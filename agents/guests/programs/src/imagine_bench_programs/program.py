@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import re
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,6 +23,9 @@ LIMITS = Limits(call_s=30.0, memory=1 << 30)
 """Thirty seconds for the start, and for all macro-actions from one macrostate; one gibibyte."""
 _SUM = 1e-6
 """By how much probabilities may miss a sum of 1."""
+_DIGITS = "@0123456789ab"
+_SPELLED = re.compile(r"(.*)@([0-9a-f]{12})", re.DOTALL)
+"""A file and digits of its digest; a path may hold an @ of its own."""
 _MOST = 100_000
 """Symbols, with memories, that a program may lead to."""
 
@@ -32,9 +36,10 @@ def spelled(argument: str) -> str:
     Raises:
         InvalidValueError: It cannot be read, or the digits that follow it are not those of its content.
     """
-    name, at, digits = argument.rpartition("@") if "@" in argument else (argument, "", "")
+    given = _SPELLED.fullmatch(argument)
+    name, digits = given.groups() if given else (argument, "")
     found = hashlib.sha256(_source(name).encode()).hexdigest()[:12]
-    if at and digits != found:
+    if digits not in ("", found):
         raise InvalidValueError(
             f"{name} was changed: its digest is {found}, not {digits}. Give {name} alone to begin anew with it."
         )
@@ -63,7 +68,7 @@ class Program(SymbolRules):
 
     def __init__(self, argument: str, sizes: Sequence[int], n_actions: int, limits: Limits = LIMITS) -> None:
         super().__init__(n_actions)
-        self.name = spelled(argument).rpartition("@")[0]
+        self.name = spelled(argument)[: -len(_DIGITS)]
         self.sizes = tuple(sizes)
         self._known: dict[State, list[tuple[Outcome, ...]]] = {}
         make = f"{__package__}.guest:Served"

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.exact.factors import FactorGraph, Machine, factor_graph, keys, machine, numbered
 from imagine_bench.interfaces import State, TaskSpec
+from imagine_bench.judge.truth import added_up, total_variation
 
 from .symbol_rules import SymbolRules
 
@@ -49,7 +49,7 @@ def score(rules: SymbolRules, spec: TaskSpec) -> Scores:
         imagined = _distribution(rules, states[row], action)
         expected.append(imagined)
         outcomes = range(first[pair], first[pair + 1])
-        real = _added((states[truth.after[each]], float(truth.probability[each])) for each in outcomes)
+        real = added_up((states[truth.after[each]], float(truth.probability[each])) for each in outcomes)
         distances.append(total_variation(real, imagined))
         likeliest = max(imagined, key=lambda state: imagined[state])
         for state, share in real.items():
@@ -71,23 +71,10 @@ def efficiency(learner: float, own: int) -> float:
     return min(1.0, (learner / own) ** 2)
 
 
-def total_variation(one: Distribution, other: Distribution) -> float:
-    """Half the sum of absolute differences."""
-    return 0.5 * sum(abs(one.get(key, 0.0) - other.get(key, 0.0)) for key in {*one, *other})
-
-
-def _added(pairs: Iterable[tuple[State, float]]) -> Distribution:
-    """The probability of each value."""
-    found: defaultdict[State, float] = defaultdict(float)
-    for value, share in pairs:
-        found[value] += share
-    return dict(found)
-
-
 def _distribution(rules: SymbolRules, state: State, action: int) -> Distribution:
     """Probabilities of the next symbols."""
     outcomes = rules.outcomes(rules.start(state), action)
-    return _added((each.macrostate[: len(state)], each.probability) for each in outcomes)
+    return added_up((each.macrostate[: len(state)], each.probability) for each in outcomes)
 
 
 def _ranked_first(state: State, real: Distribution, imagined: Distribution, states: int) -> float:
@@ -114,8 +101,8 @@ def _entries_found(truth: Machine, graph: FactorGraph, expected: list[Distributi
             shares[row].append((value, share))
         for row, law in enumerate(shares):
             imagined = expected[factor.action * truth.n_play + row].items()
-            own = _added((tuple(state[child] for child in children), share) for state, share in imagined)
-            if total_variation(_added(law), own) >= _SAME:
+            own = added_up((tuple(state[child] for child in children), share) for state, share in imagined)
+            if total_variation(added_up(law), own) >= _SAME:
                 wrong.add(int(factor.entry[row]))
         yield len({*factor.entry.tolist()} - wrong)
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from imagine_bench.interfaces import Outcome, State
 
-from .laws import Laws, Row
+from .delay import Row, changes, complete
+from .laws import Laws
 
 _DEPTH = 20
 """Macro-actions that are planned ahead."""
@@ -41,6 +42,8 @@ class Writer:
         self._learned = 0
         self._tried: Counter[tuple[int, int, int]] = Counter()
         """How often each macro-action was tried with a value of a factor; one that changed anything is enough."""
+        self._taken: list[int] = []
+        """The macro-actions of this episode."""
         self._met: set[tuple[tuple[int, int], ...]] = set()
         """Values, with their places, that met in a transition: those of the law that held; if none, all pairs."""
 
@@ -49,20 +52,40 @@ class Writer:
         self.rows.append(row)
         if min(*row.now, *row.then) < 0:
             return
-        for factor, value in enumerate(row.now):
-            self._tried[row.action, factor, value] += 1 if row.then == row.now else _TRIES
-        expected = max(self.laws.outcomes(row.now, row.action), key=lambda each: each.probability)
-        as_expected = (expected.macrostate, expected.reward, expected.terminated) == (row.then, row.reward, row.ended)
+        episode = self.rows[len(self.rows) - 1 - row.step :]
+        changed = changes(episode, self.laws.delay)[-1:]
+        *_, present = self.laws.present(episode)
+        for each in changed:
+            self._count_try(each)
+        expected = self._likeliest(present.now, present.action)
+        as_expected = (expected.reward, expected.terminated) == (row.reward, row.ended)
+        as_expected &= all(self._likeliest(each.now, each.action).macrostate == each.then for each in changed)
         if not as_expected or len(self.rows) >= _GROWTH * self._learned:
             self.write()
         else:
-            self._met |= set(self._claims(row))
+            self._met |= set(self._claims(present))
+
+    def begin_episode(self) -> None:
+        """Forget the macro-actions so far."""
+        self._taken = []
+
+    def _count_try(self, row: Row) -> None:
+        for factor, value in enumerate(row.now):
+            self._tried[row.action, factor, value] += 1 if row.then == row.now else _TRIES
+
+    def _likeliest(self, state: State, action: int) -> Outcome:
+        return max(self.laws.outcomes(state, action), key=lambda each: each.probability)
 
     def write(self) -> None:
         """Find the laws of all transitions so far."""
+        before = self.laws.delay
         self.laws = Laws(self.sizes, self.n_actions, self.rows)
         self._learned = len(self.rows)
-        self._met = {claim for row in self.rows for claim in self._claims(row)}
+        self._met = {claim for row in self.laws.present(self.rows) for claim in self._claims(row)}
+        if self.laws.delay != before:
+            self._tried.clear()
+            for row in complete(changes(self.rows, self.laws.delay)):
+                self._count_try(row)
 
     def _claims(self, row: Row) -> list[tuple[tuple[int, int], ...]]:
         """The values whose meeting decides a transition's reward and end, as far as the laws say; else all pairs."""
@@ -79,7 +102,14 @@ class Writer:
         return not tried or not self._met.issuperset(self._claims(row))
 
     def choose(self, state: State, *, explore: bool) -> int:
-        """The first macro-action of the best plan from some symbols, along the likeliest outcomes."""
+        """The first macro-action of the best plan from the newest symbols, along the likeliest outcomes."""
+        action = self._planned(self.laws.after(state, self._taken), explore=explore)
+        self._taken.append(action)
+        return action
+
+    def _planned(self, state: State, *, explore: bool) -> int:
+        if min(state) < 0:
+            return int(self.rng.integers(self.n_actions))
         unknown = max((row.reward for row in self.rows), default=0.0)
         unknown = max(unknown, 1.0) / (1.0 - _DISCOUNT)
         values = np.full(self.n_actions, -np.inf)
@@ -90,7 +120,7 @@ class Writer:
             further: list[tuple[State, int | None, float]] = []
             for (now, first, so_far), action in itertools.product(paths, range(self.n_actions)):
                 begun = action if first is None else first
-                likeliest = max(self.laws.outcomes(now, action), key=lambda each: each.probability)
+                likeliest = self._likeliest(now, action)
                 then = likeliest.macrostate
                 earned = so_far + weight * likeliest.reward
                 if explore and self._is_unknown(now, action, likeliest):
