@@ -224,11 +224,12 @@ def _tables(layers: list[_Layer], numbers: dict[State, int]) -> list[_Table]:
 
 def _value(tables: list[_Table], policy: Ints) -> float:
     """The success probability of a policy (O,), exactly."""
-    now = tables[0].first
+    now: Floats = tables[0].first
     won = 0.0
     for table in tables:
         pair = np.arange(len(now)), policy[table.shown]
         won += float(now @ table.wins[pair])
         weights = now[:, None] * table.share[pair]
-        now = np.bincount(table.then[pair].ravel(), weights.ravel(), minlength=max(1, table.following))
+        reached = np.bincount(table.then[pair].ravel(), weights.ravel(), minlength=max(1, table.following))
+        now = reached.astype(np.float64)
     return won

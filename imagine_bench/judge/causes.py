@@ -382,6 +382,6 @@ def lived_again(env: Env, agent: Agent, rules: Rules, seed: int, actions: Sequen
         terminated=bool(terminated),
         faults=faults,
         misread=misread(agent, np.array(frames), shown[:-1]).tolist(),
-        hidden=(shown[:-1] < 0).any(axis=1).tolist(),
+        hidden=[bool(row.min() < 0) for row in shown[:-1]],
         seed=seed,
     )

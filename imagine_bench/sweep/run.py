@@ -168,7 +168,8 @@ def plan_level(suite: Suite, level: Level, agent: str) -> list[Planned]:
     except InvalidValueError:
         if fields.pop("after", None) is None:
             raise
-        fields.pop("after_episodes", None)
+        for name in ("after_episodes", "unannounced"):
+            fields.pop(name, None)
         whole, encoders = plan(level.task, "quick", **fields)
     return [(dataclasses.replace(whole, seeds=(seed,)), encoders) for seed in whole.seeds]
 

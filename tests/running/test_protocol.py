@@ -50,10 +50,16 @@ def test_any_change_changes_the_hash():
         "headlines": (("imagination", "dqn"),), "most_looks": 2, "recorded_seeds": 2, "few_seeds": (("dqn", 0),),
         "code": (("my_agent", "0123456789ab"),),
     }  # fmt: skip
-    others = {"after_episodes", "feedback_error", "agent_names"}  # the last one says how names are written
+    others = {
+        "after_episodes",
+        "unannounced",
+        "feedback_error",
+        "agent_names",
+    }  # the last one says how names are written
     assert {*changes, *others} >= {field.name for field in dataclasses.fields(Protocol)}
     after = dataclasses.replace(base, after=("arrow_puzzle",))
     assert dataclasses.replace(after, after_episodes=7).hash != after.hash
+    assert dataclasses.replace(after, unannounced=True).hash != after.hash
     taught = dataclasses.replace(base, feedback=1.0)
     assert dataclasses.replace(taught, feedback_error=0.1).hash != taught.hash
     hashes = {dataclasses.replace(base, **{name: value}).hash for name, value in changes.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -184,6 +185,34 @@ def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monke
     assert len(result.training_length) == len(alone.training_length) == 6
 
 
+def test_an_unannounced_change_is_told_to_nobody_and_episodes_are_counted_on(tmp_path: Path) -> None:
+    result = do(
+        tmp_path / "run", after=("arrow_puzzle_hard", "arrow_puzzle_toward"), after_episodes=3, unannounced=True
+    )
+    (pupil,) = Pupil.made
+    assert pupil.carried == []
+    assert [*dict.fromkeys(episode for episode, _ in pupil.shown)] == list(range(12))
+    assert result.checkpoints[0].env_steps == result.training_length.sum(), "budgets count the last task alone"
+
+
+def test_any_learner_that_is_told_nothing_takes_another_task_before(tmp_path: Path) -> None:
+    words = [
+        "bench",
+        "--task",
+        "arrow_puzzle_toward",
+        "--preset",
+        "smoke",
+        "--execution",
+        "kinematic",
+        "--agents",
+        "dqn",
+    ]
+    more = ["--budgets", "2", "--after", "arrow_puzzle", "--after-episodes", "2", "--unannounced", "--workers", "1"]
+    assert main([*words, *more, "--out", str(tmp_path)]) == 0
+    (kept,) = tmp_path.glob("arrow_puzzle_toward/*/protocol.json")
+    assert json.loads(kept.read_text())["unannounced"] is True
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
@@ -191,6 +220,7 @@ def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monke
             ["--after", "arrow_puzzle_hard"],
             "Agent 'dqn' has no model of the world to carry over; leave --after out, or that agent.",
         ),
+        (["--unannounced"], "unannounced is True, but no task comes before; give it in after."),
         (["--queries", "2"], "Agent 'dqn' cannot query an oracle; leave --queries out"),
         (["--after", "pick_place"], "arrow_puzzle cannot come after pick_place: their frames show different scenes"),
     ],

@@ -16,7 +16,7 @@ from imagine_bench import registry
 from imagine_bench.exact.splits import split_of
 from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
-from imagine_bench.sweep.grid import LADDER, Experiment, Level, Suite
+from imagine_bench.sweep.grid import LADDER, SEPARATING, Experiment, Level, Suite
 from imagine_bench.sweep.run import plan_level, run_suite
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
@@ -137,6 +137,22 @@ def test_every_level_is_a_world_in_which_something_can_be_learned():
             assert registry.task_name(level.task) == level.task
             if (split := level.protocol.get("split")) is not None:
                 assert split_of(registry.task(level.task).rules, split).test
+
+
+def test_what_separates_names_its_agents_and_three_open_challenges():
+    separating, *challenges = SEPARATING.experiments
+    assert registry.task_name(separating.levels[0].task) == separating.levels[0].task
+    assert [each.name for each in challenges] == ["unseen_goal", "changed_rule", "late_frames"]
+    assert SEPARATING.agents != LADDER.agents and {"dqn", "lewm", "laws:given"} < set(SEPARATING.agents)
+    assert dataclasses.replace(SEPARATING, agents=("dqn",)).hash == SEPARATING.hash
+    for each in SEPARATING.experiments:
+        for level in each.levels:
+            (planned, _), *others = plan_level(SEPARATING, level, "sb3_dqn")
+            assert len(others) == 2 and planned.seeds == (400,) and planned.budgets[-1] == level.episodes
+    changed = challenges[1].levels[0]
+    (untold, _), *_ = plan_level(SEPARATING, changed, "dqn")
+    (blind, _), *_ = plan_level(SEPARATING, changed, "random")
+    assert (untold.after, untold.unannounced, blind.after, blind.unannounced) == (("arrow_puzzle",), True, (), False)
 
 
 def test_who_cannot_carry_over_starts_anew():
