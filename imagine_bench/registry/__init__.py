@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -196,7 +197,7 @@ def _named_entry(one: Entrant, own: Mapping[str, Any], group: str) -> Any:
     is_prefix = bool(getattr(known.get(prefix), "argument", ""))
     if is_prefix and argument:
         entry = known[prefix]
-        return dataclasses.replace(entry, title=f"{entry.title or prefix} {argument.partition('@')[0]}")
+        return dataclasses.replace(entry, title=f"{entry.title or prefix} {re.sub('@[0-9a-f]{12}$', '', argument)}")
     if is_prefix:
         raise InvalidValueError(f"{prefix} alone is no name; give {prefix}:ARGUMENT. {known[prefix].description}")
     if colon and prefix in known and not argument.isidentifier():
