@@ -327,6 +327,32 @@ def why() -> None:
     figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
 
 
+def separating() -> None:
+    """Success in the world that separates and in the open challenges, beside chance: a panel each, a dot a seed."""
+    folders = sorted(RESULTS.glob("separating-*"), key=lambda folder: folder.name != "separating-world")
+    figure, every = plt.subplots(1, len(folders), figsize=(3.1 * len(folders), 3.2), sharey=True, layout="constrained")
+    for axes, folder in zip(every, folders, strict=True):
+        kept = json.loads((folder / "bench.json").read_text())
+        protocol = kept["protocol"]
+        last = protocol["budgets"][-1]
+        agents = [label_today(agent) for agent in protocol["agents"]]
+        for place, agent in enumerate(agents):
+            values = 100 * rates(folder.name, agent)[last]
+            axes.bar(place, values.mean(), width=0.6, color=CAUSE_COLORS[2])
+            axes.plot([place] * len(values), values, ".", color=figures.INK)
+        axes.axhline(100 * kept["certificate"]["chance_level"], color=CAUSE_COLORS[4], linestyle="--", label="chance")
+        axes.axhline(100 * kept["certificate"]["optimum"], color=CAUSE_COLORS[0], label="optimum")
+        axes.set_xticks(range(len(agents)), [agent.replace("_", "\n") for agent in agents], fontsize=8)
+        before = protocol["after_episodes"] if protocol["after"] else 0
+        name = folder.name.partition("-")[2].replace("_", " ").replace("world", "separating")
+        axes.set_title(f"{name}: {before + last:,} episodes", fontsize=9.5)
+        axes.set_ylim(0, 104)
+        axes.spines[["top", "right"]].set_visible(False)
+    every[0].set_ylabel("test episodes solved (%)")
+    every[-1].legend(loc="center right", frameon=False)
+    figure.savefig(HERE / "separating.png", dpi=120, facecolor="white")
+
+
 def suite() -> None:
     """Scores of the kept suites as a heat map; they are of two seeds, too few for an interval."""
     scores: dict[str, dict[str, float]] = {}
@@ -459,7 +485,7 @@ def tasks() -> None:
     runpy.run_path(str(HERE / "draw_tasks.py"))["tasks"]()
 
 
-FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, suite, evidence, promise, parameters, tasks)
+FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, separating, suite, evidence, promise, parameters, tasks)
 PICTURES = {each.__name__: each for each in FIGURES}
 
 if __name__ == "__main__":

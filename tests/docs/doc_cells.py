@@ -152,6 +152,19 @@ def worst_best(budget: str, where: str) -> str:
     return f"{percent(values.mean())} [{100 * values.min():.0f}, {100 * values.max():.0f}]"
 
 
+def scaled(budget: str, where: str) -> str:
+    """Mean over seeds between the exact chance of the bench's world (0) and its optimum (1)."""
+    exact = _json(f"{where.rpartition('/')[0]}/bench.json")["certificate"]
+    found = (scores(budget, where).mean() - exact["chance_level"]) / (exact["optimum"] - exact["chance_level"])
+    return f"{found:.2f}".replace("-", "−")
+
+
+def bounds(where: str) -> str:
+    """Chance and optimum of a bench's world, %."""
+    exact = _json(f"{where}/bench.json")["certificate"]
+    return f"{percent(exact['chance_level'])} / {percent(exact['optimum'])}"
+
+
 def seeds(budget: str, where: str) -> str:
     """Every seed, %."""
     return ", ".join(percent(value) for value in scores(budget, where))
