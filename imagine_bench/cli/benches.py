@@ -157,6 +157,7 @@ class Bench:
         given["variants"] = added_up(self.budget.variants)
         given.pop("until_decided")
         given.pop("most_seeds")
+        given["unannounced"] = self.learner.unannounced or None
         options = {name: value for name, value in given.items() if value not in (None, ())}
         return self.task, self.preset, {"overrides": overrides, **options}
 
