@@ -485,7 +485,21 @@ def tasks() -> None:
     runpy.run_path(str(HERE / "draw_tasks.py"))["tasks"]()
 
 
-FIGURES = (peers, ladder, thesis_settings, rungs, mild, margins, why, separating, suite, evidence, promise, parameters, tasks)
+FIGURES = (
+    peers,
+    ladder,
+    thesis_settings,
+    rungs,
+    mild,
+    margins,
+    why,
+    separating,
+    suite,
+    evidence,
+    promise,
+    parameters,
+    tasks,
+)
 PICTURES = {each.__name__: each for each in FIGURES}
 
 if __name__ == "__main__":
