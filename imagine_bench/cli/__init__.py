@@ -29,6 +29,7 @@ from imagine_bench.cli.tools import (
     EncoderCommand,
     New,
     Play,
+    Serve,
     ViewCommand,
 )
 from imagine_bench.errors import (
@@ -60,6 +61,7 @@ Command = (
     | Annotated[EncoderCommand, subcommand("encoder")]
     | Annotated[ViewCommand, subcommand("view")]
     | Play
+    | Serve
     | Describe
     | Annotated[CheckCommand, subcommand("check")]
     | New
@@ -95,7 +97,7 @@ ELSEWHERE = {
 """Former commands that are measurements of a checkout now, and the line to type there."""
 _OF_VALUES = re.compile(r"Error parsing (--[a-z-]+)(.*)", re.DOTALL)
 """The parser's complaint about a value, behind which it speaks of types."""
-_TASK_FIRST = {"bench", "judge", "sweep", "dataset", "encoder", "play", "check", "describe"}
+_TASK_FIRST = {"bench", "judge", "sweep", "dataset", "encoder", "play", "serve", "check", "describe"}
 """Commands whose first word is a task; of others it may be a path."""
 
 

@@ -33,6 +33,7 @@ from imagine_bench.interfaces.episodes import FRAME_SHAPE
 from imagine_bench.registry.entries import file_name
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.collect import describe as describe_episodes
+from imagine_bench.running.player import protocol_of_player
 from imagine_bench.store.bench_folder import newest_recording
 from imagine_bench.store.files import require_writable
 from imagine_bench.tools import demonstrations
@@ -235,10 +236,20 @@ class Play:
     quiz: int = 0
     """Answer so many questions about the task's whole world instead, as world models are asked; with --appearance and
     --seed. Their images are written into runs/quiz."""
+    keep: Word = None
+    """Your name, such as anna: keep your episodes as a run of a bench. Each begins where everybody's tests begin, all
+    count, and the same command goes on after a pause."""
+    tests: Count = None
+    """With --keep: tests to play, 20 by default."""
+    training: Count = None
+    """With --keep: training episodes before the tests, 0 by default."""
+    like: File = None
+    """With --keep: folder of a bench whose world and tests are taken, so that one report can show both."""
     film: bool = False
     """Film an episode of optimal macro-actions in contact physics instead, as a GIF."""
-    out: Path = Path("film.gif")
-    """With --film: the GIF to write; never overwritten."""
+    out: File = None
+    """With --film: the GIF to write, film.gif by default; never overwritten. With --keep: folder of all benches, runs
+    by default."""
 
     def __call__(self) -> None:
         """Play, or film."""
@@ -247,8 +258,12 @@ class Play:
         if self.quiz:
             self._quiz()
             return
+        if self.keep is not None:
+            self._keep(self.keep)
+            return
+        require_with("--keep", self, "tests", "training", "like")
         if not self.film:
-            require_with("--film", self, "out")
+            require_with("--film or --keep", self, "out")
             motion = None if self.task is None else registry.task_of_motion(self.task)
             if motion is not None:
                 require_with("a task of macro-actions", self, "model", "execution", "encoder")
@@ -266,15 +281,64 @@ class Play:
                 "--encoder."
             )
         look = self.appearance or APPEARANCES[0]
-        print(play.film(self.task, self.out, seed=self.seed, appearance=look, camera=self.camera))
+        print(play.film(self.task, self.out or Path("film.gif"), seed=self.seed, appearance=look, camera=self.camera))
+
+    def _keep(self, name: str) -> None:
+        from imagine_bench.tools import play  # noqa: PLC0415 - as above
+
+        require_with("a game without --keep", self, "model", "encoder", "film")
+        names = ("tests", "training", "seed", "like", "execution", "appearance")
+        chosen = {each: getattr(self, each) for each in names}
+        wanted = protocol_of_player(self.task, "person", name, **chosen)
+        print(play.keep_playing(wanted, self.out or Path("runs"), camera=self.camera))
 
     def _quiz(self) -> None:
         from imagine_bench.tools.quiz import quiz  # noqa: PLC0415 - as above
 
-        require_with("a game", self, "model", "execution", "encoder", "film", "out")
+        require_with("a game", self, "model", "execution", "encoder", "film", "out", "keep")
         if self.task is None:
             raise InvalidValueError("There is nothing to ask about; give a task, such as play arrow_puzzle --quiz 16.")
         print(quiz(self.task, self.quiz, seed=self.seed, appearance=self.appearance or APPEARANCES[0]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Serve:
+    """Serve a task over HTTP for language models and other programs, and keep what they play as runs of a bench.
+
+    Plain HTTP, MCP and OpenEnv, without a key, for this machine alone. Needs the plug-in imagine-bench-serving.
+    """
+
+    task: MaybeTaskWord = None
+    """Task to serve, also as --task TASK; by default that of --like."""
+    observation: Annotated[str, one_of("words", "png")] = "words"
+    """How players are shown the scene: in words, or as frames."""
+    player: Word = None
+    """Name of the player of requests that name none."""
+    tests: Count = None
+    """Tests of each player, 20 by default; they begin where everybody's tests begin."""
+    training: Count = None
+    """Training episodes of each player before the tests, 0 by default."""
+    like: File = None
+    """Folder of a bench whose world and tests are taken, so that one report can show both."""
+    execution: ExecutionWord = None
+    """physics or kinematic; by default the task's."""
+    appearance: Word = None
+    """Appearance of frames: a level, or factors."""
+    most_players: int = 16
+    """Different players that are let in."""
+    host: str = "127.0.0.1"
+    """Address that is bound to; another than 127.0.0.1 lets other machines play."""
+    port: int = 8765
+    """Port; 0 takes any free one."""
+    out: Path = Path("runs")
+    """Folder of all benches."""
+
+    def __call__(self) -> None:
+        """Serve until Ctrl-C."""
+        registry.require_guest("imagine-bench-serving", "Serving a task over HTTP")
+        served = {name: value for name, value in vars(self).items() if name not in ("host", "port")}
+        made = registry.load("imagine_bench_serving.players:Served")(**served)
+        registry.load("imagine_bench_serving.server:serve")(made, host=self.host, port=self.port)
 
 
 @dataclass(frozen=True, kw_only=True)

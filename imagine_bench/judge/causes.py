@@ -20,13 +20,15 @@ Shapes: ``S`` macrostates, ``A`` macro-actions, ``B`` branches, ``H`` the horizo
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import math
 from bisect import bisect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -37,12 +39,13 @@ from imagine_bench.interfaces import Agent, Observation, Outcome, Rules, TaskSpe
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes, FrameReader, OutcomePredictor, begin_episode
 from imagine_bench.interfaces.environments import Env
 from imagine_bench.judge.truth import added_up, total_variation
-from imagine_bench.rules import states_of
+from imagine_bench.protocols.control import Protocol
+from imagine_bench.rules import optimal_policy, states_of, tabulate
 from imagine_bench.running.run_state import make_env
 from imagine_bench.running.trained import Trained
 from imagine_bench.seeding import Purpose, SeedTree, episode_seed, evaluation_split
 from imagine_bench.store import run_folder
-from imagine_bench.store.results import PolicyTable
+from imagine_bench.store.results import Checkpoint, PolicyTable, RunResult
 
 CAUSES = {
     "forgotten": "it did not remember a part of the first frame that later ones hide",
@@ -55,6 +58,10 @@ CAUSES = {
     "unlucky": "an optimal policy would have failed too",
 }
 """Causes in the order in which tables and figures have them."""
+CAUSES_OF_PLAYERS = {
+    "decision": "its macro-actions were not the best ones, and nobody can ask a person, or a program elsewhere, why"
+}
+"""Further causes where a player's episodes are kept that is no agent."""
 FORMER_CAUSES = {"fault": "execution"}
 """Today's name of each cause that kept files call otherwise."""
 MOST_STATES = 2_000
@@ -93,7 +100,7 @@ def frames_to_ask_with(agent: Agent, spec: TaskSpec, *, appearance: str, purpose
     return read_only(frames)
 
 
-def misread(agent: Agent, frames: Frame, states: Ints) -> Bools:
+def misread(agent: Agent | None, frames: Frame, states: Ints) -> Bools:
     """Which frames (N, 64, 64, 3) of macrostates (N, M) an agent misreads; none of one that cannot say. Shape (N,).
 
     A coordinate that is hidden, -1, cannot be misread.
@@ -315,12 +322,7 @@ def causes_of(trained: Trained) -> tuple[Tested, ...]:
     """
     protocol = trained.spec.protocol
     spec = trained.task
-    if not memory_suffices(spec):
-        raise InvalidValueError(
-            f"Frames of {spec.id} are old, or hide something that changes. The right action there depends on all "
-            "that it saw before, so its failures have no one cause; ask about a world without lag whose gesture is "
-            "always shown, or gesture=first without goal_change."
-        )
+    _require_seen(spec)
     if protocol.dataset or protocol.after:
         raise InvalidValueError(
             "The experience of agents in a dataset or an earlier task is not kept; give another bench."
@@ -333,16 +335,67 @@ def causes_of(trained: Trained) -> tuple[Tested, ...]:
     purpose = evaluation_split(trained.spec.seed)
     frames = frames_to_ask_with(trained.agent, spec, appearance=protocol.appearance_in_tests, purpose=purpose)
     readable = ~misread(trained.agent, frames, np.array(states_of(spec.rules), dtype=np.int64))
+
+    def attribution_at(row: Checkpoint) -> Attribution:
+        if run.tried is None:
+            raise ArtefactError(f"{trained.folder} keeps no test episodes; run its bench anew, elsewhere.")
+        if row.beliefs is None:
+            raise InvalidValueError(f"{spec.id} has too many macrostates to ask an agent about each.")
+        tried = run.tried[run.tried[:, -1] < row.episodes, :-1].astype(np.int64)
+        return Attribution(spec, row.beliefs, tried, readable)
+
+    return _tested(run, protocol, spec.rules, trained.agent, attribution_at)
+
+
+def causes_of_player(folder: Path) -> tuple[Tested, ...]:
+    """The causes of every failure of a player that cannot be asked: bad luck, motor failure, or a decision.
+
+    The best macro-actions stand for those that it would have chosen elsewhere. Raises as :func:`causes_of`.
+    """
+    run = run_folder.load_run(folder)
+    protocol = Protocol.from_dict(run_folder.read_config(folder)["protocol"])
+    spec = protocol.spec(testing=True)
+    _require_seen(spec)
+    states = states_of(spec.rules)
+    action = optimal_policy(tabulate(spec.rules)).astype(np.int16)
+    every = [(*state, each) for state in states for each in range(spec.n_actions)]
+    best = PolicyTable(action=action, model=None)
+    attribution = Attribution(spec, best, np.array(every, dtype=np.int64), np.ones(len(states), dtype=bool))
+    found = _tested(run, protocol, spec.rules, None, lambda row: attribution)
+    return tuple(
+        dataclasses.replace(
+            each, causes={test: "decision" if cause == "values" else cause for test, cause in each.causes.items()}
+        )
+        for each in found
+    )
+
+
+def _require_seen(spec: TaskSpec) -> None:
+    """Raise InvalidValueError for a task whose frames do not show all, unless a memory of the first one suffices."""
+    if not memory_suffices(spec):
+        raise InvalidValueError(
+            f"Frames of {spec.id} are old, or hide something that changes. The right action there depends on all "
+            "that it saw before, so its failures have no one cause; ask about a world without lag whose gesture is "
+            "always shown, or gesture=first without goal_change."
+        )
+
+
+def _tested(
+    run: RunResult,
+    protocol: Protocol,
+    rules: Rules,
+    agent: Agent | None,
+    attribution_at: Callable[[Checkpoint], Attribution],
+) -> tuple[Tested, ...]:
+    """The causes of the failures of a run, whose failed tests are played again."""
+    purpose = evaluation_split(run.seed)
     found = []
     with closing(make_env(protocol, protocol.task, testing=True)) as env:
-        lived = functools.cache(functools.partial(lived_again, env, trained.agent, spec.rules))
+        lived = functools.cache(functools.partial(lived_again, env, agent, rules))
         for row in run.checkpoints:
-            if row.kept is None or run.tried is None:
-                raise ArtefactError(f"{trained.folder} keeps no test episodes; run its bench anew, elsewhere.")
-            if row.beliefs is None:
-                raise InvalidValueError(f"{spec.id} has too many macrostates to ask an agent about each.")
-            tried = run.tried[run.tried[:, -1] < row.episodes, :-1].astype(np.int64)
-            attribution = Attribution(spec, row.beliefs, tried, readable)
+            if row.kept is None:
+                raise ArtefactError(f"{run.folder} keeps no test episodes; run its bench anew, elsewhere.")
+            attribution = attribution_at(row)
             causes = {}
             for test in np.flatnonzero(~row.kept.success).tolist():
                 actions = tuple(row.kept.actions_of(test))
@@ -359,7 +412,7 @@ def is_outcome(rules: Rules, before: State, action: int, after: State) -> bool:
     return any(outcome.macrostate == after for outcome in rules.outcomes(before, action))
 
 
-def lived_again(env: Env, agent: Agent, rules: Rules, seed: int, actions: Sequence[int]) -> FailedEpisode:
+def lived_again(env: Env, agent: Agent | None, rules: Rules, seed: int, actions: Sequence[int]) -> FailedEpisode:
     """A failed test episode, played again to find the frames that the agent misread, and motor failures."""
     frame, info = env.reset(seed=seed)
     frames = []

@@ -298,7 +298,8 @@ def _seeds(protocol: Protocol, sessions: Sequence[Mapping[str, str]]) -> list[st
         require(planned == seeds, f"it has the seeds {brief(seeds)}, and {brief(session['command'])} ran others.")
     task = registry.task(protocol.task)
     preset = {**PRESETS.get(protocol.preset, {}), **task.presets.get(protocol.preset, {})}
-    usual = preset.get("seeds", Protocol.seeds)
+    is_of_player = all(map(registry.is_player, protocol.agents))  # whose run is one
+    usual = seeds[:1] if is_of_player else preset.get("seeds", Protocol.seeds)
     few = {(agent, seeds[:most][-1]) for agent, most in preset.get("few_seeds", {}).items()}
     first = TUNING_SEEDS if is_tuning_seed(seeds[0]) else 0
     is_whole = seeds == tuple(range(first, first + len(seeds))) and len(seeds) >= len(usual)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from imagine_bench.errors import InvalidValueError, brief, require_known, unprintable
+from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError, brief, require_known, unprintable
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
 from imagine_bench.interfaces.regression import RegressionSpec, Regressor, RegressorContext
-from imagine_bench.registry.builtin import AGENTS, DEMONSTRATOR, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
+from imagine_bench.registry.builtin import AGENTS, DEMONSTRATOR, PLAYERS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
 from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import (
     AgentEntry,
@@ -50,6 +51,7 @@ __all__ = [
     "DEMONSTRATOR",
     "ENCODER_GROUP",
     "MOTION",
+    "PLAYERS",
     "REGRESSIONS",
     "REGRESSION_GROUP",
     "REGRESSORS",
@@ -190,9 +192,21 @@ def _entrant_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
     return dataclasses.replace(entry, title=f"{entry.title or one.agent.replace('_', ' ')} ({one.words})")
 
 
+def is_player(agent: str) -> bool:
+    """Whether an agent's name is that of a person, or of a program elsewhere, such as ``person:anna``."""
+    with suppress(UnknownNameError, InvalidValueError, SetupError):
+        return agent_entry(agent).is_player
+    return False
+
+
+def _prefixes(group: str) -> Mapping[str, Any]:
+    """The offers of a group, in which prefixes are, and the players."""
+    return {**offers(group), **(PLAYERS if group == AGENT_GROUP else {})}
+
+
 def _named_entry(one: Entrant, own: Mapping[str, Any], group: str) -> Any:
     """The entry of a name; of a prefix and an argument its title says both."""
-    known = {**own, **offers(group)}
+    known = {**own, **_prefixes(group)}
     prefix, colon, argument = one.agent.partition(":") if isinstance(one.agent, str) else (one.agent, "", "")
     is_prefix = bool(getattr(known.get(prefix), "argument", ""))
     if is_prefix and argument:
@@ -220,7 +234,7 @@ def spelled(name: str, group: str) -> str:
         return name
     one = entrant(name)
     prefix = one.agent.partition(":")[0]
-    target = getattr(offers(group).get(prefix), "argument", "")
+    target = getattr(_prefixes(group).get(prefix), "argument", "")
     if not target:
         return name
     with guests_faults(f"The argument of {name}", target):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from imagine_bench.interfaces import OBSERVATIONS
 from imagine_bench.interfaces.regression import RegressionSpec
-from imagine_bench.registry.entries import AgentEntry, RegressorEntry, TaskEntry, WorldModelEntry
+from imagine_bench.registry.entries import AgentEntry, RegressorEntry, TaskEntry, WorldModelEntry, players_named
 
 _ARROWS = TaskEntry(
     spec="imagine_bench.tasks.arrows.spec:spec_of",
@@ -114,8 +114,10 @@ AGENTS: dict[str, AgentEntry] = {
     ),
 }
 
-OUR_AGENTS = frozenset(AGENTS)
-"""The names of this suite's agents, which nobody else may take."""
+PLAYERS = players_named("person", "A person at the keyboard, in the window of 'imagine-bench play'.")
+"""Prefixes of people whose episodes are kept, such as ``person:anna``."""
+OUR_AGENTS = frozenset({*AGENTS, *PLAYERS})
+"""The names of this suite's agents and players, which nobody else may take."""
 DEMONSTRATOR = "oracle"
 """The registered agent, privileged and optimal, that plays the episodes which learners are shown."""
 

@@ -13,7 +13,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,6 +66,8 @@ class AgentEntry:
     #: group)``; by default it has none.
     settings: str = ""
     privileged: bool = False  #: Whether it is shown the macrostate and the rules; no fair comparison
+    #: Whether it is a person, or a program elsewhere, whose episodes are kept as a run; nothing here can act for it
+    is_player: bool = False
     #: Parts of :data:`.interfaces.OBSERVATIONS` that it can take, images of any size; by default 64 x 64 frames alone
     observes: tuple[str, ...] = ()
     #: Whether it is a :class:`.interfaces.capabilities.ExternalTrainer`, whose run cannot pause.
@@ -108,7 +110,7 @@ class EncoderEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelEntry:
-    """A registered world model."""
+    """A registered world model. Raises UnknownNameError: no such kind of encoder."""
 
     #: ``"module:attr"`` of a function from AgentContext to :class:`.interfaces.model.WorldModel`; that of a privileged
     #: model takes the TaskSpec and the judge's gallery of frames.
@@ -120,6 +122,10 @@ class WorldModelEntry:
     by_default: bool = True  #: Whether it is judged where no models are named; slow ones are not
     settings: str = ""  #: As of :class:`AgentEntry`, read from ``context.overrides``; empty: there are none to give
     argument: str = ""  #: As of :class:`AgentEntry`
+
+    def __post_init__(self) -> None:
+        if self.encoder_kind is not None:
+            require_known("kind of encoder", self.encoder_kind, ENCODER_KINDS)
 
     @property
     def label(self) -> str:
@@ -160,6 +166,28 @@ def entrant(text: str) -> Entrant:
     if words and words[0] and "=" not in words[0]:
         agent = f"{agent}:{words.pop(0)}"
     return Entrant(agent, dict(parse_settings(words, f"Agent {text!r}:")))
+
+
+def players_named(name: str, description: str) -> dict[str, AgentEntry]:
+    """The registry lines of a kind of players, without training episodes and, as ``trained_...``, with some.
+
+    These are prefixes, such as that of ``person:anna``.
+    """
+    refusal = f"{__name__}:refuse_player"
+    told = f"{description} It is told the goal and the names of macro-actions, which no learner is."
+    entry = AgentEntry(
+        make=refusal, argument=refusal, learns=False, needs_encoder=False, is_player=True, title=name, description=told
+    )
+    return {name: entry, f"trained_{name}": replace(entry, learns=True, title=f"{name} with training")}
+
+
+def refuse_player(*given: object) -> str:
+    """Raise InvalidValueError: a person, or a program elsewhere, was asked for where an agent acts."""
+    del given
+    raise InvalidValueError(
+        "Nothing here can act for a person or for a program that plays over HTTP. Their episodes are kept by "
+        "'imagine-bench play TASK --keep NAME' and 'imagine-bench serve TASK'; leave them out here."
+    )
 
 
 def parse_settings(pairs: Sequence[str], where: str = "--set") -> tuple[tuple[str, Setting], ...]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known, unprintable
 from imagine_bench.interfaces.regression import RegressionSpec
-from imagine_bench.registry.builtin import AGENTS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
+from imagine_bench.registry.builtin import AGENTS, PLAYERS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
 from imagine_bench.registry.entries import (
     LABEL_OF_OLD_AGENT,
     AgentEntry,
@@ -41,7 +41,7 @@ class _Group(NamedTuple):
 
 _GROUPS = {
     TASK_GROUP: _Group("task", TaskEntry, (TASKS, REGRESSIONS)),
-    AGENT_GROUP: _Group("agent", AgentEntry, (AGENTS, REGRESSORS)),
+    AGENT_GROUP: _Group("agent", AgentEntry, (AGENTS, REGRESSORS, PLAYERS)),
     ENCODER_GROUP: _Group("encoder", EncoderEntry, ()),
     REGRESSION_GROUP: _Group("regression task", RegressionSpec, (TASKS, REGRESSIONS)),
     REGRESSOR_GROUP: _Group("regressor", RegressorEntry, (AGENTS, REGRESSORS)),

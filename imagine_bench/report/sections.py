@@ -12,7 +12,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from imagine_bench.arrays import Arrays
-from imagine_bench.judge.causes import CAUSES, FORMER_CAUSES
+from imagine_bench.judge.causes import CAUSES, CAUSES_OF_PLAYERS, FORMER_CAUSES
 from imagine_bench.recording.filmstrips import episode_strip, filmstrip, png, sampled_filmstrips
 from imagine_bench.registry.entries import file_name
 from imagine_bench.report import figures
@@ -111,18 +111,21 @@ def causes_table(rows: Iterable[Sequence[object]]) -> Table:
     tested: dict[tuple[str, str], dict[str, int]] = {}
     for agent, seed, budget, tests, _, named in (map(str, row) for row in rows):
         cause = FORMER_CAUSES.get(named, named)
-        if cause not in ("", *CAUSES):
+        if cause not in ("", *CAUSES, *CAUSES_OF_PLAYERS):
             raise ValueError(f"{named!r} is no cause")
         tested.setdefault((agent, budget), {})[seed] = int(tests)
         counts.setdefault((agent, budget), Counter())[cause] += bool(cause)
+    happened = {cause for found in counts.values() for cause in found}
+    more = {cause: words for cause, words in CAUSES_OF_PLAYERS.items() if cause in happened}
+    causes = {**CAUSES, **more}
     lines = []
     for (agent, budget), found in counts.items():
         failures = found.total()
-        shares = [percent(found[name] / failures) if failures else DASH for name in CAUSES]
+        shares = [percent(found[name] / failures) if failures else DASH for name in causes]
         of = f"{failures:,} of {sum(tested[agent, budget].values()):,}"
         lines.append([agent, f"{int(budget):,}", of, *shares])
-    header = ["agent", "real episodes", "failures", *(f"{name}, %" for name in CAUSES)]
-    meanings = "; ".join(f"{name}: {words}" for name, words in CAUSES.items())
+    header = ["agent", "real episodes", "failures", *(f"{name}, %" for name in causes)]
+    meanings = "; ".join(f"{name}: {words}" for name, words in causes.items())
     return Table("causes", header, lines, f"Shares of the failures. {meanings}.", why_dash="nothing failed")
 
 

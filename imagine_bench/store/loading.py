@@ -14,7 +14,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from imagine_bench import statistics
+from imagine_bench import registry, statistics
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import digest
@@ -34,7 +34,7 @@ _COLUMNS = (
     *("mean_return", "mean_length", "faults", "train_cpu_s", "eval_cpu_s", "solved"),
 )
 """Columns of every table of results; those of diagnostics follow."""
-_OWN = ("agents", "seeds", "budgets", "agent_names", "code")
+_OWN = ("agents", "seeds", "budgets", "agent_names", "code", "evaluation_episodes", "few_seeds", "headlines")
 """Fields in which merged benches may differ; their encoders must agree where both have one."""
 
 
@@ -175,13 +175,15 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
     """Several benches, or parts of them, that differ only in agents or in seeds, as one in a new folder below ``root``.
 
     Shown are the seeds that every agent has, and the budgets that all benches have; ``left_out`` names the other runs.
+    A person, or another player that is no agent, needs one run. Where one bench has fewer tests, the first ones of all
+    count: they begin alike.
 
     Raises:
         InvalidValueError: They differ in more, an agent's seed is in two of them, or no budget is in all.
-        ArtefactError: No seed is in all, or two runs of an agent had other settings.
+        ArtefactError: No seed is in all, two runs of an agent had other settings, or tests are not kept one by one.
     """
     protocol = _merged(results)
-    runs = {(run.agent, run.seed): run for result in results for run in result.runs}
+    runs = {(run.agent, run.seed): _of_first(run, protocol) for result in results for run in result.runs}
     if len(runs) < sum(len(result.runs) for result in results):
         raise InvalidValueError(
             "Several of the benches have the same seed of the same agent; give benches of different agents, or of "
@@ -200,6 +202,13 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
         missing=tuple(sentence for result in results for sentence in result.missing),
         left_out=tuple(f"{agent} seed {seed}" for agent, seed in sorted(runs) if seed not in part.seeds),
     )
+
+
+def _of_first(run: RunResult, protocol: Protocol) -> RunResult:
+    """A run with as many tests as a protocol has."""
+    tests = protocol.evaluation_episodes
+    rows = (row if row.test_episodes == tests else row.of_first(tests) for row in run.checkpoints)
+    return dataclasses.replace(run, checkpoints=tuple(rows))
 
 
 def _merged(results: Sequence[BenchResult]) -> Protocol:
@@ -232,4 +241,17 @@ def _merged(results: Sequence[BenchResult]) -> Protocol:
         settings_digest=first.settings_digest if same_agents else digest(digests),
         seeds=tuple(sorted({seed for protocol in protocols for seed in protocol.seeds})),
         budgets=tuple(sorted(set.intersection(*(set(protocol.budgets) for protocol in protocols)))),
+        evaluation_episodes=min(protocol.evaluation_episodes for protocol in protocols),
+        headlines=tuple(dict.fromkeys(pair for protocol in protocols for pair in protocol.headlines)),
+        few_seeds=_few_seeds(protocols),
     )
+
+
+def _few_seeds(protocols: Sequence[Protocol]) -> tuple[tuple[str, int], ...]:
+    """The agents of which few seeds are run, with their last seed; players are."""
+    found: dict[str, int] = {}
+    for protocol in protocols:
+        players = [(agent, protocol.seeds[-1]) for agent in protocol.agents if registry.is_player(agent)]
+        for agent, last in (*protocol.few_seeds, *players):
+            found[agent] = max(last, found.get(agent, last))
+    return tuple(found.items())

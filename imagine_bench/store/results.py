@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -107,6 +107,13 @@ class KeptEpisodes:
         end = int(self.lengths[: episode + 1].sum())
         return self.actions[end - int(self.lengths[episode]) : end].tolist()
 
+    def first(self, episodes: int) -> KeptEpisodes:
+        """The first of them alone."""
+        whole = {name: array for name, array in vars(self).items() if array is not None}
+        parts = {name: array[:episodes] for name, array in whole.items()}
+        parts["actions"] = self.actions[: self.lengths[:episodes].sum()]
+        return KeptEpisodes(**parts)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
@@ -137,6 +144,22 @@ class Checkpoint:
     def success_rate(self) -> float:
         """Share of test episodes that succeeded, in [0, 1]."""
         return self.successes / self.test_episodes
+
+    def of_first(self, tests: int) -> Checkpoint:
+        """The same with its first tests alone. Raises ArtefactError: the tests are not kept one by one."""
+        if self.kept is None:
+            raise ArtefactError("The test episodes of a bench are not kept, so the first ones cannot be taken alone.")
+        kept = self.kept.first(tests)
+        return replace(
+            self,
+            kept=kept,
+            test_episodes=tests,
+            successes=int(kept.success.sum()),
+            solved="".join("01"[success] for success in kept.success.astype(int)),
+            mean_return=float(kept.returns.sum()) / tests,
+            mean_length=len(kept.actions) / tests,
+            faults=int(kept.faults.sum()),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from imagine_bench.errors import (
     writing,
 )
 from imagine_bench.interfaces import TaskSpec
-from imagine_bench.judge.causes import causes_of
+from imagine_bench.judge.causes import Tested, causes_of, causes_of_player
 from imagine_bench.judge.plans import PlanResult, make_plans, require_threshold
 from imagine_bench.judge.verify import UNSHOWN, verify_runs
 from imagine_bench.recording.filmstrips import filmstrip, png
@@ -41,7 +41,14 @@ from imagine_bench.running.trained import (
     protocol_of_agents,
     require_control,
 )
-from imagine_bench.store.bench_folder import bench_facts, is_archive, newest_bench, read_control, require_either
+from imagine_bench.store.bench_folder import (
+    BenchStore,
+    bench_facts,
+    is_archive,
+    newest_bench,
+    read_control,
+    require_either,
+)
 from imagine_bench.store.files import (
     csv_text,
     lock,
@@ -223,16 +230,18 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
     bench = chosen(folder, root, task)
     where = bench / "why"
     protocol = protocol_of_agents(bench)
+    store = BenchStore(bench, protocol)
     spec = registry.task(protocol.task)
     appearance = protocol.appearance_in_tests
-    folders = learners(bench)
+    players = [store.run_folder(*pair) for pair in protocol.runs if registry.is_player(pair[0])]
+    folders = () if players else learners(bench)
     with lock(bench / ".why.lock", f"The folder {where}"):
         rows: list[Sequence[object]] = []
         for run in counted(folders, "runs", total=len(folders)):
             trained = load_trained(run, encoder=encoder)
-            for each in causes_of(trained):  # a row a failure; and one a test without any, whose cause is empty
-                for failure in each.causes.items() or [("", "")]:
-                    rows.append((trained.spec.agent, trained.spec.seed, each.episodes, each.tests, *failure))
+            rows += _cause_rows(trained.spec.agent, trained.spec.seed, causes_of(trained))
+        for run, pair in zip(players, protocol.runs, strict=False):
+            rows += _cause_rows(*pair, causes_of_player(run))
         table = causes_table(rows)
         made = {**provenance(protocol.hash), "appearance": appearance, "frames": "kinematic"}
         make_folder(where)
@@ -241,6 +250,13 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
     write_page(bench / "report", bench_page(load_so_far(bench)))
     title = f"{spec.title}, {appearance_typed(appearance)}"
     return f"{title}\n\n{table.text}\n\n{table.remark}\n\nAll rows:   {where / 'causes.csv'}"
+
+
+def _cause_rows(agent: str, seed: int, tested: Sequence[Tested]) -> Iterator[Sequence[object]]:
+    """A row a failure; and one a test without any, whose cause is empty."""
+    for each in tested:
+        for failure in each.causes.items() or [("", "")]:
+            yield (agent, seed, each.episodes, each.tests, *failure)
 
 
 # Verification ------------------------------------------------------------------------------------------------------

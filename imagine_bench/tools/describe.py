@@ -186,8 +186,9 @@ def names() -> str:
 
 
 def _agents() -> dict[str, AgentEntry]:
-    """All agents by name, and prefixes of agents' names."""
-    return {**registry.agents(), **registry.usable(registry.AGENT_GROUP)}
+    """All agents by name, and prefixes of agents' names; no people, and no programs elsewhere."""
+    found = {**registry.agents(), **registry.usable(registry.AGENT_GROUP)}
+    return {name: entry for name, entry in found.items() if not entry.is_player}
 
 
 def _world_models() -> dict[str, WorldModelEntry]:

@@ -10,9 +10,9 @@ import string
 import textwrap
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any, SupportsFloat
+from typing import Any, SupportsFloat, cast
 from unittest import mock
 
 import gymnasium
@@ -25,7 +25,9 @@ from imagine_bench.arrays import Action, Frame, Info, State
 from imagine_bench.errors import InvalidValueError, SetupError, require_integer, require_known
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer
+from imagine_bench.protocols.control import Protocol
 from imagine_bench.rules import ending
+from imagine_bench.running.player import FinishedError, played_run
 from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import episode_seed
 from imagine_bench.statistics import wilson
@@ -84,7 +86,7 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         self._reset_seed = None
         self._start = self._frame
         self._actions: list[int] = []
-        self._moves = 0
+        self._moves = getattr(self.env, "moves", 0)
         self._rollout: ImaginedRollout | None = None
         self._due: _Step | None = None
         self._said = "press a key"
@@ -173,8 +175,9 @@ class KeyboardGame(gymnasium.Wrapper[Frame, Action, Frame, Action]):
         task = self._task
         goal = textwrap.wrap(f"Goal: {task.description}", _LETTERS)
         directions = "In the frame, up is toward the human and down toward the robot. "
+        kept = getattr(self.env, "words", "")
         left = "" if task.horizon is None else f"Moves left: {task.horizon - self._moves} of {task.horizon}. "
-        return "\n".join([*goal, directions + left + f"Solved: {self.solved} of {self.episodes}."])
+        return "\n".join([*goal, directions + left + f"Solved: {self.solved} of {self.episodes}. {kept}"])
 
     def _imagination(self) -> tuple[Frame, str]:
         """The latest imagined image, gray or RGB, and in words its predictions and uncertainty."""
@@ -203,7 +206,7 @@ def play(
 
     ``model`` is a run's folder, whose agent imagines beside the person; it also says what is None, else the task's
     environment does. ``encoder`` is as of :func:`imagine_bench.running.trained.load_trained`, ``camera`` as of
-    :func:`film`.
+    :func:`film`. :func:`keep_playing` keeps the episodes.
 
     Raises:
         ImagineBenchError: Nothing to play, unknown names, a model of another task or that does not imagine, the errors
@@ -236,6 +239,23 @@ def play(
     with closing(KeyboardGame(env, spec, imaginer, seed)) as game:
         keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)
     return game.summary()
+
+
+def keep_playing(wanted: Protocol, root: Path, *, camera: str = "human") -> str:
+    """Open a window in which a person plays the episodes of a protocol, which are kept below ``root``.
+
+    Returns how often the person succeeded now, and where the episodes lie. Raises as :func:`play`, or as
+    :func:`imagine_bench.running.player.played_run`.
+    """
+    keyboard = keyboard_player()
+    spec = registry.task(wanted.task)
+    keys: dict[str, Action] = dict(zip(KEYS, range(spec.n_actions), strict=False))
+    with played_run(wanted, root, **_view(camera)) as run:
+        game = KeyboardGame(cast("gymnasium.Env[Frame, Action]", run), spec, None, 0)
+        with suppress(FinishedError), closing(game):
+            keyboard(game, fps=_FPS, keys_to_action=keys, noop=spec.n_actions)
+        bench = run.folder.parent.parent
+        return f"{game.summary()}\nNow {run.words}; kept in {bench}. The same command goes on."
 
 
 def solved_words(solved: int, episodes: int) -> str:

@@ -19,6 +19,7 @@ from worlds import draw_quickly
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError, SetupError
+from imagine_bench.running.player import played_run, protocol_of_player
 from imagine_bench.tools import play as module
 from imagine_bench.tools.play import KEYS, KeyboardGame, film, play
 
@@ -155,6 +156,27 @@ def test_keyboard_events_play_the_task(keyboard, capsys):
     assert "Solved 1 of 1 episodes (100.0%, 95 % interval 20.7% to 100.0%); chance 4.6%, optimum 100.0%." in said
     assert matplotlib.get_backend() == backend
     twin.close()
+
+
+def test_a_window_keeps_the_episodes_and_goes_on_where_it_was_closed(keyboard, capsys, tmp_path):
+    wanted = protocol_of_player("arrow_puzzle", "person", "anna", tests=2, execution="kinematic")
+    command = ["play", "arrow_puzzle", "--keep", "anna", "--tests", "2", "--execution", "kinematic"]
+    keyboard("1")
+    assert main([*command, "--out", str(tmp_path)]) == 0
+    assert "Now test 1 of 2; kept in" in (said := capsys.readouterr().out) and "goes on." in said
+    with played_run(wanted, tmp_path) as run:
+        run.reset()
+        assert run.moves == 1, "one key was pressed before the window was closed"
+    keyboard("1" * 12 + "2" * 12)
+    assert main([*command, "--out", str(tmp_path)]) == 0
+    assert "Now all 2 episodes are played" in capsys.readouterr().out
+    (folder,) = tmp_path.glob("arrow_puzzle/quick-*")
+    assert main(["verify", str(folder)]) == 0
+    keyboard("1")
+    assert main([*command, "--out", str(tmp_path)]) == 0
+    assert "No episode was finished" in capsys.readouterr().out, "no episode more is played"
+    assert main(["play", "arrow_puzzle", "--tests", "2"]) == 2
+    assert "--tests goes with --keep" in capsys.readouterr().err
 
 
 class Bare(gymnasium.Wrapper):

@@ -1,0 +1,406 @@
+"""A task over HTTP: words that are enough, three protocols, refusals, and a fuzz after which every episode holds."""
+
+from __future__ import annotations
+
+import base64
+import http.client
+import io
+import json
+import os
+import random
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from imagine_bench_serving import server as module
+from imagine_bench_serving.players import Players, Served
+from imagine_bench_serving.server import MOST_BYTES, Server, serve
+from imagine_bench_serving.sockets import accept_key
+from imagine_bench_serving.words import briefing, seen_in_words
+from PIL import Image
+
+from imagine_bench import registry
+from imagine_bench.cli import exit_code as main
+from imagine_bench.errors import ImagineBenchError, SetupError
+from imagine_bench.interfaces import TaskSpec
+from imagine_bench.judge.verify import verify_runs
+from imagine_bench.running.player import played_run, protocol_of_player
+
+SPEC = registry.task("arrow_puzzle")
+
+
+@contextmanager
+def served(root: Path, **options: object) -> Iterator[Server]:
+    """A server in a thread of this process."""
+    values: dict[str, object] = {"task": "arrow_puzzle", "tests": 3, "execution": "kinematic", "out": root, **options}
+    found: list[Server] = []
+    is_ready = threading.Event()
+
+    def ready(one: Server) -> None:
+        found.append(one)
+        is_ready.set()
+
+    thread = threading.Thread(target=serve, args=(Served(**values),), kwargs={"port": 0, "ready": ready})  # type: ignore[arg-type]
+    thread.start()
+    assert is_ready.wait(60)
+    try:
+        yield found[0]
+    finally:
+        found[0].shutdown()
+        thread.join(60)
+
+
+@pytest.mark.slow
+def test_the_real_clients_play(tmp_path: Path) -> None:
+    """``clients.sh`` installs the packages mcp and openenv, each in an environment of its own."""
+    script = Path(__file__).with_name("clients.sh")
+    with served(tmp_path / "runs") as one:
+        address = f"http://127.0.0.1:{one.server_port}"
+        command = [str(script), address, str(tmp_path / "clients")]
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHON": sys.executable}
+        )
+    if "No matching distribution" in done.stderr or "Could not fetch" in done.stderr:
+        pytest.skip("the packages cannot be installed here")
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines()] == ["mcp", "mcp", "openenv:"]
+
+
+def ask(one: Server, path: str, body: object = None, **headers: str) -> tuple[int, object]:
+    """The status and the answer; a body is sent by POST, and bytes as they are."""
+    line = http.client.HTTPConnection("127.0.0.1", one.server_port, timeout=30)
+    content = body if isinstance(body, bytes) else None if body is None else json.dumps(body).encode()
+    line.request("GET" if body is None else "POST", path, content, headers)
+    answer = line.getresponse()
+    text = answer.read().decode()
+    line.close()
+    is_json = answer.headers["Content-Type"] == "application/json"
+    return answer.status, json.loads(text) if is_json and text else text
+
+
+class Reader:
+    """Plays by the words alone: it knows the rules of a task, and finds the macrostate in what it is told."""
+
+    def __init__(self, spec: TaskSpec) -> None:
+        self._spec = spec
+
+    def action(self, words: str) -> str:
+        told = dict(pair.split(": ") for pair in words.partition("Seen now: ")[2].rstrip(".").split("; "))
+        pairs = zip(self._spec.macrostate_names, self._spec.macrostate_values, strict=True)
+        macrostate = tuple(values.index(told[name]) for name, values in pairs)
+        return self._spec.action_names[self._spec.rules.optimal_action(macrostate)]
+
+
+def play_all(one: Server, player: str) -> None:
+    reader = Reader(one.players.spec)
+    answer: dict[str, object] = {"metadata": {"all_done": False}}
+    while not answer["metadata"]["all_done"]:  # type: ignore[index]
+        _, answer = ask(one, "/reset", {"player": player})  # type: ignore[assignment]
+        while not answer["done"]:
+            action = reader.action(answer["observation"]["words"])  # type: ignore[index]
+            _, answer = ask(one, "/step", {"player": player, "action": action})  # type: ignore[assignment]
+
+
+def bench_of(root: Path, player: str) -> Path:
+    (folder,) = root.glob(f"*/*/*-{player}")
+    return folder.parent
+
+
+@pytest.mark.parametrize("task", ["arrow_puzzle", pytest.param("pick_place", marks=pytest.mark.slow)])
+def test_words_are_enough_to_solve_a_task_and_its_episodes_hold(task: str, tmp_path: Path) -> None:
+    with served(tmp_path, task=task) as one:
+        play_all(one, "ann")
+    bench = bench_of(tmp_path, "ann")
+    verdicts = verify_runs(bench)
+    assert not any(verdict.complaint or verdict.unshown for verdict in verdicts)
+    rows = (bench / "reader-ann" / "seed_0" / "metrics.csv").read_text().splitlines()
+    assert dict(zip(rows[0].split(","), rows[1].split(","), strict=True))["solved"] == "111"
+
+
+def test_words_tell_what_frames_show_and_no_more() -> None:
+    """Where a frame hides the gesture, the words do; two macrostates of one frame have the same words."""
+    hidden = {"macrostate": np.array([0, 1, 2, 0]), "shown": np.array([0, 1, 2, -1])}
+    other = {"macrostate": np.array([0, 1, 2, 1]), "shown": np.array([0, 1, 2, -1])}
+    words = seen_in_words(SPEC, hidden)  # type: ignore[arg-type]
+    assert words == seen_in_words(SPEC, other)  # type: ignore[arg-type]
+    assert words == (
+        "Seen now: left arrow: toward the human; middle arrow: right; right arrow: toward the agent; "
+        "pointed cube: not seen."
+    )
+    told = briefing(SPEC)
+    assert all(name in told for name in SPEC.action_names) and SPEC.description in told
+    assert "%" not in told and "optimal" not in told
+
+
+def test_clockwise_is_what_the_words_say() -> None:
+    """The briefing says how a quarter turn goes; the rules turn so."""
+    names = SPEC.macrostate_values[0]
+    for before, after in zip(range(4), (1, 2, 3, 0), strict=True):
+        turned = SPEC.rules.outcomes((before, 0, 0, 0), 0)[0].macrostate
+        assert turned[0] == after
+    assert names == ("toward the human", "right", "toward the agent", "left")
+    assert "toward the human to the right, from the right toward the agent, from there to the left" in briefing(SPEC)
+
+
+def test_a_viewer_is_shown_the_frame_and_no_words_of_it(tmp_path: Path) -> None:
+    with served(tmp_path, observation="png", player="bo") as one:
+        status, answer = ask(one, "/reset", {})
+        assert status == 200 and isinstance(answer, dict)
+        shown = answer["observation"]
+        assert shown["words"] == "Test 1 of 3."
+        image = np.array(Image.open(io.BytesIO(base64.b64decode(shown["png"]))))
+        _, moved = ask(one, "/step", {"action": 2})
+        assert "Seen now" not in moved["observation"]["words"]  # type: ignore[index]
+    wanted = protocol_of_player("arrow_puzzle", "viewer", "cy", tests=3, execution="kinematic")
+    with played_run(wanted, tmp_path) as run:
+        np.testing.assert_array_equal(run.reset()[0], image)
+
+
+def test_a_player_comes_back_to_another_server(tmp_path: Path) -> None:
+    with served(tmp_path) as one:
+        _, first = ask(one, "/reset", {"player": "ann"})
+        action = next(n for n in range(6) if _goes_on(first, n))
+        ask(one, "/step", {"player": "ann", "action": action})
+        with served(tmp_path) as other:
+            status, said = ask(other, "/reset", {"player": "ann"})
+            assert status == 409 and "in use by process" in said["error"]  # type: ignore[index]
+    with served(tmp_path) as one:
+        _, again = ask(one, "/reset", {"player": "ann"})
+        assert "It goes on after 1 macro-actions." in again["observation"]["words"]  # type: ignore[index]
+        play_all(one, "ann")
+    assert not any(verdict.complaint for verdict in verify_runs(bench_of(tmp_path, "ann")))
+
+
+def _goes_on(answer: object, action: int) -> bool:
+    told = answer["observation"]["words"].partition("Seen now: ")[2].rstrip(".")  # type: ignore[index]
+    values = [pair.split(": ")[1] for pair in told.split("; ")]
+    pairs = zip(SPEC.macrostate_values, values, strict=True)
+    macrostate = tuple(names.index(value) for names, value in pairs)
+    return not SPEC.rules.outcomes(macrostate, action)[0].terminated
+
+
+def test_the_model_context_protocol(tmp_path: Path) -> None:
+    def call(method: str, **params: object) -> object:
+        message = {"jsonrpc": "2.0", "id": 7, "method": method, "params": params}
+        status, answer = ask(one, "/mcp", message)
+        assert status == 200 and isinstance(answer, dict) and answer["id"] == 7
+        return answer.get("result", answer.get("error"))
+
+    with served(tmp_path, observation="png", player="bo") as one:
+        begun = call("initialize", protocolVersion="2025-06-18", capabilities={}, clientInfo={})
+        assert begun["protocolVersion"] == "2025-06-18" and SPEC.description in begun["instructions"]  # type: ignore[index]
+        assert call("initialize", protocolVersion="1999-01-01")["protocolVersion"] == "2025-11-25"  # type: ignore[index]
+        assert ask(one, "/mcp", {"jsonrpc": "2.0", "method": "notifications/initialized"}) == (202, "")
+        assert [tool["name"] for tool in call("tools/list")["tools"]] == ["reset", "step", "state"]  # type: ignore[index]
+        shown = call("tools/call", name="reset", arguments={})
+        assert [part["type"] for part in shown["content"]] == ["text", "image"]  # type: ignore[index]
+        wrong = call("tools/call", name="step", arguments={"action": 9})
+        assert wrong["isError"] and "give a number from 0 to 5" in wrong["content"][0]["text"]  # type: ignore[index]
+        assert not call("tools/call", name="step", arguments={"action": 2})["isError"]  # type: ignore[index]
+        assert "test 1 of 3" in call("tools/call", name="state")["content"][0]["text"]  # type: ignore[index]
+        assert call("tools/call", name="fly")["code"] == -32602  # type: ignore[index]
+        assert call("server/discover")["code"] == -32601  # type: ignore[index]
+        assert ask(one, "/mcp", [1])[1]["error"]["code"] == -32600  # type: ignore[index]
+        assert ask(one, "/mcp")[0] == 405, "no stream is offered"
+
+
+class Line:
+    """A WebSocket's client, as OpenEnv's: masked text, and answers of any length."""
+
+    def __init__(self, one: Server) -> None:
+        self._line = socket.create_connection(("127.0.0.1", one.server_port), timeout=30)
+        key = base64.b64encode(bytes(range(16))).decode()
+        head = f"GET /ws HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nSec-WebSocket-Key: {key}\r\n\r\n"
+        self._line.sendall(head.encode())
+        self._answers = self._line.makefile("rb")
+        lines = iter(self._answers.readline, b"\r\n")
+        assert f"Sec-WebSocket-Accept: {accept_key(key)}\r\n".encode() in list(lines)
+
+    def send(self, kind: int, content: bytes, length: int | None = None) -> None:
+        size = len(content) if length is None else length
+        head = bytes([0x80 | kind, 0x80 | size]) if size < 126 else bytes([0x80 | kind, 0xFF]) + size.to_bytes(8)
+        mask = b"\x01\x02\x03\x04"
+        self._line.sendall(head + mask + bytes(each ^ mask[place % 4] for place, each in enumerate(content)))
+
+    def frame(self) -> tuple[int, bytes]:
+        kind, size = self._answers.read(2)
+        if size == 126:
+            size = int.from_bytes(self._answers.read(2))
+        return kind & 15, self._answers.read(size)
+
+    def say(self, **message: object) -> dict[str, object]:
+        self.send(1, json.dumps(message).encode())
+        return json.loads(self.frame()[1])
+
+    def close(self) -> None:
+        self._answers.close()
+        self._line.close()
+
+
+def test_openenvs_websocket(tmp_path: Path) -> None:
+    assert accept_key("dGhlIHNhbXBsZSBub25jZQ==") == "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=", "the example of RFC 6455"
+    with served(tmp_path) as one:
+        line = Line(one)
+        begun = line.say(type="reset", data={"player": "ann"})
+        assert begun["type"] == "observation" and set(begun["data"]) == {"observation", "reward", "done", "metadata"}  # type: ignore[call-overload]
+        line.send(9, b"beat")
+        assert line.frame() == (10, b"beat")
+        done = line.say(type="step", data={"action": 2})
+        assert done["data"]["reward"] in (-1.0, -5.0, 50.0)  # type: ignore[index]
+        assert line.say(type="state")["data"]["step_count"] == 1  # type: ignore[index]
+        assert line.say(type="step", data={"action": "fly"})["data"]["code"] == "VALIDATION_ERROR"  # type: ignore[index]
+        assert "A message has the type" in line.say(type="dance")["data"]["message"]  # type: ignore[index]
+        line.send(1, b"", length=MOST_BYTES + 1)
+        assert line.frame() == (8, (1009).to_bytes(2))
+        line.close()
+        line = Line(one)
+        line.send(8, b"\x03\xe8")
+        assert line.frame() == (8, b"\x03\xe8")
+        line.close()
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "headers", "status", "complaint"),
+    [
+        ("/nowhere", None, {}, 404, "There is no such page; there are /,"),
+        ("/reset", None, {}, 405, "/reset takes POST alone"),
+        ("/reset", {}, {}, 400, 'The player is None; give a name as "player"'),
+        ("/reset", {"player": "../../etc"}, {}, 400, "A player cannot be called '../../etc'"),
+        ("/reset", {"player": "ann", "seed": 3}, {}, 400, "leave the seed out"),
+        ("/reset", [], {}, 400, "Give a mapping"),
+        ("/reset", b"{", {}, 400, "The body is no JSON"),
+        ("/reset", b"[" * 60_000, {}, 400, "The body is no JSON"),
+        ("/reset", b"9" * 60_000, {}, 400, "The body is no JSON"),
+        ("/reset", b'{"player": NaN}', {}, 400, "The body is no JSON"),
+        ("/reset", b"x" * (MOST_BYTES + 1), {}, 413, "more than 65,536 bytes"),
+        ("/reset", b"", {"Content-Length": "9" * 5000}, 413, "more than 65,536 bytes"),
+        ("/reset", b"", {"Content-Length": "-1"}, 400, "The Content-Length is no number"),
+        ("/reset", b"", {"Transfer-Encoding": "chunked"}, 411, "Content-Length"),
+        ("/reset", {"player": "ann"}, {"Origin": "http://evil.example"}, 403, "other origins"),
+        ("/", None, {"Host": "evil.example"}, 403, "127.0.0.1 and localhost alone"),
+        ("/step", {"player": "new", "action": 0}, {}, 400, "No episode goes on; reset begins the next one"),
+        ("/step", {"player": "new", "action": True}, {}, 400, "Action True does not exist"),
+        ("//[", None, {}, 404, "There is no such page"),
+        ("/ws", None, {}, 426, "/ws is a WebSocket"),
+    ],
+)
+def test_bad_requests_get_one_sentence(
+    path: str, body: object, headers: dict[str, str], status: int, complaint: str, refusing: Server
+) -> None:
+    found, answer = ask(refusing, path, body, **headers)
+    assert found == status and complaint in answer["error"]  # type: ignore[index]
+
+
+@pytest.fixture(scope="module")
+def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with served(tmp_path_factory.mktemp("runs")) as one:
+        yield one
+
+
+def test_few_players_and_few_connections_are_let_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_CONNECTIONS", 2)
+    monkeypatch.setattr(module.Handler, "timeout", 1.0)
+    with served(tmp_path, most_players=1) as one:
+        assert ask(one, "/reset", {"player": "ann"})[0] == 200
+        status, said = ask(one, "/reset", {"player": "bo"})
+        assert status == 400 and "1 players are here already" in said["error"]  # type: ignore[index]
+        silent = [socket.create_connection(("127.0.0.1", one.server_port)) for _ in range(2)]
+        with pytest.raises((http.client.HTTPException, OSError)):
+            ask(one, "/health")
+        for each in silent:
+            each.settimeout(10)
+            assert each.recv(1) == b"", "a connection that says nothing is closed"
+            each.close()
+        assert ask(one, "/health")[0] == 200
+
+
+def test_it_binds_to_this_machine_alone_and_says_where_it_cannot(tmp_path: Path, refusing: Server) -> None:
+    assert refusing.server_address[0] == "127.0.0.1" and refusing.is_local
+    players = Players(Served(task="arrow_puzzle", execution="kinematic", out=tmp_path))
+    with pytest.raises(SetupError, match=r"cannot be served at: .* give another --port"):
+        Server(players, "127.0.0.1", refusing.server_port)
+    with pytest.raises(SetupError, match="ports end at 65535"):
+        Server(players, "127.0.0.1", 70_000)
+    players.close()
+    for wrong, complaint in ({"observation": "smell"}, "No observation 'smell'"), ({"most_players": 0}, "players"):
+        with pytest.raises(ImagineBenchError, match=complaint):
+            Players(Served(task="arrow_puzzle", **wrong))  # type: ignore[arg-type]
+    assert main(["serve", "nothing"]) == 2 and main(["serve"]) == 2
+
+
+# A fuzz -------------------------------------------------------------------------------------------------------------
+
+
+def hostile(rng: random.Random) -> bytes:
+    """A request that is right, nearly right, or noise."""
+    player = rng.choice(["ann", "bo", "../x", "", "é", "x" * 50, 3, None, ["ann"], {"a": 1}])
+    action = rng.choice(
+        [*range(6), -1, 6, 10**30, 1.5, True, None, "0", SPEC.action_names[1], {"action": 2}, [], "\x00"]
+    )
+    method = rng.choice(["initialize", "tools/list", "tools/call", "ping", "x", 3, None])
+    call = {"name": rng.choice(["reset", "step", "state", "x"]), "arguments": {"player": player, "action": action}}
+    bodies = [
+        {"player": player, "action": action},
+        {"player": "ann", "action": rng.randrange(6)},
+        {"jsonrpc": "2.0", "id": rng.choice([1, "a", None, 1.5, []]), "method": method, "params": call},
+        rng.choice([[], 0, "x", None, [[[]]], {"player": {"player": "ann"}}]),
+    ]
+    body = json.dumps(rng.choice(bodies)).encode()
+    if rng.random() < 0.3:
+        cut = rng.randrange(len(body) + 1)
+        body = body[:cut] + rng.randbytes(rng.randrange(9)) + body[cut + rng.randrange(3) :]
+    length = rng.choice([len(body)] * 9 + [0, len(body) // 2, len(body) + 1, 10**9, -1])
+    path = rng.choice(["/reset", "/step", "/mcp", "/state?player=ann", "/", "/ws", "/health", "/x", "/%00", "//[", "*"])
+    verb = rng.choice(["POST"] * 6 + ["GET", "PUT", "HEAD", "POST /reset HTTP/1.1\r\nA", "\x00"])
+    more = rng.choice(
+        [""] * 6 + ["Origin: http://x\r\n", "Upgrade: websocket\r\nSec-WebSocket-Key: a\r\n", "\xff: \r\n"]
+    )
+    head = f"{verb} {path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {length}\r\n{more}\r\n"
+    request = head.encode("latin-1") + body
+    return rng.randbytes(rng.randrange(200)) if rng.random() < 0.05 else request
+
+
+def fuzz(root: Path, count: int, monkeypatch: pytest.MonkeyPatch) -> set[int]:
+    """Send so many requests, one connection each, and go on playing; returns the statuses that were answered."""
+    monkeypatch.setattr(module, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(module.Handler, "timeout", 0.2)
+    monkeypatch.setattr(module, "SOCKET_PATIENCE_S", 0.2)
+    statuses = set()
+    rng = random.Random(0)
+    with served(root, tests=3, most_players=4) as one:
+        for _ in range(count):
+            line = socket.create_connection(("127.0.0.1", one.server_port), timeout=30)
+            line.sendall(hostile(rng))
+            line.shutdown(socket.SHUT_WR)
+            answer = b""
+            try:
+                while part := line.recv(65_536):
+                    answer += part
+            except ConnectionResetError:  # it was closed while more lay in it
+                pass
+            line.close()
+            if answer.startswith(b"HTTP/1.1 "):
+                statuses.add(int(answer[9:12]))
+        assert ask(one, "/health") == (200, {"status": "healthy"})
+        for player in ("ann", "bo"):
+            if not ask(one, f"/state?player={player}")[1]["all_done"]:  # type: ignore[index]
+                play_all(one, player)
+    for player in ("ann", "bo"):
+        assert not any(verdict.complaint for verdict in verify_runs(bench_of(root, player)))
+    return statuses
+
+
+def test_a_fuzz_of_some_hundred_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    statuses = fuzz(tmp_path, 300, monkeypatch)
+    assert {200, 400, 403, 404, 405} <= statuses and 500 not in statuses, statuses
+
+
+@pytest.mark.slow
+def test_a_fuzz_of_ten_thousand_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert 500 not in fuzz(tmp_path, 10_000, monkeypatch)

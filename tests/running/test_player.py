@@ -1,0 +1,229 @@
+"""Episodes of a person are kept as a run: nothing is lost, left out or played twice, and a bench's commands take it."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_runs import Inline
+
+from imagine_bench import registry
+from imagine_bench.cli import exit_code as main
+from imagine_bench.errors import BusyError, ImagineBenchError, InvalidValueError
+from imagine_bench.judge.verify import verify_runs
+from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.running.bench import bench
+from imagine_bench.running.player import FinishedError, PlayedRun, played_run, protocol_of_player
+from imagine_bench.running.trained import load_trained
+from imagine_bench.store import run_folder
+from imagine_bench.store.loading import load_so_far, merge
+from imagine_bench.store.results import BenchResult, RunResult
+from imagine_bench.tools.audits import why_report
+
+SPEC = registry.task("arrow_puzzle")
+
+
+def wanted(name: str = "anna", **options: object) -> Protocol:
+    values: dict[str, object] = {"tests": 4, "execution": "kinematic", **options}
+    return protocol_of_player("arrow_puzzle", "person", name, **values)  # type: ignore[arg-type]
+
+
+def lasting(macrostate: tuple[int, ...], number: int, moves: int) -> int:
+    """In every second episode the best macro-action. In the others two that end nothing, then one that loses."""
+    if number % 2:
+        return SPEC.rules.optimal_action(macrostate)
+    outcomes = [SPEC.rules.outcomes(macrostate, action)[0] for action in range(SPEC.n_actions)]
+    quiet = [action for action, each in enumerate(outcomes) if not each.terminated]
+    losing = [action for action, each in enumerate(outcomes) if each.terminated and not each.success]
+    return (quiet if moves < 2 else [*losing, *quiet])[0]
+
+
+def play_one(run: PlayedRun, most: int = 99) -> None:
+    """Play the next episode, or as many macro-actions of it."""
+    _, info = run.reset()
+    over = False
+    while not over and most:
+        macrostate = tuple(np.asarray(info["macrostate"]).tolist())
+        _, _, terminated, truncated, info = run.step(lasting(macrostate, run.number, run.moves))
+        over = terminated or truncated
+        most -= 1
+
+
+def play_all(protocol: Protocol, root: Path) -> Path:
+    with played_run(protocol, root) as run:
+        while not run.is_done:
+            play_one(run)
+        return run.folder
+
+
+def content(folder: Path) -> RunResult:
+    return dataclasses.replace(run_folder.load_run(folder), folder=None)
+
+
+def same(one: RunResult, other: RunResult) -> bool:
+    kept = [[row.kept for row in run.checkpoints] for run in (one, other)]
+    return one.checkpoints == other.checkpoints and all(
+        np.array_equal(getattr(first, name), getattr(second, name))
+        for first, second in zip(*kept, strict=True)
+        for name in vars(first)
+    )
+
+
+@pytest.fixture(scope="module")
+def anna(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return play_all(wanted(), tmp_path_factory.mktemp("runs"))
+
+
+def test_a_persons_run_is_verified_explained_and_reported(anna: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "runs" / anna.parents[1].name
+    shutil.copytree(anna.parents[1], folder)
+    row = content(anna).checkpoints[0]
+    assert (row.test_episodes, row.solved, row.env_steps) == (4, "0101", 0)
+    assert [verdict.complaint for verdict in verify_runs(folder)] == ["", ""]
+    assert not any(verdict.unshown for verdict in verify_runs(folder))
+    said = why_report(folder, root=tmp_path, task=None, encoder=None)
+    assert "2 of 4" in said and "decision" in said
+    assert main(["report", str(folder)]) == 0
+    page = (folder / "report" / "index.html").read_text()
+    assert "person:anna" in page and "A person at the keyboard" in page
+    assert main(["verify", str(folder)]) == 0
+
+
+def test_a_forged_success_does_not_hold(tmp_path: Path) -> None:
+    folder = play_all(wanted(), tmp_path)
+    snapshot = run_folder.load_newest(folder / run_folder.CHECKPOINTS)
+    assert snapshot is not None
+    rows = [{**row, "solved": "1111", "successes": 4} for row in snapshot.values["rows"]]
+    forged = {name: np.ones_like(a) if name.endswith("success") else a for name, a in snapshot.arrays.items()}
+    run_folder.save_snapshot(
+        folder / run_folder.CHECKPOINTS,
+        dataclasses.replace(snapshot, arrays=forged, values={**snapshot.values, "rows": rows}),
+    )
+    (folder / "DONE").unlink()
+    result = run_folder.load_so_far(folder)
+    assert result is not None
+    run_folder.write_metrics(folder, result.checkpoints)
+    run_folder.finish(folder)
+    assert "test 0: the success is False, and True was kept" in verify_runs(folder.parents[1])[0].complaint
+
+
+@pytest.mark.parametrize("training", [None, 3])
+def test_an_interrupted_run_ends_in_the_same_bits(training: int | None, tmp_path: Path) -> None:
+    """It is left in the middle of an episode, at an end before the next begins, and killed at any moment."""
+    chosen = wanted(training=training)
+    whole = play_all(chosen, tmp_path / "whole")
+    root = tmp_path / "parts"
+    with played_run(chosen, root) as run:
+        play_one(run, most=2)
+    with played_run(chosen, root) as run:
+        assert run.moves == 0
+        run.reset()
+        assert run.moves == 2, "the episode that was left goes on"
+        play_one(run)
+        shutil.copytree(root, tmp_path / "killed")  # as a kill would leave it: over, and the next one not begun
+    with played_run(chosen, tmp_path / "killed") as run:
+        run.reset()
+        assert (run.number, run.moves) == (1, 0)
+        play_one(run, most=1)
+    parts = [play_all(chosen, each) for each in (root, tmp_path / "killed")]
+    assert all(same(content(whole), content(part)) for part in parts)
+    verdicts = verify_runs(parts[1].parents[1])
+    assert not any(verdict.complaint for verdict in verdicts)
+    assert verdicts[0].episodes == (7 if training else 4 * len(chosen.budgets))
+
+
+def test_a_line_that_was_cut_off_is_no_move(tmp_path: Path) -> None:
+    with played_run(wanted(), tmp_path) as run:
+        play_one(run, most=2)
+        moves = run.folder / "moves.txt"
+    before = moves.read_text()
+    assert before.count("\n") == 2
+    moves.write_text(f"{before}0 5")
+    with played_run(wanted(), tmp_path) as run:
+        run.reset()
+        assert run.moves == 2
+        run.step(5)
+    assert moves.read_text() == f"{before}0 5\n"
+
+
+def test_a_kill_before_the_mark_loses_nothing(tmp_path: Path) -> None:
+    folder = play_all(wanted(), tmp_path)
+    before = content(folder)
+    (folder / "DONE").unlink()
+    (folder / "metrics.csv").unlink()
+    with played_run(wanted(), tmp_path) as run:
+        assert run.is_done
+    assert same(before, content(folder))
+
+
+def test_one_process_at_a_time_and_no_episode_more(tmp_path: Path) -> None:
+    with played_run(wanted(), tmp_path) as run:
+        with pytest.raises(BusyError, match="is in use by process"), played_run(wanted(), tmp_path):
+            pass
+        first = run.reset()[1]["macrostate"].tolist()
+        assert run.reset(seed=9)[1]["macrostate"].tolist() == first, "nobody draws another start"
+        play_one(run)
+        with pytest.raises(InvalidValueError, match="No episode goes on; reset begins the next one"):
+            run.step(0)
+        while not run.is_done:
+            play_one(run)
+        with pytest.raises(FinishedError, match="person:anna: all 4 episodes are played; give another name"):
+            run.reset()
+
+
+def test_a_person_stands_in_the_table_of_a_bench(tmp_path: Path) -> None:
+    """Its tests are the bench's first ones, and the bench's row with as many tests is that of its first ones."""
+    planned = protocol(
+        "arrow_puzzle", "smoke", agents=("random", "oracle"), seeds=(0, 1), evaluation_episodes=9, execution="kinematic"
+    )
+    there = bench(planned, {}, root=tmp_path, launcher=Inline())
+    assert isinstance(there, BenchResult)
+    played = protocol_of_player(None, "person", "anna", tests=4, like=there.folder)
+    mine = load_so_far(play_all(played, tmp_path).parents[1])
+    table = merge([there, mine], tmp_path)
+    assert table.protocol.agents == ("random", "oracle", "person:anna")
+    assert table.protocol.evaluation_episodes == 4
+    assert [(run.agent, run.seed) for run in table.runs] == [
+        *[("random", 0), ("oracle", 0), ("person:anna", 0)],
+        *[("random", 1), ("oracle", 1)],
+    ]
+    whole = {(run.agent, run.seed): run.checkpoints[0] for run in there.runs}
+    for run in table.runs[:2]:
+        row = run.checkpoints[0]
+        before = whole[run.agent, run.seed]
+        assert before.kept is not None and row.kept is not None
+        assert row.solved == before.solved[:4] and row.successes == row.solved.count("1")  # type: ignore[index]
+        assert row.mean_return == pytest.approx(before.kept.returns[:4].mean())
+        assert row.mean_length == pytest.approx(before.kept.lengths[:4].mean())
+        assert row.kept.actions.tolist() == before.kept.actions[: before.kept.lengths[:4].sum()].tolist()
+        starts = table.runs[2].checkpoints[0].kept.starts  # type: ignore[union-attr]
+        assert row.kept.starts.tolist() == starts.tolist()
+    without = dataclasses.replace(there.runs[0].checkpoints[0], kept=None)
+    with pytest.raises(ImagineBenchError, match="are not kept, so the first ones cannot be taken alone"):
+        without.of_first(4)
+
+
+@pytest.mark.parametrize(
+    ("call", "complaint"),
+    [
+        (lambda: wanted(name="../x"), "A player cannot be called '../x'; give 1 to 40 of the letters"),
+        (lambda: wanted(name="a" * 41), "cannot be called"),
+        (lambda: wanted(tests=0), "evaluation_episodes is 0; give 1 to"),
+        (lambda: wanted(training=0), "training"),
+        (lambda: protocol_of_player(None, "person", "anna"), "There is nothing to play; give a task"),
+        (lambda: protocol("arrow_puzzle", agents=("person:anna",)), "Nothing here can act for a person"),
+        (lambda: protocol("arrow_puzzle", agents=("person",)), "person alone is no name; give person:ARGUMENT"),
+    ],
+)
+def test_bad_input_is_one_sentence(call: Callable[[], object], complaint: str) -> None:
+    with pytest.raises(ImagineBenchError, match=complaint.replace(".", r"\.")):
+        call()
+
+
+def test_nobody_acts_for_a_person(anna: Path) -> None:
+    with pytest.raises(InvalidValueError, match="Nothing here can act for a person"):
+        load_trained(anna)
