@@ -55,7 +55,8 @@ class MacroEnv(SceneEnv):
     Observation Space: ``Box(0, 255, (64, 64, 3), uint8)``, one upright RGB frame with the human at the top, unless
     ``observation`` says otherwise.
 
-    Rewards: those of the task's rules, for the macrostate that was read back from the scene.
+    Rewards: those of the task's rules, for the macrostate that was read back from the scene, and noise where the
+    appearance has it.
 
     Starting State: one of the rules' start states, equally likely, or ``reset(options={"macrostate": ...})``.
 
@@ -204,7 +205,7 @@ class MacroEnv(SceneEnv):
             outcome = self._rules.judge(start, chosen, reading.macrostate)
             fault = fault or f"the scene reads {reading.macrostate}, the rules say {intended.macrostate}"
         info = self._info(success=outcome.success, legal=outcome.success or not outcome.terminated, fault=fault)
-        return float(outcome.reward), outcome.terminated, False, info
+        return self.world.reward(outcome.reward, self.np_random), outcome.terminated, False, info
 
     def prepare(self) -> None:
         """Compile the executor of macro-actions, if it is not yet."""

@@ -25,6 +25,7 @@ from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import Point
 from .scenes.control_views import varied_by_appearance
 from .scenes.fragments import Composite, draw_composite
+from .scenes.nuisances import Nuisance, draw_nuisance
 
 MAX_TILT_RAD = math.radians(10.0)
 MAX_SKEW_RAD = math.radians(20.0)
@@ -67,6 +68,7 @@ class WorldState:
     composite: Composite | None  #: where frames are patched, the fragments of the latest
     sensing: Sensing
     places: tuple[Place, ...] = ()  #: as :attr:`World.places`
+    nuisance: Nuisance | None = None  #: the nuisances of the latest frame, where there are any
     sleep: Sleep = field(default_factory=dict)  #: the sleeping bodies, by the names in ``mjData``
 
 
@@ -102,6 +104,7 @@ class World(abc.ABC):
         cameras, varied = varied_by_appearance(model, materials)
         self._appearance = AppearanceSampler(model, level, cameras=cameras, materials=varied)
         self._composite: Composite | None = None
+        self._nuisance: Nuisance | None = None
         self._distraction = Distraction(model, distractors) if distractors else None
         starts = [int(model.joint(f"{body}_joint").qposadr[0]) for body in objects]
         self.object_qpos = np.array(starts)[:, None] + np.arange(7)  # [N, 7]
@@ -153,6 +156,7 @@ class World(abc.ABC):
             composite=self._composite,
             sensing=replace(self.sensing),
             places=self.places,
+            nuisance=self._nuisance,
             sleep=self._sleep(),
         )
 
@@ -163,6 +167,7 @@ class World(abc.ABC):
         for mine, then in zip(looks_of(self.model), state.looks, strict=True):
             mine[:] = then
         self._composite = state.composite
+        self._nuisance = state.nuisance
         self.places = state.places
         self.sensing.aside_m = state.sensing.aside_m
         self.sensing.turned_rad = state.sensing.turned_rad
@@ -222,6 +227,7 @@ class World(abc.ABC):
         self.set_gesture(gesture)
         if self._distraction is not None:
             self._distraction.place(self.data, rng)
+        self._nuisance = draw_nuisance(self.level, rng)
         self.update()
 
     def draw_places(self, most_m: float, rng: np.random.Generator) -> None:
@@ -256,11 +262,13 @@ class World(abc.ABC):
         return (*macrostate[:-1], HIDDEN) if self.model.mat_rgba[self._people[0], 3] == 0.0 else macrostate
 
     def vary(self, rng: np.random.Generator, *, move_objects: bool = True) -> None:
-        """Draw this frame's light, colors, camera and hands as the appearance says, then its distractors.
+        """Draw this frame's nuisances, light, colors, camera and hands as the appearance says, then its distractors.
 
         Where frames are patched of fragments, a fragment's pose holds too unless objects must not move: an object that
         physics moved stays there.
         """
+        if self._nuisance is not None:
+            self._nuisance = self._nuisance.following(rng)
         if self.level.pool is not None:
             self._patch(rng, move_objects=move_objects)
         elif self._varies:
@@ -291,8 +299,18 @@ class World(abc.ABC):
             self.set_gesture(gesture, offset_m, self.level.hand_yaw_rad * turn)
 
     def composite(self, frame: Frame) -> Frame:
-        """The agent's frame from a rendered one (H, W, 3): itself but where frames are photographs."""
-        return frame if self._composite is None else self._composite.of(frame)
+        """The agent's frame from a rendered one (H, W, 3): itself, unless frames are patched or have nuisances."""
+        patched = frame if self._composite is None else self._composite.of(frame)
+        return patched if self._nuisance is None else self._nuisance.of(patched)
+
+    def reward(self, ruled: float, rng: np.random.Generator) -> float:
+        """The reward that the agent gets for that of the rules: on average the same, and the same where it is exact."""
+        reward = float(ruled)
+        if self.level.reward_std:
+            reward += self.level.reward_std * float(rng.standard_normal())
+        if self.level.reward_step:
+            reward += self.level.reward_step * int(rng.integers(-1, 2))
+        return reward
 
     @abc.abstractmethod
     def set_outcome(self, action: int, intended: State) -> None:

@@ -480,6 +480,19 @@ def parameters() -> None:
     Image.fromarray(np.concatenate(halves, axis=1)).save(HERE / "parameters.png", optimize=True)
 
 
+def nuisances() -> None:
+    """Each nuisance of frames in three frames of one episode and in the first frame of another."""
+    rows = {}
+    for given in ("clean", *(f"{name}=1" for name in appearance.NUISANCES[:4]), "harsh"):
+        with gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance=given) as env:
+            frames = [env.reset(seed=3, options={"macrostate": START})[0]]
+            frames += [env.step(action)[0] for action in (0, 2)]
+            frames.append(env.reset(options={"macrostate": START})[0])
+        rows[given] = frames
+    drawn = strips(rows, ["start", "after one action", "after two", "another start"])
+    Image.fromarray(drawn.repeat(2, axis=0).repeat(2, axis=1)).save(HERE / "nuisances.png", optimize=True)
+
+
 def tasks() -> None:
     """An image of every task."""
     runpy.run_path(str(HERE / "draw_tasks.py"))["tasks"]()
@@ -498,6 +511,7 @@ FIGURES = (
     evidence,
     promise,
     parameters,
+    nuisances,
     tasks,
 )
 PICTURES = {each.__name__: each for each in FIGURES}

@@ -61,8 +61,8 @@ class WorldOptions:
     execution: ExecutionWord = None
     """How macro-actions happen: physics (the default), or kinematic (their outcome is set)."""
     appearance: Word = None
-    """How much frames vary: clean (the default), mild, strong, patched (from a finite pool), or factors such as
-    light=0.5,camera=0.2."""
+    """How much frames vary: clean (the default), mild, strong, patched (from a finite pool), harsh (shifted, shadowed,
+    occluded and noisy), or factors such as light=0.5,camera=0.2."""
     physics: ManyWords = ()
     """Settings of the physics of grasping, as name=value, such as pad_friction=0.5."""
     observation: Word = None

@@ -24,6 +24,8 @@ from imagine_bench.store.files import expanded, lock, make_folder, reading, sha2
 
 _TRAIN = "imagine_bench.agents.encoders.cli:retrain"
 _FIT = "imagine_bench.agents.encoders.training:fit_offered"
+_BUNDLED_AT = [name for name in APPEARANCES if name != "harsh"]
+"""Named appearances for which encoders are made beforehand; for all others they are trained on first use."""
 _SUFFIX = ".safetensors"
 _PATIENCE_S = 3600.0
 READS_AT_LEAST = 0.9
@@ -131,7 +133,7 @@ def own(spec: TaskSpec, appearance: str, kind: str = "latents") -> Path:
     if name in bundled():
         return bundled()[name]
     has_others = any(other.startswith(f"{spec.encoder}-") for other in bundled())
-    if has_others and registry.is_own(spec.id) and appearance_typed(appearance) in APPEARANCES:
+    if has_others and registry.is_own(spec.id) and appearance_typed(appearance) in _BUNDLED_AT:
         raise ArtefactError(
             f"No encoder {name!r} is bundled; train one with 'imagine-bench encoder --task {spec.id} --appearance "
             f"{appearance_typed(appearance)}' (for codes with --recipe codes) and give it with --encoder."

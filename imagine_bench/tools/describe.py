@@ -34,6 +34,7 @@ _APPEARANCES = (
     "Light and the poses of objects and of the hand vary a little.",
     "Light, colors, camera and the poses of objects and of the hand vary much.",
     "Each frame is patched from fragments of a finite pool.",
+    "As clean, with a shift, a shadow, noise and an occluder in frames, and noise in rewards.",
 )
 _LAUNCHERS = (
     "Processes of this machine: the default.",

@@ -10,6 +10,7 @@ from numbers import Real
 import mujoco
 import numpy as np
 
+from imagine_bench.appearance import FACTORS
 from imagine_bench.arrays import Floats, Info, Ints, Observed, State
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import PhysicsSettings, TaskSpec
@@ -166,6 +167,11 @@ class MotionEnv(SceneEnv):
         if level.pool is not None:
             raise InvalidValueError(
                 "Appearance 'patched' patches images of macrostates; give clean, mild, strong or factors."
+            )
+        if level.has_nuisances or level.reward_std or level.reward_step:
+            raise InvalidValueError(
+                f"Appearance {level.name!r} has nuisances, which change frames and rewards of macro-actions; give "
+                f"clean, mild, strong or {', '.join(FACTORS)}."
             )
         super().__init__(
             spec,

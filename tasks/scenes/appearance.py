@@ -33,6 +33,12 @@ class Appearance:
     pool: int | None = None
     gamma_half_width: float = 0.0  #: of gamma about 1, every frame; with a pool only
     noise_std: float = 0.0  #: of the sensor's Gaussian noise, of full scale, every frame; with a pool only
+    shift_px: float = 0.0  #: of an episode's frames, of 64 pixels, down and to the right
+    shadow_depth: float = 0.0  #: share of the light that is missing in the middle of the shadow; no half-width
+    noise_levels: float = 0.0  #: standard deviation of the sensor's noise, of 255, every frame
+    occluder_px: float = 0.0  #: edge of a gray square somewhere in every frame, of 64 pixels
+    reward_std: float = 0.0  #: standard deviation of the noise of every reward
+    reward_step: float = 0.0  #: added to every reward, taken from it, or neither, each in a third of all cases
 
     @property
     def varies_every_frame(self) -> bool:
@@ -41,7 +47,13 @@ class Appearance:
         camera = (self.camera_offset_m, self.camera_angle_rad)
         return any(amount > 0 for amount in (*hand, *camera, self.light_fraction, self.color_fraction))
 
+    @property
+    def has_nuisances(self) -> bool:
+        """Whether frames change after they are rendered; see :mod:`.nuisances`."""
+        return any((self.shift_px, self.shadow_depth, self.noise_levels, self.occluder_px))
 
+
+_CLEAN = Appearance(name="clean", object_offset_m=0.0025, object_yaw_rad=math.radians(2.0))
 _PHOTO = Appearance(
     name="photo",
     object_offset_m=0.005,
@@ -58,7 +70,7 @@ _PHOTO = Appearance(
 LEVELS: dict[str, Appearance] = {
     level.name: level
     for level in (
-        Appearance(name="clean", object_offset_m=0.0025, object_yaw_rad=math.radians(2.0)),
+        _CLEAN,
         Appearance(
             name="mild",
             object_offset_m=0.005,
@@ -80,6 +92,16 @@ LEVELS: dict[str, Appearance] = {
         ),
         _PHOTO,
         replace(_PHOTO, name=HELD_OUT["photo"]),
+        replace(
+            _CLEAN,
+            name="harsh",
+            shift_px=4.0,
+            shadow_depth=0.5,
+            noise_levels=20.0,
+            occluder_px=8.0,
+            reward_std=0.5,
+            reward_step=0.5,
+        ),
     )
 }
 
@@ -92,6 +114,17 @@ _FIELDS = {
     "hand": ("hand_offset_m", "hand_yaw_rad"),
 }
 """The variations of each factor."""
+_NUISANCES = {
+    "shift": "shift_px",
+    "shadow": "shadow_depth",
+    "noise": "noise_levels",
+    "occlusion": "occluder_px",
+    "reward_noise": "reward_std",
+    "reward_steps": "reward_step",
+}
+"""The same of each nuisance."""
+_DARKEST = 0.95
+"""Most of the light that a shadow takes."""
 
 
 def appearance(given: str | Mapping[str, float]) -> Appearance:
@@ -101,13 +134,16 @@ def appearance(given: str | Mapping[str, float]) -> Appearance:
 
 
 def between(name: str, factors: Mapping[str, float]) -> Appearance:
-    """The point of these factors, by linear interpolation of each between the levels that are points."""
+    """The point of these factors: each is interpolated between the levels that are points, a nuisance also beyond."""
     widths = dict[str, Any]()
     for factor, fields in _FIELDS.items():
-        levels = {point.get(factor, 0.0): LEVELS[level] for level, point in POINTS.items()}
+        levels = {POINTS[level].get(factor, 0.0): LEVELS[level] for level in ("clean", "mild", "strong")}
         for each in fields:
             at = [getattr(level, each) for level in levels.values()]
             widths[each] = float(np.interp(factors.get(factor, 0.0), list(levels), at))
+    for nuisance, each in _NUISANCES.items():
+        widths[each] = factors.get(nuisance, 0.0) * getattr(LEVELS["harsh"], each)
+    widths["shadow_depth"] = min(widths["shadow_depth"], _DARKEST)
     return Appearance(name=name, **widths)
 
 

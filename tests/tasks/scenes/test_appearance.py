@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.scenes.appearance import LEVELS, appearance, between, looks_of
 
-from imagine_bench.appearance import FACTORS, POINTS, appearance_name
+from imagine_bench.appearance import FACTORS, NUISANCES, POINTS, appearance_name
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.judge.judgement import Judgement
 from imagine_bench.protocols.control import protocol
@@ -31,6 +31,8 @@ def make(task="Arrows", **options):
         ({"light": 0, "hand": 0.0}, "clean"),
         ("light=0.5,pose=0.50,hand=5e-1", "mild"),
         (dict.fromkeys(FACTORS, 1), "strong"),
+        (dict.fromkeys(NUISANCES, 1), "harsh"),
+        ("noise=1.5,pose=0.5", "pose=0.5,noise=1.5"),
         ("camera=0.2,light=0.5", "light=0.5,camera=0.2"),
         ({"camera": np.float64(0.2), "light": 0.5, "pose": 0}, "light=0.5,camera=0.2"),
         ("hand=1", "hand=1.0"),
@@ -54,10 +56,12 @@ def test_one_appearance_has_one_name(given, name):
         ("light=nan", "Appearance has light='nan'; give a number from 0 to 1."),
         (
             "ligth=0.5",
-            "No factor of appearance 'ligth'. Did you mean 'light'? Known: light, colors, camera, pose, hand.",
+            "No factor of appearance 'ligth'. Did you mean 'light'? Known: light, colors, camera, pose, hand, shift, "
+            "shadow, noise, occlusion, reward_noise, reward_steps.",
         ),
         ("light=0.5,light=0.5", "names light twice; give it once."),
-        ("light=0.5,strong", "No factor of appearance 'strong'. Known: light, colors, camera, pose, hand."),
+        ("light=0.5,strong", "No factor of appearance 'strong'. "),
+        ("noise=2.1", "Appearance has noise='2.1'; give a number from 0 to 2."),
         (3, "No appearance '3'."),
     ],
 )
@@ -70,11 +74,15 @@ def test_bad_appearances_end_with_one_sentence(given, complaint):
         assert complaint in str(caught.value) and "\n" not in str(caught.value)
 
 
+NUISANCE_FIELDS = ("shift_px", "shadow_depth", "noise_levels", "occluder_px", "reward_std", "reward_step")
+
+
 @pytest.mark.parametrize("level", POINTS)
 def test_levels_are_points_of_the_factors(level):
     found = between(level, POINTS[level])
     assert found == LEVELS[level]
-    widths = {field.name for field in dataclasses.fields(found)} - {"name", "pool", "gamma_half_width", "noise_std"}
+    others = {"name", "pool", "gamma_half_width", "noise_std", *NUISANCE_FIELDS}
+    widths = {field.name for field in dataclasses.fields(found)} - others
     half = between("", dict.fromkeys(FACTORS, 0.25))
     assert all(
         getattr(LEVELS["clean"], each) < getattr(half, each) < getattr(LEVELS["strong"], each) for each in widths
