@@ -143,7 +143,7 @@ def light_alone(spec: TaskSpec, render: Render) -> EvalSet | None:
 
 def about_light(spec: TaskSpec, light: EvalSet) -> WorldQuestions:
     """The pairs of :func:`light_alone`: the outcome of a macro-action, shown in two lights."""
-    return light_pairs(spec.rules, light.macrostates, light.asked[::FRAMES, 0], _generator(spec, "light answers"))
+    return light_pairs(spec, light.macrostates, light.asked[::FRAMES, 0], _generator(spec, "light answers"))
 
 
 SETS = {"one_step": one_step, "rollouts": rollouts, "ranked": ranked, "after": after_the_end}

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imagine_bench.arrays import Bools, Floats, Ints, State
-from imagine_bench.interfaces import Rules, TaskSpec
+from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge.worlds.families import (
     STREAM,
     ChangedRule,
@@ -241,16 +241,16 @@ def _single_causes(world: _World, names: Sequence[str], *, looks: bool) -> list[
     return [_factors_changed(world, pairs), pairs]
 
 
-def light_pairs(rules: Rules, states: tuple[State, ...], actions: Ints, rng: np.random.Generator) -> WorldQuestions:
+def light_pairs(spec: TaskSpec, states: tuple[State, ...], actions: Ints, rng: np.random.Generator) -> WorldQuestions:
     """Pairs of frames of one macrostate in two lights, and a macro-action: which macrostate follows?
 
     Args:
-        rules: The rules.
+        spec: The task.
         states: The macrostate of each pair. Length P.
         actions: The macro-action of each pair, the only one that the tables of these questions hold. Shape (P,).
         rng: Draws the possible answers.
     """
-    every, table = exact_table(rules, states, 2)
+    every, table = exact_table(spec.rules, states, 2)
     rows = np.arange(len(states))
     truth = TransitionTable(by_frame=table.by_frame[rows, actions, None], drawn=table.drawn[rows, actions, None])
     world = _World(np.array(every, dtype=np.int64), truth, rng)
@@ -260,7 +260,8 @@ def light_pairs(rules: Rules, states: tuple[State, ...], actions: Ints, rng: np.
     options = np.array([_outcomes(world, of_pair) for of_pair in usual(truth, shown)])
     pairs = SingleCausePairs(shown=shown, causes=("light",) * len(states), options=options)
     no_edges = np.zeros((0, 0, 0), dtype=bool)
-    return WorldQuestions(states=every, truth=truth, families=(pairs,), edges=no_edges)
+    named = Named(every, spec.action_names, spec.macrostate_names)
+    return WorldQuestions(states=every, truth=truth, families=(pairs,), edges=no_edges, named=named)
 
 
 def _outcomes(world: _World, shares: Floats) -> list[list[int]]:
