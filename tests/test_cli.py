@@ -97,7 +97,7 @@ def test_wrong_words_get_one_line_and_exit_code_2(
         ("judge ArrowPuzzleMotion", "type: python -m imagine_bench_motion judge ArrowPuzzleMotion"),
         ("check arrow_puzzle --turns 5", "--turns goes with --physics; leave it out"),
         ("check arrow_puzzle --physics --agent random", "Physics is measured of a task; give one, and no --agent"),
-        ("play arrow_puzzle --out x.gif", "--out goes with --film; leave it out"),
+        ("play arrow_puzzle --out x.gif", "--out goes with --film or --keep; leave it out"),
         ("play arrow_puzzle --film --execution kinematic", "A film is of the oracle in a task, in contact physics"),
         ("play arrow_puzzle --encoder x", "--encoder goes with --model"),
         ("play arrow_puzzle --camera up", "No camera 'up'. Known: human, far."),

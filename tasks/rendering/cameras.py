@@ -6,10 +6,17 @@ import numpy as np
 
 from imagine_bench.errors import InvalidValueError, brief
 
-from ..scenes.constants import AGENT_CAMERA, AGENT_GROUP, ARM_GROUP, CONTROL_GROUP, SCENE_GROUP, SETTING_GROUP
+from ..scenes.constants import (
+    AGENT_CAMERA,
+    AGENT_GROUP,
+    ARM_GROUP,
+    CONTROL_GROUP,
+    FRAME_PX,
+    SCENE_GROUP,
+    SETTING_GROUP,
+)
 from .renderer import View
 
-FRAME_PX = 64
 MAX_IMAGE_PX = 4096
 _SMALL_PX = 256
 DRAWN_GROUPS = (SCENE_GROUP, ARM_GROUP, SETTING_GROUP)

@@ -28,6 +28,9 @@ OBSERVATION_QPOS_RAD = (-0.012, -1.013, -0.388, 1.66, 0.245, 0.972, 4.401)
 HOME_QPOS_RAD = (0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161)
 """Published Sawyer home configuration (gripper straight down), the posture that IK prefers."""
 
+FRAME_PX = 64
+"""Edge of an agent's frame."""
+
 SCENE_GROUP = 0
 AGENT_GROUP = 1
 ARM_GROUP = 2

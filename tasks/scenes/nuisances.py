@@ -11,8 +11,8 @@ import numpy as np
 
 from imagine_bench.arrays import Floats, Frame
 
-from ..rendering.cameras import FRAME_PX
 from .appearance import Appearance
+from .constants import FRAME_PX
 
 _WHITE = 255.0
 _SHADOW_RADIUS = 0.2
@@ -55,7 +55,8 @@ class Nuisance:
             left = round(column * (width - edge))
             seen[top : top + edge, left : left + edge] = _WHITE * gray
         if level.noise_levels:
-            seen += level.noise_levels * np.random.default_rng(self.noise_seed).standard_normal(frame.shape)
+            rng = np.random.default_rng(self.noise_seed)
+            seen += level.noise_levels * rng.standard_normal(frame.shape)
         return np.rint(np.clip(seen, 0.0, _WHITE)).astype(np.uint8)
 
     def _shadow(self, height: int, width: int) -> Floats:

@@ -140,7 +140,7 @@ def best_sets(rules: Rules, horizon: int) -> list[dict[State, set[int]]]:
     "task",
     [
         "arrows:cubes=2,slip=0.7",
-        "arrows:cubes=2,fickle=0.3,slip=0.7",
+        pytest.param("arrows:cubes=2,fickle=0.3,slip=0.7", marks=pytest.mark.slow),
     ],
 )
 def test_unlucky_is_what_an_optimal_policy_fails_with_the_same_draws(task: str, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from .factors import Code, CodeTransition, as_arrays, from_arrays
 from .model import FactoredModel
 from .perception import CodePerception, LearnedPerception, load_code_perception
 from .planner import TIE, Objective, Planner
+from .rewards import EXACT, RewardClasses, reward_classes
 from .settings import HYPERPARAMETERS, FactoredSettings
 
 ACCEPTED = 0.5
@@ -30,6 +31,8 @@ _EXPECTED = 0.9
 """A transition held less probable than this is unexpected, as is any that would still be explored."""
 _TERMINAL = 0.5
 """Predicted probability above which an imagined episode ends."""
+_REWARDS_GROWTH = 1.2
+"""Rewards are classed anew once so many times the transitions of the last time were seen."""
 _SURE = 0.5
 """Probability with which each macro-action of a query must lead where it is imagined to."""
 
@@ -52,6 +55,11 @@ class CodeAgent:
         self.perception = perception
         self.replay: list[CodeTransition] = []
         """Every transition that happened or was asked about, in that order; none is dropped."""
+        self.rewards: RewardClasses = EXACT
+        self.class_rewards: list[float] = []
+        """The reward of the class of each replayed transition: the model learns from these."""
+        self.classed = 0
+        """In how many of the first replayed transitions classes of rewards were looked for."""
         self.meters = Meters()
         self._reset_model()
 
@@ -104,18 +112,40 @@ class CodeAgent:
             code = self.perception.code(transition.observation.frame)
             following = self.perception.code(transition.next_observation.frame)
             row = CodeTransition(code, transition.action, following, transition.reward, transition.terminated)
-            (probability,), (unknown,) = self.model.probabilities([row])
+            class_reward = self.rewards.reward(row)
+            (probability,), (unknown,) = self.model.probabilities([row._replace(reward=class_reward)])
             unexpected = bool(probability < _EXPECTED or unknown > self.settings.planning.exploration_threshold)
             self.replay.append(row)
-            if unexpected:
+            self.class_rewards.append(class_reward)
+            due = len(self.replay) - self._task_start >= _REWARDS_GROWTH * (self.classed - self._task_start)
+            if due and self._class_rewards():
+                self._relearn(self.tasks, len(self.replay))
+            elif unexpected:
                 self.learn()
         self.meters.add("model/unexpected", float(unexpected))
         self.meters.count("time/model_s")
 
+    @property
+    def _task_start(self) -> int:
+        """How much was replayed when this task began."""
+        return self.tasks[-1] if self.tasks else 0
+
+    def _class_rewards(self) -> bool:
+        """Class the rewards of this task anew; whether any may have changed."""
+        start = self._task_start
+        before = self.rewards
+        self.rewards = reward_classes(self.replay[start:])
+        self.classed = len(self.replay)
+        if self.rewards is EXACT and before is EXACT:
+            return False
+        self.class_rewards[start:] = [row.reward for row in self.rewards.of(self.replay[start:])]
+        return True
+
     def learn(self, end: int | None = None) -> None:
         """Bring the model from the first ``learned`` transitions to the first ``end``, or all, and plan anew."""
-        for row in self.replay[self.learned : end]:
-            self.model.add(row)
+        new = slice(self.learned, end)
+        for row, reward in zip(self.replay[new], self.class_rewards[new], strict=True):
+            self.model.add(row._replace(reward=reward))
         self.model.outcomes.fit()
         self.planner.learned()
         self.learned = len(self.replay) if end is None else end
@@ -133,6 +163,8 @@ class CodeAgent:
         """Keep the dynamics, and earlier causes as priors; see :meth:`.outcomes.OutcomeModel.reset_for_new_task`."""
         self.learn()
         self._begin_task()
+        self.rewards = EXACT
+        self.classed = self._task_start
         self.meters = Meters()  # a measurement on an earlier task is no diagnosis of this one
 
     def _begin_task(self) -> None:
@@ -167,6 +199,7 @@ class CodeAgent:
         sizes = self.perception.sizes
         values = {
             "learned": self.learned,
+            "classed": self.classed,
             "tasks": list(self.tasks),
             "exploration": self.rng.bit_generator.state,
             "meters": self.meters.state(),
@@ -174,7 +207,8 @@ class CodeAgent:
             "code_sizes": list(sizes),
             "n_actions": self.n_actions,
         }
-        return AgentState(arrays=snapshot.prefixed("replay", as_arrays(self.replay, len(sizes))), values=values)
+        arrays = {**as_arrays(self.replay, len(sizes)), "class_reward": np.array(self.class_rewards, dtype=np.float64)}
+        return AgentState(arrays=snapshot.prefixed("replay", arrays), values=values)
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot by learning from all that is replayed once more.
@@ -186,6 +220,10 @@ class CodeAgent:
 
     def _take_up(self, state: AgentState) -> None:
         self.replay = from_arrays(snapshot.below("replay", state.arrays))
+        self.class_rewards = state.arrays["replay/class_reward"].tolist()
+        self.classed = state.values["classed"]
+        first = state.values["tasks"][-1] if state.values["tasks"] else 0
+        self.rewards = reward_classes(self.replay[first : self.classed])
         self._relearn(state.values["tasks"], state.values["learned"])
         self.meters.restore(state.values["meters"])
         self.rng.bit_generator.state = state.values["exploration"]
@@ -238,6 +276,7 @@ class FactoredAgent(CodeAgent):
         told = label or Label(0.0, False)
         asked = CodeTransition(codes[-2], int(actions[-1]), codes[-1], told.reward, told.terminated, has_dynamics=False)
         self.replay.append(asked._replace(has_reward=label is not None))
+        self.class_rewards.append(self.rewards.reward(asked))
         with self.meters.cpu_time("time/model_s"):
             self.learn()
 

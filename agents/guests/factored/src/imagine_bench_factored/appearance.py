@@ -105,7 +105,7 @@ class SeenFactor(NamedTuple):
         return wrong.argmin(axis=1), known.all(axis=1) & (wrong.min(axis=1) == 0)
 
 
-def read(factors: list[SeenFactor], frames: Frame) -> tuple[Codes, Mask]:
+def read(factors: list[SeenFactor], frames: Frame | Images) -> tuple[Codes, Mask]:
     """Codes (N, P) of frames (N, 64, 64, 3), and whether each value is known, (N, P)."""
     images = relative(frames)
     shapes = contours(images)
@@ -115,7 +115,7 @@ def read(factors: list[SeenFactor], frames: Frame) -> tuple[Codes, Mask]:
     return np.stack([value for value, _ in pairs], axis=1), np.stack([known for _, known in pairs], axis=1)
 
 
-def find(frames: Frame, begins: Mask | None = None, actions: Ints | None = None) -> list[SeenFactor]:
+def find(frames: Frame | Images, begins: Mask | None = None, actions: Ints | None = None) -> list[SeenFactor]:
     """The factors of frames (N, 64, 64, 3) in the order in which they were seen; none where nothing changes.
 
     ``begins``: which are the first of an episode, (N,); none if not given. ``actions``: which led from each frame to
@@ -187,7 +187,7 @@ def quiet(images: Images, rests: Images) -> Images:
     shown = np.ones(images.shape[:3], dtype=bool)
     shown[:, noise] = np.any([(np.abs(colors - one[noise]) <= _CHANGE).all(axis=-1) for one in rests], axis=0)
     shown |= scipy.ndimage.binary_closing(shown, np.ones((1, 3, 3)))
-    return np.where(shown[..., None], images, np.float32(_MEDIAN_COLOR))
+    return np.where(shown[..., None] | np.isnan(images), images, np.float32(_MEDIAN_COLOR))
 
 
 def _first_bound(joint: list[Codes]) -> tuple[int, int] | None:
@@ -205,17 +205,21 @@ def bound(one: Ints, other: Ints) -> bool:
     table = np.zeros((one.max() + 1, other.max() + 1))
     np.add.at(table, (one, other), 1.0)
     table = table[table.sum(axis=1) >= _SEEN][:, table.sum(axis=0) >= _SEEN]
-    if min(table.shape) < 2:
+    if min(table.shape) < 2 or not table.any():
         return False
     expected = np.multiply.outer(table.sum(axis=1), table.sum(axis=0)) / table.sum()
     few = (table > 0).sum() < sum(table.shape)
     return bool(few and expected[table == 0].sum() >= _EXPECTED)
 
 
-def relative(frames: Frame) -> Images:
-    """Frames in units of the median of each color, slightly blurred. Shape (N, 64, 64, 3)."""
+def relative(frames: Frame | Images) -> Images:
+    """Frames in units of the median of each color, slightly blurred. Shape (N, 64, 64, 3).
+
+    Pixels that are hidden, and those beside them, are no numbers.
+    """
     images = frames.astype(np.float32)
-    images /= np.maximum(np.median(images.reshape(len(images), -1, 3), axis=1), _DARK)[:, None, None]
+    median = np.nanmedian if np.isnan(images).any() else np.median
+    images /= np.maximum(median(images.reshape(len(images), -1, 3), axis=1), _DARK)[:, None, None]
     for axis in (1, 2):
         images = scipy.ndimage.convolve1d(images, np.array([0.25, 0.5, 0.25], np.float32), axis, mode="nearest")
     return images
@@ -240,9 +244,14 @@ def changes(images: Images) -> Mask:
 
     Small holes are closed. Shape (N - 1, 64, 64).
     """
+    hidden = np.isnan(images[..., 0])
+    images = np.nan_to_num(images)
     before = images[:-1]
     after = images[1:]
     change = np.maximum(_beyond(before, after), _beyond(after, before)).max(axis=-1) > _CHANGE
+    if hidden.any():
+        hidden = scipy.ndimage.binary_dilation(hidden, np.ones((1, 3, 3)))
+        change &= ~(hidden[:-1] | hidden[1:])
     change = np.pad(change, ((0, 0), (2, 2), (2, 2)))
     return scipy.ndimage.binary_closing(change, np.ones((1, 3, 3)))[:, 2:-2, 2:-2]
 
@@ -311,22 +320,50 @@ def _window(mask: Mask) -> tuple[slice, slice]:
 
 
 def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
-    """How unlike crops (N, D) and others (E, D) of one mask are: 1 - correlation at the best shift. Shape (N, E)."""
-    shape = mask[_window(mask)].shape
-    margin = (SHIFT_PX, SHIFT_PX)
-    image = np.pad(crop.reshape(len(crop), 2, *shape), ((0, 0), (0, 0), margin, margin))
-    shifted = np.lib.stride_tricks.sliding_window_view(image, shape, axis=(2, 3)).transpose(0, 2, 3, 1, 4, 5)
+    """How unlike crops (N, D) and others (E, D) of one mask are: 1 - correlation at the best shift. Shape (N, E).
+
+    Of crops, but not of the others, parts may be hidden: only the rest is compared.
+    """
+    hidden = np.isnan(crop).any(axis=1)
+    if hidden.any():
+        apart = np.empty((len(crop), len(others)))
+        apart[~hidden] = distances(crop[~hidden], others, mask, flat)
+        apart[hidden] = [_shown_distances(each, others, mask, flat) for each in crop[hidden]]
+        return apart
+    shifted = _shifted(crop, mask)
     best = np.stack([(each.reshape(-1, others.shape[1]) @ others.T).max(axis=0) for each in shifted])
     energy = np.sqrt(np.multiply.outer((crop**2).sum(axis=1) + flat, (others**2).sum(axis=1) + flat))
     return np.maximum(1.0 - (best + flat) / energy, 0.0).astype(np.float64)
 
 
+def _shifted(crop: Images, mask: Mask) -> Images:
+    """Crops (N, D) of one mask at all shifts, with zeros beyond their windows. Shape (N, S, S, 2, rows, columns)."""
+    shape = mask[_window(mask)].shape
+    margin = (SHIFT_PX, SHIFT_PX)
+    image = np.pad(crop.reshape(len(crop), 2, *shape), ((0, 0), (0, 0), margin, margin))
+    return np.lib.stride_tricks.sliding_window_view(image, shape, axis=(2, 3)).transpose(0, 2, 3, 1, 4, 5)
+
+
+def _shown_distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
+    """As :func:`distances`, of one crop (D,) of which a part is hidden. Shape (E,)."""
+    size = others.shape[1]
+    own = _shifted(np.nan_to_num(crop)[None], mask).reshape(-1, size)
+    shown = 1.0 - _shifted(np.isnan(crop).astype(np.float32)[None], mask).reshape(-1, size)
+    energy = (crop[~np.isnan(crop)] ** 2).sum() + flat
+    of_others = shown @ (others**2).T + flat
+    like = (own @ others.T + flat) / np.sqrt(energy * of_others)
+    return np.asarray(np.maximum(1.0 - like.max(axis=0), 0.0), dtype=np.float64)
+
+
 def _part(shapes: Images, mask: Mask, actions: Ints) -> tuple[Part | None, float]:
     """The part at a mask, None where all of its crops are alike; and the share of looks that were seen once."""
     own = crops(shapes, mask)
-    energy = (own**2).sum(axis=1)
+    whole = np.flatnonzero(~np.isnan(own).any(axis=1))
+    if not len(whole):
+        return None, 0.0
+    energy = (own[whole] ** 2).sum(axis=1)
     flat = _FLAT * float(np.quantile(energy, 0.9) or energy.max() or 1.0)
-    chosen = np.unique(np.linspace(0, len(own) - 1, _COMPARED).round().astype(np.int64))
+    chosen = whole[np.unique(np.linspace(0, len(whole) - 1, _COMPARED).round().astype(np.int64))]
     before = np.flatnonzero(actions >= 0)
     while True:
         apart = distances(own[chosen], own[chosen], mask, flat)
@@ -343,7 +380,7 @@ def _part(shapes: Images, mask: Mask, actions: Ints) -> tuple[Part | None, float
             tried.append((part, values, found, known))
         part, values, _, known = tried[-1]
         singles = float((np.bincount(values) == 1).sum()) / len(values) if len(values) >= _TELLING else 0.0
-        strange = np.setdiff1d(np.flatnonzero(~known), chosen)
+        strange = np.setdiff1d(np.intersect1d(np.flatnonzero(~known), whole), chosen)
         if singles > _NOISE or not len(strange) or len(chosen) > _COMPARED:
             return (part if part.values.max() > 0 else None), singles
         chosen = np.union1d(chosen, strange[:_COMPARED])

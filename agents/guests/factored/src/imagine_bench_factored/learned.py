@@ -23,7 +23,8 @@ from . import appearance
 from .agent import CodeAgent
 from .factors import CodeTransition, contradictions, remembering
 from .model import choose
-from .perception import LearnedPerception
+from .perception import LearnedPerception, Sight, find_sight
+from .rewards import reward_classes
 from .settings import LEARNED, LearnedSettings
 
 _CONTRADICTIONS = 0.01
@@ -75,10 +76,10 @@ class LearnedPerceptionAgent(CodeAgent):
                 before = transition.observation.frame
                 after = transition.next_observation.frame
                 perception.remember(before, transition.action, after, begins=self._observed == 1)
-                found = perception.found
+                sight = perception.sight
                 found_in = perception.found_in
                 if perception.renew():
-                    self._recode(found, found_in)
+                    self._recode(sight, found_in)
                     if perception.found_in not in perception.history:
                         perception.history.append(perception.found_in)
             self.meters.count("time/perception_s")
@@ -86,10 +87,10 @@ class LearnedPerceptionAgent(CodeAgent):
         if transition.terminated or transition.truncated:
             self.begin_episode()
 
-    def _recode(self, found: list[appearance.SeenFactor], found_in: int) -> None:
+    def _recode(self, sight: Sight, found_in: int) -> None:
         """Give every replayed transition the codes that its frames have now, and learn from all of them once more.
 
-        The factors ``found`` before are kept where outcomes contradict the present factors and did not contradict
+        The factors seen before are kept where outcomes contradict the present factors and did not contradict
         those.
         """
         perception = self.perception
@@ -97,18 +98,20 @@ class LearnedPerceptionAgent(CodeAgent):
         of_task = slice(self.tasks[-1] if self.tasks else 0, count)  # other tasks have other outcomes
         rows = self._rows()
         few = _CONTRADICTIONS * (count - of_task.start)
-        if found and contradictions(rows[of_task]) > few:
-            found_now = perception.found
+        if sight.factors and _contradictions(rows[of_task]) > few:
+            sight_now = perception.sight
             found_now_in = perception.found_in
-            perception.take(found, found_in)
+            perception.take(sight, found_in)
             earlier = self._rows()
-            if contradictions(earlier[of_task]) > few:
-                perception.take(found_now, found_now_in)
+            if _contradictions(earlier[of_task]) > few:
+                perception.take(sight_now, found_now_in)
             else:
                 rows = earlier
         begins = perception.begins
-        perception.memory = choose(rows[of_task], begins[of_task], perception.seen_sizes, self.n_actions, self.settings)
+        classed = reward_classes(rows[of_task]).of(rows[of_task])
+        perception.memory = choose(classed, begins[of_task], perception.seen_sizes, self.n_actions, self.settings)
         self.replay = remembering(rows, begins[:count], perception.memory)
+        self._class_rewards()
         self._relearn(self.tasks, count)
         perception.begin_episode()
         if self.replay and perception.memory and not begins[count]:
@@ -127,9 +130,10 @@ class LearnedPerceptionAgent(CodeAgent):
         perception = self.perception
         for count in perception.history:
             seen = perception.first(count)
-            found = appearance.find(*seen)
+            sight = find_sight(*seen)
             begun = sum(compress(perception.begins, [after < count for _, after in perception.transitions]))
-            yield Perceived(begun, tuple(len(factor.joint) for factor in found), image(found, seen[0]))
+            sizes = tuple(len(factor.joint) for factor in sight.factors)
+            yield Perceived(begun, sizes, image(sight.factors, _shown(sight.standard.of(seen[0]))))
 
     def diagnostics(self) -> dict[str, float]:
         """Also its perception."""
@@ -154,13 +158,23 @@ class LearnedPerceptionAgent(CodeAgent):
         self._take_up(state)
 
 
+def _contradictions(rows: Sequence[CodeTransition]) -> int:
+    """As :func:`.factors.contradictions`, but for those of rewards that chance changes."""
+    return contradictions(reward_classes(rows).of(rows))
+
+
 def _flat(state: AgentState) -> AgentState:
     """A snapshot whose codes are in one row: how many factors they are of changes as it learns."""
     codes = {name: array.ravel() for name, array in state.arrays.items() if name in ("replay/code", "replay/following")}
     return AgentState(arrays={**state.arrays, **codes}, values=state.values)
 
 
-def image(found: Sequence[appearance.SeenFactor], frames: Frame) -> Pixels:
+def _shown(frames: Frame | appearance.Images) -> appearance.Images:
+    """Normal frames for people: hidden pixels are black."""
+    return np.nan_to_num(frames.astype(np.float32))
+
+
+def image(found: Sequence[appearance.SeenFactor], frames: Frame | appearance.Images) -> Pixels:
     """The mean of ``frames`` (N, 64, 64, 3) in gray, with a color a factor that was found. Shape (320, 320, 3)."""
     drawn = np.repeat(frames.mean(axis=(0, 3))[..., None], 3, axis=2)
     for factor, color in zip(found, _COLORS, strict=False):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from imagine_bench.values import Json
 from . import appearance
 from .factors import Code, Codes, Mask, Memory
 from .settings import LearnedPerceptionSettings
+from .standard import Standard, standard_of
 
 _FIRST = 4
 _RECENT = 4
@@ -87,6 +89,19 @@ def _rows(codes: Codes, sizes: Sequence[int], *, factored: bool) -> list[Code]:
     return [tuple(row) for row in rows.tolist()]
 
 
+class Sight(NamedTuple):
+    """Factors, and the normal frame that they are seen in."""
+
+    factors: list[appearance.SeenFactor]
+    standard: Standard
+
+
+def find_sight(frames: Frame, begins: Mask, actions: Ints) -> Sight:
+    """The factors of frames (N, 64, 64, 3) without nuisances; see :func:`.appearance.find`."""
+    standard = standard_of(frames)
+    return Sight(appearance.find(standard.of(frames), begins, actions), standard)
+
+
 class LearnedPerception:
     """Frames seen so far, and the codes that they have by the factors that were found in the first ``looked_at`` of
     them.
@@ -109,7 +124,7 @@ class LearnedPerception:
         self.unknown = False
         """Whether anything seen since has no known value."""
         self._remembered = 0
-        self.take([], 0)
+        self.take(Sight([], Standard()), 0)
 
     @property
     def seen_sizes(self) -> tuple[int, ...]:
@@ -158,7 +173,7 @@ class LearnedPerception:
         """The codes of frames (N, 64, 64, 3), and which values are known, (N, P)."""
         if not self.found:
             return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=bool)
-        codes, known = appearance.read(self.found, frames)
+        codes, known = appearance.read(self.found, self.sight.standard.of(frames))
         return _rows(codes, [len(factor.joint) for factor in self.found], factored=self._factored), known
 
     def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
@@ -180,7 +195,7 @@ class LearnedPerception:
 
     def look(self, count: int) -> None:
         """Find factors in the first ``count`` frames remembered."""
-        self.take(appearance.find(*self.first(count)) if count else [], count)
+        self.take(find_sight(*self.first(count)) if count else Sight([], Standard()), count)
         self.looked_at = count
         self.unknown = False
 
@@ -193,9 +208,10 @@ class LearnedPerception:
                 actions[before] = action
         return np.stack(self.frames[:count]), begins, actions
 
-    def take(self, found: list[appearance.SeenFactor], found_in: int) -> None:
+    def take(self, sight: Sight, found_in: int) -> None:
         """See these factors from now on."""
-        self.found = found
+        self.sight = sight
+        self.found = sight.factors
         self.found_in = found_in
         self.memory: Memory | None = None
         self._recent: dict[bytes, tuple[Code, bool]] = {}

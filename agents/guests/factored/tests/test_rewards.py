@@ -1,0 +1,89 @@
+"""Rewards that chance changes: their classes, and that exact rewards have none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from agent_states import same
+from fake_pictures import agent, played
+from imagine_bench_factored.factors import CodeTransition
+from imagine_bench_factored.learned import LearnedPerceptionAgent
+from imagine_bench_factored.rewards import EXACT, reward_classes
+
+from imagine_bench.interfaces import AgentState
+
+RULED = ((-1.0, False), (-1.0, False), (-1.0, False), (-5.0, True), (-5.0, True), (50.0, True))
+PICKS = ((0.0, False), (1.0, False), (-5.0, True), (5.0, True))
+
+
+def rows(
+    count: int, *, outcomes: Sequence[tuple[float, bool]] = RULED, codes: int = 12, std: float = 0.0, step: float = 0.0
+) -> list[CodeTransition]:
+    """Transitions whose code and action decide the outcome; rewards are noisy by a deviation, or by three steps."""
+    rng = np.random.default_rng(0)
+    found = []
+    for code, action in zip(
+        rng.integers(codes, size=count).tolist(), rng.integers(6, size=count).tolist(), strict=True
+    ):
+        reward, ends = outcomes[(7 * code + 5 * action) % len(outcomes)]
+        noise = std * float(rng.standard_normal()) + step * int(rng.integers(-1, 2))
+        found.append(CodeTransition((code,), action, ((code + action) % codes,), reward + noise, ends))
+    return found
+
+
+@pytest.mark.parametrize("outcomes", [RULED, PICKS])
+def test_exact_rewards_have_no_classes_and_stay_as_they_are(outcomes: Sequence[tuple[float, bool]]) -> None:
+    for count in (0, 1, 8, 60, 400):
+        given = rows(count, outcomes=outcomes)
+        assert reward_classes(given) is EXACT
+        assert EXACT.of(given) == given
+
+
+@pytest.mark.parametrize(("std", "step"), [(0.5, 0.0), (0.0, 0.5), (0.5, 0.5), (1.0, 0.0)])
+def test_noisy_rewards_have_the_classes_of_the_rules(std: float, step: float) -> None:
+    found = reward_classes(rows(200, std=std, step=step))
+    assert found.centers[False] == pytest.approx([-1.0], abs=0.25)
+    assert found.centers[True] == pytest.approx([-5.0, 50.0], abs=0.4)
+    new = CodeTransition((99,), 0, (98,), 49.0, True)
+    assert found.reward(new) == found.centers[True][1]
+    assert found.reward(new._replace(reward=20.0)) == 20.0, "it is like none that was seen"
+    assert found.reward(new._replace(terminated=False)) == 49.0
+
+
+def test_transitions_seen_often_are_told_apart_though_their_rewards_overlap() -> None:
+    found = reward_classes(rows(600, outcomes=PICKS, std=0.5))
+    assert found.centers[False] == pytest.approx([0.0, 1.0], abs=0.15)
+    assert found.centers[True] == pytest.approx([-5.0, 5.0], abs=0.15)
+    exact = {row[:3]: row.reward for row in rows(600, outcomes=PICKS)}
+    wrong = [row for row in rows(600, outcomes=PICKS, std=0.5) if abs(found.reward(row) - exact[row[:3]]) > 0.3]
+    assert len(wrong) < 0.02 * 600
+
+
+def test_a_few_rewards_make_no_class_of_their_own() -> None:
+    found = reward_classes(rows(30, std=0.5))
+    assert len(found.centers[False]) == 1 and len(found.centers[True]) <= 3
+
+
+def live(learner: LearnedPerceptionAgent, episodes: range) -> None:
+    for episode in episodes:
+        noise = np.random.default_rng((9, episode))
+        for transition in played(learner, np.random.default_rng((0, episode)), explore=True):
+            noisy = transition.reward + 0.2 * float(noise.standard_normal())
+            learner.observe(replace(transition, reward=noisy), episode=episode)
+
+
+@pytest.mark.slow
+def test_it_learns_from_noisy_rewards_and_resumes_to_the_same_bits() -> None:
+    learner = agent()
+    live(learner, range(12))
+    state = learner.state()
+    twin = agent()
+    twin.restore(AgentState(arrays=dict(state.arrays), values=dict(state.values)))
+    for each in (learner, twin):
+        live(each, range(12, 16))
+    assert same(learner.state(), twin.state())
+    assert learner.rewards is not EXACT
+    assert len(learner.model.outcomes.outcomes) < 0.2 * len(learner.replay), "not one outcome for each reward"
