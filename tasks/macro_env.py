@@ -20,11 +20,10 @@ from imagine_bench.values import Json
 from .motion.executor import MacroResult
 from .observations import Observer
 from .parameters.parameters import delivered, hides
-from .rendering.cameras import FRAME_PX
 from .scene_env import BUILT, RENDER_MODES, WINDOW_HZ, SceneEnv, Step
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
-from .scenes.constants import AGENT_CAMERA, FAR_CAMERA, HUMAN_CAMERA
+from .scenes.constants import AGENT_CAMERA, FAR_CAMERA, FRAME_PX, HUMAN_CAMERA
 from .world import World, WorldState
 
 _MOST_KEPT = 20_000

@@ -21,12 +21,12 @@ from imagine_bench.interfaces import OBSERVATION_SIZES_PX, OBSERVATIONS, Rules
 from imagine_bench.rules import require_macrostates, states_of
 
 from .parameters.parameters import HIDDEN
-from .rendering.cameras import FRAME_PX, agent_camera_view, control_view, human_camera_view
+from .rendering.cameras import agent_camera_view, control_view, human_camera_view
 from .rendering.renderer import Renderer, View
 from .scenes.appearance import Appearance
 from .scenes.appearance import appearance as appearance_level
 from .scenes.arm import TCP_SITE, arm_columns, tcp_in_world
-from .scenes.constants import CONTROL_CAMERAS, HUMAN_CAMERA
+from .scenes.constants import CONTROL_CAMERAS, FRAME_PX, HUMAN_CAMERA
 from .world import World
 
 CONTROL_OBSERVATIONS = (*CONTROL_CAMERAS, "proprio", "objects", "state")

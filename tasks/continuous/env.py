@@ -20,12 +20,11 @@ from ..motion.arm_model import ArmModel
 from ..motion.executor import blew_up
 from ..observations import Observer
 from ..parameters.parameters import delivered, hides
-from ..rendering.cameras import FRAME_PX
 from ..scene_env import BUILT, RENDER_MODES, SceneEnv, Step
 from ..scenes.appearance import Appearance
 from ..scenes.appearance import appearance as appearance_level
 from ..scenes.arm import ARM_JOINTS, arm_columns
-from ..scenes.constants import FAR_CAMERA, HUMAN_CAMERA
+from ..scenes.constants import FAR_CAMERA, FRAME_PX, HUMAN_CAMERA
 from ..world import MAX_PLACEMENT_M, World, WorldState
 from .controls import HandControl, Motion
 from .dense import Potential

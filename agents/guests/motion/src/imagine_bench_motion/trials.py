@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 from imagine_bench.tasks.continuous.env import MotionEnv
-from imagine_bench.tasks.rendering.cameras import FRAME_PX
-from imagine_bench.tasks.scenes.constants import CONTROL_CAMERAS
+from imagine_bench.tasks.scenes.constants import CONTROL_CAMERAS, FRAME_PX
 
 from imagine_bench.errors import InvalidValueError
 
