@@ -397,6 +397,7 @@ def _judged(root: Path, *models: str, seeds: tuple[int, ...]) -> tuple[Path, Jud
     return folder, one
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_few")
 def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tmp_path: Path) -> None:
     """An agent's own reading of its images counts for nothing."""

@@ -195,6 +195,7 @@ def test_an_unannounced_change_is_told_to_nobody_and_episodes_are_counted_on(tmp
     assert result.checkpoints[0].env_steps == result.training_length.sum(), "budgets count the last task alone"
 
 
+@pytest.mark.slow
 def test_any_learner_that_is_told_nothing_takes_another_task_before(tmp_path: Path) -> None:
     words = [
         "bench",

@@ -56,6 +56,10 @@ def test_an_old_name_is_refused_with_the_new_one() -> None:
         registry.agent_entry("factored_own")
 
 
+ADDED = "class_reward"
+"""An array of snapshots that the kept one is too old to have."""
+
+
 def test_a_kept_bench_is_read_and_finished_under_todays_labels(tmp_path: Path) -> None:
     kept = read_protocol(KEPT)
     assert kept.agents == ("factored:given", "factored")
@@ -71,6 +75,7 @@ def test_a_kept_bench_is_read_and_finished_under_todays_labels(tmp_path: Path) -
     for run in result.runs:
         learned = hashlib.sha256()
         for name, array in sorted(final_arrays(run.folder).items()):
-            learned.update(name.encode() + array.tobytes())
+            if not name.endswith(ADDED):
+                learned.update(name.encode() + array.tobytes())
         digests[run.agent] = learned.hexdigest()[:16]
     assert digests == LEARNED

@@ -215,8 +215,9 @@ class CodeAgent:
 
         ArtefactError if it does not fit this agent, and then nothing was changed.
         """
-        snapshot.require_fit(state, self.state(), equal=("settings", "code_sizes", "n_actions"))
-        self._take_up(state)
+        complete = with_reward_classes(state)
+        snapshot.require_fit(complete, self.state(), equal=("settings", "code_sizes", "n_actions"))
+        self._take_up(complete)
 
     def _take_up(self, state: AgentState) -> None:
         self.replay = from_arrays(snapshot.below("replay", state.arrays))
@@ -227,6 +228,15 @@ class CodeAgent:
         self._relearn(state.values["tasks"], state.values["learned"])
         self.meters.restore(state.values["meters"])
         self.rng.bit_generator.state = state.values["exploration"]
+
+
+def with_reward_classes(state: AgentState) -> AgentState:
+    """A snapshot with what those of before 2026-11-28 lack: at that time every reward was its own class."""
+    if "classed" in state.values or "replay/reward" not in state.arrays:
+        return state
+    rewards = state.arrays["replay/reward"]
+    arrays = {**state.arrays, "replay/class_reward": rewards.astype(np.float64)}
+    return AgentState(arrays=arrays, values={**state.values, "classed": len(rewards)})
 
 
 class FactoredAgent(CodeAgent):

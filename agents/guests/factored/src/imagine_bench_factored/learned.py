@@ -20,7 +20,7 @@ from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observatio
 from imagine_bench.interfaces.capabilities import Perceived
 
 from . import appearance
-from .agent import CodeAgent
+from .agent import CodeAgent, with_reward_classes
 from .factors import CodeTransition, contradictions, remembering
 from .model import choose
 from .perception import LearnedPerception, Sight, find_sight
@@ -152,10 +152,11 @@ class LearnedPerceptionAgent(CodeAgent):
 
         ArtefactError if it does not fit this agent, and then nothing was changed.
         """
-        snapshot.require_fit(_flat(state), _flat(self.state()), equal=("settings", "n_actions"))
-        self.perception.load(state)
-        self._longest = state.values["longest"]
-        self._take_up(state)
+        complete = with_reward_classes(state)
+        snapshot.require_fit(_flat(complete), _flat(self.state()), equal=("settings", "n_actions"))
+        self.perception.load(complete)
+        self._longest = complete.values["longest"]
+        self._take_up(complete)
 
 
 def _contradictions(rows: Sequence[CodeTransition]) -> int:
