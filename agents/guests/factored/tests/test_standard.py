@@ -154,3 +154,14 @@ def test_most_hidden_pixels_are_no_numbers_and_few_others() -> None:
     different = hidden & (np.abs(seen.astype(int) - frames).max(axis=-1) > 40)
     assert found[different].mean() > 0.8
     assert found[~hidden].mean() < 0.02
+
+
+def test_crops_that_are_all_hidden_in_part_are_compared_by_the_rest() -> None:
+    mask = np.zeros((64, 64), dtype=bool)
+    mask[10:14, 10:14] = True
+    draws = np.random.default_rng(3)
+    whole = appearance.crops(draws.normal(size=(3, 64, 64, 2)), mask)
+    hidden = whole.copy()
+    hidden[:, 0] = np.nan
+    apart = appearance.distances(hidden, whole, mask, 1e-6)
+    assert (apart.argmin(axis=1) == np.arange(3)).all()

@@ -327,7 +327,8 @@ def distances(crop: Images, others: Images, mask: Mask, flat: float) -> Floats:
     hidden = np.isnan(crop).any(axis=1)
     if hidden.any():
         apart = np.empty((len(crop), len(others)))
-        apart[~hidden] = distances(crop[~hidden], others, mask, flat)
+        if not hidden.all():
+            apart[~hidden] = distances(crop[~hidden], others, mask, flat)
         apart[hidden] = [_shown_distances(each, others, mask, flat) for each in crop[hidden]]
         return apart
     shifted = _shifted(crop, mask)
