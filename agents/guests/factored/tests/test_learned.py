@@ -9,9 +9,9 @@ import pytest
 from agent_states import same
 from fake_codes import drawn, starts
 from fake_pictures import Code, agent, picture, played, shape
-from imagine_bench_factored import appearance
 from imagine_bench_factored.learned import LearnedPerceptionAgent
 from imagine_bench_factored.perception import LearnedPerception
+from imagine_bench_factored.seeing import appearance
 from imagine_bench_factored.settings import LearnedPerceptionSettings
 from numpy.typing import NDArray
 

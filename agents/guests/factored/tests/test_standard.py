@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fake_pictures import picture, shape
-from imagine_bench_factored import appearance
-from imagine_bench_factored.standard import Standard, standard_of
+from imagine_bench_factored.seeing import appearance
+from imagine_bench_factored.seeing.standard import Standard, standard_of
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame

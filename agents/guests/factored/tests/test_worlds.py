@@ -5,7 +5,7 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench_factored import appearance
+from imagine_bench_factored.seeing import appearance
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import written
-from imagine_bench_programs.delay import Row, changes, too_early
-from imagine_bench_programs.laws import Laws, ends_of, simplest
-from imagine_bench_programs.writer import Writer
+from imagine_bench_programs.writing.delay import Row, changes, too_early
+from imagine_bench_programs.writing.laws import Laws, ends_of, simplest
+from imagine_bench_programs.writing.writer import Writer
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate

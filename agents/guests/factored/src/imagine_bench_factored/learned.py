@@ -19,12 +19,12 @@ from imagine_bench.arrays import Pixels
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.interfaces.capabilities import Perceived
 
-from . import appearance
 from .agent import CodeAgent, with_reward_classes
 from .factors import CodeTransition, contradictions, remembering
 from .model import choose
 from .perception import LearnedPerception, Sight, find_sight
 from .rewards import reward_classes
+from .seeing import appearance
 from .settings import LEARNED, LearnedSettings
 
 _CONTRADICTIONS = 0.01

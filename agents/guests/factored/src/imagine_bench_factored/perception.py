@@ -17,10 +17,10 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState
 from imagine_bench.values import Json
 
-from . import appearance
 from .factors import Code, Codes, Mask, Memory
+from .seeing import appearance
+from .seeing.standard import Standard, standard_of
 from .settings import LearnedPerceptionSettings
-from .standard import Standard, standard_of
 
 _FIRST = 4
 _RECENT = 4

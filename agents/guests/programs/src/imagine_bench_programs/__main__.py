@@ -21,7 +21,7 @@ from imagine_bench.registry.machine import describe_environment
 from .experience import macro_actions_of, play, write_experience
 from .program import Program
 from .scores import Scores, efficiency, score
-from .writer import Writer
+from .writing.writer import Writer
 
 _TIMES = 2.0
 """Macro-actions of a writer, in units of the cautious learner's."""

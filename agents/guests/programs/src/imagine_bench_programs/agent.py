@@ -8,11 +8,11 @@ from imagine_bench.agents.meters import Meters
 
 from imagine_bench.interfaces import AgentContext, AgentState, Arrays, Observation, State, Transition
 
-from .delay import Row
 from .program import Program
 from .settings import HYPERPARAMETERS
 from .symbols import Symbols
-from .writer import Writer
+from .writing.delay import Row
+from .writing.writer import Writer
 
 _TYPES = {
     "now": np.int64,

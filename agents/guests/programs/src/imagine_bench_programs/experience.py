@@ -13,7 +13,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.registry import task
 
-from .delay import Row
+from .writing.delay import Row
 
 Choose = Callable[[State], int]
 _FILE = "experience.json"

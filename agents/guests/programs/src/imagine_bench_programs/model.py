@@ -13,12 +13,12 @@ from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import Imagined, imagined_outcomes
 from imagine_bench.rules import Outcomes, outcomes_by_depth
 
-from .delay import Row
-from .laws import Laws
 from .program import Program
 from .settings import HYPERPARAMETERS
 from .symbol_rules import SymbolRules
 from .symbols import Symbols
+from .writing.delay import Row
+from .writing.laws import Laws
 
 
 class SymbolModel:

@@ -26,7 +26,7 @@ import scipy
 
 from imagine_bench.arrays import Floats, Floats32, Frame, Ints
 
-from .factors import Codes, Mask
+from ..factors import Codes, Mask
 
 Images = Floats32
 

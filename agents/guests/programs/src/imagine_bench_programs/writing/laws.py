@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Outcome, State
 
+from ..symbol_rules import SymbolRules
 from .delay import MOST_DELAY, Row, changes, complete, too_early
-from .symbol_rules import SymbolRules
 
 _CONTRADICTED = 20.0
 """Nats that a transition costs which no law explains."""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from imagine_bench.arrays import Floats32, Frame, Ints
 
-from .factors import Mask
+from ..factors import Mask
 
 Images = Floats32
 Spectrum = NDArray[np.complex128]

@@ -1,0 +1,1 @@
+"""From frames to values: nuisances are taken away, then regions and their values are found."""
