@@ -231,7 +231,7 @@ class CodeAgent:
 
 
 def with_reward_classes(state: AgentState) -> AgentState:
-    """A snapshot with what those of before 2026-11-28 lack: at that time every reward was its own class."""
+    """A snapshot with the classes of rewards, which those of before 2026-11-28 lack: every reward was its own class."""
     if "classed" in state.values or "replay/reward" not in state.arrays:
         return state
     rewards = state.arrays["replay/reward"]

@@ -59,7 +59,7 @@ _SOFT_PX = 1.2  # standard deviation of the window that takes noise away before 
 _BLOCK_PX = 16
 _STRIDE_PX = 8
 _ABOVE = 1.1  # times the edge of noise
-_UNEXPLAINED = 1.3  # times the energy of noise, below which what no component explains is noise
+_UNEXPLAINED = 1.3  # times the energy of noise; a remainder that no component explains is noise below this
 
 _LEVELS = 16  # of each color, where usual colors are counted
 _USUAL = 0.06  # share of the frames, and least number, that show a usual color
@@ -67,7 +67,7 @@ _USUAL_TIMES = 3
 _BLOB_PX = 9  # pixels of an occluder
 _STILL = 0.75  # share of the frames in which a pixel of the background looks as in the median frame
 _STILL_LIKE = 20.0  # of 255
-_TELLING = 40  # frames in which what is unusual can be told from what is new
+_TELLING = 40  # frames from which an unusual patch can be told from a new one
 _OCCLUDED = 0.25  # share of the frames with something unusual before the background: there are occluders
 
 
@@ -256,7 +256,7 @@ def _components(images: Images, noise: float) -> _Components:
 
 
 def _denoised(images: Images, components: _Components, light: Images) -> Images:
-    """Blocks on their components; of what these do not explain as much stays as is more than noise.
+    """Blocks on their components; the part of the remainder that is larger than noise stays.
 
     ``light``: images were divided by it, and so was their noise. Shape (N, 64, 64).
     """
