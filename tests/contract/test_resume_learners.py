@@ -43,9 +43,9 @@ def do(folder: Path, agent: str, every_s: float) -> RunResult:
 _DO_LESS = (
     "imagination", "imagination_only", "dqn_more_updates", "q_learning_macrostate", "dyna_q_macrostate",
     "count_table_directed_macrostate", "posterior_sampling_macrostate", "dqn_codes", "imagination_exact_filter",
-    "dreamer_v3_latents", "count_table",
+    "dreamer_v3", "count_table",
 )  # fmt: skip
-"""Agents that do as much as another of the same class or less, which the fast tests kill."""
+"""Agents of whose class the fast tests kill another, which does more or takes less time."""
 
 
 EACH = [pytest.param(agent, marks=[pytest.mark.slow] * (agent in _DO_LESS)) for agent in LEARNERS]

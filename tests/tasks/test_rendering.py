@@ -215,7 +215,6 @@ def test_a_window_of_gymnasium_s_ends_no_environment_s_drawing(desktop):
     shown = HumanRendering(make(render_mode="rgb_array"))
     other.reset(seed=0)
     shown.reset(seed=0)
-    shown.step(0)
     """
     after = "frame = other.step(1)[0]; shown.close(); frame = other.step(0)[0]"
     command = ["xvfb-run", "-a"] if desktop else []
