@@ -68,7 +68,13 @@ def test_honest_results_hold(court: Court) -> None:
     assert court.verdict(court.honest, "0") == "passed"
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in PASSING])
+SLOWEST = "the best seed copied"  # every run is a copy, and each is played again
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=[pytest.mark.slow] * (kind == SLOWEST)) for kind in KINDS if kind not in PASSING],
+)
 def test_a_forged_agent_is_found(court: Court, kind: str) -> None:
     """With every run of an agent forged, playing again or training one run again shows it."""
     folder, forger = court.forged(kind, 3 if "later" in kind else 0, every=True)  # none from a longer run
