@@ -55,7 +55,7 @@ def test_the_planner_solves_what_the_rules_say_and_robot_time_adds_up() -> None:
 
 
 def test_an_agents_own_settings_reach_it() -> None:
-    spec = environment("planner", cubes=1, slip=0.0).spec
+    spec = environment("planner", cubes=3, slip=0.0).spec
     usual: Any = make_agent("dqn", spec, 0)
     other: Any = make_agent("dqn:controller.discount=0.5", spec, 0)
     assert other.settings.controller.discount == 0.5 != usual.settings.controller.discount
