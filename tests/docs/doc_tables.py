@@ -92,9 +92,10 @@ def _caption(tests: Sequence[Compared]) -> list[str]:
     if not sizes:
         return ["", f"*Too few seeds to say which is better: none of {len(tests)} comparisons can be shown.*"]
     least, most = (f"{size:.1f}" if size < 9.95 else f"{size:.0f}" for size in (min(sizes), max(sizes)))
-    could = f"{least} to {most} points" if least != most else f"{least} points"
-    few = f" Too few seeds in {len(tests) - len(sizes)}." if len(sizes) < len(tests) else ""
-    return ["", f"*Bold: shown (Holm, {len(tested)} tests). Detectable: {could}.{few}*"]
+    could = f"{least} to {most} points (by cell)" if least != most else f"{least} points"
+    few = f" In {len(tests) - len(sizes)} cells there are too few seeds for a test." if len(sizes) < len(tests) else ""
+    bold = f"Bold: the difference is shown (p < 0.05, corrected for {len(tested)} tests)."
+    return ["", f"*{bold} A true difference of {could} would be shown with a probability of 80 %.{few}*"]
 
 
 def _cells(line: str) -> list[str]:
