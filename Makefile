@@ -112,9 +112,9 @@ mutants: ready  ## Plant 300 small bugs one at a time and count those that a tes
 lint: ready  ## Check style, format and types
 	@$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/mypy
 	@rm -rf build/installed && mkdir -p build/installed/imagine_bench
-	@cd build/installed && for guest in controls factored motion peers programs regression serving; do ln -s ../../agents/guests/$$guest/src/imagine_bench_$$guest .; done
+	@cd build/installed && for guest in board controls factored motion peers programs regression serving; do ln -s ../../agents/guests/$$guest/src/imagine_bench_$$guest .; done
 	@cd build/installed/imagine_bench && ln -s ../../../imagine_bench/* ../../../agents ../../../tasks ../../../assets .
-	@MYPYPATH=build/installed $(BIN)/mypy --cache-dir .mypy_cache/guests -p imagine_bench_controls -p imagine_bench_factored -p imagine_bench_motion -p imagine_bench_peers -p imagine_bench_programs -p imagine_bench_regression -p imagine_bench_serving
+	@MYPYPATH=build/installed $(BIN)/mypy --cache-dir .mypy_cache/guests -p imagine_bench_board -p imagine_bench_controls -p imagine_bench_factored -p imagine_bench_motion -p imagine_bench_peers -p imagine_bench_programs -p imagine_bench_regression -p imagine_bench_serving
 
 browser: ready  ## Build the page that plays the puzzle in a browser, into build/browser/play; needs npm once
 	@OMP_NUM_THREADS=1 $(BIN)/python docs/browser/make.py

@@ -64,7 +64,6 @@ FOLDERS = (
     "imagine_bench/adapters",
     "imagine_bench/testing",
     "imagine_bench/tools",
-    "imagine_bench/board",
     "imagine_bench/cli",
     PACKAGE,
 )

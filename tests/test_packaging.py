@@ -24,7 +24,7 @@ _TOP = Path(__file__).parent.parent
 _PROJECT = tomllib.loads((_TOP / "pyproject.toml").read_text())
 _LOCK = (_TOP / ".ci/requirements.lock").read_text()
 _PYTHONS = ("3.11", "3.12", "3.13", "3.14")
-_GUESTS = ("controls", "factored", "motion", "peers", "programs", "regression", "serving")
+_GUESTS = ("board", "controls", "factored", "motion", "peers", "programs", "regression", "serving")
 _ROOMS = ("tasks", "agents", "assets")
 
 

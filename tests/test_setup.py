@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 TOOLS = "awk bash cat chmod cksum cp dirname grep head id mkdir mktemp rm tail uname".split()
-GUESTS = ("controls", "factored", "motion", "peers", "programs", "regression", "serving")
+GUESTS = ("board", "controls", "factored", "motion", "peers", "programs", "regression", "serving")
 LOCK = "--no-deps --require-hashes -r .ci/requirements.lock"
 # An interpreter that pretends: it makes an environment of itself and notes the packages to install.
 PRETENDER = r"""

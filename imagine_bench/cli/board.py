@@ -1,21 +1,19 @@
-"""The commands of the leaderboard: submit, board and daily."""
+"""The commands of the leaderboard: submit, board and daily. The plug-in imagine-bench-board carries them out."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from imagine_bench import registry
 from imagine_bench.cli.benches import Bench, Budget, Learner, Tests, WorldOptions
 from imagine_bench.cli.options import EncoderWord, File, Launch, Word, Words, one_of, require_with
-from imagine_bench.errors import CheckFailedError, InvalidValueError, require_known
-from imagine_bench.judge.verify import cost
+from imagine_bench.errors import require_known
 
 _ACTIONS = ("check", "page", "open", "file", "reveal")
-_ROUND_NEEDED = "'board {}' needs {}; give it too."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,12 +33,9 @@ class Submit:
 
     def __call__(self) -> None:
         """Write."""
-        from imagine_bench.board.submit import submit  # noqa: PLC0415 - matplotlib loads slowly
-
         if self.round is None:
             require_with("--round", self, "encoder")
-        for folder in submit(self.run, self.out, author=self.author, round_folder=self.round, encoder=self.encoder):
-            print(folder)
+        registry.load(registry.command("submit"))(**vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,46 +63,8 @@ class Board:
 
     def __call__(self) -> None:
         """Do it."""
-        {"check": self._check, "page": self._page, "open": self._open, "file": self._file, "reveal": self._reveal}[
-            require_known("action", self.action, _ACTIONS)
-        ]()
-
-    def _check(self, page: bool = False) -> None:
-        from imagine_bench.board.check import NEVER_SHOWN, check  # noqa: PLC0415 - likewise
-
-        begun_s = time.process_time()
-        found = check(self.path)
-        verdicts = [each.verdict for each in found]
-        print(*found, NEVER_SHOWN, cost(verdicts, time.process_time() - begun_s), sep="\n")
-        if page:
-            from imagine_bench.board.page import write_board  # noqa: PLC0415 - likewise
-
-            print(f"Page: {write_board(found, self.out)}")
-        refused = sum(bool(each.complaint) for each in verdicts)
-        if refused:
-            raise CheckFailedError(f"{refused} of {len(verdicts)} rows are refused; see above.")
-
-    def _page(self) -> None:
-        self._check(page=True)
-
-    def _open(self) -> None:
-        from imagine_bench.board.rounds import open_round  # noqa: PLC0415 - likewise
-
-        if self.closes is None:
-            raise InvalidValueError(_ROUND_NEEDED.format("open", "--closes, a day such as 2026-12-24"))
-        print(open_round(self.path, closes=self.closes, tests=self.tests, secret=self.secret))
-
-    def _file(self) -> None:
-        from imagine_bench.board.submit import file_agents  # noqa: PLC0415 - likewise
-
-        if self.round is None:
-            raise InvalidValueError(_ROUND_NEEDED.format("file", "--round, the folder of a round"))
-        print(*file_agents(self.path, self.round), sep="\n")
-
-    def _reveal(self) -> None:
-        from imagine_bench.board.rounds import reveal  # noqa: PLC0415 - likewise
-
-        print(reveal(self.path, self.secret))
+        require_known("action", self.action, _ACTIONS)
+        registry.load(registry.command("board"))(**vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,15 +85,12 @@ class Daily:
 
     def __call__(self) -> None:
         """Draw, describe, run."""
-        from imagine_bench.board.daily import world_of_day  # noqa: PLC0415 - likewise
-
-        world = world_of_day(self.date, self.secret)
-        print(world)
+        task = registry.load(registry.command("daily"))(date=self.date, secret=self.secret)
         if self.agents is None:
             require_with("--agents", self, "seeds", "budgets")
             return
         Bench(
-            task=world.task,
+            task=task,
             world=WorldOptions(execution="kinematic"),
             learner=Learner(agents=self.agents),
             budget=Budget(seeds=self.seeds, budgets=self.budgets),

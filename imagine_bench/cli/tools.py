@@ -335,10 +335,7 @@ class Serve:
 
     def __call__(self) -> None:
         """Serve until Ctrl-C."""
-        registry.require_guest("imagine-bench-serving", "Serving a task over HTTP")
-        served = {name: value for name, value in vars(self).items() if name not in ("host", "port")}
-        made = registry.load("imagine_bench_serving.players:Served")(**served)
-        registry.load("imagine_bench_serving.server:serve")(made, host=self.host, port=self.port)
+        registry.load(registry.command("serve"))(**vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -191,7 +191,7 @@ class Guest:
     package: str  #: its name as pip knows it
     module: str  #: its name as Python imports it
     is_ours_alone: bool  #: whether it needs no library of others, beyond those of this suite
-    names: Mapping[str, tuple[str, ...]]  #: its offers, by group of entry points
+    names: Mapping[str, Mapping[str, str]]  #: its offers and their places in its code, by group of entry points
     install: str  #: the command line that installs it
 
 
@@ -204,7 +204,6 @@ def guests() -> tuple[Guest, ...]:
     found = []
     for file in sorted(Path(str(resources.files("imagine_bench.agents"))).glob("guests/*/pyproject.toml")):
         project = tomllib.loads(file.read_text())["project"]
-        names = {group: tuple(points) for group, points in project["entry-points"].items()}
         what = f"-e {file.parent}" if (file.parent / "src").is_dir() else project["name"]
         package = project["name"]
         found.append(
@@ -212,7 +211,7 @@ def guests() -> tuple[Guest, ...]:
                 package=package,
                 module=package.replace("-", "_"),
                 is_ours_alone=all(needed.startswith("imagine-bench") for needed in project["dependencies"]),
-                names=names,
+                names=project["entry-points"],
                 install=f"pip install {what}",
             )
         )

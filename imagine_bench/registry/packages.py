@@ -15,10 +15,12 @@ AGENT_GROUP = "imagine_bench.agents"
 ENCODER_GROUP = "imagine_bench.encoders"
 REGRESSION_GROUP = "imagine_bench.regressions"
 REGRESSOR_GROUP = "imagine_bench.regressors"
+COMMAND_GROUP = "imagine_bench.commands"
 STUDY_GROUP = "imagine_bench.studies"
 WORLD_MODEL_GROUP = "imagine_bench.world_models"
 """Entry points in which installed packages make their offers: each the ``"module:attr"`` of a TaskEntry, AgentEntry,
-EncoderEntry, RegressionSpec, RegressorEntry, Study or WorldModelEntry."""
+EncoderEntry, RegressionSpec, RegressorEntry, Study or WorldModelEntry; of a plug-in of this suite, the function that
+carries out a command."""
 
 
 def guest_with(group: str, name: str) -> Guest | None:
@@ -50,6 +52,16 @@ def require_guest(package: str, doing: str) -> None:
             raise SetupError(
                 f"{doing} needs the package {package}, which is not installed. Install it with: {guest.install}"
             )
+
+
+def command(name: str) -> str:
+    """The place of the function that carries out a command of a plug-in, as :func:`.loading.load` takes it.
+
+    Raises SetupError, with the line that installs it, where the plug-in is missing.
+    """
+    (guest,) = (each for each in guests() if name in each.names.get(COMMAND_GROUP, {}))
+    require_guest(guest.package, f"'imagine-bench {name}'")
+    return guest.names[COMMAND_GROUP][name]
 
 
 def guest_packages() -> dict[str, set[str]]:

@@ -118,6 +118,13 @@ def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_l
     for words in (["judge", "ArrowPuzzleMotion"], ["play", "ArrowPuzzleMotion"]):
         assert main(words) == 2
         assert f"needs the package imagine-bench-motion, {install}" in capsys.readouterr().err
+    for words in ("daily", "board check docs/board", "submit runs", "serve arrow_puzzle"):
+        assert main(words.split()) == 2
+        command = words.split()[0]
+        folder = names[command]
+        needed = f"needs the package imagine-bench-{folder.name}, which is not installed."
+        line = f"imagine-bench: 'imagine-bench {command}' {needed} Install it with: pip install -e {folder}\n"
+        assert capsys.readouterr().err == line
 
 
 @pytest.mark.usefixtures("without_guests")

@@ -17,7 +17,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
 from socket import socket
-from typing import cast
+from typing import Any, cast
 from urllib.parse import SplitResult, parse_qsl, urlsplit
 
 from imagine_bench.errors import BusyError, ImagineBenchError, InvalidValueError, SetupError, plain, reason
@@ -311,6 +311,11 @@ def serve(
             server.serve_forever()
     finally:
         players.close()
+
+
+def serve_command(*, host: str, port: int, **served: Any) -> None:
+    """The command ``imagine-bench serve``; the other options are fields of :class:`Served`."""
+    serve(Served(**served), host=host, port=port)
 
 
 _HELP = """\

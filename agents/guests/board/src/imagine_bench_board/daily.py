@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from imagine_bench import registry
-from imagine_bench.board import rounds
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.rules import RuleFacts
 from imagine_bench.values import Setting
+
+from . import rounds
 
 _CUBES = (3, 4)
 """More are drawn slowly: each draw enumerates its world."""

@@ -12,8 +12,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from imagine_bench import registry
-from imagine_bench.board.check import NEVER_SHOWN, Checked
-from imagine_bench.board.rows import Row
 from imagine_bench.registry.entries import file_name
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.report import figures
@@ -31,6 +29,9 @@ from imagine_bench.report.page import (
     texts,
 )
 from imagine_bench.store.files import make_folder, table_text, write_bytes
+
+from .check import NEVER_SHOWN, Checked
+from .rows import Row
 
 _PERSON = "person"
 """The prefix of people's names among players."""

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 from board_forging import on
+from imagine_bench_board.daily import world_of_day
 
 from imagine_bench import registry
-from imagine_bench.board.daily import world_of_day
 from imagine_bench.cli import exit_code
 from imagine_bench.errors import InvalidValueError
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from board_forging import BoardForger, honest_board
 from board_kinds import KINDS
-
-from imagine_bench.board.check import Checked, check
+from imagine_bench_board.check import Checked, check
 
 VARIANTS = 23
 """Of each kind, in the slow test: 529 forgeries."""

@@ -14,11 +14,12 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
 
-from imagine_bench.board.rows import NAME
 from imagine_bench.errors import ArtefactError, InvalidValueError, brief, require
 from imagine_bench.protocols.data import MOST, require_types
 from imagine_bench.seeding import SEEDS
 from imagine_bench.store.files import make_folder, read_json, reading, sha256, write_json
+
+from .rows import NAME
 
 ROUNDS = "rounds"
 """The folder of a board that holds its rounds."""

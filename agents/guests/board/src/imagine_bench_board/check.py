@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from imagine_bench import registry
-from imagine_bench.board import rounds
-from imagine_bench.board.rows import CARD, ROWS, Row, read_row, require_whole
 from imagine_bench.errors import ArtefactError, require
 from imagine_bench.judge.verify import Replays, has_own_failures, verify_tests
 from imagine_bench.running.bench import counted
 from imagine_bench.running.retraining import Verdict, judged, part_digest
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, evaluation_split
+
+from . import rounds
+from .rows import CARD, ROWS, Row, read_row, require_whole
 
 NOT_VOUCHED = ("the player", "which seeds and how many tests", "the price", "what was seen beforehand")
 """Claims of every row that no replay shows."""

@@ -14,10 +14,10 @@ from unittest import mock
 
 import numpy as np
 from forging import Hand, Remembering, honest_bench, tests_by
+from imagine_bench_board import rounds
+from imagine_bench_board.rows import CARD, EPISODES
+from imagine_bench_board.submit import file_agents, submit
 
-from imagine_bench.board import rounds
-from imagine_bench.board.rows import CARD, EPISODES
-from imagine_bench.board.submit import file_agents, submit
 from imagine_bench.running.evaluation import EpisodeLog
 
 CLOSES = "2026-12-24"

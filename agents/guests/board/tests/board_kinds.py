@@ -12,9 +12,9 @@ from collections.abc import Mapping
 
 from board_forging import ROUND, BoardForger, Forgery, OpenRow
 from forging import WORLD
+from imagine_bench_board.rounds import promise
 
 from imagine_bench import registry
-from imagine_bench.board.rounds import promise
 from imagine_bench.running.evaluation import EvaluationCounts, RecordedEnv, replay
 from imagine_bench.running.run_state import make_env
 from imagine_bench.seeding import episode_seed

@@ -9,12 +9,12 @@ from pathlib import Path
 import bench_fakes  # noqa: F401 - registers its agents
 import pytest
 from board_forging import AFTER, BEFORE, CLOSES, ROUND, TESTS, on, with_round
+from imagine_bench_board import rounds
+from imagine_bench_board.check import check
+from imagine_bench_board.rows import read_row
+from imagine_bench_board.submit import file_agents, submit
 from small_runs import Inline, small
 
-from imagine_bench.board import rounds
-from imagine_bench.board.check import check
-from imagine_bench.board.rows import read_row
-from imagine_bench.board.submit import file_agents, submit
 from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.running.bench import bench

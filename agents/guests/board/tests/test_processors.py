@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from imagine_bench_board.check import row_folders
 from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 
-from imagine_bench.board.check import row_folders
-
-BOARD = Path(__file__).parents[2] / "docs" / "board"
+BOARD = Path(__file__).parents[4] / "docs" / "board"
 _C_LIBRARY = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX512DQ,-AVX2,-AVX,-FMA,-FMA4"}
 _NUMPY = {"NPY_DISABLE_CPU_FEATURES": " ".join(name for name in __cpu_dispatch__ if __cpu_features__[name])}
 _TORCH = {"ATEN_CPU_CAPABILITY": "default"}
@@ -31,7 +30,7 @@ import hashlib, json, sys
 from pathlib import Path
 import gymnasium
 import imagine_bench
-from imagine_bench.board.check import check
+from imagine_bench_board.check import check
 env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", observation="state")
 poses = hashlib.sha256()
 for seed in range(5):

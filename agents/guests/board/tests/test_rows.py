@@ -12,12 +12,12 @@ from pathlib import Path
 import bench_fakes  # noqa: F401 - registers its agents
 import pytest
 from board_forging import OpenRow
+from imagine_bench_board.check import NEVER_SHOWN, NOT_VOUCHED, check
+from imagine_bench_board.page import write_board
+from imagine_bench_board.rows import CARD, EPISODES, LARGEST, read_row
+from imagine_bench_board.submit import submit
 from small_runs import Inline, small
 
-from imagine_bench.board.check import NEVER_SHOWN, NOT_VOUCHED, check
-from imagine_bench.board.page import write_board
-from imagine_bench.board.rows import CARD, EPISODES, LARGEST, read_row
-from imagine_bench.board.submit import submit
 from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.running.bench import bench

@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-from imagine_bench.board import rounds
-from imagine_bench.board.rows import Claims, Figures, Price, Row, write_row
 from imagine_bench.errors import ArtefactError, InvalidValueError, require
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.registry.entries import file_name
@@ -22,6 +20,9 @@ from imagine_bench.seeding import episode_seed
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, is_archive, read_control
 from imagine_bench.store.results import Checkpoint
+
+from . import rounds
+from .rows import Claims, Figures, Price, Row, write_row
 
 T = TypeVar("T")
 
