@@ -32,50 +32,10 @@ from typing import Any
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
+from mutant_rooms import ROOMS
 
 ROOT = Path(__file__).resolve().parents[2]
 REASONS = Path(__file__).with_name("mutants_that_may_live.json")
-_RULES = ("tests/tasks/arrows/test_arrow_rules.py", "tests/tasks/pick_place/test_pick_place_rules.py")
-_FACTORED = (
-    "agents/guests/factored/tests/test_factored_formulas.py", "agents/guests/factored/tests/test_factored.py",
-    "agents/guests/factored/tests/test_transfer.py",
-)  # fmt: skip
-_CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/running/test_runner.py")
-ROOMS: dict[str, dict[str, Sequence[str]]] = {
-    "rules": {
-        "tasks/arrows/rules.py": _RULES[:1],
-        "tasks/pick_place/rules.py": _RULES[1:],
-        "imagine_bench/rules.py": _RULES,
-    },
-    "filter": {
-        "agents/imagination/filter.py": (
-            "tests/agents/imagination/test_rollouts.py", "tests/agents/imagination/test_model_only.py",
-        ),
-    },
-    "uncertainties": {
-        "agents/imagination/uncertainty.py": ("tests/agents/imagination/test_uncertainty.py",),
-        "agents/imagination/mixture.py": (
-            "tests/agents/imagination/test_mixture.py", "tests/agents/imagination/test_uncertainty.py",
-        ),
-    },
-    "statistics": {"imagine_bench/statistics.py": ("tests/test_statistics.py",)},
-    "resume": {
-        "imagine_bench/store/run_folder.py": _CHECKPOINTS,
-        "imagine_bench/values.py": _CHECKPOINTS,
-        "imagine_bench/running/evaluation.py": _CHECKPOINTS,
-        "imagine_bench/running/run_state.py": _CHECKPOINTS[::-1],
-    },
-    "report": {
-        "imagine_bench/report/data.py": (
-            "tests/report/test_report_data.py", "tests/report/test_filmstrips.py", "tests/report/test_report.py",
-        ),
-    },
-    "own agent": {
-        f"agents/guests/factored/src/imagine_bench_factored/{name}.py": _FACTORED
-        for name in ("agent", "dynamics", "factors", "model", "outcomes", "perception", "planner")
-    },
-}  # fmt: skip
-"""Of each room the files, and the tests of each file, those that find most first."""
 _GUARDS = {"frozen", "slots", "kw_only", "strict", "validate_args"}
 """Arguments that change nothing in a correct program: of dataclasses, ``zip`` and distributions."""
 _SLOWEST = 5.0
@@ -178,14 +138,14 @@ def _test(where: Path, tests: Sequence[str], log: Path, mutated: bool) -> None:
     """Run some tests of a copy of the checkout, in a process that does nothing else."""
     os.setsid()
     os.chdir(where)
-    os.environ["PYTHONPATH"] = str(where)
+    packages = [str(where), *map(str, sorted(where.glob("agents/guests/*/src")))]
+    os.environ["PYTHONPATH"] = os.pathsep.join(packages)
     sys.dont_write_bytecode = mutated
-    sys.path.insert(0, str(where))
+    sys.path[:0] = packages
     with log.open("w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    here = [name for name in tests if (where / name).exists()]
-    os._exit(int(importlib.import_module("pytest").main(["-x", "-p", "no:cacheprovider", *here])))
+    os._exit(int(importlib.import_module("pytest").main(["-x", "-p", "no:cacheprovider", *tests])))
 
 
 def main() -> int:
