@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -62,7 +61,7 @@ class EncoderCard:
     @classmethod
     def from_json(cls, text: str) -> EncoderCard:
         """Undo :meth:`to_json`; an error of any kind where it is not an encoder's card of this format."""
-        values: dict[str, Any] = json.loads(text)
+        values = json.loads(text)
         if values.pop("format") != FORMAT:
             raise InvalidValueError(f"its format is not {FORMAT}")
         values.pop("content", None)

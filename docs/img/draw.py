@@ -5,19 +5,15 @@ import json
 import runpy
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
-import gymnasium
 import matplotlib as mpl
 import numpy as np
-from PIL import Image
 
-from imagine_bench import appearance, reference, registry, statistics
+from imagine_bench import reference, registry, statistics
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.judge.causes import CAUSES, FORMER_CAUSES
-from imagine_bench.recording.filmstrips import Tile, sheet
 from imagine_bench.registry.entries import label_today
 from imagine_bench.report import figures
 from imagine_bench.report.data import collect
@@ -376,32 +372,6 @@ def suite() -> None:
     figure.savefig(HERE / "suite.png", dpi=110, facecolor="white")
 
 
-PARAMETERS = ({}, {"slip": 0.5}, {"goal_change": 0.7}, {"gesture": "first"}, {"lag": 1}, {"distractors": 4})
-FACTORS = ("", *(f"{name}=1" for name in appearance.FACTORS))
-START = (2, 1, 0, 1)
-TURNS = {"left turned": 0, "middle turned": 2, "right turned": 4}
-"""A start and macro-actions by whose rules no two arrows are ever equal and no episode ends."""
-
-
-def walk(options: Mapping[str, Any]) -> list[np.ndarray]:
-    """Frames of the same episode in a world of these parameters."""
-    with gymnasium.make("imagine_bench/Arrows-v0", execution="kinematic", **options) as env:
-        frame, info = env.reset(seed=18, options={"macrostate": START})
-        frames = [frame]
-        for action in TURNS.values():
-            frame, _, over, _, info = env.step(action)
-            if over or not info["legal"]:
-                raise ValueError(f"With {options} the episode ends at {info['macrostate']}; choose another start.")
-            frames.append(frame)
-    return frames
-
-
-def vary(factor: str) -> list[np.ndarray]:
-    """Frames of one macrostate where one factor of appearance varies."""
-    world, rng = registry.task("arrow_puzzle"), np.random.default_rng(1)
-    return list(world.render_macrostates(np.array([(0, 1, 2, 1)] * 4), factor or "clean", rng))
-
-
 def evidence() -> None:
     """Total variation of each judged fit, and its exploit with the upper bound, by the size of its data."""
     with (RESULTS / "arrow_puzzle_clockwise-levels-judge" / "scores.csv").open() as file:
@@ -459,45 +429,6 @@ def promise() -> None:
     plot.savefig(HERE / "promise.png", dpi=100)
 
 
-def strips(rows: Mapping[str, list[np.ndarray]], titles: Sequence[str]) -> np.ndarray:
-    """Named rows of frames below one another, with titles above the first row."""
-    drawn = []
-    for label, frames in rows.items():
-        above = [""] * len(frames) if drawn else titles
-        drawn.append((label, [Tile(frame, title) for frame, title in zip(frames, above, strict=True)]))
-    return sheet(drawn)
-
-
-def parameters() -> None:
-    """Each parameter as frames of one episode, and each factor of appearance as frames of one macrostate.
-
-    A pixel of a frame is two pixels of the image in each direction, so that none is interpolated.
-    """
-    worlds = {" ".join(f"{name} = {value}" for name, value in each.items()): walk(each) for each in PARAMETERS}
-    worlds = {name or "no parameter": frames for name, frames in worlds.items()}
-    factors = {each or "clean": vary(each) for each in FACTORS}
-    halves = (strips(worlds, ["start", *TURNS]), strips(factors, ["one macrostate", "", "", ""]))
-    Image.fromarray(np.concatenate(halves, axis=1)).save(HERE / "parameters.png", optimize=True)
-
-
-def nuisances() -> None:
-    """Each nuisance of frames in three frames of one episode and in the first frame of another."""
-    rows = {}
-    for given in ("clean", *(f"{name}=1" for name in appearance.NUISANCES[:4]), "harsh"):
-        with gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance=given) as env:
-            frames = [env.reset(seed=3, options={"macrostate": START})[0]]
-            frames += [env.step(action)[0] for action in (0, 2)]
-            frames.append(env.reset(options={"macrostate": START})[0])
-        rows[given] = frames
-    drawn = strips(rows, ["start", "after one action", "after two", "another start"])
-    Image.fromarray(drawn.repeat(2, axis=0).repeat(2, axis=1)).save(HERE / "nuisances.png", optimize=True)
-
-
-def tasks() -> None:
-    """An image of every task."""
-    runpy.run_path(str(HERE / "draw_tasks.py"))["tasks"]()
-
-
 FIGURES = (
     peers,
     ladder,
@@ -510,11 +441,17 @@ FIGURES = (
     suite,
     evidence,
     promise,
-    parameters,
-    nuisances,
-    tasks,
 )
-PICTURES = {each.__name__: each for each in FIGURES}
+OF_SCENES = ("parameters", "nuisances", "tasks")
+"""Pictures of ``draw_scenes.py``."""
+
+
+def of_scenes(name: str) -> None:
+    """Draw a picture of scenes."""
+    runpy.run_path(str(HERE / "draw_scenes.py"))[name]()
+
+
+PICTURES = {each.__name__: each for each in FIGURES} | {name: partial(of_scenes, name) for name in OF_SCENES}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or PICTURES:

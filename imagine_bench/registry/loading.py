@@ -20,9 +20,9 @@ from imagine_bench.errors import EXTRAS, ImagineBenchError, SetupError, lacking,
 from imagine_bench.registry.builtin import AGENTS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
 from imagine_bench.registry.by_value import CodeByValue
 
-_TABLES: Sequence[dict[str, Any]] = (AGENTS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS)
-_HERE = "__main__:"
 Registered = Sequence[dict[str, Any]]
+_TABLES: Registered = (AGENTS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS)
+_HERE = "__main__:"
 _LOADING: ContextVar[str] = ContextVar("_LOADING", default="")
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jinja2
 import numpy as np
@@ -21,6 +21,8 @@ from imagine_bench.store.files import csv_text, make_folder, sweep, write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from imagine_bench.store.results import AllRuns, P, R
 
 _TERMINAL = 80  # characters
 DASH = "–"  # printed where there is no number; the table's caption says why
@@ -260,7 +262,7 @@ def texts(page: Page, *, images: bool = True) -> dict[str, str]:
     return {**page.files, "index.html": environment.get_template("page.html.j2").render(page=page)}
 
 
-def made(result: Any) -> dict[str, object]:
+def made(result: AllRuns[P, R]) -> dict[str, object]:
     """How a result of any kind was made: the facts of its Page, with the settings of its learners by name.
 
     All seeds of a learner have the same settings.

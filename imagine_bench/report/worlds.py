@@ -79,11 +79,12 @@ def _indented(family: str) -> str:
 def worlds_csv(cells: Mapping[tuple[str, int], Sequence[Mapping[str, Any]]]) -> str:
     """Every score of every cell, a row a family."""
     names = ("right", "brier", *_ENDS, "edges_wrong", "edges")
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, float | str]] = []
     for (model, transitions), each in cells.items():
         for cell in each:
             for family, scores in cell.get("worlds", {}).items():
-                rows.append({"model": model, "transitions": transitions, "seed": cell["seed"], "family": family})
                 values = {name: scores.get(name, math.nan) for name in names}
-                rows[-1] |= {name: "" if math.isnan(value) else f"{value:.6g}" for name, value in values.items()}
+                written = {name: "" if math.isnan(value) else f"{value:.6g}" for name, value in values.items()}
+                named = {"model": model, "transitions": transitions, "seed": cell["seed"], "family": family}
+                rows.append({**named, **written})
     return table_text(rows)

@@ -1,6 +1,6 @@
-"""Draws an image of every task: ``python docs/img/draw.py tasks``."""
+"""Draws pictures of scenes: parameters of worlds, nuisances, tasks. ``python docs/img/draw.py tasks`` draws one."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,8 @@ from imagine_bench_regression import robot_ik, toy_regression
 from matplotlib import pyplot as plt
 from PIL import Image, ImageDraw
 
-from imagine_bench.recording.filmstrips import font
+from imagine_bench import appearance, registry
+from imagine_bench.recording.filmstrips import Tile, font, sheet
 from imagine_bench.report import figures
 
 HERE = Path(__file__).parent
@@ -73,6 +74,66 @@ def as_image(figure: plt.Figure) -> Image.Image:
     figure.set_dpi(100)
     figure.canvas.draw()
     return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+
+
+PARAMETERS = ({}, {"slip": 0.5}, {"goal_change": 0.7}, {"gesture": "first"}, {"lag": 1}, {"distractors": 4})
+FACTORS = ("", *(f"{name}=1" for name in appearance.FACTORS))
+START = (2, 1, 0, 1)
+TURNS = {"left turned": 0, "middle turned": 2, "right turned": 4}
+"""A start and macro-actions by whose rules no two arrows are ever equal and no episode ends."""
+
+
+def walk(options: Mapping[str, Any]) -> list[np.ndarray]:
+    """Frames of the same episode in a world of these parameters."""
+    with gymnasium.make("imagine_bench/Arrows-v0", execution="kinematic", **options) as env:
+        frame, info = env.reset(seed=18, options={"macrostate": START})
+        frames = [frame]
+        for action in TURNS.values():
+            frame, _, over, _, info = env.step(action)
+            if over or not info["legal"]:
+                raise ValueError(f"With {options} the episode ends at {info['macrostate']}; choose another start.")
+            frames.append(frame)
+    return frames
+
+
+def vary(factor: str) -> list[np.ndarray]:
+    """Frames of one macrostate where one factor of appearance varies."""
+    world, rng = registry.task("arrow_puzzle"), np.random.default_rng(1)
+    return list(world.render_macrostates(np.array([(0, 1, 2, 1)] * 4), factor or "clean", rng))
+
+
+def strips(rows: Mapping[str, list[np.ndarray]], titles: Sequence[str]) -> np.ndarray:
+    """Named rows of frames below one another, with titles above the first row."""
+    drawn = []
+    for label, frames in rows.items():
+        above = [""] * len(frames) if drawn else titles
+        drawn.append((label, [Tile(frame, title) for frame, title in zip(frames, above, strict=True)]))
+    return sheet(drawn)
+
+
+def parameters() -> None:
+    """Each parameter as frames of one episode, and each factor of appearance as frames of one macrostate.
+
+    A pixel of a frame is two pixels of the image in each direction, so that none is interpolated.
+    """
+    worlds = {" ".join(f"{name} = {value}" for name, value in each.items()): walk(each) for each in PARAMETERS}
+    worlds = {name or "no parameter": frames for name, frames in worlds.items()}
+    factors = {each or "clean": vary(each) for each in FACTORS}
+    halves = (strips(worlds, ["start", *TURNS]), strips(factors, ["one macrostate", "", "", ""]))
+    Image.fromarray(np.concatenate(halves, axis=1)).save(HERE / "parameters.png", optimize=True)
+
+
+def nuisances() -> None:
+    """Each nuisance of frames in three frames of one episode and in the first frame of another."""
+    rows = {}
+    for given in ("clean", *(f"{name}=1" for name in appearance.NUISANCES[:4]), "harsh"):
+        with gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", appearance=given) as env:
+            frames = [env.reset(seed=3, options={"macrostate": START})[0]]
+            frames += [env.step(action)[0] for action in (0, 2)]
+            frames.append(env.reset(options={"macrostate": START})[0])
+        rows[given] = frames
+    drawn = strips(rows, ["start", "after one action", "after two", "another start"])
+    Image.fromarray(drawn.repeat(2, axis=0).repeat(2, axis=1)).save(HERE / "nuisances.png", optimize=True)
 
 
 def tasks() -> None:
