@@ -472,6 +472,10 @@ def chance_exact(task: str) -> str:
     return f"{100 * _facts(task).chance_level:.3f}"
 
 
+def optimum_exact(task: str) -> str:
+    return f"{100 * _facts(task).optimum:.3f}"
+
+
 def shortest(task: str) -> str:
     return f"{_facts(task).mean_plan_length:.3f}"
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib import resources
 
 import pytest
-from doc_cells import price_to, scores
+from doc_cells import ROOT, price_to, scores
 
 from imagine_bench.tools.describe import describe_task
 
@@ -26,3 +27,5 @@ def test_describe_names_bound_best_known_and_cautious_learner() -> None:
     bound, best, cautious = (page.index(text) for text in ("12 transitions", "96 macro-actions", "112 ± "))
     assert bound < best < cautious
     assert "best known" not in describe_task("arrow_puzzle_easy")
+    (quoted,) = re.findall(r"```text\n(.*?)```", (ROOT / "docs/explanation/certificates.md").read_text(), re.DOTALL)
+    assert set(quoted.splitlines()) <= set(page.splitlines())
