@@ -37,8 +37,11 @@ def rates(folder: str, agent: str) -> dict[int, np.ndarray]:
     return {budget: np.array(values) for budget, values in sorted(found.items())}
 
 
-def curve(axes: plt.Axes, folder: str, agent: str, label: str | None = None) -> None:
-    """Interquartile mean over seeds with its 95 % interval, or with the range of seeds that are too few for one."""
+def curve(axes: plt.Axes, folder: str, agent: str, label: str | None = None, like: str = "") -> None:
+    """Interquartile mean over seeds with its 95 % interval, or with the range of seeds that are too few for one.
+
+    The line has the color and marks of the agent, or of another one that it is ``like``.
+    """
     table = rates(folder, agent)
     budgets = list(table)
     tests = json.loads((RESULTS / folder / "bench.json").read_text())["protocol"]["evaluation_episodes"]
@@ -47,7 +50,7 @@ def curve(axes: plt.Axes, folder: str, agent: str, label: str | None = None) -> 
     if np.isnan(intervals).any():
         intervals = [(values.min(), values.max()) for values in table.values()]
     ends = 100 * np.array(intervals)
-    style = figures.line_style(agent)
+    style = figures.line_style(like or agent)
     axes.plot(budgets, means, label=label or agent, markersize=5, linewidth=2, **style)
     axes.fill_between(budgets, *zip(*ends, strict=True), color=style["color"], alpha=0.15, linewidth=0)
 
@@ -255,6 +258,8 @@ def mild() -> None:
     figure, axes = plt.subplots(figsize=(7, 3.2), layout="constrained")
     curve(axes, "arrow_puzzle-mild-ten_seeds", "imagination_uncertainty")
     curve(axes, "arrow_puzzle-mild-ten_seeds", "dqn")
+    curve(axes, "arrow_puzzle-mild-dqn-five_updates", "dqn", "dqn, five updates\neach macro-action", like="count_table")
+    axes.set_title("Interquartile mean of ten seeds; band: 95 % interval", fontsize=10)
     axes.set_ylabel("test episodes solved (%)")
     finish(axes, [500, 1000, 2000])
     figure.legend(loc="outside right upper", frameon=False)
@@ -380,24 +385,22 @@ def evidence() -> None:
     plot, axes = plt.subplots(figsize=(8, 4.4), layout="constrained")
     for place, model in enumerate(dict.fromkeys(row["model"] for row in rows), 2):
         style = {"color": figures.COLORS[place % 8], "marker": figures.MARKERS[place % 7], "alpha": 0.7}
-        label = registry.world_model_entry(model).label
         for row in (row for row in rows if row["model"] == model):
             away, low, high = (float(row[name]) for name in ("total_variation", "exploit", "exploit_bound"))
-            area = 30 * (1 + sizes.index(int(row["transitions"]))) ** 1.5
+            area = 25 * 3 ** sizes.index(int(row["transitions"]))
             axes.vlines(away, low, high, color=style["color"])
-            axes.scatter(away, low, s=area, label=label, **style)
-            label = None
-    axes.axvline(0.1, color="gray", linewidth=1, linestyle=":")
-    axes.axhline(20.0, color="gray", linewidth=1, linestyle=":")
+            axes.scatter(away, low, s=area, **style)
+        for place_of_size, size in enumerate(sizes):
+            axes.scatter([], [], s=25 * 3**place_of_size, label=f"{model}, {size} transitions", **style)
     axes.set_xscale("symlog", linthresh=0.01)
     axes.set_xlim(-0.001, 1.1)
     axes.set_xticks([0.0, 0.01, 0.1, 1.0], ["0", "0.01", "0.1", "1"])
-    axes.set_xlabel("total variation of one macro-action, L1 (linear below 0.01, then logarithmic)")
-    axes.set_ylabel("exploit, L7 (units of reward)")
-    axes.set_title(f"A mark a fit; the larger, the more transitions: {', '.join(map(str, sizes))}", fontsize=10)
+    axes.set_xlabel("total variation after one macro-action, L1 (scale: linear below 0.01, then logarithmic)")
+    axes.set_ylabel("exploit, L7 (units of reward)\nmark: found; line: to the upper bound")
+    axes.set_title("arrows:cubes=3,goal=clockwise: each mark is one training of a model", fontsize=10)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(loc="upper right", frameon=False)
+    axes.legend(loc="upper right", frameon=False, labelspacing=0.9)
     plot.savefig(HERE / "evidence.png", dpi=100)
 
 
@@ -419,8 +422,9 @@ def promise() -> None:
         style = {"color": figures.COLORS[place % 8], "marker": figures.MARKERS[place % 7]}
         axes.scatter(across, shares, s=36, alpha=0.8, label=label, **style)
     axes.axhline(5.0, color="gray", linewidth=1, linestyle=":")
-    axes.set_xticks(range(len(models)), [registry.world_model_entry(model).label for model in models], fontsize=8)
-    axes.set_ylabel("accepted though wrong (%)")
+    axes.set_xticks(range(len(models)), models, fontsize=8)
+    axes.set_ylabel("accepted though wrong (% of transitions)")
+    axes.set_title("One training of each model; each mark is one exact share", fontsize=10)
     axes.grid(axis="y", alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper left")
