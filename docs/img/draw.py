@@ -409,7 +409,7 @@ def promise() -> None:
     with (RESULTS / "arrow_puzzle-signals-judge" / "scores.csv").open() as file:
         rows = list(csv.DictReader(file))
     where = {
-        "on_data": "on its data (promised: at most 5 %)",
+        "on_data": "on its data (guaranteed: at most 5 %)",
         "rare": "where its data is rare",
         "policies": "under other policies, mean",
         "worst_policy": "under the worst policy",
