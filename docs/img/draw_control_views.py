@@ -18,7 +18,7 @@ HERE = Path(__file__).parent
 SCALE = 4
 EDGE_PX = 64 * SCALE
 GAP_PX = 6
-TITLE_PX = 22
+TITLE_PX = 26
 CLEAN = appearance("clean")
 
 
@@ -35,7 +35,7 @@ class Motion:
 
 MOTIONS = (
     Motion(1, (1, 0), 0, (2, 0), {"one cube, at rest": 0.0, "above": 0.25, "gripped": 0.42, "turned 45 degrees": 0.53}),
-    Motion(3, (3, 0, 1, 0), 3, (3, 3, 1, 0), {"three cubes, at rest": 0.0, "half turned": 0.53}),
+    Motion(3, (3, 0, 1, 0), 3, (3, 3, 1, 0), {"three cubes, at rest": 0.0, "turned 45 degrees": 0.53}),
     Motion(6, (1, 0, 3, 2, 0, 1, 3), 5, (1, 0, 0, 2, 0, 1, 3), {"six cubes, at rest": 0.0, "one gripped": 0.42}),
     Motion(0, (0, 0, 0, 1), 1, (0, 1, 0, 3), {"pick-and-place, at rest": 0.0, "car gripped": 0.45, "car held": 1.0}),
     Motion(0, (0, 1, 0, 3), 3, (0, 2, 0, 3), {"car over the palm": 0.5}),
@@ -61,7 +61,7 @@ def column(title: str, world: World, qpos: np.ndarray) -> Image.Image:
     world.data.qpos[:] = qpos
     world.update()
     canvas = Image.new("RGB", (EDGE_PX, TITLE_PX + len(CONTROL_CAMERAS) * (EDGE_PX + GAP_PX)), "white")
-    ImageDraw.Draw(canvas).text((2, 3), title, "#202020", ImageFont.load_default(15))
+    ImageDraw.Draw(canvas).text((2, 3), title, "#202020", ImageFont.load_default(19))
     for row, camera in enumerate(CONTROL_CAMERAS):
         frame = Image.fromarray(Renderer(world.model, control_view(camera)).frame(world.data))
         enlarged = frame.resize((EDGE_PX, EDGE_PX), Image.Resampling.NEAREST)
