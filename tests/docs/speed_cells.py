@@ -1,7 +1,8 @@
-"""Cells of speed and fidelity: figures of ``make speed``, and rounds of ``tests/measure/control_speed.py``."""
+"""Cells of speed and fidelity: ``make speed``, and ``tests/measure/control_speed.py``; and of models of motions."""
 
 from __future__ import annotations
 
+import csv
 import functools
 import json
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 _SPEED = Path(__file__).parents[2] / "docs" / "results" / "speed"
+_MOTION = _SPEED.parent / "motion"
 _TASK = "arrow_puzzle: "
 _OURS = ("ours", "ours_pick_place")
 
@@ -87,3 +89,14 @@ def beside_mujoco(suite: str, images: str) -> str:
     step_us, simulated_us, drawn_us = 1e6 * np.median(each, axis=0)
     ratio = np.median(each[:, 0] / each[:, 1:].sum(axis=1))
     return f"{ratio:.2f} ({step_us:.0f} against {simulated_us:.0f} + {drawn_us:.0f})"
+
+
+def motion_judged(file: str, model: str, score: str) -> str:
+    """A share of the judge of motions, %, or the CPU seconds of a fit: mean (lowest to highest seed)."""
+    with (_MOTION / f"{file}.csv").open() as rows:
+        values = [float(row[score]) for row in csv.DictReader(rows) if row["model"] == model and row[score]]
+    if not values:
+        return "–"
+    factor = 1.0 if score == "fit_s" else 100.0
+    mean, low, high = (f"{factor * each:.0f}" for each in (np.mean(values), min(values), max(values)))
+    return mean if low == high or score == "fit_s" else f"{mean} ({low} to {high})"
