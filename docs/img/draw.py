@@ -184,17 +184,16 @@ def ladder() -> None:
     beyond = 1.6 * max(max(table) for table in tested.values())
     found = {agent: [beyond if each is None else each for each in seeds] for agent, seeds in reached.items()}
     order = sorted(found, key=lambda agent: (np.median(found[agent]), np.mean(found[agent])))
-    figure, axes = plt.subplots(figsize=(9, 1.2 + 0.34 * len(order)), layout="constrained")
+    figure, axes = plt.subplots(figsize=(9, 1.2 + 0.45 * len(order)), layout="constrained")
     for place, agent in enumerate(order):
         _, color, marker = family(agent)
         middle = np.median(found[agent])
-        axes.plot([min(found[order[0]]), middle], [place] * 2, color=color, linewidth=2, alpha=0.4)
-        axes.plot([middle], [place], "|", color=color, markersize=15, markeredgewidth=2.5)
-        for point, shift in zip(found[agent], np.linspace(-0.12, 0.12, len(found[agent])), strict=True):
+        axes.plot([middle], [place], "|", color=color, markersize=24, markeredgewidth=1.5, alpha=0.5)
+        for point, shift in zip(found[agent], np.linspace(-0.28, 0.28, len(found[agent])), strict=True):
             axes.plot([point], [place + shift], ">" if point == beyond else marker, color=color, markersize=4.5)
     if floor:
         axes.axvline(floor.episodes, **figures.REFERENCE)
-        said = f"a marker a seed, bar: median; dashed: cost of a cautious learner, {floor.episodes:.0f} episodes"
+        said = f"each marker is a seed, a line is their median; dashed: cautious learner, {floor.episodes:.0f} episodes"
         axes.set_title(said, fontsize=9, loc="left")
     axes.set_yticks(range(len(order)), order)
     axes.set_xscale("log")
@@ -206,7 +205,8 @@ def ladder() -> None:
     axes.spines[["top", "right"]].set_visible(False)
     for said, color, marker in list(FAMILIES.values())[:3]:
         axes.plot([], [], marker, color=color, label=said)
-    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    axes.plot([], [], ">", color="#606060", label="95 % not reached")
+    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     figure.savefig(HERE / "ladder.png", dpi=110)
 
 
