@@ -142,7 +142,7 @@ def _parsed(words: Sequence[str]) -> tuple[Command, list[str]]:
     return tyro.cli(
         Command,
         prog=_PROGRAM,
-        description="Robotics benchmarks that measure how far imagination cuts the real interaction a robot needs. "
+        description="Robotics benchmarks that measure how many real episodes imagination saves a robot. "
         "'imagine-bench list' names all tasks, agents, presets and models; --version says which version this is.",
         args=words,
         config=_CONFIG,
