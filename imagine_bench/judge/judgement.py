@@ -101,7 +101,7 @@ class Judgement:
         if registry.task(self.task).sight is not None:
             raise InvalidValueError(
                 f"Frames of task {self.task!r} hide or delay a part of the macrostate, and the exact answers are about "
-                "all of it. Judge a task without the dials gesture and lag."
+                "all of it. Judge a task without the parameters gesture and lag."
             )
         if self.encoder_file is not None:
             gives = encoders.kind(self.encoder_file)

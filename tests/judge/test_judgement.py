@@ -452,7 +452,7 @@ _TWICE = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:mo
     ("given", "kind", "words"),
     [
         ({"sizes": (30, 20)}, InvalidValueError, "ascending numbers"),
-        ({"task": "arrows:cubes=2,lag=1"}, InvalidValueError, "hide or delay a part .* without the dials"),
+        ({"task": "arrows:cubes=2,lag=1"}, InvalidValueError, "hide or delay a part .* without the parameters"),
         (
             {"models": ("copy", "structured"), "encoder": "pick_place-mild"},
             InvalidValueError,
