@@ -1,4 +1,4 @@
-"""A world a day: an arrow puzzle that its date draws, with exact facts, which nobody can have trained on."""
+"""A world a day: an arrow puzzle that its date draws, with exact facts, on which hardly anybody has trained."""
 
 from __future__ import annotations
 
