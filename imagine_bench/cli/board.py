@@ -69,7 +69,7 @@ class Board:
 
 @dataclass(frozen=True, kw_only=True)
 class Daily:
-    """Name the world of a day, with its exact facts, and run agents on it: a world on which hardly anybody has trained."""
+    """Name the world of a day, with its exact facts, and run agents on it: hardly anybody has trained on it."""
 
     date: Word = None
     """The day, such as 2026-12-24; by default today, in UTC."""

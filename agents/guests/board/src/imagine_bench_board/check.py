@@ -21,12 +21,12 @@ from .rows import CARD, ROWS, Row, read_row, require_whole
 NOT_VOUCHED = ("the player", "which seeds and how many tests", "the price", "what was seen beforehand")
 """Claims of every row that no replay shows."""
 NEVER_SHOWN = (
-    "A replay shows that these macro-actions, from these starts, in this world, have these outcomes. It cannot show who "
-    "chose them: episodes of an oracle or of another agent play again as well. It cannot show the training: neither its "
-    "real episodes and macro-actions nor its CPU seconds. It cannot show which images and tasks were seen before, nor "
-    "which runs were left out because they failed. The agents of a round were filed before its starts were known, so "
-    "none was trained for them; but only someone who trains them again can see that they played: imagine-bench verify "
-    "--train 1, with the commit and the command of the card."
+    "A replay shows that these macro-actions, from these starts, in this world, have these outcomes. It cannot show "
+    "who chose them: episodes of an oracle or of another agent play again as well. It cannot show the training: "
+    "neither its real episodes and macro-actions nor its CPU seconds. It cannot show which images and tasks were seen "
+    "before, nor which runs were left out because they failed. The agents of a round were filed before its starts "
+    "were known, so none was trained for them; but only someone who trains them again can see that they played: "
+    "imagine-bench verify --train 1, with the commit and the command of the card."
 )
 
 
