@@ -25,7 +25,7 @@ from imagine_bench.tasks.scenes.tabletop import add_tabletop
 from imagine_bench.arrays import Floats
 
 EVERY = 4
-"""Timesteps of 5 ms from one row of a motion to the next; between rows the page interpolates linearly."""
+"""Timesteps of 8 ms from one row of a motion to the next; between rows the page interpolates linearly."""
 
 
 _FOR_LATER = re.compile(' input="[a-z]*"')

@@ -136,6 +136,7 @@ def test_words_tell_what_frames_show_and_no_more() -> None:
     told = briefing(SPEC)
     assert all(name in told for name in SPEC.action_names) and SPEC.description in told
     assert "%" not in told and "optimal" not in told
+    assert told in (Path(__file__).parents[4] / "docs/how_to/players.md").read_text(), "the page shows it in full"
 
 
 def test_clockwise_is_what_the_words_say() -> None:
