@@ -17,16 +17,16 @@ from .questions import DEPTH
 Cell = Mapping[str, Any]
 _SHARES = {"right": "right", "unread": "unread", "raised_right": "raised", "painted": "painted", "pairs": "pairs"}
 _SCORES = (
-    "Percent of {pairs} pairs of motions; means over seeds of data and model, [95 % interval] with seven seeds or "
-    "more, else (lowest to highest seed). Right: the motion as planned; the imagined final frame shows the macrostate "
-    "that the simulator ends in. Unread: likewise, but the frame shows nothing of this world. Raised: right for the "
-    "same motion 60 mm higher, which grips nothing. Painted: raised motions of which the model "
-    "paints the end of the planned one. Pairs: both motions are right. Level: what a model is told, the commands or "
-    "the macro-action alone. The simulator's own frames show the reader's errors."
+    "Percent of {pairs} pairs of motions; mean over seeds of data and model, with the 95 % interval in square brackets "
+    "(seven seeds or more), else the lowest and the highest seed in parentheses. right: the imagined image of the "
+    "motion as planned shows the macrostate that the simulator ends in. unread: the reader recognizes nothing in this "
+    "image. raised: right for the same motion 60 mm higher, which grips nothing. painted: the imagined image of the "
+    "raised motion shows the end of the motion as planned. pairs: both motions are right. level: whether the model is "
+    "told the commands, or the macro-action alone. The row simulator shows the errors of the reader."
 )
 _DRIFT = (
-    "Drift: percent of {chains} chains of {depth} planned motions of which every frame so far shows the right "
-    "macrostate; each motion is imagined from the frame imagined before."
+    "Drift: percent of {chains} chains of {depth} planned motions in which every macrostate so far is right. Each "
+    "motion is imagined from the image that was imagined before."
 )
 
 
