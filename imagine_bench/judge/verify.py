@@ -112,7 +112,7 @@ class Replays:
 def _agree(where: str, claimed: Mapping[str, object], found: Sequence[object]) -> None:
     """Raise ArtefactError for the first claim, by name, that differs from the value found in its place."""
     for (name, claim), value in zip(claimed.items(), found, strict=True):
-        require(claim == value, f"{where}{name} is {brief(value)}, and {brief(claim)} was kept.")
+        require(claim == value, f"{where}{name} is {brief(value)}, and the file says {brief(claim)}.")
 
 
 @dataclasses.dataclass
@@ -352,18 +352,18 @@ def verify_tests(
 
 def _compare(kept: KeptEpisodes, again: KeptEpisodes, what: str, first: int = 0) -> None:
     """Raise ArtefactError for the first of all episodes that is not as it was kept; ``first`` is its number."""
-    require(kept.actions.shape == again.actions.shape, f"{what}s are not all of the macro-actions that were kept.")
+    require(kept.actions.shape == again.actions.shape, f"{what}s are not all of the macro-actions in the file.")
     for name, word in _CLAIMS.items():
         claimed = getattr(kept, name)
         replayed = getattr(again, name)
         if claimed is None:  # in an older run
             continue
-        shapes = f"{what}s have {word} of shape {replayed.shape}, and {claimed.shape} was kept."
+        shapes = f"{what}s have {word} of shape {replayed.shape}, and the file has {claimed.shape}."
         require(claimed.shape == replayed.shape, shapes)
         differs = claimed != replayed
         if name == "sim_times_s":
             differs = ~np.isclose(claimed, replayed, rtol=_SAME_TIME)
         if differs.any():
             number = int(differs.reshape(len(differs), -1).any(axis=1).argmax())
-            found = f"the {word} is {replayed[number]}, and {claimed[number]} was kept"
+            found = f"the {word} is {replayed[number]}, and the file says {claimed[number]}"
             raise ArtefactError(f"{what} {first + number}: {found}.")

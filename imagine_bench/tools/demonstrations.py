@@ -325,11 +325,11 @@ def _compare(where: str, kept: Arrays, found: Arrays) -> None:
     for name in (*OUTCOMES, "macrostates"):
         then = kept[name]
         now = found[name]
-        require(then.shape == now.shape, f"{where}: {name} has shape {now.shape}, and {then.shape} was kept.")
+        require(then.shape == now.shape, f"{where}: {name} has shape {now.shape}, and the file has {then.shape}.")
         differs = np.flatnonzero((then != now).reshape(len(then), -1).any(axis=1))
         if len(differs):
             row = int(differs[0])
-            said = f"{name} {row} is {brief(now[row].tolist())}, and {brief(then[row].tolist())} was kept"
+            said = f"{name}[{row}] is {brief(now[row].tolist())}, and the file says {brief(then[row].tolist())}"
             raise ArtefactError(f"{where}: {said}.")
     n_rows = len(kept["proprio"])
     off = np.abs(kept["proprio"] - found["proprio"][:n_rows]).max(axis=1)

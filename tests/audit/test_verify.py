@@ -179,7 +179,7 @@ def test_whatever_is_claimed_of_training_follows_from_its_macro_actions(pair: Pa
     ("claim", "complaint"),
     [
         ({"execution": "physics"}, "the simulated time in seconds is"),
-        ({"settings_digest": "0123456789ab"}, "and '0123456789ab' was kept"),
+        ({"settings_digest": "0123456789ab"}, "and the file says '0123456789ab'"),
         ({"encoder": "other@0123456789ab"}, "it names the encoder other@0123456789ab, and no agent reads latents"),
     ],
 )

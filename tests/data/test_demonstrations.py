@@ -164,7 +164,7 @@ def test_the_command_says_whether_a_folder_holds(tmp_path: Path, capsys: pytest.
     said = capsys.readouterr().out
     assert said == "Holds. 1 of 1 episodes replay from seed and commands to equal rewards and macrostates.\n"
     assert main(["verify", str(tmp_path / "forged")]) == 1
-    assert "rewards 3 is 0.0, and 1.0 was kept" in capsys.readouterr().out
+    assert "rewards[3] is 0.0, and the file says 1.0" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,7 @@ def test_a_forged_success_does_not_hold(tmp_path: Path) -> None:
     assert result is not None
     run_folder.write_metrics(folder, result.checkpoints)
     run_folder.finish(folder)
-    assert "test 0: the success is False, and True was kept" in verify_runs(folder.parents[1])[0].complaint
+    assert "test 0: the success is False, and the file says True" in verify_runs(folder.parents[1])[0].complaint
 
 
 @pytest.mark.parametrize("training", [None, 3])

@@ -71,7 +71,7 @@ def test_a_refused_row_ends_with_exit_code_1(row: Path, capsys: pytest.CaptureFi
     opened.write()
     assert exit_code(["board", "check", str(row.parents[1])]) == 1
     said = capsys.readouterr()
-    assert f"{row.name}: refused: seed 1, after 4 episodes: successes is 1, and 2 was kept." in said.out
+    assert f"{row.name}: refused: seed 1, after 4 episodes: successes is 1, and the file says 2." in said.out
     assert "1 of 1 rows are refused; see above." in said.err
 
 
