@@ -93,7 +93,7 @@ encoder: ready  ## Train an encoder for TASK anew and say how it compares to the
 film: ready  ## Film an episode of TASK as a GIF
 	@$(BIN)/imagine-bench play --film $(options)
 
-doctor: ready  ## Say what this machine has, and in words what is wrong with it
+doctor: ready  ## Describe this machine, and name each fault of it in words
 	@$(BIN)/imagine-bench doctor
 
 test: ready  ## Run the tests, but for those that take minutes each; ARGS goes to pytest

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Runs the tests of environments, rules and fidelity in the current Python, for another MuJoCo than the lock's, and
-# says what differs: each test that fails, in a line.
+# prints each test that fails, in a line.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python -c 'import mujoco; print("MuJoCo", mujoco.__version__)'

@@ -93,7 +93,7 @@ make_venv() {
 
 pip_install() { "$venv/bin/python" -m pip install -qq --disable-pip-version-check --retries 1 "$@"; }
 
-# uv installs in seconds what takes pip a minute. It reads none of pip's settings, so what it cannot find, pip may.
+# uv installs in seconds what takes pip a minute. It reads none of pip's settings, so pip may find a package that uv cannot.
 # Where Python may not write bytecode, the packages are compiled now: otherwise each process compiles torch again.
 install() {
     local uv compile=()

@@ -21,7 +21,7 @@ class Meters:
 
     @contextmanager
     def cpu_time(self, name: str) -> Iterator[None]:
-        """Add the CPU seconds of the block, uncounted: :meth:`count` says what they are a mean of."""
+        """Add the CPU seconds of the block, uncounted: :meth:`count` says by how much they are divided."""
         start = time.process_time()
         yield
         self.add(name, time.process_time() - start, 0.0)

@@ -38,7 +38,7 @@ class Range:
 
 
 def between(low: float, high: float, why: str = "") -> Range:
-    """Numbers from ``low`` to ``high``, both allowed; ``why`` says what is wrong with the others."""
+    """Numbers from ``low`` to ``high``, both allowed; ``why`` is the reason against the others."""
     return Range(lambda value: low <= value <= high, f"must lie in [{low:g}, {high:g}]" + (why and f": {why}"))
 
 

@@ -19,7 +19,7 @@ FACTORS = ("light", "colors", "camera", "pose", "hand")
 """Brightness; colors; the camera's pose; how objects lie at the start; the hand's pose. Each is from 0 to 1."""
 NUISANCES = ("shift", "shadow", "noise", "occlusion", "reward_noise", "reward_steps")
 """A shift of an episode's frames; a soft shadow that moves; the sensor's noise; something in the way; Gaussian noise of
-rewards; one of three rewards by chance. Each is from 0 to 2, and 1 is what ``harsh`` has."""
+rewards; one of three rewards by chance. Each is from 0 to 2, and 1 is the value of ``harsh``."""
 MOST: Mapping[str, float] = {**dict.fromkeys(FACTORS, 1.0), **dict.fromkeys(NUISANCES, 2.0)}
 """The largest value of each factor, in the order in which names hold them."""
 POINTS: Mapping[str, Mapping[str, float]] = {

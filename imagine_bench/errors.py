@@ -123,7 +123,7 @@ class ArtefactError(ImagineBenchError):
 
 
 class SetupError(ImagineBenchError):
-    """The machine lacks something: headless GL, disk space, write permission. Says what to install or change."""
+    """The machine lacks something: headless GL, disk space, write permission. Names the remedy."""
 
 
 @contextlib.contextmanager
@@ -191,7 +191,7 @@ EXTRAS = {
 
 
 def lacking(module: str) -> SetupError:
-    """What to say where a module of an extra is not installed."""
+    """The error where a module of an extra is not installed."""
     return SetupError(f"This needs {module}, which is not installed: pip install 'imagine-bench[{EXTRAS[module]}]'.")
 
 

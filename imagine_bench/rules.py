@@ -251,7 +251,7 @@ class HorizonOptimum:
 
     success: Floats  #: largest success probability with H actions left. Shape (S,).
     returns: Floats  #: expected undiscounted return of that policy. Shape (S,).
-    actions: NDArray[np.int16]  #: what to do with t + 1 actions left. Shape (H, S).
+    actions: NDArray[np.int16]  #: the action to take with t + 1 actions left. Shape (H, S).
 
 
 def horizon_optimum(tables: RuleTables, horizon: int) -> HorizonOptimum:

@@ -249,7 +249,7 @@ class World(abc.ABC):
     def draw_placement_noise(self, rng: np.random.Generator) -> None:
         """Draw where the next macro-action puts objects down: as far off their places as at a start.
 
-        Then no frame tells what was moved before. Without it, objects come down exactly on their places.
+        Then no frame tells which object was moved before. Without it, objects come down exactly on their places.
         """
         self._placement_noise = rng.uniform(-1.0, 1.0, (len(self._placement_noise), 3)).tolist()
 
@@ -283,7 +283,7 @@ class World(abc.ABC):
     def _patch(self, rng: np.random.Generator, *, move_objects: bool) -> None:
         objects, _ = self._objects()
         gesture = self._read_gesture()
-        hidden = self.observed((*objects, gesture))[-1]  # light would tell what is hidden
+        hidden = self.observed((*objects, gesture))[-1]  # light would show the hidden gesture
         self._composite = draw_composite(self.level, objects, hidden, rng)
         for index, (value, fragment) in enumerate(zip(objects, self._composite.objects, strict=True)):
             if move_objects:

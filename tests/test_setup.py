@@ -208,7 +208,7 @@ def test_an_activated_environment_is_not_made_with_itself(ready: Checkout) -> No
 
 @pytest.fixture
 def make() -> Callable[..., tuple[int, str]]:
-    """Exit code and output of make, which only says what it would do."""
+    """Exit code and output of make, which only prints its commands."""
     kept = ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL")  # make's own variables would reach the inner make
     environment = {name: os.environ[name] for name in kept if name in os.environ}
 

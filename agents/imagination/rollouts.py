@@ -243,7 +243,7 @@ class Imagination:
             generator: Draws the outcomes.
             depth: Most steps.
             cut: Whether a rollout ends where the model says that the episode does, or with its first transition that
-                :meth:`admits` discards; else all go on to the end, and :meth:`keeps` says what is kept.
+                :meth:`admits` discards; else all go on to the end, and :meth:`keeps` says which are kept.
         """
         gathered = torch.zeros(len(z), device=z.device)
         for _ in range(depth):

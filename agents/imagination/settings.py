@@ -172,7 +172,7 @@ _FAST_5: dict[str, Override] = {
     "model.reward_hidden": Override((256, 256), "CPU time: 3 x 512 is most of the arithmetic of the thesis' model"),
     "model.termination_hidden": Override((128, 128), "CPU time; and 2 x 256: 13 points less (deviations)"),
     "model.dropout": Override(0.0, "one network with 25 % solves 7 points less (factors)"),
-    "model.members": Override(3, "without dropout, networks that disagree say what the dynamics do not know"),
+    "model.members": Override(3, "without dropout, networks that disagree show where the dynamics are unknown"),
     "model.learning_rate": Override(2e-3, "fewer updates a step want larger ones; 1e-3: 9 points less (deviations)"),
     "model.updates_per_step": Override(4, "CPU time; sixteen alone: no gain shown (deviations)"),
     "model.batch_size": Override(128, "CPU time; 512 alone: no gain shown at 500 (deviations)"),

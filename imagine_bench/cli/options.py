@@ -25,7 +25,7 @@ Repeated = tyro.conf.UseAppendAction[tuple[tuple[T, ...], ...]]
 
 
 def shown(metavar: str) -> object:
-    """How the help shows an option that may be left out; its description says what happens then."""
+    """How the help shows an option that may be left out; its description says the effect."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="(optional)")
 
 

@@ -303,7 +303,7 @@ class Play:
 
 @dataclass(frozen=True, kw_only=True)
 class Serve:
-    """Serve a task over HTTP for language models and other programs, and keep what they play as runs of a bench.
+    """Serve a task over HTTP for language models and other programs, and keep their episodes as runs of a bench.
 
     Plain HTTP, MCP and OpenEnv, without a key, for this machine alone. Needs the plug-in imagine-bench-serving.
     """

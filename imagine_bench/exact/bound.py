@@ -91,7 +91,7 @@ class _Success:
 
 
 def lower_bound(machine: Machine, graph: FactorGraph, horizon: int, share: float = SHARE) -> int:
-    """Before so many transitions no learner's policy solves ``share`` of what the optimum solves, on average."""
+    """Before so many transitions no learner solves ``share`` of the episodes that the optimum solves, on average."""
     cell, count = cells(machine, graph)
     success = _Success(machine, cell, count, horizon)
 

@@ -48,7 +48,7 @@ class _Table:
     """A layer as arrays: N situations, A actions, at most W continuations of each."""
 
     first: Floats  # the largest probabilities. Shape (N,)
-    shown: Ints  # the number of what each situation shows. Shape (N,)
+    shown: Ints  # the number of the observation in each situation. Shape (N,)
     then: Ints  # where the episode goes on. Shape (N, A, W)
     share: Floats  # with these probabilities, 0 for places that are not used. Shape (N, A, W)
     wins: Floats  # Shape (N, A)
@@ -200,7 +200,7 @@ def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int]) -> tuple
 
 
 def _tables(layers: list[_Layer], numbers: dict[State, int]) -> list[_Table]:
-    """The layers as arrays; ``numbers`` are those of what frames show."""
+    """The layers as arrays; ``numbers`` are those of observations."""
     found = []
     following = [*layers[1:], None]
     for layer, after in zip(layers, following, strict=True):

@@ -57,7 +57,7 @@ def begin_episode(agent: object) -> None:
 
 @runtime_checkable
 class MemoryReader(Protocol):
-    """An agent of which can be said what it remembers of an episode; it changes nothing in the agent."""
+    """An agent whose memory of an episode can be read; reading changes nothing in the agent."""
 
     def read_memory(self, frame: Frame, sizes: Sequence[int]) -> Ints:
         """The values that a linear read-out finds in the memory after the frame that was acted on last, or the next.
@@ -178,7 +178,7 @@ class Imaginer(Protocol):
 
 @runtime_checkable
 class FrameReader(Protocol):
-    """An agent that can say what it takes a frame for."""
+    """An agent that can say which macrostate it reads in a frame."""
 
     def read_frames(self, frames: Frame) -> Ints:
         """Macrostates (N, M), as a probe reads them from how frames (N, 64, 64, 3) are encoded; it changes nothing."""

@@ -199,8 +199,8 @@ class Attribution:
     ) -> bool:
         """Whether the episode succeeds where frames are read right and a plan is followed.
 
-        If the agent's action is among equally good ones of the plan, it is the plan's. If it only ``remembers``, what
-        it misread stays misread.
+        If the agent's action is among equally good ones of the plan, it is the plan's. If it only ``remembers``, a
+        misread frame stays misread.
         """
         replaced = episode.misread
         if remembers:
@@ -228,7 +228,7 @@ class Attribution:
 
 
 def _remembered(macrostates: Ints, spec: TaskSpec, states: Sequence[State]) -> Ints:
-    """Macrostates (S, A, B, M) that a model expects; what it expects to be hidden is as in the macrostate before."""
+    """Macrostates (S, A, B, M) that a model expects; a coordinate that it expects to be hidden is as before."""
     values = np.array([len(each) for each in spec.macrostate_values])
     before = np.array(states)[:, None, None]
     hidden = (macrostates < 0) | (macrostates >= values)
@@ -238,7 +238,7 @@ def _remembered(macrostates: Ints, spec: TaskSpec, states: Sequence[State]) -> I
 def memory_suffices(spec: TaskSpec) -> bool:
     """Whether all is known to an agent that remembers an episode's first frame.
 
-    Then no frame is late, the first one shows everything, and what later ones hide does not change.
+    Then no frame is late, the first one shows everything, and coordinates that later ones hide do not change.
     """
     sight = spec.sight
     if sight is None:

@@ -1,4 +1,4 @@
-"""Does a model notice that a rule changed, and does it know what another macro-action would have led to?
+"""Does a model notice that a rule changed, and does it know the outcome of another macro-action?
 
 A change is noticed by the model's surprise, the negative logarithm of the probability that it gives to the next frame,
 as its images are read. A CUSUM detector (Page, 1954) adds up how far surprise lies above its usual level and says so

@@ -392,7 +392,7 @@ def _end_scores(questions: EvalSet, predictions: Predictions) -> Scores:
 
 
 def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Floats, seen: Bools) -> Scores:
-    """How well each uncertainty offered tells what it should."""
+    """How well each uncertainty that a model offers finds its errors."""
     wrong = away > _WRONG
     entropy = np.array([-sum(p * math.log(p) for p in exact.values()) for exact, _ in pairs])
     to_tell = {

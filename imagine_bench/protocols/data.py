@@ -86,7 +86,7 @@ class ProtocolData(ABC):
         """The inverse of :meth:`as_dict`; names of an earlier edition become today's labels."""
         names = data["agents"]
         if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-            return cls(**data)  # which says what is wrong with them
+            return cls(**data)  # its errors name the fault
         edition = edition_of(names, data.get("agent_names", FIRST))
         agents = [agent_label(agent, {"agent_names": edition}) for agent in names]
         return cls(**{**data, "agents": agents, "agent_names": edition})

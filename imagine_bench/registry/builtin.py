@@ -69,7 +69,7 @@ AGENTS: dict[str, AgentEntry] = {
         needs_encoder=False,
         privileged=True,
         observes=OBSERVATIONS,
-        description="Is told what frames show, remembers it, knows the rules, acts optimally: the ceiling, no learner.",
+        description="Is told the content of frames, remembers it, knows the rules, acts optimally: the ceiling.",
     ),
     "dqn": AgentEntry(
         make="imagine_bench.agents.dqn:make",

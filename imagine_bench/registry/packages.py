@@ -1,4 +1,4 @@
-"""Packages that offer anything, by what their metadata says: nothing of them is imported."""
+"""Packages that offer anything, by their metadata: nothing of them is imported."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ _GROUPS = {
 
 
 def describe_group(group: str, *, what: str, kind: type, own: Container[str]) -> None:
-    """Say what packages offer in a group; a room above the registry says it of its own group when it is imported.
+    """Describe the offers in a group; a room above the registry describes its own group when it is imported.
 
     Args:
         group: Name of the group of entry points.

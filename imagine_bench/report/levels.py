@@ -74,7 +74,7 @@ def claims_table() -> Table:
     """The claims of each level."""
     header = ["level", "it supports the claim", "it does not show"]
     rows = [[level.name, level.supports, level.shows_not] for level in LEVELS]
-    return Table("claims", header, rows, "What each level supports, and what it leaves open.", prose=True)
+    return Table("claims", header, rows, "Claims that each level supports, and claims that it leaves open.", prose=True)
 
 
 def film_image(model: str, title: str, spec: TaskSpec, film: Mapping[str, Any], frames: Mapping[str, Pixels]) -> Image:

@@ -175,7 +175,7 @@ def _seal(values: Mapping[str, Json]) -> str:
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever is wrong with the file ``path``, which should be ``what``, into one ArtefactError."""
+    """Turn any error with the file ``path``, which should be ``what``, into one ArtefactError."""
     try:
         yield
     except ArtefactError:  # of a file that this one names

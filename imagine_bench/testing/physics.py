@@ -1,4 +1,4 @@
-"""``imagine-bench check TASK --physics``: does physics do what the rules say, and how nearly does it fail?
+"""``imagine-bench check TASK --physics``: does physics follow the rules, and how nearly does it fail?
 
 Fidelity is measured on long random walks beside a perfect execution. Margins are how far each setting that makes a
 grasp hold may go before macro-actions fail.

@@ -53,7 +53,7 @@ class Check(pytest.Item):
             pytest.skip(str(why))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """The sentence that says what is wrong; of an error that is not ours, where it happened."""
+        """The sentence that names the fault; of an error that is not ours, where it happened."""
         if isinstance(excinfo.value, ImagineBenchError):
             return str(excinfo.value)
         return super().repr_failure(excinfo, style)

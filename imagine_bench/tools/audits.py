@@ -220,7 +220,7 @@ def why_report(folder: Path | None, *, root: Path, task: str | None, encoder: st
     """Find the one cause of every failed test of a bench's learners, keep them, and write its report anew.
 
     The bench is as in :func:`chosen`, ``encoder`` as in :func:`imagine_bench.running.trained.load_trained`.
-    Returns what to print.
+    Returns the text to print.
 
     Raises:
         ImagineBenchError: No bench, or none with an agent that can be taken up again.

@@ -100,7 +100,7 @@ def collect(
         raise InvalidValueError(f"episodes is {episodes} and seed {seed}; give {allowed}.")
     look = appearance_name(appearance)
     settings = DemonstrationSettings(task=task, policy=policy, seed=seed, appearance=look, size=size)
-    stage(task, look, size)  # tells what is wrong before any process begins
+    stage(task, look, size)  # raises its errors before any process begins
     with new_folder(folder, format) as partial:
         (partial / "episodes").mkdir()
         files = [partial / f"episodes/{index:06}.npz" for index in range(episodes)]

@@ -40,7 +40,7 @@ addopts = ["--imagine-bench-{kind}={name}"]
 def new_package(kind: str, name: str, out: Path) -> str:
     """Write ``out/<name>/``: ``pyproject.toml``, and ``src/<name>.py``, which passes the checks as it is.
 
-    Returns what to do next.
+    Returns the next steps, in words.
 
     Raises:
         UnknownNameError: Another kind than those of :data:`KINDS`.

@@ -41,7 +41,7 @@ class Turn:
 
 @dataclass(frozen=True, kw_only=True)
 class Arrows(WorldParameters):
-    """A world; its canonical name says what differs from the defaults.
+    """A world; its canonical name says the parameters that differ from the defaults.
 
     Raises:
         InvalidValueError: A value of the wrong type or out of its range, or values that contradict each other.

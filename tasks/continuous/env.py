@@ -35,8 +35,9 @@ SLOWEST_HZ = 5.0
 """In a longer period the wrist could turn a cube past a quarter and on to the next one unseen."""
 REWARDS = ("sparse", "dense")
 SECONDS_PER_MACRO_ACTION = 3.0
-"""An episode is truncated after so many seconds for each macro-action of the task's horizon: 1.3 times what planned
-motions take in the arrow puzzle from wherever the hand may be, and twice in pick-and-place (docs: certificates)."""
+"""An episode is truncated after so many seconds for each macro-action of the task's horizon: 1.3 times the time
+of planned motions in the arrow puzzle from wherever the hand may be, and twice in pick-and-place (docs: certificates).
+"""
 _LET_GO_M = 0.003
 """A grip is over when each finger is told to be so much further apart than before, and touches nothing."""
 

@@ -122,7 +122,7 @@ class CarryExecutor(MacroExecutor):
     ) -> MacroResult:
         """Reach for ``place_m`` with object ``held`` or nothing, and come back with ``then``; a visit if they are one.
 
-        ``near`` is a solution nearby, and ``why`` says what it means where the place cannot be reached.
+        ``near`` is a solution nearby, and ``why`` says the consequence where the place cannot be reached.
         """
         before_m = REST_OPENING_M if held is None else OBJECTS[held].squeeze_m
         after_m = REST_OPENING_M if then is None else OBJECTS[then].squeeze_m

@@ -193,7 +193,7 @@ class WorldParameters:
 
 
 class WorldRules(Rules):
-    """The macrostate machine of a world with parameters; a task says what its macro-actions do without them."""
+    """The macrostate machine of a world with parameters; a task gives the effects of its macro-actions without them."""
 
     world: WorldParameters
 

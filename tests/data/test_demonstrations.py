@@ -1,4 +1,4 @@
-"""Demonstrations of continuous control: what happened, in each format the same, and only that replays."""
+"""Demonstrations of continuous control: the same motion in each format, and only that replays."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Tables of the pages, recomputed from docs/results.
 
-A comment before a table names its folders and says what its cells are, in the words of :data:`.CELLS`, a call a column:
+A comment before a table names its folders and describes its cells, in the words of :data:`.CELLS`, a call a column:
 
     <!-- table: A=arrow_puzzle-quick; iqm(@,A/dqn)|average(@,A/random) -->
 

@@ -1,4 +1,4 @@
-"""Every table of README and docs says what docs/results and the thesis' data say."""
+"""Every table of README and docs has the numbers of docs/results and of the thesis' data."""
 
 from __future__ import annotations
 

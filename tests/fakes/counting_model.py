@@ -171,7 +171,7 @@ class RuledModel:
 
 
 def ruled(task: TaskSpec, *, filtered: bool = True, uncertain: Collection[tuple[State, int]] = ()) -> Imagination:
-    """What :class:`RuledModel` imagines."""
+    """The imagination of :class:`RuledModel`."""
     model = RuledModel(task, uncertain)
     settings = Settings(imagination=ImaginationSettings(temperature=0.0, threshold=0.3, weight_samples=T))
     size, n = model.latent_size, task.n_actions

@@ -152,7 +152,7 @@ class Processes:
         return self.start(suite, core, str(WORKERS / suite.worker), mode, images, f"{number:g}", *suite.arguments)
 
     def measured(self, suite: Suite, mode: str, images: str, number: float) -> dict[str, float | str]:
-        """What a worker prints."""
+        """The output of a worker."""
         found: dict[str, float | str] = json.loads(
             _last_line(suite, self.worker(suite, self.core, mode, images, number))
         )

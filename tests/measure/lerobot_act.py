@@ -33,7 +33,7 @@ CAMERAS = ("hand", "front")
 
 
 def trained(dataset: LeRobotDataset) -> tuple[ACTPolicy, Any, Any]:
-    """ACT after some training steps, and what goes before and behind it."""
+    """ACT after some training steps, and the steps before and behind it."""
     features = dataset_to_policy_features(dataset.meta.features)
     outputs = {name: each for name, each in features.items() if each.type is FeatureType.ACTION}
     inputs = {name: each for name, each in features.items() if name not in outputs}

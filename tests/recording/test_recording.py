@@ -116,7 +116,7 @@ class _HandsOver(FakeImaginer):
 
 
 class _SeesAndExplores(FakeAgent):
-    """Has learned to see, in two steps, and says what it does not know of its actions."""
+    """Has learned to see, in two steps, and says how unknown each action is."""
 
     def perceived(self) -> list[Perceived]:
         return [Perceived(n, (2,) * n, np.full((8, 8, 3), n, dtype=np.uint8)) for n in (0, 3)]

@@ -6,7 +6,11 @@ from collections.abc import Sequence
 
 _ARROWS = "tests/tasks/arrows/test_arrow_rules.py"
 _PICK_PLACE = "tests/tasks/pick_place/test_pick_place_rules.py"
-_WORLDS = ("tests/tasks/parameters/test_parameters.py", "tests/tasks/arrows/test_many_cubes.py")
+_WORLDS = (
+    "tests/tasks/arrows/test_arrow_oracle.py",
+    "tests/tasks/parameters/test_parameters.py",
+    "tests/tasks/arrows/test_many_cubes.py",
+)
 _FACTORED = tuple(
     f"agents/guests/factored/tests/test_{name}.py"
     for name in ("factored_formulas", "factored", "learned", "transfer", "memory", "slips", "rewards", "worlds")
@@ -17,7 +21,13 @@ ROOMS: dict[str, dict[str, Sequence[str]]] = {
     "rules": {
         "tasks/arrows/rules.py": (_ARROWS, *_WORLDS),
         "tasks/pick_place/rules.py": (_PICK_PLACE,),
-        "imagine_bench/rules.py": ("tests/test_rules.py", _ARROWS, _PICK_PLACE, "tests/exact/test_optimum.py"),
+        "imagine_bench/rules.py": (
+            "tests/test_rules.py",
+            _ARROWS,
+            _PICK_PLACE,
+            "tests/exact/test_optimum.py",
+            "tests/judge/test_truth.py",
+        ),
     },
     "filter": {
         "agents/imagination/filter.py": (
@@ -46,7 +56,6 @@ ROOMS: dict[str, dict[str, Sequence[str]]] = {
             "tests/report/test_report_data.py",
             "tests/report/test_filmstrips.py",
             "tests/report/test_report.py",
-            "tests/contract/test_guests.py",
         ),
     },
     "own agent": {

@@ -1,10 +1,10 @@
 """Plants small bugs, one at a time, and counts those that a test notices: ``make mutants``.
 
-cosmic-ray says what can be changed in the files below. Of all the places a sample is drawn, as many a room, and at
-each place one of its changes. Each is made in a copy of the checkout, where the tests of its file run until one fails.
-Tried mutants are kept as they come in ``build/mutants.jsonl``: the same command goes on there, and tries again those
-that no test noticed. In the end ``build/mutants.json`` holds the counts and ``build/mutants.csv`` all that was tried,
-with the reason why a survivor may live, as far as ``mutants_that_may_live.json`` gives one.
+cosmic-ray lists the possible changes in the files of ``mutant_rooms.py``. Of all the places a sample is drawn, as many
+a room, and at each place one of its changes. Each is made in a copy of the checkout, where the tests of its file run
+until one fails. Tried mutants are kept as they come in ``build/mutants.jsonl``: the same command goes on there, and
+tries again those that no test noticed. In the end ``build/mutants.json`` holds the counts and ``build/mutants.csv`` all
+that was tried, with the reason why a survivor may live, as far as ``mutants_that_may_live.json`` gives one.
 """
 
 from __future__ import annotations

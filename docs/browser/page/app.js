@@ -349,7 +349,7 @@ class Page {
     this.game.reset([...episode.start]);
     this.#begin();
     this.queue = episode.actions.map((action, at) => ({ action, reached: episode.states[at] }));
-    this.#say({ text: `Playing what ${this.row.title} did.`, tone: '' });
+    this.#say({ text: `Playing the episode of ${this.row.title}.`, tone: '' });
     this.#update();
   }
 }

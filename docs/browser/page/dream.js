@@ -45,11 +45,11 @@ export class Dream {
     this.latents = this.model.encode(this.real.getImageData(0, 0, WHOLE, WHOLE).data);
     this.turns = 0;
     this.#showImagined();
-    this.#say('The model has just seen this frame. Turn a cube: it will imagine what comes.');
+    this.#say('The model has just seen this frame. Turn a cube: it will imagine the next frame.');
   }
 
   /**
-   * Imagine a macro-action, and say what was expected of it.
+   * Imagine a macro-action, and say the expected outcome.
    * @param {import('./rules.js').Turn[]} turns
    * @param {number} row of the macrostate that was reached
    * @param {import('./rules.js').Outcome} outcome

@@ -1,4 +1,4 @@
-// One episode after another in a world: who may do what, what it led to, and how it ended. No page, no drawing.
+// One episode after another in a world: whose turn it is, the outcome of each turn, and how it ended. No page, no drawing.
 
 /**
  * Numbers in [0, 1) that repeat with their seed (Mulberry32).
@@ -51,7 +51,7 @@ export class Game {
   }
 
   /**
-   * What a macro-action shall lead to.
+   * The outcome that a macro-action shall have.
    * @param {number} action
    * @returns {{outcome: import('./rules.js').Outcome, slips: boolean}}
    */

@@ -160,7 +160,7 @@ export class WorldModel {
   }
 
   /**
-   * What the model expects of a macro-action.
+   * The outcome that the model expects of a macro-action.
    * @param {Float32Array} latents
    * @param {number} action
    * @returns {{latents: Float32Array, reward: number, ends: number, disagreement: number}}

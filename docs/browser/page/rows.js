@@ -71,7 +71,7 @@ function checkEpisode(rules, episode, index) {
 
 /**
  * A row, checked.
- * @param {any} given what was read from its file
+ * @param {any} given the content of its file
  * @returns {Row}
  */
 export function readRow(given) {

@@ -201,7 +201,7 @@ export class View {
   /**
    * @param {any} drawn a program
    * @param {number[]} groups
-   * @param {boolean} casts whether only what casts a shadow is drawn
+   * @param {boolean} casts whether only bodies that cast a shadow are drawn
    */
   #drawParts(drawn, groups, casts) {
     const { gl } = this;

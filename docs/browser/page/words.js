@@ -1,4 +1,4 @@
-// What the page says about a world and about what happened.
+// The words of the page about a world and about its episodes.
 
 import { FAMILY } from './constants.js';
 
@@ -14,7 +14,7 @@ export function percent(share) {
 }
 
 /**
- * The goal in one sentence, and what is forbidden.
+ * The goal in one sentence, and the forbidden turns.
  * @param {import('./rules.js').Rules} rules
  * @returns {string}
  */
@@ -31,7 +31,7 @@ export function goalOf(rules) {
 }
 
 /**
- * What makes the world harder than the plain one.
+ * The parameters that make the world harder than the plain one.
  * @param {import('./world.js').World} world
  * @returns {string}
  */

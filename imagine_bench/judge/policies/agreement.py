@@ -32,7 +32,7 @@ def dense(model: Model) -> DenseModel:
 
 
 def of_actions(model: DenseModel, values: Floats) -> Floats:
-    """The expected return of each macro-action, where ``values`` (..., S) are those of what follows. (..., S, A)."""
+    """The expected return of each macro-action, where ``values`` (..., S) are those of the next ones. (..., S, A)."""
     return model.reward + np.tensordot(values, model.onward, axes=(-1, 2))
 
 

@@ -38,7 +38,7 @@ class PolicySet(NamedTuple):
 
 
 class PolicyWorld(NamedTuple):
-    """A world's policies, and what they are worth in it."""
+    """A world's policies, and their values in it."""
 
     states: tuple[State, ...]  # length S
     starts: Floats  # probability of each macrostate at the start of an episode. Shape (S,).

@@ -1,4 +1,4 @@
-"""Families of questions about a whole world: what is shown, the possible answers, and the probability of each answer.
+"""Families of questions about a whole world: the shown frames, possible answers, and the probability of each answer.
 
 A question has C possible answers, in an order that was drawn. Its exact probabilities are the answer of the rules'
 table, and a model's answer is that of the model's table, so a model that is exact in every single macro-action is exact
@@ -41,7 +41,7 @@ class Family(Protocol):
 
     @property
     def options(self) -> Ints:
-        """What each answer stands for, in the order that is shown. Shape (N, C)."""
+        """The meaning of each answer, in the order that is shown. Shape (N, C)."""
 
     def answer(self, table: TransitionTable) -> Floats:
         """The probability of each answer by a table. Shape (N, C)."""

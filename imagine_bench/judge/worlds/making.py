@@ -223,7 +223,7 @@ def _where(chosen: Bools, one: Transitions, other: Transitions) -> Transitions:
 
 
 def _single_causes(world: _World, names: Sequence[str], *, looks: bool) -> list[Family]:
-    """Pairs of starts that differ in one coordinate, or only in how they look; and what each cause changes."""
+    """Pairs of starts that differ in one coordinate, or only in how they look; and the effects of each cause."""
     play = world.coordinates[: world.n_states]
     differ = play[:, None] != play[None]  # [S, S, M]
     alone = {name: differ[..., i] & (differ.sum(axis=2) == 1) for i, name in enumerate(names)}

@@ -236,7 +236,7 @@ class _Worker(Generic[Item, News]):
 
     @property
     def sources(self) -> list[Connection | int]:
-        """What to wait for."""
+        """The pipe and the end of the process, to wait for."""
         return [self._pipe, self.process.sentinel]
 
     def begin(self, item: Item) -> None:

@@ -52,7 +52,7 @@ class Hand:
         tilt_deg: float | None = None,
         seconds: float = 0.8,
     ) -> Hand:
-        """Move there smoothly; what is None stays."""
+        """Move there smoothly; a value of None stays."""
         to_m = self.at_m.copy()
         for axis, value in enumerate((x_m, y_m, None if height_m is None else TABLE_HEIGHT_M + height_m)):
             if value is not None:

@@ -40,7 +40,7 @@ SMALL: dict[str, Any] = {
 
 
 class FakeEncoder:
-    """What :class:`imagine_bench.agents.encoders.encoder.Encoder` offers."""
+    """The methods of :class:`imagine_bench.agents.encoders.encoder.Encoder`."""
 
     latent_size = LATENTS
     device = torch.device("cpu")

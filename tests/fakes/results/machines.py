@@ -56,7 +56,7 @@ class Wheels:
 
 @dataclass(frozen=True, kw_only=True)
 class Glimpse:
-    """What frames show of :class:`Wheels`: the finger always, in the first frame only, or with a probability."""
+    """The observation model of :class:`Wheels`: the finger always, in the first frame only, or with a probability."""
 
     finger: str | float = "always"
     lag: int = 0

@@ -179,7 +179,7 @@ def wall(make: Make, images: Images, seconds: float) -> dict[str, float]:
 
 
 def run(make: Make) -> None:
-    """Do what the arguments say and print it."""
+    """Measure as the arguments say, and print it."""
     mode, images, number = sys.argv[1:4]
     modes = {
         "steps": lambda: steps(make, Images.of(images), float(number)),

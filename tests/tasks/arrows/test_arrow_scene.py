@@ -65,7 +65,7 @@ def test_a_cube_off_its_place_is_a_problem(world, change, problem):
     assert reading.macrostate[1] == 0
 
 
-# --- what the camera sees ----------------------------------------------------------------------------------------
+# --- the camera's frames -----------------------------------------------------------------------------------------
 
 
 def test_the_arm_is_out_of_the_agent_s_view(world, camera):

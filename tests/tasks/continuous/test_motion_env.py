@@ -1,4 +1,4 @@
-"""Continuous control: what motions do to macrostates, and what no motion can do."""
+"""Continuous control: the effects of motions on macrostates, and effects that no motion can have."""
 
 from __future__ import annotations
 
@@ -232,7 +232,7 @@ def test_the_dense_reward_sums_to_the_sparse_one_less_the_potential_of_the_start
 
 @pytest.mark.parametrize("family", ["arrows", "pick_place"])
 def test_a_grip_that_slips_leaves_the_object_where_it_is(family: str) -> None:
-    """Of 14 grips each slips or not, as drawn; what slips is no event and no fault, what holds is its macro-action."""
+    """Of 14 grips each slips or not, as drawn; a slip is no event and no fault, a firm grip is its macro-action."""
     env, expert = environment(family, slip=0.5, **(FREE if family == "arrows" else {}))
     slipped = 0
     for seed in range(14):
@@ -303,7 +303,7 @@ def test_macro_actions_and_certificates_refuse_a_placement() -> None:
 
 
 def test_a_turn_about_the_hand_leaves_its_place() -> None:
-    """By hand twist, half a turn a second: what is gripped is not dragged aside."""
+    """By hand twist, half a turn a second: a gripped object is not dragged aside."""
     env, _ = environment("arrows")
     env.reset(seed=0)
     before_m = env.data.site_xpos[env.world.model.site("tcp").id].copy()
@@ -339,7 +339,7 @@ def test_the_least_time_of_a_macro_action_follows_from_heights_and_the_largest_t
 
 @pytest.mark.parametrize("axis", [2, 5])
 def test_the_hand_keeps_to_the_largest_twist(axis: int) -> None:
-    """At full speed, down or about the vertical, from rest at the observation pose: what the least time assumes."""
+    """At full speed, down or about the vertical, from rest at the observation pose: the least time assumes this."""
     env, _ = environment("arrows")
     env.reset(seed=0)
     site = env.world.model.site("tcp").id

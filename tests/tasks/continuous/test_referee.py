@@ -281,7 +281,7 @@ class ToldReferee(Referee):
 def test_an_event_is_a_macro_action_or_says_what_else_it_is(
     before: State, touched: tuple[int, ...], prepare: Callable[[MotionEnv], None], fault: str | None
 ) -> None:
-    """The scene stands as the start says; the macrostate before says what it came from."""
+    """The scene stands as the start says; the macrostate before says where it came from."""
     env = free()
     env.reset(seed=0, options={"macrostate": START})
     prepare(env)
@@ -467,7 +467,7 @@ def test_no_motion_earns_more_than_the_best_macro_actions(guard: str) -> None:
 
 
 def best_of_these_gestures(env: MotionEnv, start: State) -> float:
-    """The return of doing what the human asks for, whose gestures are drawn as in the episode of seed 0.
+    """The return of fulfilling the human's wishes, whose gestures are drawn as in the episode of seed 0.
 
     Whatever they do not ask for ends the episode with less than nothing, so no other macro-actions earn more.
     """

@@ -69,7 +69,7 @@ def test_a_gesture_is_seen_as_often_as_said(id_):
 @pytest.mark.parametrize("execution", ["kinematic", "physics"])
 @pytest.mark.parametrize(("id_", "parameters"), [(IDS[0], {"gesture": 0.5}), (IDS[1], {"lag": 1})])
 def test_what_was_moved_stands_as_if_it_never_was(id_, parameters, execution):
-    """Its pose is spread as after a reset, else frames would tell what memory should; a turn's yaw is off by 1 degree.
+    """Its pose is spread as after a reset, else frames would replace memory; a turn's yaw is off by 1 degree.
 
     Where nothing is hidden it stands on its place.
     """

@@ -235,7 +235,7 @@ def test_a_gripper_that_has_let_go_is_open_in_both_executions(state, action):
         env.close()
 
 
-# --- what the camera sees ----------------------------------------------------------------------------------------
+# --- the camera's frames -----------------------------------------------------------------------------------------
 
 
 def pixels(frame, color):

@@ -1,4 +1,4 @@
-"""The images of continuous control: they show what matters, and leave physics and other views as they are."""
+"""The images of continuous control: they show hand and objects, and leave physics and other views as they are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nuisances: each changes what it says, by as much as it says, and nothing else; other appearances stay to the bit."""
+"""Nuisances: each changes its own property, by its own amount, and nothing else; other appearances stay to the bit."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_noisy_rewards_are_on_average_those_of_the_rules(given):
 
 
 def test_truth_stays_as_it_is():
-    """Macrostates, ends and what is legal are those without nuisances; so chance and optimum are, too."""
+    """Macrostates, ends and legal states are those without nuisances; so chance and optimum are, too."""
     walks = []
     for given in ("clean", "harsh"):
         with make(given) as env:

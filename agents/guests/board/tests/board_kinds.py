@@ -22,7 +22,7 @@ from imagine_bench.seeding import episode_seed
 PLAYER = "the player"
 SEEDS = "which seeds and how many tests"
 PRICE = "the price"
-BEFOREHAND = "what was seen beforehand"
+BEFOREHAND = "the data seen beforehand"
 
 
 def edited_card(f: BoardForger) -> OpenRow:

@@ -1,4 +1,4 @@
-"""Rows of a leaderboard: what is written is read again, the check plays it, and hostile files get one sentence."""
+"""Rows of a leaderboard: a written row is read again, the check plays it, and hostile files get one sentence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``factored`` remembers of an episode: chosen by evidence alone, and worth as much as it should be."""
+"""The memory of ``factored`` within an episode: chosen by evidence alone, and worth as much as it should be."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def test_it_queries_what_is_uncertain_and_learns_no_dynamics() -> None:
     assert isinstance(learner, QueryingAgent)
     assert learner.query(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
     live(learner, range(12), np.random.default_rng(0))
-    learner.learn()  # what was expected too
+    learner.learn()  # the expected outcome, too
 
     def unknown() -> float:
         given = {"actions": np.array([0]), "depth": 1, "rng": np.random.default_rng(0)}
@@ -133,7 +133,7 @@ def test_it_queries_what_is_uncertain_and_learns_no_dynamics() -> None:
 def test_what_has_no_label_teaches_nothing_and_is_not_asked_again() -> None:
     learner = agent()
     live(learner, range(12), np.random.default_rng(0))
-    learner.learn()  # what was expected too
+    learner.learn()  # the expected outcome, too
     seen, asked = Observation(frame=frame((0, 1, 1))), []
     values = learner.q_values(seen)
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""What ``factored`` finds in frames of worlds that are hard to see."""
+"""Factors that ``factored`` finds in frames of worlds that are hard to see."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ def test_a_point_moves_with_the_thing_that_it_marks() -> None:
 
 
 class Watching(Clone):
-    """Gives one command only, and keeps what it saw."""
+    """Gives one command only, and keeps its observations."""
 
     def __init__(self) -> None:
         self.about = {"observation": "front,proprio", "size_px": 32}

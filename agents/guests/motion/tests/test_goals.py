@@ -37,7 +37,7 @@ def test_a_goal_is_reached_by_the_optimal_macro_actions_alone(task: str, start: 
     desired = np.array([each["desired_goal"] for _, each in rewards])
     np.testing.assert_array_equal(goals.compute_reward(achieved, desired, {}), [reward for reward, _ in rewards])
     assert rewards[0][0] == -1.0
-    assert info["is_success"] or task == "pick_place"  # what the human asks for next is a matter of chance
+    assert info["is_success"] or task == "pick_place"  # the human's next wish is a matter of chance
     relabelled = goals.compute_reward(achieved, np.broadcast_to(achieved[-1], achieved.shape), {})
     assert relabelled[-1] == 0.0
     assert relabelled[0] == -1.0

@@ -1,4 +1,4 @@
-"""Programs in a file: what they may do, their exactness, their names, and benches and judgements of them."""
+"""Programs in a file: their limits, their exactness, their names, and benches and judgements of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ARROWS = Path(__file__).parents[1] / "examples" / "arrows.py"
 SIZES = (4, 4, 4, 3)
 STATE = (0, 1, 2, 0, 0)
 REACHES = "import collections\ncollections._sys.modules"
-"""Loaded modules, past the checked import: what they do is refused by the audit hook."""
+"""Loaded modules, past the checked import: the audit hook refuses their calls."""
 HOSTILE = {
     "hangs": ("while True: pass", "it was stopped after 6 s, the limit of a call."),
     "hangs when it is asked": ("def outcomes(s, a):\n while True: pass", "it was stopped after 6 s"),

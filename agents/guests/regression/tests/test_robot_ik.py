@@ -96,7 +96,7 @@ def test_sample_counts_out_of_range_name_the_range(variant: str) -> None:
 
 
 def test_decisions_are_carried_out_by_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of networks that say what they like: the arm rests where equation 4.29 puts the joints, and misses by that."""
+    """Of networks with any output: the arm rests where equation 4.29 puts the joints, and misses by that."""
 
     def predict(points: np.ndarray, purpose: str) -> Prediction:
         shape, rng = points.shape[:2], np.random.default_rng(len(purpose))

@@ -85,7 +85,7 @@ def ask(one: Server, path: str, body: object = None, **headers: str) -> tuple[in
 
 
 class Reader:
-    """Plays by the words alone: it knows the rules of a task, and finds the macrostate in what it is told."""
+    """Plays by the words alone: it knows the rules of a task, and finds the macrostate in the text."""
 
     def __init__(self, spec: TaskSpec) -> None:
         self._spec = spec

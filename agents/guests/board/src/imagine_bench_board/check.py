@@ -18,7 +18,7 @@ from imagine_bench.seeding import Purpose, evaluation_split
 from . import rounds
 from .rows import CARD, ROWS, Row, read_row, require_whole
 
-NOT_VOUCHED = ("the player", "which seeds and how many tests", "the price", "what was seen beforehand")
+NOT_VOUCHED = ("the player", "which seeds and how many tests", "the price", "the data seen beforehand")
 """Claims of every row that no replay shows."""
 NEVER_SHOWN = (
     "A replay shows that these macro-actions, from these starts, in this world, have these outcomes. It cannot show "
@@ -32,7 +32,7 @@ NEVER_SHOWN = (
 
 @dataclass(frozen=True, kw_only=True)
 class Checked:
-    """A row and what was found."""
+    """A row and its verdict."""
 
     verdict: Verdict
     row: Row | None = None  #: None where it was refused

@@ -37,7 +37,7 @@ ROWS = "rows"
 LARGEST = {CARD: 1 << 18, EPISODES: 1 << 23}
 """The files of a row, and the most bytes that each may have."""
 NAME = re.compile(r"[a-z0-9][a-z0-9_.,=-]{0,79}")
-"""Names of rows and rounds: what every file system and every address on the web takes as it is."""
+"""Names of rows and rounds: of characters that every file system and every address on the web takes as they are."""
 _LONGEST = 300
 """Characters of a claim."""
 
@@ -189,7 +189,7 @@ def require_files(folder: Path) -> None:
 
 
 def read_row(folder: Path) -> Row:
-    """Read a row; nothing is played. Raises ArtefactError: it is damaged, or not what a row may hold."""
+    """Read a row; nothing is played. Raises ArtefactError: it is damaged, or holds more than a row may."""
     require_files(folder)
     card = read_json(folder / CARD, "the card of a row")
     with reading(folder / CARD, f"a card of the format {FORMAT!r}"):

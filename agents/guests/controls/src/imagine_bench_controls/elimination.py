@@ -46,7 +46,7 @@ def value_sets(state: State, most: int) -> list[Values]:
 
 
 class EliminationModel:
-    """What leads where, and what brings which outcome, as far as the transitions so far decide it."""
+    """The effects and outcomes of macro-actions, as far as the transitions so far decide them."""
 
     def __init__(self) -> None:
         self._moves: dict[tuple[int, int, int], Counter[int]] = {}
@@ -135,7 +135,7 @@ class EliminationAgent:
         self._plans = {}
 
     def _values(self, observation: Observation, *, explore: bool) -> Floats:
-        """Values (A,); what is unknown is worth the largest reward seen, and in tests 0."""
+        """Values (A,); an unknown outcome is worth the largest reward seen, and in tests 0."""
         state = true_state(observation)
         plan = self._plans.setdefault(explore, {})
         if state not in plan:

@@ -2,8 +2,8 @@
 
 All that it sees is remembered, up to a bound. As soon as something has no known value, or much more was seen, factors
 and values are found anew (:mod:`.appearance`), remembered transitions get their codes anew, and dynamics and outcomes
-are learned from them once more: nothing that happened is lost. Then it also decides what it had better remember of an
-episode (:func:`.model.choose`). Once as many frames are remembered as may be, perception stays as it is.
+are learned from them once more: nothing that happened is lost. Then it also chooses the factors of an episode that it
+remembers (:func:`.model.choose`). Once as many frames are remembered as may be, perception stays as it is.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class Results(NamedTuple):
     p_continues: Floats  #: probability that this branch comes about and the episode goes on. Shape (N, A, B).
     reward: Floats  #: expected reward. Shape (N, A), as of all that follow.
     p_terminated: Floats  #: probability that the episode ends
-    unknown: Floats  #: probability that something untested decides what happens
+    unknown: Floats  #: probability that something untested decides the outcome
 
 
 class FactoredModel:
@@ -130,7 +130,7 @@ class FactoredModel:
         return following, np.where(untried, 0.0, sure)
 
     def untested(self, codes: Codes, following: Codes) -> Floats:
-        """P(something untested decides what actions from ``codes`` (N, P) to codes (N, A, P) bring). Shape (N, A)."""
+        """P(something untested decides the steps from ``codes`` (N, P) to codes (N, A, P)). Shape (N, A)."""
         count, actions, factors = following.shape
         before = np.repeat(codes, actions, axis=0)
         after = following.reshape(-1, factors)

@@ -145,7 +145,7 @@ class Causes(NamedTuple):
 
 
 class OutcomeModel:
-    """Predicts outcomes, of those seen so far, and says what is untested."""
+    """Predicts outcomes, of those seen so far, and names the untested causes."""
 
     def __init__(self, sizes: tuple[int, ...], n_actions: int, settings: OutcomeSettings) -> None:
         self.settings = settings

@@ -124,7 +124,7 @@ def collect(
 
 
 class Turn(NamedTuple):
-    """What is demonstrated next."""
+    """The next demonstration."""
 
     appearance: int  #: its place among the appearances
     macro_action: int

@@ -69,7 +69,7 @@ class Served:
             raise InvalidValueError(f"it has no function {FUNCTION}(symbols, action).")
         self._remembers = len(inspect.signature(self._function).parameters) > 2
         self._memories: list[Hashable] = [None]
-        """What the program wants to be remembered, by number; a new episode begins with number 0."""
+        """The memory of the program, by number; a new episode begins with number 0."""
         self._numbers: dict[Hashable, int] = {None: 0}
 
     def facts(self) -> Arrays:

@@ -32,7 +32,7 @@ Answer = dict[str, Json]
 
 @dataclass(frozen=True, kw_only=True)
 class Served:
-    """What a server serves: the world, the episodes of each player, and what players are shown."""
+    """The choices of a server: the world, the episodes of each player, and the form of observations."""
 
     task: str | None
     observation: str = OBSERVATIONS[0]  #: ``"words"`` or ``"png"``

@@ -80,7 +80,7 @@ class Handler(BaseHTTPRequestHandler):
         """Say nothing; the episodes are the record."""
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuse what the library refuses, such as a request line that is none, in the same form."""
+        """Refuse requests that the library refuses, such as a request line that is none, in the same form."""
         del explain
         self.close_connection = True
         self._send(HTTPStatus(code), {"error": f"{message or HTTPStatus(code).phrase}."})
@@ -131,7 +131,7 @@ class Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, act(_mapping(self._body())))
 
     def _require_own_page(self) -> None:
-        """Refuse what a browser sends for a page of another origin, also where its name now leads to this machine."""
+        """Refuse requests of a page of another origin, also where its name now leads to this machine."""
         host = _split(f"//{self.headers.get('Host', '')}").hostname
         origin = self.headers.get("Origin")
         if cast("Server", self.server).is_local and host not in _LOCAL:

@@ -8,7 +8,7 @@ import struct
 from io import BufferedIOBase
 
 _MAGIC = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
-"""What a server adds to the client's key, RFC 6455, section 1.3."""
+"""The text that a server adds to the client's key, RFC 6455, section 1.3."""
 _TEXT = 1
 _CLOSE = 8
 _PING = 9
@@ -31,8 +31,8 @@ class TextSocket:
     """Text messages over an open connection.
 
     Args:
-        incoming: What the client sends.
-        outgoing: What it is sent.
+        incoming: The bytes from the client.
+        outgoing: The bytes to the client.
         most_bytes: Bytes of the longest message that is taken.
     """
 

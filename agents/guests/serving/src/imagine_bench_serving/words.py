@@ -1,8 +1,8 @@
-"""A task in words, for whoever answers in words: the goal, what macro-actions do, and what a frame shows.
+"""A task in words, for whoever answers in words: the goal, the effects of macro-actions, and the content of a frame.
 
-The words of a moment tell what a probe with perfect eyes reads in the frame of that moment, and nothing else: the value
-of each coordinate of the macrostate, or that it is not seen. They tell no rule that the description of the task does
-not, no plan, and no probability.
+The words of a moment tell the value of each coordinate of the macrostate in the frame of that moment, as a perfect
+probe reads it, or that the coordinate is not seen; nothing else. They tell no rule that the description of the task
+does not, no plan, and no probability.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _OF_TASKS = {
     "pick_place": "The ball stands on the left, the car in the middle and the cup on the right. A picked object is in "
     "the robot's hand; only one can be there.",
 }
-"""What a look at the scene shows of macro-actions, by the beginning of the task's name."""
+"""The effects of macro-actions that one look at the scene shows, by the beginning of the task's name."""
 
 
 def briefing(spec: TaskSpec) -> str:

@@ -52,7 +52,7 @@ class RememberingAgent(DQN, ABC):
         self.begin_episode()
 
     def begin_episode(self) -> None:
-        """Forget what was seen; see :class:`.capabilities.EpisodeRememberer`."""
+        """Forget the episode so far; see :class:`.capabilities.EpisodeRememberer`."""
         self._seen = Past()
         self._lived = Past()
 

@@ -72,14 +72,14 @@ _OCCLUDED = 0.25  # share of the frames with something unusual before the backgr
 
 
 class _Components(NamedTuple):
-    """What blocks of pixels mostly show; a corner, a mean (D,) and components (K, D) for each of them."""
+    """The usual content of blocks of pixels; a corner, a mean (D,) and components (K, D) for each of them."""
 
     noise: float
     blocks: tuple[tuple[int, int, Images, Images], ...]
 
 
 class Standard(NamedTuple):
-    """What a normal frame is like; a correction that is None is not made."""
+    """The properties of a normal frame; a correction that is None is not made."""
 
     spectrum: Spectrum | None = None  #: of the reference's contours. Shape (64, 64).
     reference: Images | None = None  #: the median frame. Shape (64, 64, 3).

@@ -19,7 +19,7 @@ from imagine_bench.registry.entries import ENCODER_KINDS
 GROUP = "imagine_bench.motion_models"
 """Entry points in which packages offer models of motions, this one too."""
 LEVELS = ("commands", "macro-action")
-"""What a model is told of a motion: all its commands, or the one macro-action that it was planned for."""
+"""The input of a model about a motion: all its commands, or the one macro-action that it was planned for."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,1 +1,1 @@
-"""How laws are found: what a change belongs to, the laws that explain it, and a writer that plays to find out."""
+"""How laws are found: the causes of a change, the laws that explain it, and a writer that plays to find out."""

@@ -35,7 +35,7 @@ def changes(rows: Sequence[Row], delay: int) -> list[Row]:
     """Transitions with the macro-action that was taken ``delay`` steps before, instead of their own.
 
     Each transition of an episode is to follow the one before it. At the beginning of an episode the first symbols are
-    repeated; these transitions are of no macro-action, and are left out. What follows an end is never seen.
+    repeated; these transitions are of no macro-action, and are left out. The symbols after an end are never seen.
     """
     found = []
     for place, row in enumerate(rows):
