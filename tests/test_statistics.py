@@ -134,6 +134,11 @@ def test_equal_runs_differ_by_more_than_their_tests() -> None:
     assert near.p > 0.2
 
 
+def test_runs_that_are_all_alike_differ_by_nothing_with_a_p_of_1() -> None:
+    found = statistics.difference([0.5] * 6, [0.5] * 6)
+    assert (found.value, found.low, found.high, found.p) == (0.0, 0.0, 0.0, 1.0)
+
+
 def test_holm_by_hand() -> None:
     found = statistics.holm([0.04, 0.01, math.nan, 0.03])
     assert found.tolist() == pytest.approx([0.06, 0.03, math.nan, 0.06], nan_ok=True), "never below a smaller one's"

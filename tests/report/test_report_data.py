@@ -15,7 +15,7 @@ from fake_results import WIDE, bench_result, rewritten
 from imagine_bench import reference, registry, statistics
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report.bench import bench_page, cost, success
-from imagine_bench.report.data import DIFFERENCE, SCORE, collect, frames_before, open_loop_means
+from imagine_bench.report.data import DIFFERENCE, SCORE, collect, frames_before, known_agent, open_loop_means
 from imagine_bench.report.page import DASH, count, seconds
 from imagine_bench.rules import fewest_actions
 from imagine_bench.store import encoders
@@ -199,3 +199,9 @@ def test_an_agent_whose_tests_are_not_known_leaves_nothing_to_pair(result: Bench
     runs = [run if run.agent == "dqn" else each for run, each in zip(result.runs, known.runs, strict=True)]
     data = collect(dataclasses.replace(known, runs=tuple(runs)))
     assert not any("alone" in record for record in data.records)
+
+
+def test_an_agent_of_an_absent_package_has_an_entry_that_makes_nothing() -> None:
+    found = known_agent("of_nobody")
+    assert found.make == "" and found.description == "Its package is not installed here."
+    assert known_agent("dqn") == registry.agent_entry("dqn")
