@@ -146,8 +146,8 @@ def certificate_rows(found: Certificate) -> dict[str, str]:
     rows["facts"] = f"{found.facts} local entries and conditions, of at most {found.width} coordinates each"
     if found.lower_bound:
         rows["lower bound"] = (
-            f"{found.lower_bound} transitions, before which no learner solves {100 * SHARE:.0f} % of what the best "
-            "policy solves, on average over the worlds that differ by the names of their actions"
+            f"{found.lower_bound} transitions, before which no learner solves {100 * SHARE:.0f} % of the tests "
+            "that the best policy solves, on average over the worlds that differ by the names of their actions"
         )
     if found.floor is not None:
         floor = found.floor
