@@ -8,6 +8,7 @@ _ARROWS = "tests/tasks/arrows/test_arrow_rules.py"
 _PICK_PLACE = "tests/tasks/pick_place/test_pick_place_rules.py"
 _WORLDS = (
     "tests/tasks/arrows/test_arrow_oracle.py",
+    "tests/tasks/arrows/test_arrow_description.py",
     "tests/tasks/parameters/test_parameters.py",
     "tests/tasks/arrows/test_many_cubes.py",
 )

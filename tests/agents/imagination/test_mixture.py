@@ -84,11 +84,12 @@ def test_average_is_over_coefficients_means_and_variances() -> None:
 
 def test_an_ensemble_predicts_with_all_its_members_components() -> None:
     """Two members that swap the order of their components: averaging them one by one would invent a third place."""
-    means = torch.tensor([[0.0, 10.0], [10.0, 0.0]]).view(2, 1, 2, 1)  # [E, N, K, Z]
-    members = mdn.Mixture(torch.full((2, 1, 2), 0.5).log(), means, torch.full((2, 1, 2, 1), -3.0))
+    means = torch.tensor([[[0.0, 10.0], [1.0, 11.0]], [[10.0, 0.0], [11.0, 1.0]]])[..., None]  # [E, N, K, Z]
+    members = mdn.Mixture(torch.full((2, 2, 2), 0.5).log(), means, torch.full((2, 2, 2, 1), -3.0))
     pooled = mdn.average(members, members=2)
-    assert sorted(pooled.means.flatten().tolist()) == [0.0, 0.0, 10.0, 10.0]
-    torch.testing.assert_close(pooled.log_weights.exp(), torch.full((1, 4), 0.25))
+    assert pooled.means.tolist() == [[[0.0], [10.0], [10.0], [0.0]], [[1.0], [11.0], [11.0], [1.0]]]
+    torch.testing.assert_close(pooled.log_weights.exp(), torch.full((2, 4), 0.25))
+    torch.testing.assert_close(pooled.log_sigmas, torch.full((2, 4, 1), -3.0))
 
 
 @pytest.mark.parametrize(("components", "least", "most"), [(6, 0.0, 0.25), (1, 0.5, 1.0)])
