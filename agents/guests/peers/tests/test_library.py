@@ -47,7 +47,7 @@ def do(folder: Path, agent: str = LATENTS, seed: int = 0, **changes: Any) -> Run
 @pytest.mark.parametrize(
     "agent",
     [
-        "sb3_qrdqn", LATENTS, "sb3_ppo_latents", IMAGINING[0],
+        "sb3_qrdqn", LATENTS, "sb3_ppo_latents", "sb3_ppo_rnd_latents", IMAGINING[0],
         *(pytest.param(name, marks=pytest.mark.slow) for name in ("sb3_dqn", IMAGINING[1])),
     ],
 )  # fmt: skip
@@ -69,7 +69,7 @@ def test_its_loop_is_counted_and_tested_and_leaves_no_temporary_files(
     assert (first.test_episodes, last.test_episodes) == (2, 2)
     if "ppo" not in agent:
         assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
-    if agent == "sb3_ppo_latents":  # ten epochs of two batches for each 8 macro-actions
+    if agent in ("sb3_ppo_latents", "sb3_ppo_rnd_latents"):  # ten epochs of two batches for each 8 macro-actions
         assert last.diagnostics["gradient_updates"] == 20 * ((last.env_steps - 1) // 8) > 0
     if agent in IMAGINING:
         assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == [first.env_steps, last.env_steps]

@@ -43,6 +43,13 @@ SB3_PPO_LATENTS = AgentEntry(
     title="SB3 PPO (latents)",
     description="Stable-Baselines3's PPO, which learns a policy, on the same latents.",
 )
+SB3_PPO_RND_LATENTS = AgentEntry(
+    make="imagine_bench_peers.sb3:make_curious_ppo",
+    settings="imagine_bench_peers.sb3_settings:CURIOUS",
+    external_training_loop=True,
+    title="SB3 PPO + RND (latents)",
+    description="The same PPO, with a bonus for what was seldom seen: random network distillation.",
+)
 SB3_DQN_IMAGINED = AgentEntry(
     make="imagine_bench_peers.sb3:make_imagining_dqn",
     settings=_IMAGINING_SETTINGS,

@@ -22,7 +22,8 @@ from imagine_bench.interfaces import AgentContext, AgentState, Observation, Tran
 from imagine_bench.interfaces.capabilities import OnEpisode
 
 from .mixed_experience import MixedExperience
-from .sb3_settings import HYPERPARAMETERS, IMAGINING, PIXELS, QUANTILES, PPOSettings
+from .novelty import NoveltyBonus
+from .sb3_settings import CURIOUS, HYPERPARAMETERS, IMAGINING, PIXELS, QUANTILES, PPOSettings
 
 _SEEDS = 2**31
 """The library takes seeds below this; numpy's global generator, which it draws from, would take twice as many."""
@@ -64,7 +65,8 @@ class LibraryAgent:
         if explores:
             keywords["exploration_fraction"] = explores / steps  # exploration depends on the step alone
         scale = self.settings.reward_scale
-        world = gymnasium.wrappers.TransformReward(self._experience(env), lambda reward: scale * float(reward))
+        scaled = gymnasium.wrappers.TransformReward(self._experience(env), lambda reward: scale * float(reward))
+        world = self._with_bonus(scaled)
         named = isinstance(world.observation_space, gymnasium.spaces.Dict)
         policy = "MultiInputPolicy" if named else "CnnPolicy" if self._encoder is None else "MlpPolicy"
         self._model = self._algorithm(policy, world, seed=self._seed, device=self._device, **keywords)
@@ -73,6 +75,10 @@ class LibraryAgent:
     def _experience(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
         """The environment in which the library trains."""
         return env if self._encoder is None else LatentObservation(env, self._encoder)
+
+    def _with_bonus(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+        """The environment with rewards that the agent pays itself, if it does."""
+        return env
 
     def _steps_an_episode(self, horizon: int) -> int:
         """The most steps that it makes for one real episode."""
@@ -116,6 +122,17 @@ class LibraryAgent:
         raise ArtefactError("An agent of Stable-Baselines3 cannot be taken up again; run its bench anew.")
 
 
+class CuriousLibraryAgent(LibraryAgent):
+    """A learner of the library that also earns a bonus for latents that were seldom seen."""
+
+    def __init__(self, context: AgentContext, algorithm: str) -> None:
+        super().__init__(context, algorithm, CURIOUS)
+        self._novelty_seeds = context.seeds.child("novelty")
+
+    def _with_bonus(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+        return NoveltyBonus(env, self.settings.novelty, self._novelty_seeds)
+
+
 class ImaginingLibraryAgent(LibraryAgent):
     """A learner of the library that trains on real and imagined episodes alike, the latter through the filter."""
 
@@ -156,6 +173,8 @@ make_dqn_latents = partial(LibraryAgent, algorithm="stable_baselines3:DQN")
 """The ``sb3_dqn_latents`` agent."""
 make_ppo = partial(LibraryAgent, algorithm="stable_baselines3:PPO")
 """The ``sb3_ppo_latents`` agent: PPO (Schulman et al. 2017)."""
+make_curious_ppo = partial(CuriousLibraryAgent, algorithm="stable_baselines3:PPO")
+"""The ``sb3_ppo_rnd_latents`` agent: the same with random network distillation (Burda et al. 2018)."""
 make_imagining_dqn = partial(ImaginingLibraryAgent, algorithm="stable_baselines3:DQN")
 """The ``sb3_dqn_imagined`` agent."""
 make_imagining_ppo = partial(ImaginingLibraryAgent, algorithm="stable_baselines3:PPO")

@@ -62,6 +62,19 @@ class PPOSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class NoveltySettings:
+    """Settings of random network distillation, a bonus for observations that were seldom seen."""
+
+    #: Of the bonus beside the scaled reward, chosen on seeds 1001 and 1002; the paper has 1 beside 2.
+    weight: float = setting(0.02, NOT_NEGATIVE)
+    learning_rate: float = setting(1e-3, POSITIVE)  #: step size of the predictor's optimiser
+    width: int = setting(64, between(1, 4096))  #: hidden units, and outputs, of both networks
+    discount: float = setting(0.99, PROBABILITY)  #: of the sum of errors whose deviation scales the bonus
+    update_every: int = setting(16, between(1, 10_000))  #: macro-actions between updates of the predictor
+    epochs: int = setting(4, COUNT)  #: gradient steps then, each on all of these observations
+
+
+@dataclass(frozen=True, kw_only=True)
 class LibrarySettings:
     """All settings of an agent from Stable-Baselines3, of which an algorithm reads its own section."""
 
@@ -77,6 +90,13 @@ class MixSettings:
     """How real and imagined experience mix."""
 
     imagined_episodes: int = setting(4, between(0, 1000))  #: after each real episode, once imagination has begun
+
+
+@dataclass(frozen=True, kw_only=True)
+class CuriousSettings(LibrarySettings):
+    """Those with a bonus for what was seldom seen."""
+
+    novelty: NoveltySettings = field(default_factory=NoveltySettings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,4 +116,5 @@ PIXELS = Hyperparameters.everywhere(LibrarySettings(sb3=SB3Settings(gradient_ste
 """Of the DQN on frames, chosen on seeds 1001 and 1002. An update costs about thirty times as much CPU time there."""
 QUANTILES = Hyperparameters.everywhere(LibrarySettings(sb3=QuantileSettings(gradient_steps=2)))
 """Of QR-DQN on frames: those of the DQN. With the library's 200 quantiles a run would take three times as long."""
+CURIOUS = Hyperparameters.everywhere(CuriousSettings())
 IMAGINING = Hyperparameters({name: _joined(group) for name, group in IMAGINATION.groups.items()})
