@@ -103,7 +103,7 @@ class HandControl:
             given = np.asarray(action)
         except (TypeError, ValueError) as error:
             raise self._refused(action, "is no array of numbers") from error
-        if given.dtype.kind not in "biuf" or np.ma.is_masked(action):
+        if given.dtype.kind not in "biuf" or (isinstance(action, np.ma.MaskedArray) and np.ma.is_masked(action)):
             raise self._refused(action, "has parts that are no real numbers")
         given = given.astype(np.float64)
         if given.shape != (len(self.names),) or not all(map(math.isfinite, given.tolist())):
@@ -127,9 +127,9 @@ class HandControl:
         else:
             most_rad = self._most_rad
             asked_rad = action[:-1] * most_rad if self.control == "joint_delta" else action[:-1] - joints_rad
-            step_rad = np.clip(asked_rad, -most_rad, most_rad)
-            within_rad = np.clip(joints_rad + step_rad, self._ik.lower_rad, self._ik.upper_rad)
-            limited = "" if np.array_equal(joints_rad + asked_rad, within_rad) else "reach"
+            step_rad = np.minimum(np.maximum(asked_rad, -most_rad), most_rad)
+            within_rad = np.minimum(np.maximum(joints_rad + step_rad, self._ik.lower_rad), self._ik.upper_rad)
+            limited = "" if within_rad.tolist() == (joints_rad + asked_rad).tolist() else "reach"
             joints_rad = within_rad
         return Command(joints_rad, opening_m, limited)
 

@@ -305,6 +305,11 @@ class MotionEnv(SceneEnv):
         """Where the servos are told to bring the point between the fingers, in the world. Shape (3,)."""
         return self.controls.hand_pose(self.data.ctrl[self._columns.ctrl[: len(ARM_JOINTS)]])[0]
 
+    def servo_targets(self) -> Floats:
+        """The servos' present commands: the seven joints (rad), and the opening of each finger (m). Shape (8,)."""
+        targets: Floats = self.data.ctrl[self._columns.ctrl[: len(ARM_JOINTS) + 1]].copy()
+        return targets
+
     def servo_forces(self) -> Floats:
         """The present efforts of the servos: torques of the seven joints (N m), forces of both fingers (N). Shape
         (9,).

@@ -14,9 +14,11 @@ from imagine_bench.running.bench import counted
 from imagine_bench.running.retraining import Verdict, judged, part_digest
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, evaluation_split
+from imagine_bench.store.files import read_json
 
-from . import rounds
-from .rows import CARD, ROWS, Row, read_row, require_whole
+from . import motions, rounds
+from .motions import MotionRow
+from .rows import CARD, ROWS, Row, read_row, require_files, require_whole
 
 NOT_VOUCHED = ("the player", "which seeds and how many tests", "the price", "the data seen beforehand")
 """Claims of every row that no replay shows."""
@@ -35,7 +37,7 @@ class Checked:
     """A row and its verdict."""
 
     verdict: Verdict
-    row: Row | None = None  #: None where it was refused
+    row: Row | MotionRow | None = None  #: None where it was refused
 
     def __str__(self) -> str:
         if self.row is None:
@@ -73,11 +75,16 @@ class _Court:
 
     def checked(self, folder: Path) -> Checked:
         """The verdict on one row."""
-        read: list[Row] = []
+        read: list[Row | MotionRow] = []
         verdict = judged(folder.name, functools.partial(self._check, folder, read))
         return Checked(verdict=verdict, row=None if verdict.complaint else read[0])
 
-    def _check(self, folder: Path, read: list[Row]) -> Verdict:
+    def _check(self, folder: Path, read: list[Row | MotionRow]) -> Verdict:
+        require_files(folder)
+        if read_json(folder / CARD, "the card of a row").get("format") == motions.FORMAT:
+            moved = motions.read_motions(folder)
+            read.append(moved)
+            return Verdict(what=moved.name, episodes=motions.check_motions(moved), unshown=NOT_VOUCHED)
         row = read_row(folder)
         read.append(row)
         require_whole(row, registry.task(row.protocol.task))

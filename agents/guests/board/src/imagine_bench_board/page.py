@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -31,7 +32,8 @@ from imagine_bench.report.page import (
 from imagine_bench.store.files import make_folder, table_text, write_bytes
 
 from .check import NEVER_SHOWN, Checked
-from .rows import Row
+from .motions import RATE_HZ, MotionRow
+from .rows import Claims, Row
 
 _PERSON = "person"
 """The prefix of people's names among players."""
@@ -95,6 +97,31 @@ def _curves(rows: Sequence[Row]) -> Figure:
     return figure
 
 
+def _motion_cells(row: MotionRow) -> dict[str, str]:
+    """The cells of a row of continuous control."""
+    tests = row.protocol.tests
+    address = f"{row.name}.html#tests"
+    solved = percent(row.vouched.successes / tests)
+    return {
+        "player (claimed)": row.claimed.agent,
+        "solved, %": Markup('<a href="{}">{}</a>').format(address, solved),
+        "return": decimals(row.vouched.mean_return),
+        "robot seconds a test": decimals(row.vouched.mean_periods / RATE_HZ),
+        "faults": f"{row.vouched.faults:,}",
+        "tests": f"{tests:,}",
+        "starts": row.starts,
+        "seen beforehand (claimed)": row.claimed.seen_beforehand,
+    }
+
+
+def _motion_section(world: str, rows: Sequence[MotionRow]) -> Section:
+    """The table of a world of continuous control."""
+    best_first = sorted(rows, key=lambda row: -row.vouched.mean_return)
+    words = "Each command, 25 a second, was carried out again. The columns that are marked so are claimed."
+    table = Table.of(f"table-{file_name(world)}", [_motion_cells(row) for row in best_first], "", "not said")
+    return Section(world, [words], tables=[table])
+
+
 def _section(world: str, rows: Sequence[Row]) -> Section:
     """The table and the curve of a world."""
     best_first = sorted(rows, key=lambda row: -float(np.mean(_success(row, row.protocol.budgets[-1]))))
@@ -118,10 +145,14 @@ def _section(world: str, rows: Sequence[Row]) -> Section:
 def board_page(checked: Sequence[Checked]) -> Page:
     """The page of a board that was checked."""
     worlds: dict[str, list[Row]] = {}
+    moved: dict[str, list[MotionRow]] = {}
     for each in checked:
-        if each.row is not None:
+        if isinstance(each.row, Row):
             worlds.setdefault(each.row.world, []).append(each.row)
+        elif each.row is not None:
+            moved.setdefault(each.row.world, []).append(each.row)
     sections = [_section(world, rows) for world, rows in worlds.items()]
+    sections += [_motion_section(world, rows) for world, rows in moved.items()]
     held = sum(each.row is not None for each in checked)
     answer = f"{held} of {len(checked)} rows hold: each of their test episodes was played again, to equal results."
     verdicts = Table("verdicts", ["row", "verdict"], [[each.verdict.what, str(each)] for each in checked], prose=True)
@@ -148,6 +179,24 @@ def _csv(row: Row) -> list[Mapping[str, float | str]]:
     return [{**named, **vars(tested), **vars(price)} for tested, price in both]
 
 
+def motion_page(row: MotionRow, verdict: str) -> Page:
+    """The page of a row of continuous control: its verdict, each test episode, and its claims."""
+    episodes = [
+        {
+            "test": str(test),
+            "start (the environment's seed)": str(row.protocol.start(test)),
+            "robot seconds": decimals(each.periods / RATE_HZ),
+            "return": printed(each.total_reward, "g"),
+            "solved": "yes" if each.solved else "no",
+            "fault": "yes" if each.fault else "no",
+        }
+        for test, each in enumerate(row.motions)
+    ]
+    title = f"{row.vouched.successes:,} of {len(episodes):,} tests solved"
+    tests = Section(title, answers=[verdict], tables=[Table.of("tests", episodes)])
+    return _page_of(row.name, row.world, [tests], row.claimed, asdict(row.protocol), "")
+
+
 def row_page(row: Row, verdict: str) -> Page:
     """The page of a row: its verdict, each test episode, and its claims."""
     sections = []
@@ -170,21 +219,33 @@ def row_page(row: Row, verdict: str) -> Page:
         sections.append(Section(title, tables=[table]))
     names = registry.task(row.protocol.task).action_names
     legend = "; ".join(f"{number}: {name}" for number, name in enumerate(names))
+    tests = Section("The tests", [f"Macro-actions: {legend}."], answers=[verdict])
+    return _page_of(row.name, row.world, [tests, *sections], row.claimed, row.protocol.as_dict(), row.round)
+
+
+def _page_of(
+    name: str, world: str, sections: list[Section], claimed: Claims, protocol: Mapping[str, Any], round_name: str
+) -> Page:
+    """The page of a row of any kind."""
     return Page(
-        title=row.name,
-        subtitle=row.world,
-        question="Do these macro-actions, from these starts, have these outcomes?",
+        title=name,
+        subtitle=world,
+        question="Do these actions, from these starts, have these outcomes?",
         table=Table("claims", ["claim", "value"], []),
-        sections=[Section("The tests", [f"Macro-actions: {legend}."], answers=[verdict]), *sections],
+        sections=sections,
         files={},
-        facts={"claimed": asdict(row.claimed), "protocol": row.protocol.as_dict(), "round": row.round or "none"},
+        facts={"claimed": asdict(claimed), "protocol": dict(protocol), "round": round_name or "none"},
     )
+
+
+def _page_of_row(row: Row | MotionRow, verdict: str) -> Page:
+    return row_page(row, verdict) if isinstance(row, Row) else motion_page(row, verdict)
 
 
 def write_board(checked: Sequence[Checked], out: Path) -> Path:
     """Write the page of a board and the pages of its rows; returns the path of the first."""
     pages = {"": board_page(checked)} | {
-        each.row.name: row_page(each.row, str(each)) for each in checked if each.row is not None
+        each.row.name: _page_of_row(each.row, str(each)) for each in checked if each.row is not None
     }
     make_folder(out)
     for name, page in pages.items():

@@ -1,0 +1,335 @@
+"""Rows of continuous control: test episodes of any policy, kept as commands to the joints, and played again.
+
+Whatever control a policy uses, its commands end as targets of the seven joints and the fingers, 25 times a second.
+These float32 targets are kept. A replay needs no inverse kinematics, and costs little more than the simulation itself.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import json
+import zlib
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from imagine_bench.tasks.continuous.controls import MOST_OPEN_M, HandControl
+from imagine_bench.tasks.motion.arm_model import ArmModel
+
+from imagine_bench import registry
+from imagine_bench.arrays import Floats32, Info, Observed
+from imagine_bench.errors import ArtefactError, InvalidValueError, require
+from imagine_bench.protocols.data import require_types
+from imagine_bench.registry.machine import describe_environment
+from imagine_bench.seeding import SEEDS, episode_seed
+from imagine_bench.store.files import make_folder, read_json, reading, write_bytes, write_json
+from imagine_bench.values import Json, unpack
+
+from .rows import CARD, EPISODES, OPEN, Claims, require_files
+
+if TYPE_CHECKING:
+    from imagine_bench.tasks.continuous.env import MotionEnv
+
+FORMAT = "imagine_bench board motions 1"
+RATE_HZ = 25.0
+"""Commands a second."""
+SLACK_PERIODS = 3
+"""Control periods by which an event may come earlier or later on another kind of processor."""
+MOST_TESTS = 1000
+_COMMAND = np.dtype("<f4")
+_WIDTH = 8
+"""Numbers of a command: seven joints in rad, and the grip."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionProtocol:
+    """All that decides the tests of a row: the world, and the starts."""
+
+    task: str  #: The task of macro-actions, whose world it is
+    appearance: str = "clean"
+    placement: float = 0.0  #: How far, in m, objects start off their slots
+    seed: int = 0  #: Decides the starts of all tests
+    tests: int = 100
+
+    def __post_init__(self) -> None:
+        require_types(self)
+        if not 1 <= self.tests <= MOST_TESTS or not 0 <= self.seed < SEEDS:
+            allowed = f"1 to {MOST_TESTS:,} tests and a seed from 0 to {SEEDS - 1:,}"
+            raise InvalidValueError(f"tests is {self.tests} and seed {self.seed}; give {allowed}.")
+
+    def start(self, test: int) -> int:
+        """The environment's seed of a test."""
+        return episode_seed("evaluation", self.seed, test)
+
+    def make(self, **options: Any) -> gymnasium.Env[Any, Any]:
+        """The environment, controlled by joints. Raises whatever :func:`gymnasium.make` does for a wrong value."""
+        require("@" not in self.task, "its task names a file; write the world out in one line.")
+        env_id = registry.motion_id(registry.task(self.task).env_id)
+        given: dict[str, Any] = {"appearance": self.appearance, "placement": self.placement, "control": "joint"}
+        return gymnasium.make(env_id, disable_env_checker=True, **given, **options)
+
+    @property
+    def world(self) -> str:
+        """The world in words."""
+        off = f", objects up to {100 * self.placement:g} cm off their slots" if self.placement else ""
+        return f"{self.task}, continuous control at 25 Hz, {self.appearance}{off}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """A test episode."""
+
+    commands: Floats32 = field(repr=False)  #: shape (N, 8)
+    total_reward: float
+    solved: bool
+    fault: bool  #: whether a fault ended it
+    fingerprint: int  #: CRC-32 of the start and of each event: macrostates and rewards
+
+    @property
+    def periods(self) -> int:
+        """Its length in control periods."""
+        return len(self.commands)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionFigures:
+    """Numbers that follow from the tests."""
+
+    successes: int
+    faults: int
+    mean_return: float
+    mean_periods: float  #: of 1/25 s
+
+    @classmethod
+    def of(cls, motions: Sequence[Motion]) -> MotionFigures:
+        """Those of some tests."""
+        return cls(
+            successes=sum(each.solved for each in motions),
+            faults=sum(each.fault for each in motions),
+            mean_return=float(np.mean([each.total_reward for each in motions])),
+            mean_periods=float(np.mean([each.periods for each in motions])),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionRow:
+    """A row."""
+
+    name: str  #: That of its folder
+    protocol: MotionProtocol
+    vouched: MotionFigures
+    claimed: Claims
+    motions: tuple[Motion, ...] = field(repr=False)
+
+    starts = OPEN
+    """Rounds have no tests of motions."""
+
+    @property
+    def world(self) -> str:
+        """The world of its tests in words."""
+        return self.protocol.world
+
+
+class _Tally:
+    """What is known of an episode while it is played."""
+
+    def __init__(self, info: Info) -> None:
+        self.total_reward = 0.0
+        self.solved = self.fault = self.over = False
+        self.fingerprint = 0
+        self._sign(info, 0.0)
+
+    def add(self, reward: float, terminated: bool, truncated: bool, info: Info) -> None:
+        """Count a control period."""
+        self.total_reward += reward
+        self.solved |= bool(info["is_success"])
+        self.fault |= bool(info["fault"])
+        self.over = terminated or truncated
+        if info["event"]:
+            self._sign(info, reward)
+
+    def _sign(self, info: Info, reward: float) -> None:
+        signed = json.dumps([info["macrostate"].tolist(), reward]).encode()
+        self.fingerprint = zlib.crc32(signed, self.fingerprint)
+
+    def motion(self, commands: Floats32) -> Motion:
+        """The episode so far."""
+        return Motion(
+            commands=commands,
+            total_reward=self.total_reward,
+            solved=self.solved,
+            fault=self.fault,
+            fingerprint=self.fingerprint,
+        )
+
+
+class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """The tests of a row as one environment: each reset begins the next of them, whatever seed it is given.
+
+    Play ``tests`` episodes to their ends with any policy, then :meth:`write` the row. Episodes after the last test are
+    not kept, so loops that reset once more, such as Stable-Baselines3's ``evaluate_policy``, may be used.
+
+    Args:
+        task: The task of macro-actions whose world it is, such as ``"arrow_puzzle"`` or ``"arrows:cubes=2"``.
+        control: How the policy acts: ``"twist"``, ``"pose"``, ``"joint_delta"`` or ``"joint"``.
+        observation: The policy's observation, as :class:`MotionEnv` takes it.
+        size: Edge of its images in pixels.
+        told: Whether the goal is given in words.
+        **protocol: Further fields of :class:`MotionProtocol`: ``appearance``, ``placement``, ``seed``, ``tests``.
+
+    Raises:
+        UnknownNameError, InvalidValueError: A value that the environment does not take.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        control: str = "twist",
+        observation: str = "hand,front,proprio",
+        size: int = 64,
+        told: bool = False,
+        **protocol: Any,
+    ) -> None:
+        self.protocol = MotionProtocol(task=registry.task_name(task), **protocol)
+        super().__init__(self.protocol.make(observation=observation, size=size, told=told))
+        self._motion: MotionEnv = self.env.unwrapped  # type: ignore[assignment]
+        self._control = HandControl(control, ArmModel(), self._motion.period_s)
+        self.action_space = self._control.space
+        self._commands: list[Floats32] = []
+        self._tally: _Tally | None = None
+        self.motions: list[Motion] = []
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observed, Info]:
+        """Begin the next test. Raises InvalidValueError: the one before was left before its end."""
+        del seed, options
+        if self._tally is not None and self._commands:
+            raise InvalidValueError(f"Test {len(self.motions)} was left before its end; a row has whole episodes.")
+        observation, info = self.env.reset(seed=self.protocol.start(len(self.motions) % self.protocol.tests))
+        self._tally = _Tally(info) if len(self.motions) < self.protocol.tests else None
+        self._commands = []
+        return observation, info
+
+    def step(self, action: Floats32) -> tuple[Observed, float, bool, bool, Info]:
+        """One control period, by the policy's control."""
+        before = self._motion.servo_targets()
+        command = self._control.command(self._control.checked(action), before[:-1], float(before[-1]))
+        grip = 2.0 * command.opening_m / MOST_OPEN_M - 1.0
+        joints = np.append(command.joints_rad, grip).astype(_COMMAND)
+        observation, reward, terminated, truncated, info = self.env.step(joints)
+        if self._tally is not None:
+            self._commands.append(joints)
+            self._tally.add(float(reward), terminated, truncated, info)
+            if self._tally.over:
+                self.motions.append(self._tally.motion(np.stack(self._commands)))
+                self._tally = None
+        return observation, float(reward), terminated, truncated, {**info, "limited": command.limited}
+
+    def write(self, out: Path | str, name: str, *, agent: str, **claims: Any) -> Path:
+        """Write the row ``name`` below a folder, and return its path.
+
+        Args:
+            out: The folder of rows, such as ``docs/board/rows``.
+            name: Of the row.
+            agent: Who played.
+            **claims: Further fields of :class:`.rows.Claims`: ``author``, ``seen_beforehand``, ``frames_beforehand``.
+
+        Raises:
+            InvalidValueError: Not all tests were played, or there is a row of this name.
+        """
+        if len(self.motions) < self.protocol.tests:
+            raise InvalidValueError(f"{len(self.motions)} of {self.protocol.tests} tests were played; play all.")
+        where = Path(out) / name
+        if where.exists():
+            raise InvalidValueError(f"{where} exists; remove it, or give another name.")
+        machine = describe_environment()
+        facts = {"commit": str(machine["commit"]), "command": str(machine["command"])}
+        claimed = Claims(agent=agent, **{**facts, **claims})
+        episodes = json.dumps([_columns(each) for each in self.motions], separators=(",", ":")).encode()
+        card: dict[str, Json] = {
+            "format": FORMAT,
+            "protocol": dataclasses.asdict(self.protocol),
+            "vouched": dataclasses.asdict(MotionFigures.of(self.motions)),
+            "claimed": dataclasses.asdict(claimed),
+            "episodes_sha256": hashlib.sha256(episodes).hexdigest(),
+        }
+        make_folder(where)
+        write_bytes(where / EPISODES, episodes)
+        write_json(where / CARD, card)
+        return where
+
+
+def _columns(motion: Motion) -> dict[str, Any]:
+    """An episode as the file has it."""
+    commands = motion.commands.astype(_COMMAND).tobytes()
+    return {**vars(motion), "commands": base64.b64encode(commands).decode()}
+
+
+def _motion_of(columns: dict[str, Any]) -> Motion:
+    """The inverse of :func:`_columns`. Raises ArtefactError: it has no commands, or some that are no numbers."""
+    content = base64.b64decode(columns["commands"], validate=True)
+    commands = np.frombuffer(content, _COMMAND).reshape(-1, _WIDTH).astype(np.float32)
+    require(len(commands) > 0 and bool(np.isfinite(commands).all()), "a test has commands that are no finite numbers.")
+    motion = Motion(**{**columns, "commands": commands})
+    for name, kind in (("total_reward", float), ("solved", bool), ("fault", bool), ("fingerprint", int)):
+        require(type(getattr(motion, name)) is kind, f"a test's {name} is no {kind.__name__}.")
+    return motion
+
+
+def read_motions(folder: Path) -> MotionRow:
+    """Read a row; nothing is played. Raises ArtefactError: it is damaged, or not what a row may hold."""
+    require_files(folder)
+    card = read_json(folder / CARD, "the card of a row")
+    with reading(folder / CARD, f"a card of the format {FORMAT!r}"):
+        protocol: MotionProtocol = unpack(MotionProtocol, card["protocol"], {})
+        vouched: MotionFigures = unpack(MotionFigures, card["vouched"], {})
+        claimed: Claims = unpack(Claims, card["claimed"], {})
+    content = (folder / EPISODES).read_bytes()
+    found = hashlib.sha256(content).hexdigest()
+    require(found == card["episodes_sha256"], f"{EPISODES} has the digest {found}, and its card says another.")
+    with reading(folder / EPISODES, "the episodes of a row"):
+        motions = tuple(map(_motion_of, json.loads(content)))
+    return MotionRow(name=folder.name, protocol=protocol, vouched=vouched, claimed=claimed, motions=motions)
+
+
+def check_motions(row: MotionRow) -> int:
+    """Play every test of a row again; returns how many. Raises ArtefactError: a claim does not hold."""
+    tests = row.protocol.tests
+    require(len(row.motions) == tests, f"it has {len(row.motions)} tests, and its protocol {tests}.")
+    figures = MotionFigures.of(row.motions)
+    for name, found in vars(figures).items():
+        claimed = getattr(row.vouched, name)
+        require(claimed == found, f"{name} is {found:g}, and {claimed:g} was kept.")
+    with closing(row.protocol.make(observation="state")) as env:
+        unwrapped: Any = env.unwrapped
+        for test, kept in enumerate(row.motions):
+            _compare(f"test {test}", kept, _played(unwrapped, row.protocol.start(test), kept.commands))
+    return tests
+
+
+def _compare(where: str, kept: Motion, played: Motion | None) -> None:
+    """Raise ArtefactError where an episode is not as it was kept."""
+    if played is None:
+        raise ArtefactError(f"{where}: it does not end where its commands do.")
+    for name in ("total_reward", "solved", "fault", "fingerprint"):
+        found = getattr(played, name)
+        claimed = getattr(kept, name)
+        require(found == claimed, f"{where}: its {name.replace('_', ' ')} is {found}, and {claimed} was kept.")
+
+
+def _played(env: MotionEnv, seed: int, commands: Floats32) -> Motion | None:
+    """The episode of some commands, None where it does not end with the last of them, give or take the slack."""
+    _, info = env.reset(seed=seed)
+    tally = _Tally(info)
+    for period in range(len(commands) + SLACK_PERIODS):
+        tally.add(*env.act(commands[min(period, len(commands) - 1)]))
+        if tally.over:
+            is_near = period + 1 >= len(commands) - SLACK_PERIODS
+            return tally.motion(commands) if is_near else None
+    return None

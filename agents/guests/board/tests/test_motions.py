@@ -1,0 +1,225 @@
+"""Rows of continuous control: tests are recorded by any control, played again by joints, and forgeries are refused."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench_board.check import NOT_VOUCHED, check
+from imagine_bench_board.motions import SLACK_PERIODS, MotionTests, read_motions
+from imagine_bench_board.page import write_board
+from imagine_bench_board.rows import CARD, EPISODES
+
+from imagine_bench.errors import InvalidValueError, UnknownNameError
+
+WORLD = "arrows:cubes=1"
+TESTS = 4
+
+
+def played(root: Path, **options: Any) -> Path:
+    """A row whose even tests the expert plays and whose odd ones nobody does: there the hand stays where it is."""
+    env = MotionTests(WORLD, observation="proprio", tests=TESTS, seed=30, **options)
+    motion: Any = env.unwrapped
+    expert = Expert(motion)
+    for test in range(TESTS):
+        env.reset()
+        over = False
+        while not over:
+            if test % 2 == 0 and expert.is_done:
+                expert.begin(motion.task.rules.optimal_action(motion.episode.macrostate))
+            target = expert.act() if test % 2 == 0 else np.append(motion.servo_targets()[:-1], 1.0)
+            _, _, terminated, truncated, _ = env.step(target)
+            over = terminated or truncated
+    return env.write(root, "expert-and-nobody", agent="expert", author="a founder")
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return played(tmp_path_factory.mktemp("board") / "rows", control="joint")
+
+
+@pytest.fixture
+def row(honest: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(honest, tmp_path / "rows" / honest.name)
+
+
+def test_an_honest_row_holds_and_says_what_happened(row: Path, tmp_path: Path) -> None:
+    read = read_motions(row)
+    assert [each.solved for each in read.motions] == [True, False, True, False]
+    assert read.vouched.successes == 2 and read.vouched.faults == 0
+    assert [each.periods for each in read.motions][1::2] == [750, 750]  # 3 s for each of ten macro-actions
+    (found,) = check(row.parents[1] / "rows" / row.name)
+    assert str(found) == (
+        f"{row.name}: holds in {WORLD}, continuous control at 25 Hz, clean; open starts; 4 episodes played again; "
+        f"not vouched: {', '.join(NOT_VOUCHED)}"
+    )
+    page = write_board([found], tmp_path / "page").read_text()
+    assert "continuous control at 25 Hz" in page and f'href="{row.name}.html#tests"' in page
+    assert "2 of 4 tests solved" in (tmp_path / "page" / f"{row.name}.html").read_text()
+
+
+@pytest.mark.parametrize("control", ["twist", "joint_delta", "pose"])
+def test_whatever_control_a_policy_has_its_joint_commands_play_again(tmp_path: Path, control: str) -> None:
+    env = MotionTests(WORLD, control=control, observation="proprio", tests=2, seed=3, appearance="mild", placement=0.02)
+    rng = np.random.default_rng(7)
+    low, high = env.action_space.low, env.action_space.high
+    for _ in range(2):
+        env.reset()
+        over = False
+        while not over:
+            _, _, terminated, truncated, _ = env.step(rng.uniform(low, high).astype(np.float32))
+            over = terminated or truncated
+    (found,) = check(env.write(tmp_path, "random", agent="random"))
+    assert "holds" in str(found) and "objects up to 2 cm off their slots" in str(found)
+
+
+def test_every_test_is_played_whole_and_no_more_than_asked(tmp_path: Path) -> None:
+    env = MotionTests(WORLD, control="joint", observation="proprio", tests=1, seed=3)
+    env.reset(seed=99)
+    rest = np.append(env.unwrapped.servo_targets()[:-1], 1.0)  # type: ignore[attr-defined]
+    env.step(rest)
+    with pytest.raises(InvalidValueError, match="Test 0 was left before its end"):
+        env.reset()
+    with pytest.raises(InvalidValueError, match="0 of 1 tests were played; play all"):
+        env.write(tmp_path, "early", agent="nobody")
+    while not env.step(rest)[3]:
+        pass
+    env.reset()  # as loops of libraries do once more
+    env.step(rest)
+    env.reset()
+    written = env.write(tmp_path, "whole", agent="nobody")
+    assert [each.periods for each in read_motions(written).motions] == [750]
+    with pytest.raises(InvalidValueError, match="exists; remove it, or give another name"):
+        env.write(tmp_path, "whole", agent="nobody")
+
+
+def test_a_library_s_own_loop_plays_the_tests(tmp_path: Path) -> None:
+    evaluation = pytest.importorskip("stable_baselines3.common.evaluation")
+
+    class Still:
+        def predict(self, observation: Any, state: Any = None, **more: Any) -> tuple[Any, None]:
+            return np.zeros((len(observation), 7), np.float32), None
+
+    env = MotionTests(WORLD, observation="proprio", tests=2, seed=3)
+    with pytest.warns(UserWarning, match="not wrapped with a ``Monitor``"):
+        mean, _ = evaluation.evaluate_policy(Still(), env, n_eval_episodes=2)
+    assert mean == 0.0
+    (found,) = check(env.write(tmp_path, "still", agent="still"))
+    assert found.verdict.episodes == 2 and not found.verdict.complaint
+
+
+def commands_of(part: dict[str, Any]) -> Any:
+    return np.frombuffer(base64.b64decode(part["commands"]), "<f4").reshape(-1, 8).copy()
+
+
+def put(part: dict[str, Any], commands: Any) -> None:
+    part["commands"] = base64.b64encode(commands.astype("<f4").tobytes()).decode()
+
+
+def solved_everywhere(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    parts[1] |= {"solved": True, "total_reward": 50.0}
+
+
+def dearer(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    parts[0]["total_reward"] += 1.0
+
+
+def other_fingerprint(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    parts[1]["fingerprint"] ^= 1
+
+
+def swapped(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    parts[0], parts[1] = parts[1], parts[0]
+
+
+def copied(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    parts[1] = dict(parts[0])
+
+
+def dropped(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    del parts[1]
+    card["protocol"]["tests"] -= 1
+
+
+def cut(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    put(parts[1], commands_of(parts[1])[:300])
+
+
+def longer(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    commands = commands_of(parts[0])
+    put(parts[0], np.concatenate([commands, np.repeat(commands[-1:], SLACK_PERIODS + 1, axis=0)]))
+
+
+def another_seed(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    card["protocol"]["seed"] += 1
+
+
+def another_world(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    card["protocol"]["task"] = "arrows:cubes=2"
+
+
+def no_numbers(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    commands = commands_of(parts[1])
+    commands[5, 3] = np.nan
+    put(parts[1], commands)
+
+
+def no_commands(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    parts[1]["commands"] = "not base64!"
+
+
+def a_file_s_world(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    card["protocol"]["task"] = "arrows:@/etc/passwd"
+
+
+def no_flag(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    parts[0]["solved"] = "yes"
+
+
+def too_many(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    card["protocol"]["tests"] = 10**9
+
+
+FORGERIES = [
+    solved_everywhere, dearer, other_fingerprint, swapped, copied, dropped, cut, longer, another_seed, another_world,
+    no_numbers, no_commands, a_file_s_world, no_flag, too_many,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("forgery", FORGERIES)
+def test_forged_rows_are_refused_in_one_line(
+    row: Path, forgery: Callable[[dict[str, Any], list[dict[str, Any]]], None]
+) -> None:
+    """The forger brings digest and figures up to date."""
+    card = json.loads((row / CARD).read_text())
+    parts = json.loads((row / EPISODES).read_text())
+    forgery(card, parts)
+    content = json.dumps(parts).encode()
+    card["episodes_sha256"] = hashlib.sha256(content).hexdigest()
+    lengths = [len(part["commands"]) * 3 // 4 // 32 for part in parts]
+    card["vouched"] = {
+        "successes": sum(part["solved"] is True for part in parts),
+        "faults": sum(part["fault"] for part in parts),
+        "mean_return": float(np.mean([part["total_reward"] for part in parts])),
+        "mean_periods": float(np.mean(lengths)),
+    }
+    (row / EPISODES).write_bytes(content)
+    (row / CARD).write_text(json.dumps(card))
+    (found,) = check(row)
+    assert found.row is None and found.verdict.complaint
+    assert "\n" not in str(found) and "Traceback" not in str(found)
+
+
+def test_wrong_values_are_one_error() -> None:
+    with pytest.raises(InvalidValueError, match="give 1 to 1,000 tests and a seed"):
+        MotionTests(WORLD, tests=0)
+    with pytest.raises(UnknownNameError, match="twits"):
+        MotionTests(WORLD, control="twits")
