@@ -129,6 +129,11 @@ def test_a_single_weight_sample_cannot_be_compared(
     Imagination(2, 2, modest, filtered=False, seeds=SeedTree(0), device=CPU)
 
 
+def test_two_weight_samples_can_be_compared() -> None:
+    every = ImaginationSettings(weight_samples=2, curiosity=0.5, confidence_scale=1.0, reward_threshold=1.0)
+    Imagination(2, 2, Settings(imagination=every), filtered=True, seeds=SeedTree(0), device=CPU)
+
+
 @pytest.mark.parametrize(
     ("exploration", "epsilon", "least", "most"), [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.1, 0.4), (0.0, 1.0, 0.3, 0.7)]
 )
