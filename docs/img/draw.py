@@ -122,13 +122,25 @@ def kept_curves() -> dict[str, tuple[list[float], list[float]]]:
     return dict(sorted(found.items(), key=lambda each: -each[1][1][-1]))
 
 
+NAMED_PEERS = (
+    "factored:given", "factored", "count_table", "imagination", "dqn", "dqn_efficient", "sb3_dqn", "sb3_qrdqn",
+    "sb3_ppo_latents", "lewm", "dreamer_v3 tuned",
+)  # fmt: skip
+"""The agents whose curves have a name; the others are drawn pale."""
+
+
 def peers() -> None:
     """Success curves of our agents and of libraries' against real macro-actions."""
     figure, axes = plt.subplots(figsize=(9.4, 5.6), layout="constrained")
     ends: list[float] = []
     for agent, (steps, success) in kept_curves().items():
         _, color, marker = family(agent)
-        axes.plot(steps, success, marker=marker, color=color, markersize=4, linewidth=1.4, alpha=0.8)
+        is_named = name_of_row(agent) in NAMED_PEERS
+        axes.plot(
+            steps, success, marker=marker, color=color, markersize=4, linewidth=1.6, alpha=0.9 if is_named else 0.2
+        )
+        if not is_named:
+            continue
         height = success[-1]
         while any(abs(height - other) < LABEL_GAP for other in ends):
             height -= LABEL_GAP / 4
@@ -137,7 +149,7 @@ def peers() -> None:
             name_of_row(agent),
             (steps[-1], success[-1]),
             (RIGHT, height),
-            fontsize=8,
+            fontsize=9,
             va="center",
             arrowprops={"arrowstyle": "-", "color": color, "alpha": 0.35, "linewidth": 0.7, "relpos": (0, 0.5)},
         )
@@ -147,7 +159,7 @@ def peers() -> None:
     ticks = [100, 200, 500, 1_000, 2_000]
     axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
     axes.minorticks_off()
-    axes.set(xlim=(100, RIGHT), ylim=(-18, 104), yticks=range(0, 101, 20))
+    axes.set(xlim=(100, RIGHT), ylim=(-4, 104), yticks=range(0, 101, 20))
     axes.set_xlabel("real macro-actions of training (logarithmic); dotted: chance")
     axes.set_ylabel("test episodes solved (%)")
     axes.grid(alpha=0.3)
