@@ -280,8 +280,11 @@ def test_describe_says_what_every_setting_means(
     for name, entry in offered().items():
         if ":" not in name:
             assert main(["describe", name]) == 0
-        found = describe(name).partition("\nSettings of the preset quick")[2]
+        page = describe(name)
+        form = f"{name}:ARGUMENT" if getattr(entry, "argument", "") else name
+        found = page.partition("\nSettings of the preset quick")[2]
         heads = re.findall(r"\n  (\S+) = (\S+)", found)
+        assert not heads or f" as {form}{',' if ':' in form else ':'}NAME=VALUE\n" in page
         assert len(re.findall(r"\n {6}(?!must|may|one of| )", found)) >= len(heads), name
         if target := getattr(entry, "settings", ""):
             settings = registry.load(target)

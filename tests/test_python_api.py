@@ -53,8 +53,8 @@ from imagine_bench.agents.baselines import RandomAgent
 FIRST = 1
 TABLE = {"left": [0, 2], "right": (1, 3)}
 
-def shifted(number, by=FIRST):
-    return number + by
+def shifted(number, by=FIRST, *, twice=0):
+    return number + by + 2 * twice
 
 class Base(RandomAgent):
     names = {"one", "two", "three", "four"}
@@ -116,6 +116,7 @@ def code(source: str = _SOURCE) -> dict[str, Any]:
     [
         ("% 6", "% 5", True),
         ("FIRST = 1", "FIRST = 2", True),
+        ("twice=0", "twice=1", True),
         ("number + by", "number - by", True),
         ('"left": [0, 2]', '"left": [0, 4]', True),
         ('"three", "four"', '"three"', True),

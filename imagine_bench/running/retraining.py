@@ -171,17 +171,21 @@ def _compared(what: str, kept: RunResult, again: RunResult, differing: Sequence[
     wrong = [name for name, digest in before.items() if now.get(name, digest) != digest]
     facts = " and ".join(differing)
     remedy = f" Here it is trained with another {facts}; train it again with the same." if differing else ""
-    if wrong and _OF_MACHINES & {*differing}:
+    elsewhere = _OF_MACHINES & {*differing}
+    said = f"for its {facts} is said to have been another"
+    if wrong and elsewhere:
         alike = _beyond_rounding(kept, again, remedy)
-        unshown = (f"bits, for its {facts} is said to have been another",)
-        return Verdict(what=what, holds=f"its first {alike:,} training episodes repeat", unshown=unshown)
+        return Verdict(what=what, holds=f"its first {alike:,} training episodes repeat", unshown=(f"bits, {said}",))
     require(not wrong, f"{' '.join(wrong[:1])} does not repeat.{remedy}")
+    holds = f"repeats to the bit in {len(before)} parts"
+    if elsewhere:
+        return Verdict(what=what, holds=holds, unshown=(f"CPU seconds, {said}",))
     costs = [(run.checkpoints[-1].train_cpu_s, sum(row.eval_cpu_s for row in run.checkpoints)) for run in (kept, again)]
     for name, was_s, is_s in zip(("training", "tests"), *costs, strict=True):
         factor, cpu_s = SAME_COST
-        is_near = bool(differing) or max(was_s, is_s) <= factor * min(was_s, is_s) + cpu_s
+        is_near = max(was_s, is_s) <= factor * min(was_s, is_s) + cpu_s
         require(is_near, f"{was_s:,.1f} CPU s of {name} were kept, and it took {is_s:,.1f}.")
-    return Verdict(what=what, holds=f"repeats to the bit in {len(before)} parts")
+    return Verdict(what=what, holds=holds)
 
 
 def _beyond_rounding(kept: RunResult, again: RunResult, remedy: str) -> int:

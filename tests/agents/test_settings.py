@@ -182,6 +182,7 @@ def test_an_unknown_name_lists_what_exists(name: str, overrides: dict[str, Any],
         ("model.components", 2.5, "'model.components' was given 2.5; it takes a whole number"),
         ("imagination.reduction", "median", "No value of setting imagination.reduction: 'median'"),
         ("imagination.temperature", float("nan"), r"imagination.temperature is nan; it must lie in \[0, 1e\+06\]"),
+        ("memory.priority_correction", 1.5, r"memory.priority_correction is 1.5; it must lie in \[0, 1\]"),
         ("imagination.termination_threshold", 0.9, r"is 0.9; it must lie in \[0, 0.5\]: it bounds the less likely"),
     ],
 )

@@ -160,8 +160,17 @@ def test_on_another_processor_tests_repeat_where_training_does(pair: Path, tmp_p
     assert "2 of 8 tests went otherwise, though training was the same" in trained.complaint
 
 
-def test_on_another_processor_all_that_is_the_same_to_the_bit_holds(pair: Path, tmp_path: Path) -> None:
-    assert conclusion(verify(forged(pair, tmp_path, elsewhere), again())) is None
+def test_on_another_processor_all_but_the_costs_may_hold(pair: Path, tmp_path: Path) -> None:
+    found = verify(forged(pair, tmp_path, elsewhere), again())
+    error = conclusion(found)
+    assert error is not None and error.exit_code == 3 and "repeats to the bit" in str(found[-1])
+    assert str(error).endswith("Not compared: CPU seconds, for its cpu is said to have been another.")
+
+
+def test_another_commit_is_no_reason_for_other_costs(pair: Path, tmp_path: Path) -> None:
+    folder = forged(pair, tmp_path, partial(invent_prices, name="train_cpu_s"))
+    change_sessions(folder, lambda found: found["environment"].update(commit="f" * 40))
+    assert "CPU s of training were kept" in verify(folder, again())[-1].complaint
 
 
 @pytest.mark.parametrize(

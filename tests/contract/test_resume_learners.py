@@ -56,10 +56,13 @@ def test_copies_and_pickles_of_a_learner_learn_on_by_themselves(agent: str) -> N
     one = checked_agent(agent, "arrow_puzzle")
     original = one.make()
     one.train(original, range(2))
+    early = original.state()
+    as_it_was = copy.deepcopy(early)
     twins = [copy.deepcopy(original), pickle.loads(pickle.dumps(original))]
     ends = [(one.train(each, range(2, 4)), each.state()) for each in (*twins, original)]
     for actions, state in ends[:2]:
         assert actions == ends[2][0] and same(state, ends[2][1])
+    assert same(early, as_it_was), "a snapshot does not change while the learner learns on"
 
 
 @pytest.mark.parametrize("agent", EACH)

@@ -78,6 +78,7 @@ def test_a_noisy_expert_fails_plans_again_and_still_succeeds(monkeypatch: pytest
     monkeypatch.setattr(module.Expert, "begin", noted)
     told = episode("noisy", 1)
     assert told["success"][-1] and begun == [True, False] * (len(begun) // 2)
+    assert set(told["actions"][:, -1]) <= set(episode()["actions"][:, -1]), "its grip has no noise"
     assert not np.array_equal(told["actions"], episode("expert", 1)["actions"][: len(told["actions"])])
 
 

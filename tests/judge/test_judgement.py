@@ -170,7 +170,7 @@ def _blind() -> Iterator[None]:
 def said(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Said]:
     """The documentation's model, and three that fail, in a package, are judged beside the two ends of the scale."""
     page = (ROOT / "docs" / "how_to" / "world_model.md").read_text()
-    code = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[0].replace("my_package", "their_models")
+    code = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[0].replace("nearest:make", "their_models:make")
     folder, root = tmp_path_factory.mktemp("package"), tmp_path_factory.mktemp("judge")
     (folder / "pyproject.toml").write_text(_PYPROJECT)
     (folder / "their_models.py").write_text(code + _MORE)
@@ -464,6 +464,18 @@ _TWICE = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:mo
 def test_nonsense_is_refused(given: dict[str, object], kind: type[Exception], words: str) -> None:
     with pytest.raises(kind, match=words):
         Judgement(**{"task": "pick_place", "models": ("copy",), **given})  # type: ignore[arg-type]
+
+
+def test_judgements_that_cannot_be_compared_lie_apart() -> None:
+    one = Judgement(task="pick_place", models=("copy",))
+    others = {
+        "task": "arrow_puzzle", "sizes": (5,), "samples": 3, "appearance": "mild", "policy": "optimal", "order": 1,
+    }  # fmt: skip
+    changed = [dataclasses.replace(one, **{name: value}) for name, value in others.items()]
+    folders = {each.folder_name for each in (one, *changed)}
+    assert len(folders) == 1 + len(others)
+    for more in ({"models": ("copy", "exact")}, {"seeds": (7,)}, {"sizes": (2, 10_000)}):
+        assert dataclasses.replace(one, **more).folder_name == one.folder_name, "these are cells of one folder"
 
 
 def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> None:

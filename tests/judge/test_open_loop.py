@@ -94,7 +94,7 @@ class Told(bench_fakes.RulesImaginer):
         states[wrong, 3] += 1
         unsure = {"epistemic": np.where(wrong, 0.8, 0.1), "modal": np.where(wrong, 0.2, 0.9)}
         rollout = super().imagine(frame, actions=actions, depth=depth, rng=rng)
-        return dataclasses.replace(rollout, macrostates=states, **unsure)
+        return dataclasses.replace(rollout, macrostates=states, accepted=rollout.accepted & ~wrong, **unsure)
 
 
 def test_scores_by_depth(puzzle: EvalSet) -> None:
@@ -116,6 +116,7 @@ def test_uncertainty_is_held_to_the_errors_it_should_find(puzzle: EvalSet) -> No
     assert loop.judged.tolist() == [40] * 3 + [20] + [40] * 6  # a transition that begins wrong is not judged
     assert (loop.auroc_epistemic[2], loop.auroc_modal[2], loop.auroc_aleatoric[2]) == (1.0, 0.0, 0.5)
     assert np.isnan(loop.auroc_epistemic[[0, 1, 3, 9]]).all()  # nothing is wrong there
+    assert (loop.correct[2], loop.accepted[2], loop.correct_accepted[2]) == (0.5, 0.5, 1.0)
 
 
 class Perfect(bench_fakes.RulesImaginer):

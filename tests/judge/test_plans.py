@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -176,6 +177,12 @@ def test_no_agent_without_imagination_and_no_empty_series() -> None:
     for count, words in ((1, "does not imagine; give the run of one that does"), (0, "0 plans show nothing")):
         with pytest.raises(InvalidValueError, match=words):
             next(make_plans(trained(object()), count=count, execution="kinematic"))
+
+
+def test_faults_and_macro_actions_are_counted_one_by_one(right: list[PlanResult]) -> None:
+    plans = [dataclasses.replace(right[number], faults=number) for number in range(4)]
+    found = summarise(plans)
+    assert (found["faults"], found["steps"], found["attempted"]) == (6, sum(plan.done for plan in plans), 4)
 
 
 def test_what_is_written_holds_every_plan(wrong: list[PlanResult], right: list[PlanResult], tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from imagine_bench.judge.worlds.families import (
     TwoWorlds,
 )
 from imagine_bench.judge.worlds.graph import edges_of_rules, hamming_distance
-from imagine_bench.judge.worlds.making import LOOK, WorldQuestions, world_questions
+from imagine_bench.judge.worlds.making import LOOK, QUERIES, WorldQuestions, world_questions
 from imagine_bench.judge.worlds.scores import MARGIN, scores_right, world_scores
 from imagine_bench.judge.worlds.tables import Transitions, TransitionTable, likelihood
 from imagine_bench.rules import Dynamics, Rules, states_of_play
@@ -137,6 +137,14 @@ class ByHand:
                 member[value] = member.get(value, 0.0) + p
         apart = 0.5 * sum(abs(values[0].get(v, 0.0) - values[1].get(v, 0.0)) for v in {*values[0], *values[1]})
         return [apart if option == YES else 1.0 - apart for option in of.options[row]]
+
+
+@pytest.mark.parametrize("task", [SLIPS, "pick_place", "arrows:cubes=3"])
+def test_half_of_the_factors_change(task: str) -> None:
+    asked = asked_of(task)
+    (family,) = (each for each in asked.families if isinstance(each, FactorsChanged))
+    changed = family.distances(asked.truth) >= 0.5
+    assert (changed.sum(), (~changed).sum()) == (QUERIES // 2, QUERIES // 2)
 
 
 @TASKS

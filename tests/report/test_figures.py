@@ -38,6 +38,8 @@ def test_the_success_figure_draws_scores_bands_and_the_thesis(data: ReportData) 
     for agent in WIDE.agents:
         assert [(row["episodes"], 100.0 * row["success_iqm"]) for row in data.of(agent)] in lines(axes)
     assert len(axes.collections) >= len(WIDE.agents)
+    looks = {(line.get_color(), line.get_marker()) for line in axes.get_lines()}
+    assert {(style["color"], style["marker"]) for style in map(figures.line_style, WIDE.agents)} <= looks
     thesis = [(budget, 100.0 * mean) for budget, (mean, _) in data.thesis["dqn"].items()]
     assert any(np.allclose(each, thesis) for each in lines(axes) if len(each) == len(thesis))
     short = bench_result(data.result.folder, protocol=dataclasses.replace(WIDE, budgets=(10, 20)))

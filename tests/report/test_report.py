@@ -21,6 +21,7 @@ from imagine_bench.report import bench_page, write_report
 from imagine_bench.report.bench import shown, verdict
 from imagine_bench.report.data import DIFFERENCE, GAIN, SCORE, collect
 from imagine_bench.report.page import DASH, Page, Table, percent, signed_percent, texts
+from imagine_bench.store import encoders
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
 
@@ -186,6 +187,25 @@ def shifted(result: BenchResult, **shares: list[int]) -> BenchResult:
 def test_the_verdict_says_which_way_it_went(many: BenchResult, successes: list[int], sentence: str) -> None:
     changed = shifted(many, dqn=[100, 102, 102, 102, 102, 102, 104], imagination=successes)
     assert sentence in verdict(collect(changed))
+
+
+def test_a_verdict_s_p_is_of_the_budgets_that_it_names(many: BenchResult) -> None:
+    base = [100, 102, 102, 102, 102, 102, 104]
+
+    def change(run: RunResult, row: Checkpoint) -> Checkpoint:
+        better = run.agent == "imagination" and row.episodes > 250
+        solved = base[many.protocol.seeds.index(run.seed)] + 50 * better
+        return dataclasses.replace(row, successes=solved) if run.agent in ("dqn", "imagination") else row
+
+    assert "imagination: better than dqn at 2,000 and 6,000 (p < .001)." in verdict(collect(rewritten(many, change)))
+
+
+def test_each_agent_that_sees_through_a_doubtful_encoder_is_named(
+    result: BenchResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encoders, "doubt", lambda path: "fog" if path is None else "a window")
+    said = [line for line in verdict(collect(result)) if " sees through " in line]
+    assert [line.split("”")[0][1:] for line in said] == list(result.protocol.agents)
 
 
 def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult) -> None:

@@ -85,6 +85,25 @@ def test_a_run_counts_what_happens(tmp_path: Path) -> None:
     assert (result.agent, result.seed, result.recording) == ("table", 3, None)
 
 
+def test_observers_ask_about_frames_as_tests_show_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, set[tuple[str, str]]] = {}
+
+    def note(name: str) -> None:
+        asked[name] = set()
+        asking = getattr(observers, name)
+
+        def noted(*given: Any, appearance: str, purpose: str, **more: Any) -> Any:
+            asked[name].add((appearance, purpose))
+            return asking(*given, appearance=appearance, purpose=purpose, **more)
+
+        monkeypatch.setattr(observers, name, noted)
+
+    for name in ("surviving_actions", "frames_to_ask_with", "examples", "imagine_sampled_rollouts"):
+        note(name)
+    do(tmp_path, "imaginer", test_appearance="mild", budgets=(1,), evaluation_episodes=1, open_loop_starts=2)
+    assert list(asked.values()) == [{("mild", "evaluation")}] * 4
+
+
 def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
     bench_fakes.Pupil.made.clear()
     for name in ("pupil", "pupil_privileged"):

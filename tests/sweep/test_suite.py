@@ -110,6 +110,15 @@ def test_the_page_shows_every_score_and_the_hash(result):
         key: tuple(dataclasses.replace(each, train_cpu_s=10.0) for each in levels)
         for key, levels in result.levels.items()
     }
+    of_levels = {
+        key: tuple(
+            dataclasses.replace(each, environment={**each.environment, "commit": f"of {each.level.name}"})
+            for each in levels
+        )
+        for key, levels in result.levels.items()
+    }
+    made = suite_page(dataclasses.replace(result, levels=of_levels)).facts
+    assert made["commits of all benches"] == "of 0, of 0.3, of 3, of 5, of hard"
     prices = suite_page(dataclasses.replace(result, levels=priced)).table.rows[-1]
     runs = len(TINY.seeds) * sum(len(each.levels) for each in TINY.experiments)
     assert prices[1:] == [f"{10.0 * runs:.1f}"] * 3

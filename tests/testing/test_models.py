@@ -35,6 +35,7 @@ class _Wrong(Copy):
 class _Lacking:
     __init__ = Copy.__init__
     fit = imagine = Copy.fit
+    parameters = 7  # a number, and no method
 
 
 class _Spoils(_Wrong):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 from encoder_frames import CHAPTER_5, QUICK, TINY, TINY_CONV, arrow_spec, draw
-from imagine_bench.agents.encoders import training
+from imagine_bench.agents.encoders import perception, training
 from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard
 from imagine_bench.agents.encoders.probe import Latents, Probe, accuracy, train_probe
 from imagine_bench.agents.encoders.recipes import Recipe, recipe_named
@@ -153,6 +153,8 @@ def test_thesis_network_is_that_of_ha_and_schmidhuber() -> None:
     convolutions = [(32, 3, 4, 4), (64, 32, 4, 4), (128, 64, 4, 4), (256, 128, 4, 4)]
     transposed = [(1024, 128, 5, 5), (128, 64, 5, 5), (64, 32, 6, 6), (32, 3, 6, 6)]
     assert list(shapes.values()) == [*convolutions, (16, 1024), (1024, 8), *transposed]
+    logits = made_vae(TINY_CONV).generate(torch.randn(3, 8, generator=torch.Generator().manual_seed(0)))
+    assert logits.min() < 0.0 < logits.max(), "pixels can be dark and bright"
     thesis = CHAPTER_5["thesis"]
     assert (thesis.latents, thesis.beta, thesis.batch, thesis.learning_rate) == (8, 4.0, 2000, 5e-4)
     assert thesis.steps * thesis.batch == 1000 * thesis.frames == 100_000_000
@@ -228,14 +230,22 @@ def test_a_gpu_repeats_itself_and_agrees_with_the_processor(recipe: Recipe) -> N
 
 def test_probes_read_frames_and_looks_that_training_never_saw() -> None:
     drawn: list[tuple[str, np.ndarray]] = []
+    shown: list[np.ndarray] = []
 
     def noted(macrostates: np.ndarray, appearance: str, rng: np.random.Generator) -> np.ndarray:
         drawn.append((appearance, draw(macrostates, appearance, rng)))
+        shown.append(macrostates)
         return drawn[-1][1]
 
     spec = replace(arrow_spec(), render_macrostates=noted)
-    card = train_encoder(spec, recipe=QUICK, appearance="photo", seed=0).card
+    made = train_encoder(spec, recipe=QUICK, appearance="photo", seed=0)
+    card = made.card
     (looks, first), (unseen, second) = drawn
+    of_first, of_second = (
+        float((made.read_macrostate(made.encode(each)[0]) == states).all(axis=1).mean())
+        for each, states in zip((first, second), shown, strict=True)
+    )
+    assert card.probe["mlp"] == pytest.approx(of_second) != pytest.approx(of_first), "measured on frames held out"
     assert (card.appearance, looks, unseen) == ("photo", "photo", "photo_held_out")
     assert (len(first), len(second)) == (QUICK.frames, QUICK.held_out_frames)
     assert {frame.tobytes() for frame in first}.isdisjoint(frame.tobytes() for frame in second)
@@ -348,6 +358,15 @@ def test_bad_files_are_named_and_left_untouched(tiny: Encoder, tmp_path: Path) -
         with pytest.raises(ArtefactError, match=rf"e\.safetensors is not a usable encoder \(.*{reason}.*\); choose"):
             Encoder.load(path)
         assert path.read_bytes() == content
+
+
+def test_a_full_memory_of_frames_forgets_the_oldest(tiny: Encoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perception, "_CACHED", 3)
+    sees = perception.Perception(tiny)
+    shown = frames(5)
+    read = [sees.posterior(frame)[0] for frame in shown]
+    assert all(torch.equal(mu, tiny.encode(frame[None])[0][0]) for mu, frame in zip(read, shown, strict=True))
+    assert [frame.tobytes() for frame in shown[2:]] == list(sees._recent)
 
 
 def test_saving_never_overwrites(tiny: Encoder, tmp_path: Path) -> None:

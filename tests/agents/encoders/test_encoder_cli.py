@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from encoder_frames import CHAPTER_5, QUICK, arrow_spec
-from imagine_bench.agents.encoders import training
+from imagine_bench.agents.encoders import cli, training
 from imagine_bench.agents.encoders.cli import retrain
 from imagine_bench.agents.encoders.encoder import Encoder
 from PIL import Image
@@ -39,6 +39,24 @@ def test_retrain_leaves_three_files_and_never_overwrites(tmp_path: Path, monkeyp
     with pytest.raises(ArtefactError, match="exists already and is never overwritten"):
         made(tmp_path)
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == written
+
+
+def test_without_a_terminal_a_line_is_said_now_and_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def trained(spec: Any, *, progress: Any, **how: Any) -> None:
+        for second in range(100):
+            now[0] = float(second)
+            progress("training", second / 100)
+        raise KeyboardInterrupt
+
+    now = [0.0]
+    monkeypatch.setattr(cli.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(cli, "train_encoder", trained)
+    with pytest.raises(KeyboardInterrupt):
+        made(tmp_path)
+    said = [line for line in capsys.readouterr().err.splitlines() if ": training" in line]
+    assert said == [f"drawn_arrows-mild: training {share}%" for share in (16, 32, 48, 64, 80, 96)]
 
 
 @pytest.mark.parametrize(

@@ -67,6 +67,11 @@ def test_losses_compare_what_is_predicted() -> None:
     torch.testing.assert_close(losses(model, batch, draws(2)).detach(), torch.stack(expected), rtol=1e-4, atol=1e-5)
 
 
+def test_hidden_layers_have_the_precision_that_is_asked_for() -> None:
+    for name, dtype in (("bfloat16", torch.bfloat16), ("float32", torch.float32)):
+        assert {network.hidden_dtype for network in make(precision=name).networks} == {dtype}
+
+
 def test_it_learns_a_small_deterministic_chain_and_members_disagree_beyond_it() -> None:
     model = make(learning_rate=5e-3, dropout=0.0, members=3, sigma_floor=0.1)
     generator = draws(1)

@@ -183,3 +183,8 @@ def test_a_world_ends_at_its_own_horizon():
         env = gymnasium.make("imagine_bench/Arrows-v0", goal="toward_agent", execution="kinematic", **options)
         assert env.get_wrapper_attr("_max_episode_steps") == horizon
         env.close()
+
+
+def test_a_seed_of_the_order_shuffles_also_if_it_is_zero():
+    orders = [Arrows(shuffle=seed).turns for seed in (None, 0, 1)]
+    assert len(set(orders)) == 3 and len({frozenset(order) for order in orders}) == 1

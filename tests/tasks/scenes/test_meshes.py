@@ -39,3 +39,11 @@ def test_volumes_of_flat_solids_are_exact():
     assert signed_volume_m3(stack([outline, outline], (-0.1, 0.2))) == pytest.approx(0.3 * area)
     assert signed_volume_m3(box((0, 0, 0), (1, 2, 3))) == pytest.approx(6.0)
     assert signed_volume_m3(box((0, 0, 0), (1, 1, 1), taper=0.5)) == pytest.approx((1 + 0.25 + 0.5) / 3)
+
+
+@pytest.mark.parametrize("part", ["hand", "palm"])
+def test_people_see_every_limb_that_agents_see(part):
+    coarse = PARTS[part].vertices
+    smooth = PARTS[f"{part}_smooth"].vertices
+    apart_m = np.linalg.norm(coarse[:, None] - smooth[None], axis=2).min(axis=1)
+    assert apart_m.max() < 0.006

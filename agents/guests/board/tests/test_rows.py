@@ -12,15 +12,17 @@ from pathlib import Path
 import bench_fakes  # noqa: F401 - registers its agents
 import pytest
 from board_forging import OpenRow
+from imagine_bench_board import submit as submitting
 from imagine_bench_board.check import NEVER_SHOWN, NOT_VOUCHED, check
 from imagine_bench_board.page import write_board
-from imagine_bench_board.rows import CARD, EPISODES, LARGEST, read_row
+from imagine_bench_board.rows import CARD, EPISODES, LARGEST, LONGEST, read_row, world_words
 from imagine_bench_board.submit import submit
 from small_runs import Inline, small
 
 from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.running.bench import bench
+from imagine_bench.store.bench_folder import bench_facts
 from imagine_bench.store.run_folder import load_run
 
 
@@ -53,6 +55,36 @@ def test_a_bench_is_submitted_agent_by_agent(run: Path, tmp_path: Path) -> None:
     assert [read_row(folder).claimed.agent for folder in written] == ["table", "random"]
     with pytest.raises(InvalidValueError, match="exists; remove it, or give another folder to --out"):
         submit(run, tmp_path, author="", round_folder=None, encoder=None)
+
+
+def test_rows_of_unlike_tests_stand_in_tables_of_their_own() -> None:
+    one = small(agents=("random",), execution="physics")
+    unlike = {
+        "task": "arrow_puzzle_hard", "execution": "kinematic", "appearance": "mild", "test_appearance": "strong",
+        "physics": (("object_mass", 2.0),), "split": "plan_length=2", "observation": "state",
+    }  # fmt: skip
+    others = [dataclasses.replace(one, **{name: value}) for name, value in unlike.items()]
+    assert len({world_words(each) for each in (one, *others)}) == 1 + len(others)
+    assert world_words(dataclasses.replace(one, seeds=(5,), budgets=(3,))) == world_words(one)
+
+
+def test_a_long_command_is_cut(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    facts = bench_facts(run.parents[1])
+    command = f"imagine-bench bench \x1b --set\n{'a=1 ' * 100}"
+    monkeypatch.setattr(
+        submitting, "bench_facts", lambda _: {"environment": {**facts["environment"], "command": command}}
+    )
+    (folder,) = submit(run, tmp_path, author="", round_folder=None, encoder=None)
+    claimed = read_row(folder).claimed.command
+    assert claimed.startswith("imagine-bench bench  --set a=1 a=1") and len(claimed) == LONGEST
+
+
+def test_a_run_is_found_from_its_own_folder(
+    run: Path, row: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run)
+    (again,) = submit(Path(), tmp_path, author="a founder", round_folder=None, encoder=None)
+    assert read_row(again) == read_row(row)
 
 
 def test_the_check_says_the_verdict_in_one_line(row: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -110,6 +110,15 @@ def test_an_outcome_that_differs_is_unknown_for_good() -> None:
         assert learner.outcomes[code] == swaps.UNSURE
 
 
+def test_a_snapshot_stays_as_it_was_and_is_taken_up_whole() -> None:
+    learner = agent()
+    early = learner.state()
+    live(learner, 60)
+    assert learner.touched.any() and not early.arrays["table/touched"].any(), "it does not learn on"
+    learner.restore(early)
+    assert learner.outcomes == {} and not learner.touched.any()
+
+
 def test_latents_have_no_parts_to_swap(monkeypatch: pytest.MonkeyPatch) -> None:
     plain = SimpleNamespace(encoder=SimpleNamespace(card=SimpleNamespace(code_sizes=())))
     monkeypatch.setattr(swaps, "load_perception", lambda context: plain)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import fake_codes
 import numpy as np
 import pytest
 from agent_states import same
-from fake_codes import ACTIONS, agent, frame, live, starts, success
+from fake_codes import ACTIONS, FakeCodes, agent, frame, live, starts, success
 from imagine_bench_factored.agent import ACCEPTED, FactoredAgent
 from imagine_bench_factored.factors import CodeTransition
 from imagine_bench_factored.model import FactoredModel, Moves, Results
+from imagine_bench_factored.perception import CodePerception
 from imagine_bench_factored.planner import TIE, Planner
 from imagine_bench_factored.settings import FactoredSettings
 from numpy.typing import NDArray
@@ -34,6 +36,14 @@ def test_what_an_untried_action_does_is_imagined_as_expected(sizes: tuple[int, .
     stayed = np.mean([not any(following) for following, _ in drawn])
     assert stayed == pytest.approx(np.prod([chance[0] for chance in expected]), abs=0.1) and stayed < 0.8
     assert all(not any(model.sample(code, 0, rng)[0]) for _ in range(20)), "seen to stay"
+
+
+def test_whole_codes_have_a_number_each() -> None:
+    perception = CodePerception(FakeCodes(), factored=False)  # type: ignore[arg-type]
+    every = np.stack([frame(code) for code in itertools.product(range(3), range(3), range(2))])
+    assert perception.sizes == (18,)
+    assert perception.codes(every) == [(number,) for number in range(18)]
+    assert np.array_equal(perception.latents(perception.codes(every)), FakeCodes().encode(every)[0])
 
 
 def rows(codes: list[tuple[int, ...]]) -> list[CodeTransition]:

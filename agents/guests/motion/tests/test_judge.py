@@ -21,7 +21,7 @@ from imagine_bench_motion.judge.recurrent import MotionNetwork
 from imagine_bench_motion.judge.report import motion_tables
 from imagine_bench_motion.judge.scores import Simulator, score
 
-from imagine_bench.arrays import Array, Ints
+from imagine_bench.arrays import Array, Floats32, Frame, Ints
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
 
 
@@ -90,6 +90,21 @@ def test_questions_are_the_same_after_they_were_in_a_file() -> None:
     again = MotionQuestions.of(arrays).arrays()
     assert arrays.keys() == again.keys()
     assert all(np.array_equal(arrays[name], again[name]) for name in arrays)
+
+
+def test_a_model_is_given_each_part_of_a_motion_in_its_place() -> None:
+    asked = questions("arrows")
+    given: list[tuple[object, ...]] = []
+
+    class Noting(Simulator):
+        def imagine_motion(self, frames: Frame, actions: Floats32, lengths: Ints, labels: Ints) -> Frame:
+            given.append((actions, lengths, labels))
+            return super().imagine_motion(frames, actions, lengths, labels)
+
+    score("noting", Noting(asked), asked, KnownFrames(asked))
+    motions = (asked.planned, asked.raised, *asked.chains)
+    wanted = [(each.actions, each.lengths, each.labels) for each in motions]
+    assert [tuple(map(id, each)) for each in given] == [tuple(map(id, each)) for each in wanted]
 
 
 @pytest.mark.parametrize("family", FAMILIES)

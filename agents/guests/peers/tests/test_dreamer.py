@@ -18,6 +18,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import torch
     from imagine_bench.agents.encoders.encoder import Encoder, bundled_encoder
+    from imagine_bench_peers import dreamer
     from imagine_bench_peers.dreamer import Dreamer, Sequences, make
 
 
@@ -67,6 +68,21 @@ def test_sequences_are_whole_and_begin_anywhere() -> None:
     assert drawn.shape == (3, 200) and (np.diff(drawn, axis=0) == 1).all()
     assert set(drawn[0].tolist()) == {3, 4, 5}, "the oldest are forgotten, the newest are reached"
     assert memory.sample(2, 9, np.random.default_rng(0))["n"].shape == (5, 2, 1), "as many as there are"
+
+
+def test_the_target_follows_the_critic(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = learner(learning_starts=1000)
+    episode(agent, 0)
+    monkeypatch.setattr(dreamer.library, "train", lambda *_: None)
+    critic, target = (next(network.parameters()) for network in (agent._critic, agent._target))
+    rate = agent._config.algo.critic.tau
+    for number, share in ((1.0, 1.0), (2.0, rate)):
+        before = target.detach().clone()
+        with torch.no_grad():
+            critic.fill_(number)
+        agent._update()
+        assert (critic == number).all(), "the critic learns by its own loss alone"
+        torch.testing.assert_close(target.detach(), before + share * (number - before))
 
 
 def test_it_sees_latents_where_there_is_an_encoder() -> None:

@@ -110,6 +110,18 @@ def test_late_symbols_give_the_laws_of_those_that_are_not(delay: int) -> None:
     assert laws.end((4,), 0, (0,)).ended, "the reward that came at once belongs to symbols that are not seen yet"
 
 
+def test_a_new_delay_counts_all_tries_again() -> None:
+    writer = Writer((5,), 2, np.random.default_rng(0))
+    for each in late(1):
+        writer.learn(each)
+        if writer.laws.delay:
+            break
+    again = Writer((5,), 2, np.random.default_rng(0))
+    again.rows = writer.rows
+    again.write()
+    assert writer.laws.delay == again.laws.delay == 1 and writer._tried == again._tried
+
+
 def test_changes_belong_to_the_macro_action_of_before() -> None:
     first, second, third = (Row((value,), value, (value + 1,), 0.0, False, value) for value in range(3))
     assert changes([first, second, third], 1) == [second._replace(action=0), third._replace(action=1)]

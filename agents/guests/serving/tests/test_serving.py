@@ -257,6 +257,10 @@ def test_openenvs_websocket(tmp_path: Path) -> None:
         assert line.say(type="state")["data"]["step_count"] == 1  # type: ignore[index]
         assert line.say(type="step", data={"action": "fly"})["data"]["code"] == "VALIDATION_ERROR"  # type: ignore[index]
         assert "A message has the type" in line.say(type="dance")["data"]["message"]  # type: ignore[index]
+        line.send(1, b"\xff")
+        assert line.frame() == (8, (1007).to_bytes(2)), "it is no text"
+        line.close()
+        line = Line(one)
         line.send(1, b"", length=MOST_BYTES + 1)
         assert line.frame() == (8, (1009).to_bytes(2))
         line.close()

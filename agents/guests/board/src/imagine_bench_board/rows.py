@@ -38,7 +38,7 @@ LARGEST = {CARD: 1 << 18, EPISODES: 1 << 23}
 """The files of a row, and the most bytes that each may have."""
 NAME = re.compile(r"[a-z0-9][a-z0-9_.,=-]{0,79}")
 """Names of rows and rounds: of characters that every file system and every address on the web takes as they are."""
-_LONGEST = 300
+LONGEST = 300
 """Characters of a claim."""
 
 
@@ -83,9 +83,9 @@ class Claims:
     def __post_init__(self) -> None:
         require_types(self)
         for name, value in vars(self).items():
-            if isinstance(value, str) and (len(value) > _LONGEST or unprintable(value) or "\n" in value):
+            if isinstance(value, str) and (len(value) > LONGEST or unprintable(value) or "\n" in value):
                 raise InvalidValueError(
-                    f"The claim {name!r} is {brief(value)}; give at most {_LONGEST} printable characters in one line."
+                    f"The claim {name!r} is {brief(value)}; give at most {LONGEST} printable characters in one line."
                 )
         if self.frames_beforehand is not None and self.frames_beforehand < 0:
             raise InvalidValueError(f"frames_beforehand is {brief(self.frames_beforehand)}; give at least 0.")

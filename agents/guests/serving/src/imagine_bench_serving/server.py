@@ -180,7 +180,7 @@ class Handler(BaseHTTPRequestHandler):
         try:
             while True:
                 talk.send(json.dumps(self._said(talk.receive(), player)))
-        except (ClosedError, UnicodeDecodeError):
+        except ClosedError:
             return
 
     def _said(self, text: str, player: dict[str, Json]) -> Answer:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import struct
+from contextlib import suppress
 from io import BufferedIOBase
 
 _MAGIC = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
@@ -15,6 +16,7 @@ _PING = 9
 _PONG = 10
 _TOO_LARGE = 1009
 _NOT_TAKEN = 1003
+_NO_TEXT = 1007
 """Codes of a close, RFC 6455, section 7.4.1."""
 
 
@@ -42,11 +44,13 @@ class TextSocket:
         self._most_bytes = most_bytes
 
     def receive(self) -> str:
-        """The next message. Raises ClosedError, or UnicodeDecodeError: it is no text."""
+        """The next message. Raises ClosedError."""
         while True:
             kind, content = self._frame()
             if kind == _TEXT:
-                return content.decode()
+                with suppress(UnicodeDecodeError):
+                    return content.decode()
+                self.close(struct.pack("!H", _NO_TEXT))
             if kind == _PING:
                 self._send(_PONG, content)
             elif kind == _CLOSE:
