@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from types import SimpleNamespace
+from unittest import mock
 
 import fake_codes
 import numpy as np
@@ -208,7 +209,8 @@ def test_what_surprised_it_is_known_at_once() -> None:
 
 
 def test_what_draws_it_can_be_read_and_changes_nothing() -> None:
-    learner, seen, rng = agent(), Observation(frame=frame((0, 1, 0))), np.random.default_rng(0)
+    learner = agent(planning__exploration="curiosity")
+    seen, rng = Observation(frame=frame((0, 1, 0))), np.random.default_rng(0)
     assert learner.novelty(seen, rng) is None, "before anything was seen there is no measure"
     live(learner, range(2), rng)
     before, novelty = learner.state(), learner.novelty(seen, rng)
@@ -233,6 +235,38 @@ def test_optimism_values_the_unknown_at_the_best_reward(place: int) -> None:
         value = 0.5 * 0.9 * value + 0.5 * 10.0
     assert planner.values((place,), "optimistic") == pytest.approx([value])
     assert planner.values((place,)) == pytest.approx([10.0 * 0.9 ** (4 - place)])
+
+
+@pytest.mark.parametrize(("unknown", "hoped"), [(0.21, 10.0), (0.19, None)])
+def test_r_max_values_only_enough_of_the_unknown_at_the_best_reward(unknown: float, hoped: float | None) -> None:
+    class Untried(_Chain):
+        """Only the end brings a reward; the effect of the others is a little unknown."""
+
+        def results(self, codes: NDArray[np.int64], moves: Moves) -> Results:
+            found = super().results(codes, moves)
+            return found._replace(unknown=np.full_like(found.unknown, unknown))
+
+    settings = dataclasses.replace(FactoredSettings().planning, r_max_threshold=0.2, discount=0.9)
+    planner = Planner(Untried(5, settings.branches), settings)  # type: ignore[arg-type]
+    known = [10.0 * 0.9 ** (4 - place) for place in range(5)]
+    assert [planner.values((place,)).item() for place in range(5)] == pytest.approx(known)
+    found = [planner.values((place,), "r_max").item() for place in range(5)]
+    assert found == pytest.approx(known if hoped is None else [hoped] * 5)
+
+
+@pytest.mark.parametrize(
+    ("value", "r_max", "explores_by"),
+    [(30.0, 40.0, "r_max"), (30.0, 30.0, "r_max"), (10.0, 10.0, "novelty"), (10.0, 12.0, "r_max")],
+)
+def test_it_is_curious_only_where_nothing_promises_more_and_the_goal_is_far(
+    value: float, r_max: float, explores_by: str
+) -> None:
+    """50 is the best reward seen; after the 20 macro-actions of a plan it is worth 17.9."""
+    learner = agent()
+    learner.model.outcomes.rewards = np.array([-1.0, 50.0])
+    found = {"value": np.array([value, 0.0]), "r_max": np.array([r_max, 1.0]), "novelty": np.array([0.5, 0.9])}
+    with mock.patch.object(learner, "_values", lambda _, objective="value": found[objective]):
+        assert learner._exploring_values((0, 0, 0)) is found[explores_by]
 
 
 def test_a_likely_transition_is_still_a_surprise_while_unknown() -> None:

@@ -145,7 +145,7 @@ def test_dynamics_average_over_what_a_factor_may_depend_on(model: FactoredModel,
 
 def test_each_conjunction_has_a_number_of_its_own() -> None:
     """Single values and whole codes, of the code after, or of the one before together with the action."""
-    conjunctions = Conjunctions(SIZES, ACTIONS, OutcomeSettings(order=1, prior=0.1, order_decay=0.3))
+    conjunctions = Conjunctions(SIZES, ACTIONS, OutcomeSettings(order=1, prior=0.1, order_decay=0.3, choice_decay=0.5))
     every = list(itertools.product(CODES, range(ACTIONS), CODES))
     active = conjunctions.active(*(np.array([row[part] for row in every]) for part in range(3)))
     told = [
@@ -158,7 +158,9 @@ def test_each_conjunction_has_a_number_of_its_own() -> None:
     assert sorted(number for *_, number in named) == list(range(2 + 3 + 6 + 2 + 4 + 6 + 12)), "one a conjunction"
     prior = conjunctions.prior[conjunctions.group]
     for place, _, number in named:
-        assert prior[number] == pytest.approx(0.03 if place == 6 else 0.1), "two values and the action are three"
+        with_action = 0.5 if place >= 3 else 1.0
+        order = 0.3 if place == 6 else 1.0
+        assert prior[number] == pytest.approx(0.1 * order * with_action), "two values and the action are three"
 
 
 def brought(model: FactoredModel, code: Code, action: int, following: Code) -> tuple[dict[int, float], float]:
@@ -178,7 +180,7 @@ def by_noisy_or(model: FactoredModel, code: Code, action: int, following: Code) 
     silent = np.prod(1.0 - causes.strength[:, active], axis=1)
     chance = {outcome: 1.0 - float(none) for outcome, none in enumerate(silent)}
     chance[causes.default] = none = float(np.prod(np.delete(silent, causes.default)))
-    rate = causes.cause_rate[model.outcomes.conjunctions.group[active]]
+    rate = causes.cause_rate.sum(axis=0)[model.outcomes.conjunctions.group[active]]
     tested = np.prod(1.0 - rate * pseudo / (pseudo + causes.tests[active]))
     return {outcome: share / sum(chance.values()) for outcome, share in chance.items()}, float(1.0 - tested) * none
 
@@ -234,13 +236,35 @@ def test_a_goal_of_all_values_but_one_is_expected_whatever_that_one_is() -> None
     assert met > 0.5 and missed < 0.05
 
 
-def test_causes_are_found_by_expectation_maximisation() -> None:
-    """The same with dense matrices over three outcomes: which conjunctions hold in which transitions, (N, M)."""
-    learned = OutcomeModel(SIZES, ACTIONS, OutcomeSettings(order=1, sweeps=6, masked_weight=0.3))
-    rows = [row._replace(reward=2.0) if row.following == (0, 1) else row for row in lived()]
+def teach(learned: OutcomeModel, rows: list[CodeTransition], starts: list[Code]) -> None:
+    """Learn transitions, and codes that episodes began with."""
     for row in rows:
         learned.add(row)
+    for start in starts:
+        learned.add_start(start)
     learned.fit()
+
+
+def held_in_starts(learned: OutcomeModel, starts: list[Code]) -> Floats:
+    """In how many starts each conjunction of values of one code held. Shape (J,)."""
+    of_next = sum(learned.conjunctions.next.of_each)
+    held = np.zeros(len(learned.conjunctions.group))
+    for start in starts:
+        (here,) = learned.conjunctions.active(np.array([start]), np.array([0]), np.array([start]))
+        held[here[here < of_next]] += 1.0
+    return held
+
+
+@pytest.mark.parametrize("starts", [[], [(0, 0), (1, 0), (1, 0), (1, 2)]], ids=["no starts", "starts"])
+def test_causes_are_found_by_expectation_maximisation(starts: list[Code]) -> None:
+    """The same with dense matrices over three outcomes: which conjunctions hold in which transitions, (N, M).
+
+    A start is a test of every conjunction that holds in it, for outcomes that end an episode alone. A code that ended
+    an episode, (1, 2), is no evidence as a start.
+    """
+    learned = OutcomeModel(SIZES, ACTIONS, OutcomeSettings(order=1, sweeps=6, masked_weight=0.3))
+    rows = [row._replace(reward=2.0) if row.following == (0, 1) else row for row in lived()]
+    teach(learned, rows, starts)
     settings, groups, causes = learned.settings, learned.conjunctions.group, learned.causes
     assert causes is not None and len(learned.outcomes) == 3
     active = learned.conjunctions.active(*(np.array([row[part] for row in rows]) for part in range(3)))
@@ -249,6 +273,7 @@ def test_causes_are_found_by_expectation_maximisation() -> None:
     holds = (active[:, :, None] == met).any(axis=1).astype(float)
     belongs = np.eye(len(learned.conjunctions.prior))[groups[met]]  # [M, G]
     few, pseudo = settings.pseudo_conjunctions, settings.pseudo_tests
+    went_on = held_in_starts(learned, [start for start in starts if start != (1, 2)])
 
     def silent(strength: Floats) -> Floats:
         return (1.0 - settings.leak) * np.prod(1.0 - holds * strength, axis=1)
@@ -257,23 +282,29 @@ def test_causes_are_found_by_expectation_maximisation() -> None:
         return strength * ((brought == outcome) / (1.0 - silent(strength)) @ holds)
 
     def explain(default: int) -> tuple[dict[int, Floats], Floats, Floats, float]:
-        """Strengths by outcome, tests, rates, and the posterior's logarithm."""
+        """Strengths by outcome, tests, rates of those that do not end and that end, and the posterior's logarithm."""
         strengths, chance = {}, np.ones((3, len(rows)))
-        rate = 0.5 * few * learned.conjunctions.prior / (few + belongs.sum(axis=0))
+        rate = np.tile(0.25 * few * learned.conjunctions.prior / (few + belongs.sum(axis=0)), (2, 1))
         tests = (brought == default) @ holds
         cost = 0.0
         for outcome in {0, 1, 2} - {default}:
             own = learned.conjunctions.prior / 2
             strength = belongs @ own
             weight = np.where((brought == outcome) | (brought == default), 1.0, settings.masked_weight) @ holds
+            ends = learned.outcomes[outcome][1]
+            weight = weight + ends * went_on[met]
             for _ in range(settings.sweeps):
                 strength = (pseudo * belongs @ own + decided(strength, outcome)) / (pseudo + weight)
                 own = (few * learned.conjunctions.prior / 2 + strength @ belongs) / (few + belongs.sum(axis=0))
-            strengths[outcome], rate = strength, rate + own
+            strengths[outcome] = strength
+            rate[int(ends)] += own
             tests = tests + decided(strength, outcome)
             cost += float(np.maximum(strength - belongs @ own, 0.0) @ np.log(belongs @ own))
-            chance[outcome] = 1.0 - silent(strength)
             chance[default] *= silent(strength)
+        for outcome, strength in strengths.items():
+            chance[outcome] = 1.0 - silent(strength)
+            others = [1.0 - silent(strengths[other]) for other in strengths.keys() - {outcome}]
+            chance[outcome] *= np.prod(1.0 - 0.5 * np.array(others), axis=0)  # either may prevail
         likelihood = chance[brought, np.arange(len(rows))] / chance.sum(axis=0)
         return strengths, tests, rate, float(np.log(likelihood).sum()) + cost
 
@@ -284,3 +315,44 @@ def test_causes_are_found_by_expectation_maximisation() -> None:
     assert causes.tests[met] == pytest.approx(tests)
     assert causes.cause_rate == pytest.approx(rate)
     assert causes.log_posterior == pytest.approx(posterior)
+
+
+def test_starts_say_that_nothing_in_them_ends_an_episode() -> None:
+    """How much is untested, by enumeration of all transitions: a start tests for ends, and for nothing else."""
+    starts = [(0, 0), (1, 0), (1, 0)]
+    learned = OutcomeModel(SIZES, ACTIONS, OutcomeSettings())
+    teach(learned, lived()[:9], [])
+    every = [np.array(column) for column in zip(*itertools.product(CODES, range(ACTIONS), CODES), strict=True)]
+    before = learned.predict(*every)[1]
+    teach(learned, [], starts)
+    causes, pseudo, held = learned.causes, learned.settings.pseudo_tests, held_in_starts(learned, starts)
+    assert causes is not None and len(causes.outcomes) == 2
+    (ending,) = {0, 1} - {causes.default}
+    goes_on, ends = causes.cause_rate[:, learned.conjunctions.group]
+    untested = pseudo * (goes_on / (pseudo + causes.tests) + ends / (pseudo + causes.tests + held))
+    unknown = learned.predict(*every)[1]
+    for here, found in zip(learned.conjunctions.active(*every), unknown, strict=True):
+        silent = np.prod(1.0 - causes.strength[ending, here])
+        assert found == pytest.approx(silent * (1.0 - np.prod(1.0 - untested[here])))
+    in_starts = np.array([tuple(code) in starts for code in every[2].tolist()])
+    assert (unknown[in_starts] < before[in_starts]).all(), "a start makes its own code better known"
+    learned.reset_for_new_task()
+    assert not learned.starts, "another task may end where this one began"
+
+
+def test_where_causes_of_two_outcomes_hold_that_prevails_which_prevailed_before() -> None:
+    """Both ends have a cause, one value each; both causes held twice, and the bad end came. Then a new such code."""
+    sizes = (2, 2, 5)
+    learned = OutcomeModel(sizes, ACTIONS, OutcomeSettings(order=1))
+    for first, second, third in itertools.product(*map(range, sizes)):
+        outcome = (-5.0, True) if first else (50.0, True) if second else (-1.0, False)
+        if not (first and second and third >= 2):
+            learned.add(CodeTransition((0, 0, 0), 0, (first, second, third), *outcome))
+    learned.fit()
+    codes = np.array([(1, 1, 4), (1, 0, 4), (0, 1, 4)])
+    chance, _ = learned.predict(np.zeros((3, 3), dtype=np.int64), np.ones(3, dtype=np.int64), codes)
+    bad, good = (learned.outcomes.index((reward, True)) for reward in (-5.0, 50.0))
+    assert chance[0, bad] > 0.7 and chance[0, good] < 0.4, "near (2 + 1/2) / (2 + 1) and 1/6"
+    assert chance[1, bad] > 0.9 and chance[2, good] > 0.8
+    assert learned.prevails[bad, good] == pytest.approx(5.0 / 6.0, abs=0.05)
+    assert learned.prevails[bad, good] + learned.prevails[good, bad] == pytest.approx(1.0)

@@ -41,6 +41,8 @@ class CodeAgent:
     """Learns from codes alone; every transition is replayed, and the model is a function of the replay memory."""
 
     perception: CodePerception | LearnedPerception
+    _observed = 0
+    """Transitions of this episode that it was shown, its own or another's."""
 
     def __init__(
         self,
@@ -71,6 +73,10 @@ class CodeAgent:
         self.tasks: list[int] = []
         """How much was replayed when each later task began."""
 
+    def begin_episode(self) -> None:
+        """The next frame is the first of an episode; see :class:`.capabilities.EpisodeRememberer`."""
+        self._observed = 0
+
     @property
     def _ready(self) -> bool:
         """Whether anything is known of this task's rewards, so that there is something to plan for."""
@@ -85,7 +91,7 @@ class CodeAgent:
         return self.planner.values(code, objective, self._left) if self._ready else np.zeros(self.n_actions)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
-        """The action of the largest value; exploring, that which leads to the most unknown as long as there is any."""
+        """The action of the largest value; exploring, see :meth:`_exploring_values`."""
         if not self._ready:
             return int(self.rng.integers(self.n_actions)) if explore else 0
         code = self.perception.code(observation.frame)
@@ -95,16 +101,31 @@ class CodeAgent:
         return int(self.rng.choice(np.flatnonzero(values >= values.max() - TIE)))
 
     def _exploring_values(self, code: Code) -> Floats:
+        """Values (A,) that it acts by in training.
+
+        By R-max, as long as something unknown promises more than all that is known, or the best reward seen is known to
+        be within reach. Elsewhere it goes where most is unknown, until nothing is left; then it acts greedily.
+        """
         planning = self.settings.planning
         if planning.exploration == "optimism":
             return self._values(code, "optimistic")
         if planning.exploration == "random":
             return np.zeros(self.n_actions) if self.rng.random() < planning.epsilon else self._values(code)
+        if planning.exploration == "r_max":
+            hoped = self._values(code, "r_max")
+            if hoped.max() > self._values(code).max() + TIE or self._is_solved(code):
+                return hoped
         novelty = self._values(code, "novelty")
         curious = novelty.max() >= planning.exploration_threshold
         self.meters.add("exploration/share", float(curious))
         self.meters.add("exploration/novelty", float(novelty.max()))
         return novelty if curious else self._values(code)
+
+    def _is_solved(self, code: Code) -> bool:
+        """Whether the value is no less than that of the largest reward seen at the greatest depth of a plan."""
+        planning = self.settings.planning
+        best = float(self.model.outcomes.rewards.max())
+        return best > 0.0 and bool(self._values(code).max() >= planning.discount**planning.depth * best)
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Keep the transition; if it was unexpected, learn from all since the last one, and plan anew."""
@@ -112,6 +133,8 @@ class CodeAgent:
             code = self.perception.code(transition.observation.frame)
             following = self.perception.code(transition.next_observation.frame)
             row = CodeTransition(code, transition.action, following, transition.reward, transition.terminated)
+            row = row._replace(is_first=self._observed == 0)
+            self._observed += 1
             class_reward = self.rewards.reward(row)
             (probability,), (unknown,) = self.model.probabilities([row._replace(reward=class_reward)])
             unexpected = bool(probability < _EXPECTED or unknown > self.settings.planning.exploration_threshold)
@@ -124,6 +147,8 @@ class CodeAgent:
                 self.learn()
         self.meters.add("model/unexpected", float(unexpected))
         self.meters.count("time/model_s")
+        if transition.terminated or transition.truncated:
+            self.begin_episode()
 
     @property
     def _task_start(self) -> int:
@@ -215,7 +240,7 @@ class CodeAgent:
 
         ArtefactError if it does not fit this agent, and then nothing was changed.
         """
-        complete = with_reward_classes(state)
+        complete = completed(state)
         snapshot.require_fit(complete, self.state(), equal=("settings", "code_sizes", "n_actions"))
         self._take_up(complete)
 
@@ -230,13 +255,21 @@ class CodeAgent:
         self.rng.bit_generator.state = state.values["exploration"]
 
 
-def with_reward_classes(state: AgentState) -> AgentState:
-    """A snapshot with the classes of rewards, which those of before 2026-11-28 lack: every reward was its own class."""
-    if "classed" in state.values or "replay/reward" not in state.arrays:
+def completed(state: AgentState) -> AgentState:
+    """A snapshot with all that those of earlier versions lack.
+
+    Until 2026-11-28 there were no classes of rewards, so every reward was its own class; until 2026-11-29 nothing told
+    which transitions began an episode, so starts were no evidence.
+    """
+    if "replay/reward" not in state.arrays:
         return state
     rewards = state.arrays["replay/reward"]
-    arrays = {**state.arrays, "replay/class_reward": rewards.astype(np.float64)}
-    return AgentState(arrays=arrays, values={**state.values, "classed": len(rewards)})
+    arrays = {
+        "replay/class_reward": rewards.astype(np.float64),
+        "replay/is_first": np.zeros(len(rewards), dtype=np.bool_),
+        **state.arrays,
+    }
+    return AgentState(arrays=arrays, values={"classed": len(rewards), **state.values})
 
 
 class FactoredAgent(CodeAgent):

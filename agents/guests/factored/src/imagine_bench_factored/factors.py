@@ -35,6 +35,7 @@ class CodeTransition(NamedTuple):
 
     ``has_dynamics``: it happened, and so shows the order of codes; False if it was only asked about.
     ``has_reward``: reward and end are known; False if a query about it got no label.
+    ``is_first``: an episode began with it.
     """
 
     code: Code
@@ -44,6 +45,7 @@ class CodeTransition(NamedTuple):
     terminated: bool
     has_dynamics: bool = True
     has_reward: bool = True
+    is_first: bool = False
 
 
 def as_arrays(rows: Sequence[CodeTransition], factors: int) -> Arrays:

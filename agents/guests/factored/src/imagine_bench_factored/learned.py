@@ -19,7 +19,7 @@ from imagine_bench.arrays import Pixels
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 from imagine_bench.interfaces.capabilities import Perceived
 
-from .agent import CodeAgent, with_reward_classes
+from .agent import CodeAgent, completed
 from .factors import CodeTransition, contradictions, remembering
 from .model import choose
 from .perception import LearnedPerception, Sight, find_sight
@@ -44,15 +44,13 @@ class LearnedPerceptionAgent(CodeAgent):
     settings: LearnedSettings
     _acted = 0
     """Macro-actions that the agent itself chose in this episode."""
-    _observed = 0
-    """Transitions of this episode that it was shown, its own or another's."""
     _longest: int | None = None
     """After how many macro-actions an episode was cut, if any was."""
 
     def begin_episode(self) -> None:
         """The next frame is the first of an episode; see :class:`.capabilities.EpisodeRememberer`."""
+        super().begin_episode()
         self._acted = 0
-        self._observed = 0
         self.perception.begin_episode()
 
     @property
@@ -68,14 +66,13 @@ class LearnedPerceptionAgent(CodeAgent):
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Remember the frame, find factors anew if that is due, and learn as from any codes."""
         perception = self.perception
-        self._observed += 1
         if transition.truncated:
-            self._longest = max(self._observed, self._longest or 0)
+            self._longest = max(self._observed + 1, self._longest or 0)
         if not perception.full:
             with self.meters.cpu_time("time/perception_s"):
                 before = transition.observation.frame
                 after = transition.next_observation.frame
-                perception.remember(before, transition.action, after, begins=self._observed == 1)
+                perception.remember(before, transition.action, after, begins=self._observed == 0)
                 sight = perception.sight
                 found_in = perception.found_in
                 if perception.renew():
@@ -84,8 +81,6 @@ class LearnedPerceptionAgent(CodeAgent):
                         perception.history.append(perception.found_in)
             self.meters.count("time/perception_s")
         super().observe(transition, episode=episode)
-        if transition.terminated or transition.truncated:
-            self.begin_episode()
 
     def _recode(self, sight: Sight, found_in: int) -> None:
         """Give every replayed transition the codes that its frames have now, and learn from all of them once more.
@@ -152,7 +147,7 @@ class LearnedPerceptionAgent(CodeAgent):
 
         ArtefactError if it does not fit this agent, and then nothing was changed.
         """
-        complete = with_reward_classes(state)
+        complete = completed(state)
         snapshot.require_fit(_flat(complete), _flat(self.state()), equal=("settings", "n_actions"))
         self.perception.load(complete)
         self._longest = complete.values["longest"]

@@ -67,6 +67,8 @@ class FactoredModel:
             self.dynamics.add(np.array(row.code), row.action, np.array(row.following[: self._moving]))
         if row.has_reward:
             self.outcomes.add(row)
+        if row.is_first:
+            self.outcomes.add_start(row.code)
 
     def probabilities(self, rows: Sequence[CodeTransition]) -> tuple[Floats, Floats]:
         """Return the predicted probability of each of N transitions, and how much about it is unknown: (N,) and (N,).
@@ -190,7 +192,7 @@ def choose(
     if not contradictions(rows):
         return None
     half = np.cumsum(begins) % 2 == 0  # every second episode
-    causes_alone = replace(settings, outcomes=replace(settings.outcomes, pseudo_seen=_NONE_SEEN))
+    causes_alone = replace(settings, outcomes=replace(settings.outcomes, pseudo_seen=_NONE_SEEN, choice_decay=1.0))
     candidates = [Memory(f, hidden) for f, size in enumerate(sizes) if size >= _FEWEST for hidden in range(size)]
     likelihood: dict[Memory | None, float] = {}
     for memory in (None, *candidates):

@@ -5,9 +5,11 @@ causes: conjunctions of a few values of the next code, or of an action and value
 cause brings its outcome about: a noisy-OR (Pearl 1988, 4.3.2), whose causes are learned by expectation maximisation
 with sparse Beta priors. How likely a conjunction of each order is a cause at all is learned too (empirical Bayes), so
 the agent finds out by itself which causes its task has. They are the base measure of a Dirichlet prior: the outcomes of
-a transition that was seen soon weigh more. Learning conjunctions that trigger effects: DOORmax (Diuk, Cohen & Littman
-2008). A conjunction that no test has covered is known to be unknown (KWIK, Li et al. 2011), and novelty counts by
-conjunctions rather than by whole states (width-based search, Lipovetzky & Geffner 2012).
+a transition that was seen soon weigh more. Where causes of two outcomes are active, that prevails which prevailed
+before. An episode ends at none of its starts, so each is a test of the causes of ends. Learning conjunctions that
+trigger effects: DOORmax (Diuk, Cohen & Littman 2008). A conjunction that no test has covered is known to be unknown
+(KWIK, Li et al. 2011), and novelty counts by conjunctions rather than by whole states (width-based search, Lipovetzky &
+Geffner 2012).
 """
 
 from __future__ import annotations
@@ -30,6 +32,8 @@ _LARGEST_TEMPLATE = 1 << 15
 """Sets of factors with more joint values are no candidates."""
 _CERTAIN = 1.0 - 1e-6
 _LEAST = 1e-6
+_ACTIVE = 0.5
+"""Probability above which a cause is held to be active where causes of two outcomes are."""
 
 Outcome = tuple[float, bool]
 """Reward, and whether the episode ended."""
@@ -77,7 +81,9 @@ class Conjunctions:
         self.group = np.repeat([groups[kind] for kind in kinds], self.next.of_each + self.choice.of_each)
         self.of_each = np.bincount(self.group)
         beyond = np.array([max(0, values - 2) for _, values in groups])
-        self.prior: Floats = settings.prior * settings.order_decay**beyond
+        chosen = np.array([with_action for with_action, _ in groups])
+        by_kind = np.where(chosen, settings.choice_decay, 1.0)
+        self.prior: Floats = settings.prior * settings.order_decay**beyond * by_kind
 
     def active(self, codes: Ints, actions: Ints, following: Ints) -> Ints:
         """Which conjunctions hold in transitions between codes (N, P) by actions (N,). Shape (N, templates)."""
@@ -140,7 +146,9 @@ class Causes(NamedTuple):
     default: int  #: index of the default outcome, which has no causes
     strength: Floats  #: probability that a conjunction brings an outcome about. Shape (O, J).
     tests: Floats  #: how often each conjunction was tested while nothing else decided. Shape (J,).
-    cause_rate: Floats  #: probability that an untested conjunction is a cause of anything, a group. Shape (G,).
+    #: Probability that an untested conjunction is a cause, a group: of an outcome without an end, and of one with it.
+    #: Shape (2, G).
+    cause_rate: Floats
     log_posterior: float  #: log likelihood less the cost of the causes
 
 
@@ -153,6 +161,8 @@ class OutcomeModel:
         self.outcomes: list[Outcome] = []
         self._earlier: dict[Outcome, Floats] = {}
         self._counts: dict[tuple[Code, int, Code, int], int] = {}
+        self.starts: dict[Code, int] = {}
+        """How often episodes began with each code."""
         self.causes: Causes | None = None
         self.rewards: Floats = np.zeros(0)
         """Reward of each outcome that causes were learned of. Shape (O,)."""
@@ -167,6 +177,19 @@ class OutcomeModel:
         key = (row.code, row.action, row.following, self.outcomes.index(outcome))
         self._counts[key] = self._counts.get(key, 0) + 1
 
+    def add_start(self, code: Code) -> None:
+        """An episode began with this code, and so nothing that holds in it ends an episode at once."""
+        self.starts[code] = self.starts.get(code, 0) + 1
+
+    def _begun(self) -> Floats:
+        """In how many starts each conjunction held, but for starts that ended an episode once reached. Shape (J,)."""
+        ended = {following for _, _, following, outcome in self._counts if self.outcomes[outcome][1]}
+        starts = {code: times for code, times in self.starts.items() if code not in ended}
+        codes = np.array(list(starts), dtype=np.int64).reshape(-1, len(self.conjunctions.next.strides))
+        numbers = self.conjunctions.next.numbers(codes)
+        times = np.repeat(np.array(list(starts.values()), dtype=np.float64), numbers.shape[1])
+        return np.bincount(numbers.ravel(), times, minlength=len(self.conjunctions.group))
+
     def fit(self) -> None:
         """Learn the causes anew from everything seen; whichever outcome explains it best is the default."""
         if not self._counts:
@@ -175,19 +198,37 @@ class OutcomeModel:
         active = self.conjunctions.active(codes, actions, following)
         count = np.array(list(self._counts.values()), dtype=np.float64)
         evidence = _Evidence(active, outcome, count, self.conjunctions, len(self.outcomes))
+        self._went_on = self._begun()
         self._kept = np.array([self._kept_of(outcome, evidence) for outcome in range(len(self.outcomes))])
         explanations = [self._explain(evidence, default) for default in range(len(self.outcomes))]
         self.causes = causes = self._causes(evidence, max(explanations, key=lambda each: each.log_posterior))
         pseudo_tests = self.settings.pseudo_tests
-        untested = causes.cause_rate[self.conjunctions.group] * pseudo_tests / (pseudo_tests + causes.tests)
+        goes_on, ends = causes.cause_rate[:, self.conjunctions.group]
+        untested = goes_on * pseudo_tests / (pseudo_tests + causes.tests)
+        untested += ends * pseudo_tests / (pseudo_tests + causes.tests + self._went_on)
         self._spared = np.log1p(-np.vstack([causes.strength, untested])).T.copy()
         """Log probability that each conjunction causes no outcome, and last that it is no untested cause. (J, O + 1)"""
+        self.prevails = self._precedence(evidence, causes)
         self.rewards, self.ends = np.array(causes.outcomes, dtype=np.float64).T.copy()
         choices = np.column_stack([codes, actions]) @ self.conjunctions.choice.strides
         self._seen, place = np.unique(_pairs(choices, following @ self.conjunctions.next.strides), return_inverse=True)
         """Numbers of the distinct transitions, ascending; below, how often each brought each outcome, and zeros."""
         self._brought = np.zeros((len(self._seen) + 1, len(self.outcomes)))
         np.add.at(self._brought, (place, outcome), count)
+
+    def _precedence(self, evidence: _Evidence, causes: Causes) -> Floats:
+        """How probably each outcome prevails over each other where causes of both are active. Shape (O, O).
+
+        Half a case of each is known beforehand. Where outcomes are compared to themselves it is 1.
+        """
+        strength = causes.strength[:, evidence.all.met]
+        active = 1.0 - np.exp(evidence.all.holds @ np.log1p(-strength).T)  # [U, O]
+        active = np.where(active > _ACTIVE, active, 0.0)
+        came = np.eye(len(self.outcomes))[evidence.outcome] * active * evidence.all.times[:, None]
+        wins = came.T @ active  # [O, O]
+        prevails = (wins + 0.5) / (wins + wins.T + 1.0)
+        np.fill_diagonal(prevails, 1.0)
+        return prevails
 
     def reset_for_new_task(self) -> None:
         """Forget all that was seen; earlier causes become priors, until a test of this task refutes them.
@@ -201,6 +242,7 @@ class OutcomeModel:
             self._earlier = dict(zip(causes.outcomes, causes.strength, strict=True)) if weight else {}
             self.outcomes = sorted(self._earlier, key=lambda each: each != causes.outcomes[causes.default])
         self._counts = {}
+        self.starts = {}
         self.causes = None
 
     def _kept_of(self, outcome: int, evidence: _Evidence) -> Floats:
@@ -221,7 +263,7 @@ class OutcomeModel:
         choices, spared_by_choice = self._spared_by(self.conjunctions.choice, np.column_stack([codes, actions]))
         nexts, spared_by_next = self._spared_by(self.conjunctions.next, following)
         *none, tested = np.exp(spared_by_next + spared_by_choice).T
-        probability = _by_causes(np.array(none), causes.default).T  # [N, O]
+        probability = _by_causes(np.array(none), causes.default, self.prevails).T  # [N, O]
         unknown = (1.0 - tested) * probability[:, causes.default]
         probability *= self.settings.pseudo_seen / probability.sum(axis=1, keepdims=True)
         pairs = _pairs(choices, nexts)
@@ -262,6 +304,8 @@ class OutcomeModel:
         kept = self._kept[outcome, evidence.all.met]
         seen = (evidence.outcome == outcome) | (evidence.outcome == default)
         tests = settings.pseudo_tests + evidence.tests(np.where(seen, 1.0, settings.masked_weight))
+        if self.outcomes[outcome][1]:
+            tests += self._went_on[evidence.all.met]
         first = np.cumsum(tried) - tried
         base = self.conjunctions.prior / rivals
         prior = base
@@ -287,21 +331,32 @@ class OutcomeModel:
         strength = np.zeros((len(self.outcomes), all_of.sum()))
         tests = np.zeros(all_of.sum())
         tests[met] = evidence.tests(evidence.outcome == best.default)
-        rate = 0.5 * pseudo * self.conjunctions.prior / (pseudo + evidence.tried)
+        rate = np.tile(0.25 * pseudo * self.conjunctions.prior / (pseudo + evidence.tried), (2, 1))
         for outcome, cases in enumerate(evidence.of):
             if outcome == best.default:
                 continue
             strength[outcome] = np.maximum(np.repeat(best.prior[outcome], all_of), self._kept[outcome])
+            if self.outcomes[outcome][1]:
+                strength[outcome] *= settings.pseudo_tests / (settings.pseudo_tests + self._went_on)
             strength[outcome, met] = best.strength[outcome]
             tests[met[cases.met]] += cases.responsibility(best.strength[outcome, cases.met], settings.leak)
-            rate = rate + best.prior[outcome]
+            rate[int(self.outcomes[outcome][1])] += best.prior[outcome]
         return Causes(tuple(self.outcomes), best.default, strength, tests, np.minimum(rate, 0.99), best.log_posterior)
 
 
-def _by_causes(inactive: Floats, default: int) -> Floats:
-    """Activation of each outcome, of which no cause is active with this probability (O, N); the default's is unused."""
+def _by_causes(inactive: Floats, default: int, prevails: Floats | None = None) -> Floats:
+    """How probably a cause of each outcome is active and prevails over every other one; of the default, that none is.
+
+    Args:
+        inactive: Probability that no cause of each outcome is active, (O, N); the default's is unused.
+        default: The default outcome.
+        prevails: How probably each outcome prevails over each other, (O, O); by default one half.
+    """
     inactive[default] = 1.0
-    probability = 1.0 - inactive
+    active = 1.0 - inactive
+    if prevails is None:
+        prevails = 0.5 + 0.5 * np.eye(len(active))
+    probability = active * [(1.0 - lost[:, None] * active).prod(axis=0) for lost in 1.0 - prevails]
     probability[default] = inactive.prod(axis=0)
     return probability
 

@@ -4,7 +4,8 @@ Two values are planned. The *value* of an action is the expected discounted rewa
 model, Sutton 1990). Its *novelty* is the largest discounted chance of meeting something unknown on the way: the best
 single discovery, not a sum, so that cycles gain nothing. Acting for novelty until there is nothing left to find, then
 for value, is "explicit explore or exploit" (E3, Kearns & Singh 2002); valuing the unknown at the best reward seen is
-R-max (Brafman & Tennenholtz 2002). A search for the unknown ends as soon as nothing farther can be worth as much.
+R-max (Brafman & Tennenholtz 2002), which is how it explores, unless another way is set. A search for the unknown ends
+as soon as nothing farther can be worth as much.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ TIE = 1e-9
 _HAPPENS = 1e-3
 """Branches in which the episode goes on less probably than this are not followed."""
 
-Objective = Literal["value", "optimistic", "novelty"]
+Objective = Literal["value", "optimistic", "r_max", "novelty"]
 
 
 class Planner:
@@ -74,7 +75,8 @@ class Planner:
         """The value of each action in ``code``, with so many macro-actions left, or as many as it plans: (A,).
 
         ``"value"`` is the expected discounted reward; ``"optimistic"`` the same if whatever is unknown brought the
-        largest reward seen; ``"novelty"`` the largest discounted chance of meeting something unknown, of which only the
+        largest reward seen; ``"r_max"`` the same where more is unknown than a threshold, and known values elsewhere;
+        ``"novelty"`` the largest discounted chance of meeting something unknown, of which only the
         largest need be exact.
         """
         settings = self._settings
@@ -174,6 +176,8 @@ class Planner:
                 action = reward + settings.discount * ahead
             if objective == "optimistic":
                 action = (1.0 - unknown) * action + unknown * best
+            elif objective == "r_max":
+                action = np.where(unknown > settings.r_max_threshold, best, action)
             best_of = action.max(axis=1)
             if np.array_equal(best_of, state[: self.expanded]):
                 break  # every further step would be the same

@@ -45,7 +45,8 @@ class OutcomeSettings:
     #: the whole code less any one value.
     order: int = setting(3, between(0, 10))
     prior: float = setting(0.1, INSIDE)  #: prior probability that one value, or a pair, is a cause
-    order_decay: float = setting(0.3, RATE)  #: multiplies it for each value beyond two
+    order_decay: float = setting(0.1, RATE)  #: multiplies it for each value beyond two
+    choice_decay: float = setting(0.02, RATE)  #: multiplies it for one of an action and values before it
     pseudo_tests: float = setting(0.2, POSITIVE)  #: how many tests of one conjunction the prior is worth
     pseudo_conjunctions: float = setting(3.0, POSITIVE)  #: how many conjunctions of one order the prior is worth
     leak: float = setting(1e-3, INSIDE)  #: probability of an outcome without a cause
@@ -67,12 +68,14 @@ class PlanningSettings:
     branches: int = setting(8, COUNT)  #: most next codes of one action
     least_probability: float = setting(0.02, PROBABILITY)  #: less likely ones are not followed, but for the likeliest
     states: int = setting(400, between(1, 1_000_000))  #: most codes that one plan visits
-    #: ``"curiosity"`` goes where most is unknown, ``"optimism"`` values the unknown at the best reward seen,
-    #: ``"random"`` acts greedily but for random actions (the last two are ablations).
-    exploration: str = setting("curiosity", ("curiosity", "optimism", "random"))
+    #: ``"r_max"`` values all that is unknown enough at the best reward seen, and is curious where that promises
+    #: nothing. ``"curiosity"`` goes where most is unknown, ``"optimism"`` weighs the best reward seen by how much is
+    #: unknown, ``"random"`` acts greedily but for random actions (the last three are ablations).
+    exploration: str = setting("r_max", ("r_max", "curiosity", "optimism", "random"))
     novelty_discount: float = setting(0.95, PROBABILITY)  #: of novelty, a macro-action
     #: Novelty within reach below which the agent acts greedily.
     exploration_threshold: float = setting(0.01, PROBABILITY)
+    r_max_threshold: float = setting(0.2, PROBABILITY)  #: more than this is unknown enough
     epsilon: float = setting(0.1, PROBABILITY)  #: probability of a random action where exploration is random
 
 
