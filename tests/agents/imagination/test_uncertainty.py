@@ -6,7 +6,7 @@ import pytest
 import torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench.agents.imagination.uncertainty import decompose, nll
+from imagine_bench.agents.imagination.uncertainty import REDUCTIONS, decompose, nll
 
 T, N, K, Z = 6, 5, 3, 2
 
@@ -50,3 +50,9 @@ def test_nll_is_that_of_all_weight_samples_together() -> None:
     mixtures = samples(torch.float64)
     densities = [mdn.log_likelihood(mixtures.map(lambda part, t=t: part[t]), VALUES).exp() for t in range(T)]
     torch.testing.assert_close(nll(mixtures, VALUES), -torch.stack(densities).mean(dim=0).log())
+
+
+def test_the_variances_of_one_vector_become_one_number() -> None:
+    values = torch.tensor([[1.0, 2.0, 6.0], [0.0, 0.0, 3.0]])  # [N, Z]
+    found = {name: reduce(values).tolist() for name, reduce in REDUCTIONS.items()}
+    assert found == {"sum": [9.0, 3.0], "mean": [3.0, 1.0], "max": [6.0, 3.0]}

@@ -101,6 +101,7 @@ def test_a_canonical_name_says_its_world_and_only_it():
     [
         ("arrows:slip=1e-1,cubes=5", "arrows:cubes=5,slip=0.1"),
         ("arrows:cubes=3,coupling=none,fickle=1", "arrows:fickle=1.0"),
+        ("arrows:shuffle=4294967295", "arrows:shuffle=4294967295"),
         ("arrows:goal_change=0.5", "arrows:fickle=0.5"),
         ("arrows:horizon=10", "arrow_puzzle"),
         ("arrows:forbid=equal+agent,horizon=10", "arrow_puzzle_hard"),
