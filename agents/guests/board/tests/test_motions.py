@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_board.check import NOT_VOUCHED, check
 from imagine_bench_board.motions import SLACK_PERIODS, MotionTests, read_motions
 from imagine_bench_board.page import write_board
-from imagine_bench_board.rows import CARD, EPISODES
+from imagine_bench_board.rows import CARD, EPISODES, LONGEST
 
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 
@@ -78,10 +79,10 @@ def test_whatever_control_a_policy_has_its_joint_commands_play_again(tmp_path: P
             _, _, terminated, truncated, _ = env.step(rng.uniform(low, high).astype(np.float32))
             over = terminated or truncated
     (found,) = check(env.write(tmp_path, "random", agent="random"))
-    assert "holds" in str(found) and "objects up to 2 cm off their slots" in str(found)
+    assert "holds" in str(found) and f"{WORLD}, continuous control at 25 Hz, mild, objects up to 2 cm off" in str(found)
 
 
-def test_every_test_is_played_whole_and_no_more_than_asked(tmp_path: Path) -> None:
+def test_every_test_is_played_whole_and_no_more_than_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     env = MotionTests(WORLD, control="joint", observation="proprio", tests=1, seed=3)
     env.reset(seed=99)
     rest = np.append(env.unwrapped.servo_targets()[:-1], 1.0)  # type: ignore[attr-defined]
@@ -95,7 +96,9 @@ def test_every_test_is_played_whole_and_no_more_than_asked(tmp_path: Path) -> No
     env.reset()  # as loops of libraries do once more
     env.step(rest)
     env.reset()
+    monkeypatch.setattr(sys, "argv", ["play.py", "a" * 400])
     written = env.write(tmp_path, "whole", agent="nobody")
+    assert len(read_motions(written).claimed.command) == LONGEST, "a long command is cut"
     assert [each.periods for each in read_motions(written).motions] == [750]
     with pytest.raises(InvalidValueError, match="exists; remove it, or give another name"):
         env.write(tmp_path, "whole", agent="nobody")

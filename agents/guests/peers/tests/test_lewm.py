@@ -71,6 +71,12 @@ class Exact(torch.nn.Module):
         return torch.stack([angles.cos(), angles.sin()], dim=-1)
 
 
+def test_a_full_memory_forgets_the_oldest() -> None:
+    agent = learner(buffer_size=3, learning_starts=1000)
+    actions = practise(agent, 5)
+    assert agent._rows["action"] == actions[-3:] and {len(kept) for kept in agent._rows.values()} == {3}
+
+
 def test_goals_are_the_frames_that_earned_most() -> None:
     agent = learner(goals=2)
     for reward, place in ((-1.0, 0), (3.0, 1), (2.0, 0), (3.0, 2), (3.0, 3)):

@@ -31,7 +31,7 @@ from imagine_bench.seeding import SEEDS, episode_seed
 from imagine_bench.store.files import make_folder, read_json, reading, write_bytes, write_json
 from imagine_bench.values import Json, unpack
 
-from .rows import CARD, EPISODES, OPEN, Claims, require_files
+from .rows import CARD, EPISODES, OPEN, Claims, one_line, require_files
 
 if TYPE_CHECKING:
     from imagine_bench.tasks.continuous.env import MotionEnv
@@ -249,7 +249,7 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         if where.exists():
             raise InvalidValueError(f"{where} exists; remove it, or give another name.")
         machine = describe_environment()
-        facts = {"commit": str(machine["commit"]), "command": str(machine["command"])}
+        facts = {"commit": str(machine["commit"]), "command": one_line(machine["command"])}
         claimed = Claims(agent=agent, **{**facts, **claims})
         episodes = json.dumps([_columns(each) for each in self.motions], separators=(",", ":")).encode()
         card: dict[str, Json] = {

@@ -131,6 +131,11 @@ class Row:
         return world_words(self.protocol)
 
 
+def one_line(text: object) -> str:
+    """A text in one line, without control characters, cut where a claim is too long."""
+    return "".join(filter(str.isprintable, " ".join(str(text).split())))[:LONGEST]
+
+
 def world_words(protocol: Protocol) -> str:
     """All that decides how hard the tests of a protocol are: task, execution, physics, looks and starts."""
     words = [protocol.task, protocol.execution, protocol.looks]

@@ -22,7 +22,7 @@ from imagine_bench.store.bench_folder import BenchStore, bench_facts, is_archive
 from imagine_bench.store.results import Checkpoint
 
 from . import rounds
-from .rows import LONGEST, Claims, Figures, Price, Row, write_row
+from .rows import Claims, Figures, Price, Row, one_line, write_row
 
 T = TypeVar("T")
 
@@ -103,18 +103,13 @@ class Submitter:
             agent=self.agent,
             author=author,
             commit=str(environment.get("commit")),
-            command=_line(environment["command"]),
-            machine=_line(environment.get("machine", {}).get("cpu")),
-            seen_beforehand=_line(_seen_beforehand(protocol, self.agent)),
+            command=one_line(environment["command"]),
+            machine=one_line(environment.get("machine", {}).get("cpu")),
+            seen_beforehand=one_line(_seen_beforehand(protocol, self.agent)),
             frames_beforehand=_frames_beforehand(protocol, self.agent),
             prices=tuple(prices),
         )
         return Row(name=self.name, protocol=protocol, vouched=tuple(figures), claimed=claimed, logs=tuple(logs))
-
-
-def _line(text: object) -> str:
-    """A text in one line, without control characters, cut where a claim is too long."""
-    return "".join(filter(str.isprintable, " ".join(str(text).split())))[:LONGEST]
 
 
 def _some(kind: type[T], values: Mapping[str, Any]) -> T:
