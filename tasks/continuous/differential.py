@@ -41,9 +41,12 @@ class DifferentialIK:
         self._tcp = arm.model.site(TCP_SITE).id
         self.lower_rad: Floats = arm.model.jnt_range[:, 0].copy()
         self.upper_rad: Floats = arm.model.jnt_range[:, 1].copy()
+        self._range_rad = arm.model.jnt_range.T.copy()
         self._posture_rad = np.array(OBSERVATION_QPOS_RAD)
         self._weights = np.array([1.0, 1.0, 1.0, *[_ROTATION_WEIGHT] * 3])
+        self._squares = self._weights**2
         self._jacobian = np.empty((6, arm.model.nv))
+        self._hessian = np.empty((arm.model.nv, arm.model.nv))
         posture = np.full(arm.model.nv, _POSTURE_WEIGHT**2)
         posture[-1] *= _WRIST_SHARE
         self._regular = np.diag(posture)
@@ -69,20 +72,17 @@ class DifferentialIK:
             motion: Translation (m) and rotation vector (rad) of the hand, in the world. Shape (6,).
             most_rad: The largest step of each joint. Shape (7,).
         """
-        data = self._data
-        qpos_rad = data.qpos
         jacobian = self._jacobian
-        mujoco.mj_jacSite(self._model, data, jacobian[:3], jacobian[3:], self._tcp)
-        weighted = self._weights[:, None] * jacobian
-        wanted = self._weights * motion
-        hessian = weighted.T @ weighted
+        qpos_rad = self._data.qpos
+        mujoco.mj_jacSite(self._model, self._data, jacobian[:3], jacobian[3:], self._tcp)
+        hessian = self._hessian
+        mujoco.mju_sqrMatTD(hessian, jacobian, self._squares)
         hessian += self._regular
-        pull = self._pull * (self._posture_rad - qpos_rad)
-        upper = np.minimum(most_rad, self.upper_rad - qpos_rad)
-        lower = np.maximum(-most_rad, self.lower_rad - qpos_rad)
-        solved, _, status, _ = daqp.solve(
-            hessian, -(wanted @ weighted + pull), self._no_rows, upper, lower, self._kinds
-        )
+        gradient = self._pull * (qpos_rad - self._posture_rad) - (self._squares * motion) @ jacobian
+        least_rad, room_rad = self._range_rad - qpos_rad
+        lower = np.maximum(-most_rad, least_rad)
+        upper = np.minimum(most_rad, room_rad)
+        solved, _, status, _ = daqp.solve(hessian, gradient, self._no_rows, upper, lower, self._kinds)
         step_rad: Floats = np.minimum(np.maximum(solved, lower), upper) if status > 0 else np.zeros(len(upper))
-        missed = weighted @ step_rad - wanted
+        missed = self._weights * (jacobian @ step_rad - motion)
         return step_rad, bool(missed @ missed > _MAX_RESIDUAL**2)
