@@ -83,7 +83,7 @@ def control_physics(suite: str) -> str:
 
 def beside_mujoco(suite: str, images: str) -> str:
     """How many times as long our step takes as MuJoCo alone, with the absolute figures in us."""
-    rounds = _kept("control")["rounds"]
+    rounds = _kept("control_alone")["rounds"]
     parts = ("step_s", "mj_step_s", "mjr_s")
     each = np.array([[row[suite][f"own {part} {images}"] for part in parts] for row in rounds])
     step_us, simulated_us, drawn_us = 1e6 * np.median(each, axis=0)
