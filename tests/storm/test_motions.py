@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from imagine_bench_motion.judge.judgement import MotionJudgement, judge, judged
+from imagine_bench_motion.judge.judgement import MotionJudgement, data_of, judge, judged, stage
 from storms import interrupted
 
 from imagine_bench.tools import demonstrations
@@ -16,7 +16,7 @@ from imagine_bench.tools import demonstrations
 pytestmark = pytest.mark.slow
 _ENDS = ("death", "full disk", "kill")
 _FEW = MotionJudgement(task="arrow_puzzle", models=("no_change",), sizes=(2,), seeds=(0,), pairs=1, chains=1)
-_PLAYED: dict[str, Any] = {"policy": "mixed", "episodes": 3, "seed": 1000, "appearance": "mild", "size": 32}
+_PLAYED: dict[str, Any] = {"policy": "expert", "episodes": 2, "seed": 1000, "appearance": "mild", "size": 32}
 
 
 def in_this_process(
@@ -70,6 +70,8 @@ def test_a_judgement_of_motions_goes_on_after_every_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], how: str
 ) -> None:
     def act(root: Path) -> Path:
+        for kept_in_memory in (stage, data_of):
+            kept_in_memory.cache_clear()
         folder, failed = judge(_FEW, root, workers=1)
         assert not failed
         return folder

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from imagine_bench.tasks.scenes.constants import TABLE_HEIGHT_M
-from imagine_bench_motion.cloning import Clone, Scale, Training, train
+from imagine_bench_motion.cloning import Clone, Scale, Training, _varied, train
 from imagine_bench_motion.demonstrations import Demonstrations, collect, turn_of
 from imagine_bench_motion.instruction import GO_BACK, words_vector
 from imagine_bench_motion.network import ChunkPolicy, Layout, PointEye, new_network
-from imagine_bench_motion.skills import HAND_NUMBERS, HOME_COMMAND
+from imagine_bench_motion.skills import HOME_COMMAND
 from imagine_bench_motion.trials import MOST_PERIODS, share_done, tries
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
@@ -105,12 +105,42 @@ def test_a_chunk_stays_within_its_demonstration() -> None:
     assert (chunks[ends] == ends[:, None]).all()
 
 
-def test_the_hand_is_down_and_the_fingers_are_closed_where_it_grips() -> None:
+def test_the_hand_is_told_to_be_down_where_it_grips() -> None:
     data = demonstrations()
     grips = data.grips()
     assert (data.episode[grips] == data.episode).all()
-    assert (data.commands[grips, -1] <= data.commands[:, -1]).all()
-    assert (data.numbers[grips][:, HAND_NUMBERS][:, 2] < TABLE_HEIGHT_M + 0.04).all()
+    assert (data.hand_m[grips][:, 2] < TABLE_HEIGHT_M + 0.04).all()
+    starts = data.numbers[np.unique(data.episode, return_index=True)[1]][:, :21].reshape(-1, 3, 7)
+    cubes_m = starts[:, :, :2] - data.hand_m[np.unique(grips)][:, None, :2]
+    assert (np.linalg.norm(cubes_m, axis=2).min(axis=1) < 1e-3).all(), "above a cube, as it stood at the start"
+
+
+def test_fingers_that_start_close_do_not_grip_there() -> None:
+    grip = [[0.02, 0.02, 0.6, 0.3, 0.05, 0.04, 0.6], [0.0, 0.0, 0.7], [0.6, 0.04, 0.04]]
+    rows = [each for part in grip for each in part]
+    data = Demonstrations(
+        images={},
+        numbers=np.zeros((len(rows), 1), dtype=np.float32),
+        instructions=np.array([""] * len(rows)),
+        commands=np.array(rows, dtype=np.float32)[:, None],
+        hand_m=np.zeros((len(rows), 3), dtype=np.float32),
+        episode=np.repeat(np.arange(3), [len(each) for each in grip]),
+    )
+    assert np.unique(data.grips()).tolist() == [4, 7, 11]
+
+
+def test_images_are_moved_as_far_as_is_said() -> None:
+    images = np.zeros((5, 64, 64, 3), dtype=np.uint8)
+    images[:, 30, 40] = 255
+    generator = torch.Generator().manual_seed(0)
+    settings = Training(shift_px=4)
+    places = []
+    for _ in range(20):
+        varied, moved = _varied({"front": images}, torch.arange(5), settings, generator)
+        row, column = divmod(int(varied["front"][0, 0].argmax()), 64)
+        torch.testing.assert_close(moved, torch.tensor([column - 40.0, row - 30.0]) * 2 / 60)
+        places.append((row, column))
+    assert len(set(places)) > 10
 
 
 def test_a_point_moves_with_the_thing_that_it_marks() -> None:

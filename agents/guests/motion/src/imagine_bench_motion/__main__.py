@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from imagine_bench.errors import ImagineBenchError
+from imagine_bench.registry.machine import describe_environment
 
 from .cloning import Clone, Training, train
 from .demonstrations import Demonstrations, collect
@@ -20,6 +21,7 @@ from .skills import FAMILIES, PLACEMENT_M
 from .trials import summary, tries
 
 APPEARANCES = ["clean", "mild"]
+OBSERVATION = "front,proprio"
 
 
 def main() -> None:
@@ -44,7 +46,7 @@ def _add_demonstrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, help="the .npz file to write")
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1000)
-    parser.add_argument("--observation", default="hand,front,proprio", help="parts, as the environment takes them")
+    parser.add_argument("--observation", default=OBSERVATION, help="parts, as the environment takes them")
     parser.add_argument("--appearances", nargs="+", default=APPEARANCES)
     parser.add_argument("--family", choices=list(FAMILIES), default="arrows")
     parser.add_argument(
@@ -71,11 +73,13 @@ def _demonstrate(given: argparse.Namespace) -> None:
 def _add_clone(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("demonstrations", type=Path, help="a file of 'demonstrate'")
     parser.add_argument("file", type=Path, help="the file of the policy to write")
-    parser.add_argument("--observation", default="hand,front,proprio", help="the parts that the demonstrations show")
+    parser.add_argument("--observation", default=OBSERVATION, help="the parts that the demonstrations show")
     parser.add_argument("--first", type=int, help="take only so many demonstrations")
     parser.add_argument("--updates", type=int, default=Training.updates, help="gradient steps")
+    parser.add_argument("--eye-updates", type=int, default=Training.eye_updates, help="those of the heat maps, before")
+    parser.add_argument("--shift", type=int, default=Training.shift_px, help="pixels that images are moved by at most")
     parser.add_argument("--chunk", type=int, default=16, help="commands that are predicted at once")
-    parser.add_argument("--heat-maps", type=int, default=4, help="points that are looked for in each image")
+    parser.add_argument("--heat-maps", type=int, default=16, help="points that are looked for in each image")
     parser.add_argument("--seed", type=int, default=0)
     parser.set_defaults(run=_clone)
 
@@ -88,7 +92,7 @@ def _clone(given: argparse.Namespace) -> None:
         data,
         seed=given.seed,
         observation=given.observation,
-        settings=Training(updates=given.updates),
+        settings=Training(updates=given.updates, eye_updates=given.eye_updates, shift_px=given.shift),
         layout={"chunk": given.chunk, "heat_maps": given.heat_maps},
         told=lambda update, loss: print(f"{update} updates, loss {loss:.4f}", flush=True),
     )
@@ -129,7 +133,8 @@ def _try(given: argparse.Namespace) -> None:
         print(*(f"  {key}: {done} of {count}" for key, (done, count) in counted[name].items()), sep="\n")
     print(*(f"  failed: {each}" for each in counted["failed"]), sep="\n")
     if given.out is not None:
-        kept = {"about": clone.about, **_asked(given), "clone": kept_name(given.file), **counted}
+        commit = describe_environment()["commit"]
+        kept = {"about": clone.about, **_asked(given), "clone": kept_name(given.file), "commit": commit, **counted}
         given.out.write_text(json.dumps(kept, indent=1) + "\n")
 
 

@@ -18,8 +18,8 @@ from imagine_bench.errors import ArtefactError
 
 from .demonstrations import Demonstrations
 from .instruction import GO_BACK, words_vector
-from .network import ChunkPolicy, Layout, new_network
-from .skills import HAND_NUMBERS, Command, Observed, images_of, numbers_of
+from .network import POINT_PX, ChunkPolicy, Layout, new_network
+from .skills import Command, Observed, images_of, numbers_of
 
 _SMALLEST_DEVIATION = 1e-2
 """Of an input or a command that hardly varies: it is divided by this instead."""
@@ -32,10 +32,12 @@ class Training:
 
     updates: int = 6_000  #: gradient steps
     batch: int = 48  #: periods a gradient step
+    eye_updates: int = 4_000  #: gradient steps before them by which eyes with heat maps learn where the hand will grip
+    eye_batch: int = 32  #: periods in each of these
     learning_rate: float = 2e-3  #: the largest; it rises during the first 30 % of the steps, and falls to 0
     weight_decay: float = 1e-4
     number_noise: float = 0.05  #: standard deviation added to standardised inputs
-    shift_px: int = 0  #: images are moved by up to so many pixels along both axes; 0 leaves them, and their geometry
+    shift_px: int = 4  #: images are moved by up to so many pixels along both axes, and points of heat maps moved back
     brightness: float = 0.1  #: images are made brighter or darker by up to this share
 
 
@@ -198,27 +200,65 @@ def _fit(
     generator: torch.Generator,
     told: Callable[[int, float], None] | None,
 ) -> None:
+    known, which = np.unique(data.instructions, return_inverse=True)
+    words = torch.from_numpy(np.stack([words_vector(str(each)) for each in known]))[torch.from_numpy(which)]
+    seen = None
+    if network.place is not None:
+        _fit_eyes(network, data, words, settings, generator, told)
+        seen = _looked(network, data, words)
     numbers = torch.from_numpy(inputs.standardised(data.numbers))
     targets = torch.from_numpy(commands.standardised(data.commands))
     chunks = torch.from_numpy(data.chunks(network.layout.chunk))
-    known, which = np.unique(data.instructions, return_inverse=True)
-    words = torch.from_numpy(np.stack([words_vector(str(each)) for each in known]))[torch.from_numpy(which)]
-    is_turning = data.instructions != GO_BACK
-    at_grip = data.numbers[data.grips()][:, HAND_NUMBERS]
-    grips = torch.from_numpy(Scale.of(at_grip[is_turning]).standardised(at_grip))
-    turning = torch.from_numpy(is_turning).float()
-    optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, settings.learning_rate, settings.updates)
-    network.train()
-    losses = []
-    for update in range(1, settings.updates + 1):
+    learning = network if seen is None else network.body
+
+    def loss() -> Tensor:
         rows = torch.randint(len(numbers), (settings.batch,), generator=generator)
         noise = settings.number_noise * torch.randn(settings.batch, numbers.shape[1], generator=generator)
-        images = {camera: _varied(image[rows.numpy()], settings, generator) for camera, image in data.images.items()}
-        predicted, grip = network.with_grip(images, numbers[rows] + noise, words[rows])
-        loss = (predicted - targets[chunks[rows]]).abs().mean()
-        if grip is not None:
-            loss = loss + ((grip - grips[rows]).abs().mean(dim=1) * turning[rows]).mean()
+        if seen is None:
+            images, _ = _varied(data.images, rows, settings, generator)
+            looked = network.look(images, words[rows])
+        else:
+            looked = seen[rows]
+        return (network.act(looked, numbers[rows] + noise, words[rows]) - targets[chunks[rows]]).abs().mean()
+
+    _descend(learning, loss, settings.updates, settings, told)
+
+
+def _fit_eyes(
+    network: ChunkPolicy,
+    data: Demonstrations,
+    words: Tensor,
+    settings: Training,
+    generator: torch.Generator,
+    told: Callable[[int, float], None] | None,
+) -> None:
+    """Learn to see where the hand grips: the place that the expert brings it to, in each period before the event."""
+    grips = data.grips()
+    rows = torch.from_numpy(np.flatnonzero(data.instructions != GO_BACK))
+    places = torch.from_numpy(Scale.of(data.hand_m[grips[rows]]).standardised(data.hand_m[grips]))
+
+    def loss() -> Tensor:
+        some = rows[torch.randint(len(rows), (settings.eye_batch,), generator=generator)]
+        images, moved = _varied(data.images, some, settings, generator)
+        return (network.look(images, words[some], moved) - places[some]).abs().mean()
+
+    _descend(network, loss, settings.eye_updates, settings, told)
+
+
+def _descend(
+    learning: torch.nn.Module,
+    loss_of: Callable[[], Tensor],
+    updates: int,
+    settings: Training,
+    told: Callable[[int, float], None] | None,
+) -> None:
+    """Gradient steps on the losses of new batches."""
+    optimiser = torch.optim.AdamW(learning.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, settings.learning_rate, updates)
+    learning.train()
+    losses = []
+    for update in range(1, updates + 1):
+        loss = loss_of()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -229,18 +269,38 @@ def _fit(
             losses = []
 
 
+def _looked(network: ChunkPolicy, data: Demonstrations, words: Tensor) -> Tensor:
+    """All that a network sees in each period. Shape (T, P)."""
+    with torch.no_grad():
+        parts = [
+            network.look({camera: _as_input(image[rows]) for camera, image in data.images.items()}, words[rows])
+            for rows in np.array_split(np.arange(len(words)), max(1, len(words) // 256))
+        ]
+    return torch.cat(parts)
+
+
 def _as_input(images: NDArray[np.uint8]) -> Tensor:
     """Images (B, S, S, 3) as (B, 3, S, S) in [0, 1]."""
     return torch.from_numpy(np.ascontiguousarray(images)).permute(0, 3, 1, 2).float() / 255.0
 
 
-def _varied(images: NDArray[np.uint8], settings: Training, generator: torch.Generator) -> Tensor:
-    """The images of a batch as inputs, moved as a whole and each made brighter or darker, so that fewer suffice."""
-    seen = _as_input(images)
+def _varied(
+    images: Mapping[str, NDArray[np.uint8]], rows: Tensor, settings: Training, generator: torch.Generator
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Images of a batch as inputs, moved as a whole and each made brighter or darker, so that fewer suffice.
+
+    Also how far they were moved, to the right and down (2,), where the span of an image's heat map is 2.
+    """
     most = settings.shift_px
-    if most:
-        across, along = torch.randint(2 * most + 1, (2,), generator=generator).tolist()
+    across, along = torch.randint(2 * most + 1, (2,), generator=generator).tolist()
+    varied = {}
+    span_px = 1.0
+    for camera, kept in images.items():
+        seen = _as_input(kept[rows.numpy()])
+        edge = seen.shape[-1]
+        span_px = edge - POINT_PX
         padded = torch.nn.functional.pad(seen, [most] * 4, mode="replicate")
-        seen = padded[:, :, along : along + images.shape[1], across : across + images.shape[2]]
-    light = 1.0 + settings.brightness * (2.0 * torch.rand(len(seen), 1, 1, 1, generator=generator) - 1.0)
-    return seen * light
+        moved = padded[:, :, along : along + edge, across : across + edge]
+        light = 1.0 + settings.brightness * (2.0 * torch.rand(len(seen), 1, 1, 1, generator=generator) - 1.0)
+        varied[camera] = moved * light
+    return varied, torch.tensor([most - across, most - along]) * (2.0 / span_px)

@@ -21,6 +21,9 @@ NOISE_RAD = 0.004
 NOISE_KEPT = 0.8
 """Share of a period's noise that goes on in the next one."""
 
+_CLOSED = 0.06
+"""Fingers that are told to be nearly as close as in the whole demonstration grip: 1.4 mm of each finger."""
+
 MOST_TRIES = 5
 """Tries of the expert for each demonstration that is kept."""
 
@@ -33,6 +36,7 @@ class Demonstrations:
     numbers: NDArray[np.float32]  #: the other inputs: (T, P)
     instructions: NDArray[np.str_]  #: in words: (T,)
     commands: NDArray[np.float32]  #: the expert's, without noise: (T, C)
+    hand_m: NDArray[np.float32]  #: where the hand is by these commands, in the world: (T, 3)
     episode: NDArray[np.int64]  #: which demonstration: (T,)
 
     @property
@@ -48,6 +52,7 @@ class Demonstrations:
             numbers=self.numbers[kept],
             instructions=self.instructions[kept],
             commands=self.commands[kept],
+            hand_m=self.hand_m[kept],
             episode=self.episode[kept],
         )
 
@@ -58,17 +63,24 @@ class Demonstrations:
         return np.minimum(rows[:, None] + np.arange(length), last[:, None])
 
     def grips(self) -> NDArray[np.int64]:
-        """For each period, the row of its demonstration in which the fingers are told to be closest. Shape (T,)."""
-        grip = self.commands[:, -1]
+        """For each period, the row of its demonstration in which the fingers close. Shape (T,).
+
+        That is the first row of the last time that they are told to be closest: fingers may be close at a start.
+        """
         starts = np.flatnonzero(np.diff(self.episode, prepend=-1))
-        ends = [*starts[1:], len(grip)]
-        closest = [start + int(grip[start:end].argmin()) for start, end in zip(starts, ends, strict=True)]
-        return np.array(closest)[self.episode]
+        rows = []
+        for start, end in zip(starts, [*starts[1:], len(self.episode)], strict=True):
+            grip = self.commands[start:end, -1]
+            is_open = grip > grip.min() + _CLOSED
+            last = np.flatnonzero(~is_open)[-1]
+            opened = np.flatnonzero(is_open[:last])
+            rows.append(start + (opened[-1] + 1 if len(opened) else 0))
+        return np.array(rows)[self.episode]
 
     def save(self, path: Path) -> None:
         """Write one ``.npz`` file."""
         arrays: dict[str, Any] = {f"image.{camera}": image for camera, image in self.images.items()}
-        named = {name: getattr(self, name) for name in ("numbers", "instructions", "commands", "episode")}
+        named = {name: getattr(self, name) for name in ("numbers", "instructions", "commands", "hand_m", "episode")}
         np.savez(path, **arrays, **named)
 
     @classmethod
@@ -76,7 +88,7 @@ class Demonstrations:
         """Read a file that :meth:`save` has written."""
         with np.load(path) as file:
             images = {name.removeprefix("image."): file[name] for name in file.files if name.startswith("image.")}
-            named = {name: file[name] for name in ("numbers", "instructions", "commands", "episode")}
+            named = {name: file[name] for name in ("numbers", "instructions", "commands", "hand_m", "episode")}
         return cls(images=images, **named)
 
 
@@ -119,6 +131,7 @@ def collect(
         numbers=np.stack([row for each in kept for row in each.numbers]),
         instructions=np.array([words for each in kept for words in each.instructions]),
         commands=np.stack([row for each in kept for row in each.commands]),
+        hand_m=np.stack([row for each in kept for row in each.hand_m]),
         episode=np.repeat(np.arange(len(kept)), [len(each.commands) for each in kept]),
     )
 
@@ -150,6 +163,7 @@ class _Episode:
         self.numbers: list[NDArray[np.float32]] = []
         self.instructions: list[str] = []
         self.commands: list[NDArray[np.float32]] = []
+        self.hand_m: list[NDArray[np.float32]] = []
 
 
 class _Stage:
@@ -173,6 +187,7 @@ class _Stage:
             found.numbers.append(numbers_of(observation))
             found.instructions.append(GO_BACK if done else instruction)
             found.commands.append(command)
+            found.hand_m.append(env.controls.hand_pose(command[:-1])[0].astype(np.float32))
             told = command.copy()
             if disturbed:
                 off_rad = NOISE_KEPT * off_rad + rng.normal(0.0, NOISE_RAD, len(off_rad))

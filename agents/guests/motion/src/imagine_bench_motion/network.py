@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from .instruction import WIDTH
 
 _MEAN_BRIGHTNESS = 0.4
+POINT_PX = 4
+"""Pixels from one place of a heat map to the next."""
 _SHARPNESS = 5.0
 """Heat maps are multiplied by it, so that points are learned soon."""
 
@@ -58,10 +60,10 @@ class PointEye(nn.Module):
 
     def __init__(self, size_px: int, heat_maps: int) -> None:
         super().__init__()
-        self._edge = size_px // 4
+        self._edge = size_px // POINT_PX
         self._shape = (heat_maps, self._edge // 2, self._edge // 2)
         self.what = nn.Sequential(
-            nn.Conv2d(3, 16, 8, stride=4, padding=2),
+            nn.Conv2d(3, 16, 8, stride=POINT_PX, padding=2),
             nn.ReLU(),
             nn.Conv2d(16, 32, 3, padding=1),
             nn.ReLU(),
@@ -86,7 +88,7 @@ class PointEye(nn.Module):
 class ChunkPolicy(nn.Module):
     """A convolutional network a camera, and a multilayer perceptron over everything.
 
-    With heat maps the points of the first camera say where the hand will grip, and the perceptron is told so.
+    With heat maps the points of all images say where the hand will grip, and the perceptron is told this place alone.
 
     Args:
         layout: Sizes of inputs and outputs.
@@ -103,12 +105,12 @@ class ChunkPolicy(nn.Module):
                 for camera in layout.cameras
             }
         )
-        each = 2 * points or layout.features
-        wide = layout.numbers + WIDTH + each * len(layout.cameras)
-        self.grip = nn.Sequential()
+        looked = (2 * points or layout.features) * len(layout.cameras)
+        self.place: nn.Sequential | None = None
         if points and layout.cameras:
-            self.grip = nn.Sequential(nn.Linear(each + WIDTH, 64), nn.ReLU(), nn.Linear(64, 3))
-            wide += 3
+            self.place = nn.Sequential(nn.Linear(looked + WIDTH, 64), nn.ReLU(), nn.Linear(64, 3))
+            looked = 3
+        wide = layout.numbers + WIDTH + looked
         self.body = nn.Sequential(
             nn.Linear(wide, layout.hidden),
             nn.ReLU(),
@@ -125,21 +127,29 @@ class ChunkPolicy(nn.Module):
             numbers: Standardised. Shape (B, numbers).
             words: As :func:`.instruction.words_vector` says. Shape (B, 64).
         """
-        return self.with_grip(images, numbers, words)[0]
+        return self.act(self.look(images, words), numbers, words)
 
-    def with_grip(self, images: Mapping[str, Tensor], numbers: Tensor, words: Tensor) -> tuple[Tensor, Tensor | None]:
-        """As :meth:`forward`, and where the hand will grip, standardised (B, 3); None without heat maps."""
-        grip = None
-        if self.layout.heat_maps:
-            seen = [self.eyes[camera](images[camera], words) for camera in self.layout.cameras]
-        else:
-            seen = [self.eyes[camera](images[camera]) for camera in self.layout.cameras]
-        told = []
-        if len(self.grip):
-            grip = self.grip(torch.cat([seen[0], words], dim=1))
-            told = [grip.detach()]
-        flat = self.body(torch.cat([numbers, words, *seen, *told], dim=1))  # [B, chunk * commands]
-        return flat.unflatten(1, (self.layout.chunk, self.layout.commands)), grip
+    def look(self, images: Mapping[str, Tensor], words: Tensor, moved: Tensor | None = None) -> Tensor:
+        """All that the images say: the features of each camera, (B, P); with heat maps the place of the grip, (B, 3).
+
+        The place is standardised. ``moved`` (2,) says how far the images were moved to the right and down: points are
+        moved back.
+        """
+        seen = []
+        for camera in self.layout.cameras:
+            if self.place is None:
+                seen.append(self.eyes[camera](images[camera]))
+            else:
+                points = self.eyes[camera](images[camera], words)
+                seen.append(points if moved is None else points - moved.repeat(self.layout.heat_maps))
+        if self.place is None:
+            return torch.cat(seen, dim=1) if seen else words[:, :0]
+        return self.place(torch.cat([*seen, words], dim=1))  # type: ignore[no-any-return]
+
+    def act(self, looked: Tensor, numbers: Tensor, words: Tensor) -> Tensor:
+        """The next commands, as :meth:`forward`, from all that :meth:`look` gave."""
+        flat = self.body(torch.cat([numbers, words, looked], dim=1))  # [B, chunk * commands]
+        return flat.unflatten(1, (self.layout.chunk, self.layout.commands))
 
 
 def new_network(layout: Layout, size_px: int, generator: torch.Generator) -> ChunkPolicy:

@@ -33,8 +33,6 @@ HOME_COMMAND = np.array([*OBSERVATION_QPOS_RAD, 1.0], dtype=np.float32)
 """The command that keeps the arm at its observation pose, with open fingers."""
 HELD_GRIP = 0.5
 """Fingers that are told to be nearer together than this at a start hold something."""
-HAND_NUMBERS = slice(-7, -4)
-"""Where the hand's position (m) stands in :func:`numbers_of`, whose last part is ``proprio``."""
 Observed = Mapping[str, NDArray[Any]] | NDArray[Any]
 """Several parts by name, or one."""
 Command = NDArray[np.float32]
