@@ -39,14 +39,11 @@ class DifferentialIK:
         self._model = arm.model
         self._data = mujoco.MjData(arm.model)
         self._tcp = arm.model.site(TCP_SITE).id
-        self.lower_rad: Floats = arm.model.jnt_range[:, 0].copy()
-        self.upper_rad: Floats = arm.model.jnt_range[:, 1].copy()
         self._range_rad = arm.model.jnt_range.T.copy()
+        self.lower_rad, self.upper_rad = self._range_rad
         self._posture_rad = np.array(OBSERVATION_QPOS_RAD)
-        self._weights = np.array([1.0, 1.0, 1.0, *[_ROTATION_WEIGHT] * 3])
-        self._squares = self._weights**2
+        self._squares = np.array([1.0, 1.0, 1.0, *[_ROTATION_WEIGHT**2] * 3])
         self._jacobian = np.empty((6, arm.model.nv))
-        self._hessian = np.empty((arm.model.nv, arm.model.nv))
         posture = np.full(arm.model.nv, _POSTURE_WEIGHT**2)
         posture[-1] *= _WRIST_SHARE
         self._regular = np.diag(posture)
@@ -73,16 +70,16 @@ class DifferentialIK:
             most_rad: The largest step of each joint. Shape (7,).
         """
         jacobian = self._jacobian
-        qpos_rad = self._data.qpos
-        mujoco.mj_jacSite(self._model, self._data, jacobian[:3], jacobian[3:], self._tcp)
-        hessian = self._hessian
+        data = self._data
+        mujoco.mj_jacSite(self._model, data, jacobian[:3], jacobian[3:], self._tcp)
+        hessian = np.empty_like(self._regular)
         mujoco.mju_sqrMatTD(hessian, jacobian, self._squares)
         hessian += self._regular
-        gradient = self._pull * (qpos_rad - self._posture_rad) - (self._squares * motion) @ jacobian
-        least_rad, room_rad = self._range_rad - qpos_rad
-        lower = np.maximum(-most_rad, least_rad)
-        upper = np.minimum(most_rad, room_rad)
+        gradient = self._pull * (data.qpos - self._posture_rad) - (self._squares * motion) @ jacobian
+        low, high = self._range_rad - data.qpos
+        lower = np.maximum(-most_rad, low)
+        upper = np.minimum(most_rad, high)
         solved, _, status, _ = daqp.solve(hessian, gradient, self._no_rows, upper, lower, self._kinds)
         step_rad: Floats = np.minimum(np.maximum(solved, lower), upper) if status > 0 else np.zeros(len(upper))
-        missed = self._weights * (jacobian @ step_rad - motion)
-        return step_rad, bool(missed @ missed > _MAX_RESIDUAL**2)
+        missed = jacobian @ step_rad - motion
+        return step_rad, bool(missed**2 @ self._squares > _MAX_RESIDUAL**2)

@@ -355,12 +355,12 @@ class Renderer:
 
     def _fill(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Put the geoms of the view into the scene, lit by all lights if it is for people."""
-        as_compiled = model.light_active.copy() if self.view.for_people else None
-        if as_compiled is not None:
-            model.light_active[:] = True
+        lights = model.light_active
+        as_compiled = lights.copy()
+        if self.view.for_people:
+            lights[:] = True
         mujoco.mjv_updateScene(model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
-        if as_compiled is not None:
-            model.light_active[:] = as_compiled
+        lights[:] = as_compiled
 
     def close(self) -> None:
         """Leave the OpenGL context to the next renderer. Safe to call again; a later frame finds or makes one."""
