@@ -14,7 +14,7 @@ import numpy as np
 from imagine_bench import reference, registry, statistics
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.judge.causes import CAUSES, FORMER_CAUSES
-from imagine_bench.registry.entries import label_today
+from imagine_bench.registry.entries import agent_label, label_today
 from imagine_bench.report import figures
 from imagine_bench.report.data import collect
 from imagine_bench.store.loading import load_so_far
@@ -29,9 +29,10 @@ RESULTS = HERE.parent / "results"
 def rates(folder: str, agent: str) -> dict[int, np.ndarray]:
     """Success of every seed, as a share, by budget."""
     found: dict[int, list[float]] = {}
+    protocol = json.loads((RESULTS / folder / "bench.json").read_text())["protocol"]
     with (RESULTS / folder / "results.csv").open() as file:
         for row in csv.DictReader(file):
-            if label_today(row["agent"]) == agent:
+            if agent_label(row["agent"], protocol) == agent:
                 share = int(row["successes"]) / int(row["test_episodes"])
                 found.setdefault(int(row["episodes"]), []).append(share)
     return {budget: np.array(values) for budget, values in sorted(found.items())}
@@ -340,15 +341,18 @@ def why() -> None:
     figure.savefig(HERE / "why.png", dpi=130, facecolor="white")
 
 
+CHALLENGES = ("unseen_goal", "changed_rule", "late_frames")
+
+
 def separating() -> None:
     """Success in the world that separates and in the open challenges, beside chance: a panel each, a dot a seed."""
-    folders = sorted(RESULTS.glob("separating-*"), key=lambda folder: folder.name != "separating-world")
+    folders = [RESULTS / f"separating-{name}" for name in ("world", *(f"{name}-450" for name in CHALLENGES))]
     figure, every = plt.subplots(1, len(folders), figsize=(3.1 * len(folders), 3.2), sharey=True, layout="constrained")
     for axes, folder in zip(every, folders, strict=True):
         kept = json.loads((folder / "bench.json").read_text())
         protocol = kept["protocol"]
         last = protocol["budgets"][-1]
-        agents = [label_today(agent) for agent in protocol["agents"]]
+        agents = sorted(agent_label(agent, protocol) for agent in protocol["agents"])
         for place, agent in enumerate(agents):
             values = 100 * rates(folder.name, agent)[last]
             axes.bar(place, values.mean(), width=0.6, color=CAUSE_COLORS[2])
@@ -357,7 +361,7 @@ def separating() -> None:
         axes.axhline(100 * kept["certificate"]["optimum"], color=CAUSE_COLORS[0], label="optimum")
         axes.set_xticks(range(len(agents)), [agent.replace("_", "\n") for agent in agents], fontsize=8)
         before = protocol["after_episodes"] if protocol["after"] else 0
-        name = folder.name.partition("-")[2].replace("_", " ").replace("world", "separating")
+        name = folder.name.split("-")[1].replace("_", " ").replace("world", "separating")
         axes.set_title(f"{name}: {before + last:,} episodes", fontsize=9.5)
         axes.set_ylim(0, 104)
         axes.spines[["top", "right"]].set_visible(False)
