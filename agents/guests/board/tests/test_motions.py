@@ -69,7 +69,8 @@ def test_an_honest_row_holds_and_says_what_happened(row: Path, tmp_path: Path) -
 
 @pytest.mark.parametrize("control", ["twist", "joint_delta", "pose"])
 def test_whatever_control_a_policy_has_its_joint_commands_play_again(tmp_path: Path, control: str) -> None:
-    env = MotionTests(WORLD, control=control, observation="proprio", tests=2, seed=3, appearance="mild", placement=0.02)
+    mild = {"light": 0.5, "pose": 0.5, "hand": 0.5}
+    env = MotionTests(WORLD, control=control, observation="proprio", tests=2, seed=3, appearance=mild, placement=0.02)
     rng = np.random.default_rng(7)
     low, high = env.action_space.low, env.action_space.high
     for _ in range(2):
@@ -87,7 +88,7 @@ def test_every_test_is_played_whole_and_no_more_than_asked(tmp_path: Path, monke
     env.reset(seed=99)
     rest = np.append(env.unwrapped.servo_targets()[:-1], 1.0)  # type: ignore[attr-defined]
     env.step(rest)
-    with pytest.raises(InvalidValueError, match="Test 0 was left before its end"):
+    with pytest.raises(InvalidValueError, match=r"Test 0 was left before its end\. Make a new MotionTests"):
         env.reset()
     with pytest.raises(InvalidValueError, match="0 of 1 tests were played; play all"):
         env.write(tmp_path, "early", agent="nobody")
@@ -97,6 +98,10 @@ def test_every_test_is_played_whole_and_no_more_than_asked(tmp_path: Path, monke
     env.step(rest)
     env.reset()
     monkeypatch.setattr(sys, "argv", ["play.py", "a" * 400])
+    for name in ("../out", "a/b", "", "Upper", "index"):
+        with pytest.raises(InvalidValueError, match="A row cannot be called"):
+            env.write(tmp_path / "rows", name, agent="nobody")
+    assert not list(tmp_path.iterdir())
     written = env.write(tmp_path, "whole", agent="nobody")
     assert len(read_motions(written).claimed.command) == LONGEST, "a long command is cut"
     assert [each.periods for each in read_motions(written).motions] == [750]
@@ -219,6 +224,30 @@ def test_forged_rows_are_refused_in_one_line(
     (found,) = check(row)
     assert found.row is None and found.verdict.complaint
     assert "\n" not in str(found) and "Traceback" not in str(found)
+
+
+@pytest.mark.parametrize("value", ["0", False])
+def test_a_figure_of_another_type_is_named(row: Path, value: object) -> None:
+    card = json.loads((row / CARD).read_text())
+    card["vouched"]["faults"] = value
+    (row / CARD).write_text(json.dumps(card))
+    (found,) = check(row)
+    assert f"faults was given {value!r}; it takes a whole number." in found.verdict.complaint
+
+
+def test_one_world_in_other_words_stands_in_the_same_table(row: Path) -> None:
+    card = json.loads((row / CARD).read_text())
+    card["protocol"] |= {"task": f"{WORLD},slip=0", "appearance": "light=0"}
+    (row / CARD).write_text(json.dumps(card))
+    assert read_motions(row).world == f"{WORLD}, continuous control at 25 Hz, clean"
+
+
+def test_no_row_is_begun_that_its_file_could_not_hold(row: Path) -> None:
+    commands = json.loads((row / EPISODES).read_text())[1]["commands"]
+    assert len(commands) < 750 * 43
+    assert MotionTests("pick_place", observation="proprio").protocol.tests == 100
+    with pytest.raises(InvalidValueError, match="tests is 104; a row holds 103 tests of pick_place, however long"):
+        MotionTests("pick_place", observation="proprio", tests=104)
 
 
 def test_wrong_values_are_one_error() -> None:

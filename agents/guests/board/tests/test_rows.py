@@ -176,7 +176,11 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "a path for a round": (with_claim("agent", "../../etc"), "its protocol is of"),
     "control characters": (with_claim("author", "a\x1b[2Jb"), "The claim 'author' is"),
     "a long claim": (with_claim("command", "x" * 301), "give at most 300 printable characters"),
-    "frames below zero": (with_claim("frames_beforehand", -1), "frames_beforehand is -1; give at least 0."),
+    "half a character": (with_claim("author", "\ud800"), "surrogates not allowed"),
+    "half a character elsewhere": (with_protocol(preset="\ud800"), "surrogates not allowed"),
+    "from right to left": (with_claim("author", "a\u202eb"), "The claim 'author' is"),
+    "frames below zero": (with_claim("frames_beforehand", -1), "frames_beforehand is -1; give 0 to 1,000,000,000,000."),
+    "frames of 400 digits": (with_claim("frames_beforehand", 10**400), "give 0 to 1,000,000,000,000."),
     "a world in a file": (with_protocol(task="arrows:@/etc/passwd"), "its task names a file"),
     "no such task": (with_protocol(task="../arrows"), "No task '../arrows'"),
     "ten million tests": (with_protocol(evaluation_episodes=10_000_000), "it has 6 tests, and its protocol 10000000."),
@@ -204,7 +208,7 @@ def test_a_round_cannot_lead_out_of_the_board(row: Path) -> None:
             read_row(row)
 
 
-@pytest.mark.parametrize("name", ["<script>alert(1)</script>", "x y", ".hidden", "a\nb", "A" * 90, "é"])
+@pytest.mark.parametrize("name", ["<script>alert(1)</script>", "x y", ".hidden", "a\nb", "A" * 90, "é", "index"])
 def test_a_row_with_a_hostile_name_is_refused(row: Path, tmp_path: Path, name: str) -> None:
     try:
         there = row.rename(row.with_name(name.replace("/", "-")))

@@ -14,11 +14,10 @@ from imagine_bench.running.bench import counted
 from imagine_bench.running.retraining import Verdict, judged, part_digest
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, evaluation_split
-from imagine_bench.store.files import read_json
 
 from . import motions, rounds
 from .motions import MotionRow
-from .rows import CARD, ROWS, Row, read_row, require_files, require_whole
+from .rows import CARD, ROWS, Row, read_card, read_row, require_whole
 
 NOT_VOUCHED = ("the player", "which seeds and how many tests", "the price", "the data seen beforehand")
 """Claims of every row that no replay shows."""
@@ -80,8 +79,7 @@ class _Court:
         return Checked(verdict=verdict, row=None if verdict.complaint else read[0])
 
     def _check(self, folder: Path, read: list[Row | MotionRow]) -> Verdict:
-        require_files(folder)
-        if read_json(folder / CARD, "the card of a row").get("format") == motions.FORMAT:
+        if read_card(folder).get("format") == motions.FORMAT:
             moved = motions.read_motions(folder)
             read.append(moved)
             return Verdict(what=moved.name, episodes=motions.check_motions(moved), unshown=NOT_VOUCHED)

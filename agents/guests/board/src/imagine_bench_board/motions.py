@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,15 +23,16 @@ from imagine_bench.tasks.continuous.controls import MOST_OPEN_M, HandControl
 from imagine_bench.tasks.motion.arm_model import ArmModel
 
 from imagine_bench import registry
+from imagine_bench.appearance import appearance_name
 from imagine_bench.arrays import Floats32, Info, Observed
-from imagine_bench.errors import ArtefactError, InvalidValueError, require
+from imagine_bench.errors import ArtefactError, InvalidValueError, brief, require
 from imagine_bench.protocols.data import require_types
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.seeding import SEEDS, episode_seed
-from imagine_bench.store.files import make_folder, read_json, reading, write_bytes, write_json
+from imagine_bench.store.files import make_folder, reading, write_bytes, write_json
 from imagine_bench.values import Json, unpack
 
-from .rows import CARD, EPISODES, OPEN, Claims, one_line, require_files
+from .rows import CARD, EPISODES, LARGEST, NAME, OPEN, Claims, one_line, read_card
 
 if TYPE_CHECKING:
     from imagine_bench.tasks.continuous.env import MotionEnv
@@ -42,6 +43,9 @@ RATE_HZ = 25.0
 SLACK_PERIODS = 3
 """Control periods by which an event may come earlier or later on another kind of processor."""
 MOST_TESTS = 1000
+_TEST_BYTES = 200
+_PERIOD_BYTES = 43
+"""Bytes of a test in the file, and of a command of it, at most."""
 _COMMAND = np.dtype("<f4")
 _WIDTH = 8
 """Numbers of a command: seven joints in rad, and the grip."""
@@ -62,6 +66,9 @@ class MotionProtocol:
         if not 1 <= self.tests <= MOST_TESTS or not 0 <= self.seed < SEEDS:
             allowed = f"1 to {MOST_TESTS:,} tests and a seed from 0 to {SEEDS - 1:,}"
             raise InvalidValueError(f"tests is {self.tests} and seed {self.seed}; give {allowed}.")
+        require("@" not in self.task, "its task names a file; write the world out in one line.")
+        object.__setattr__(self, "task", registry.task_name(self.task))
+        object.__setattr__(self, "appearance", appearance_name(self.appearance))
 
     def start(self, test: int) -> int:
         """The environment's seed of a test."""
@@ -69,7 +76,6 @@ class MotionProtocol:
 
     def make(self, **options: Any) -> gymnasium.Env[Any, Any]:
         """The environment, controlled by joints. Raises whatever :func:`gymnasium.make` does for a wrong value."""
-        require("@" not in self.task, "its task names a file; write the world out in one line.")
         env_id = registry.motion_id(registry.task(self.task).env_id)
         given: dict[str, Any] = {"appearance": self.appearance, "placement": self.placement, "control": "joint"}
         return gymnasium.make(env_id, disable_env_checker=True, **given, **options)
@@ -105,6 +111,9 @@ class MotionFigures:
     faults: int
     mean_return: float
     mean_periods: float  #: of 1/25 s
+
+    def __post_init__(self) -> None:
+        require_types(self)
 
     @classmethod
     def of(cls, motions: Sequence[Motion]) -> MotionFigures:
@@ -181,10 +190,13 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation: The policy's observation, as :class:`MotionEnv` takes it.
         size: Edge of its images in pixels.
         told: Whether the goal is given in words.
-        **protocol: Further fields of :class:`MotionProtocol`: ``appearance``, ``placement``, ``seed``, ``tests``.
+        appearance: A name, or factors, as :class:`MotionEnv` takes them.
+        placement: How far, in m, objects start off their slots.
+        seed: Decides the starts of all tests.
+        tests: How many tests the row has.
 
     Raises:
-        UnknownNameError, InvalidValueError: A value that the environment does not take.
+        UnknownNameError, InvalidValueError: A value that the environment does not take, or more tests than a row holds.
     """
 
     def __init__(
@@ -195,11 +207,23 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation: str = "hand,front,proprio",
         size: int = 64,
         told: bool = False,
-        **protocol: Any,
+        appearance: str | Mapping[str, float] = "clean",
+        placement: float = 0.0,
+        seed: int = 0,
+        tests: int = 100,
     ) -> None:
-        self.protocol = MotionProtocol(task=registry.task_name(task), **protocol)
+        self.protocol = MotionProtocol(
+            task=registry.task_name(task),
+            appearance=appearance_name(appearance),
+            placement=placement,
+            seed=seed,
+            tests=tests,
+        )
         super().__init__(self.protocol.make(observation=observation, size=size, told=told))
         self._motion: MotionEnv = self.env.unwrapped  # type: ignore[assignment]
+        most = int(LARGEST[EPISODES] / (_TEST_BYTES + _PERIOD_BYTES * RATE_HZ * self._motion.time_limit_s))
+        if tests > most:
+            raise InvalidValueError(f"tests is {tests}; a row holds {most} tests of {task}, however long; give fewer.")
         self._control = HandControl(control, ArmModel(), self._motion.period_s)
         self.action_space = self._control.space
         self._commands: list[Floats32] = []
@@ -210,7 +234,7 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Begin the next test. Raises InvalidValueError: the one before was left before its end."""
         del seed, options
         if self._tally is not None and self._commands:
-            raise InvalidValueError(f"Test {len(self.motions)} was left before its end; a row has whole episodes.")
+            raise InvalidValueError(f"Test {len(self.motions)} was left before its end. Make a new MotionTests.")
         observation, info = self.env.reset(seed=self.protocol.start(len(self.motions) % self.protocol.tests))
         self._tally = _Tally(info) if len(self.motions) < self.protocol.tests else None
         self._commands = []
@@ -241,10 +265,13 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
             **claims: Further fields of :class:`.rows.Claims`: ``author``, ``seen_beforehand``, ``frames_beforehand``.
 
         Raises:
-            InvalidValueError: Not all tests were played, or there is a row of this name.
+            InvalidValueError: Not all tests were played, there is a row of this name, or no row can have it.
         """
         if len(self.motions) < self.protocol.tests:
             raise InvalidValueError(f"{len(self.motions)} of {self.protocol.tests} tests were played; play all.")
+        if not NAME.fullmatch(name):
+            allowed = "at most 80 of a-z, 0-9 and _.,=-, a letter or digit first, and not index"
+            raise InvalidValueError(f"A row cannot be called {brief(name)}; give {allowed}.")
         where = Path(out) / name
         if where.exists():
             raise InvalidValueError(f"{where} exists; remove it, or give another name.")
@@ -284,8 +311,7 @@ def _motion_of(columns: dict[str, Any]) -> Motion:
 
 def read_motions(folder: Path) -> MotionRow:
     """Read a row; nothing is played. Raises ArtefactError: it is damaged, or not what a row may hold."""
-    require_files(folder)
-    card = read_json(folder / CARD, "the card of a row")
+    card = read_card(folder)
     with reading(folder / CARD, f"a card of the format {FORMAT!r}"):
         protocol: MotionProtocol = unpack(MotionProtocol, card["protocol"], {})
         vouched: MotionFigures = unpack(MotionFigures, card["vouched"], {})

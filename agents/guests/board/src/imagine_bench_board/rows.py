@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from imagine_bench.errors import InvalidValueError, brief, require, unprintable
+from imagine_bench.errors import InvalidValueError, brief, require
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import require_types
@@ -34,12 +34,15 @@ OPEN = "open starts"
 """Of tests whose starts everybody could know while training."""
 ROWS = "rows"
 """The folder of a board that holds its rows."""
-LARGEST = {CARD: 1 << 18, EPISODES: 1 << 23}
+LARGEST = {CARD: 1 << 18, EPISODES: 1 << 24}
 """The files of a row, and the most bytes that each may have."""
-NAME = re.compile(r"[a-z0-9][a-z0-9_.,=-]{0,79}")
-"""Names of rows and rounds: of characters that every file system and every address on the web takes as they are."""
+NAME = re.compile(r"(?!index$)[a-z0-9][a-z0-9_.,=-]{0,79}")
+"""Names of rows and rounds: of characters that every file system and every address on the web takes as they are. The
+page of a row called index would replace that of the board."""
 LONGEST = 300
 """Characters of a claim."""
+MOST_FRAMES = 10**12
+"""Frames that an author can claim: more than anybody has, and few enough for a page."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,12 +86,12 @@ class Claims:
     def __post_init__(self) -> None:
         require_types(self)
         for name, value in vars(self).items():
-            if isinstance(value, str) and (len(value) > LONGEST or unprintable(value) or "\n" in value):
+            if isinstance(value, str) and (len(value) > LONGEST or not value.isprintable()):
                 raise InvalidValueError(
                     f"The claim {name!r} is {brief(value)}; give at most {LONGEST} printable characters in one line."
                 )
-        if self.frames_beforehand is not None and self.frames_beforehand < 0:
-            raise InvalidValueError(f"frames_beforehand is {brief(self.frames_beforehand)}; give at least 0.")
+        if self.frames_beforehand is not None and not 0 <= self.frames_beforehand <= MOST_FRAMES:
+            raise InvalidValueError(f"frames_beforehand is {brief(self.frames_beforehand)}; give 0 to {MOST_FRAMES:,}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,10 +196,18 @@ def require_files(folder: Path) -> None:
         require(size <= most, f"{path.name} has {size:,} bytes; at most {most:,} are read.")
 
 
+def read_card(folder: Path) -> dict[str, Any]:
+    """The card of a row. Raises ArtefactError: it is damaged, or has text that no page can show."""
+    require_files(folder)
+    card: dict[str, Any] = read_json(folder / CARD, "the card of a row")
+    with reading(folder / CARD, "the card of a row"):
+        json.dumps(card, ensure_ascii=False).encode()  # JSON can hold half a character, which no file can
+    return card
+
+
 def read_row(folder: Path) -> Row:
     """Read a row; nothing is played. Raises ArtefactError: it is damaged, or holds more than a row may."""
-    require_files(folder)
-    card = read_json(folder / CARD, "the card of a row")
+    card = read_card(folder)
     with reading(folder / CARD, f"a card of the format {FORMAT!r}"):
         require(card["format"] == FORMAT, f"its format is {brief(card['format'])}, and {FORMAT!r} is read.")
         require("@" not in str(card["protocol"]["task"]), "its task names a file; write the world out in one line.")
