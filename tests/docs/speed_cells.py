@@ -100,3 +100,14 @@ def motion_judged(file: str, model: str, score: str) -> str:
     factor = 1.0 if score == "fit_s" else 100.0
     mean, low, high = (f"{factor * each:.0f}" for each in (np.mean(values), min(values), max(values)))
     return mean if low == high or score == "fit_s" else f"{mean} ({low} to {high})"
+
+
+def tries_done(file: str) -> str:
+    """How many of its tries a cloned policy did."""
+    counted = json.loads((_MOTION / f"{file}.json").read_text())
+    return f"{counted['done']} of {counted['count']}"
+
+
+def tries_cpu(file: str) -> str:
+    """CPU seconds of the training of a cloned policy."""
+    return f"{json.loads((_MOTION / f'{file}.json').read_text())['about']['cpu_s']:.0f}"
