@@ -6,12 +6,14 @@ import json
 import math
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import Certificate, certificate
 
+_NUISANCES = Path(__file__).parents[2] / "docs" / "results" / "nuisances" / "nuisances.json"
 _FLOORS = Path(__file__).parents[2] / "docs" / "results" / "floors" / "floors.json"
 
 
@@ -52,3 +54,23 @@ def worlds_learned(what: str) -> str:
         "median": f"{np.median(ratios):.2f}",
     }
     return columns[what]
+
+
+def _behind(nuisance: str) -> list[dict[str, Any]]:
+    """The kept runs behind a nuisance."""
+    kept: list[dict[str, Any]] = json.loads(_NUISANCES.read_text())
+    return [run for run in kept if run["appearance"] == nuisance]
+
+
+def behind(column: str, episodes: str, nuisance: str) -> str:
+    """A column of the runs behind a nuisance after so many episodes: mean [lowest, highest seed]; shares in %."""
+    runs = _behind(nuisance)
+    values = np.array([run[column][run["episodes"].index(int(episodes))] for run in runs])
+    if column == "solved":
+        values = 100 * values
+    return f"{values.mean():,.0f} [{values.min():,.0f}, {values.max():,.0f}]"
+
+
+def behind_seeds(nuisance: str) -> str:
+    """How many seeds were run behind a nuisance."""
+    return str(len(_behind(nuisance)))

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import functools
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import gymnasium
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, require
@@ -70,6 +73,7 @@ class _Court:
     def __init__(self, scope: ExitStack) -> None:
         self._scope = scope
         self._worlds: dict[str, Replays] = {}
+        self._motion_envs: dict[tuple[str, str, float], gymnasium.Env[Any, Any]] = {}
         self._owners: dict[str, tuple[str, int]] = {}
 
     def checked(self, folder: Path) -> Checked:
@@ -82,7 +86,8 @@ class _Court:
         if read_card(folder).get("format") == motions.FORMAT:
             moved = motions.read_motions(folder)
             read.append(moved)
-            return Verdict(what=moved.name, episodes=motions.check_motions(moved), unshown=NOT_VOUCHED)
+            played = motions.check_motions(moved, self._motion_env(moved))
+            return Verdict(what=moved.name, episodes=played, unshown=NOT_VOUCHED)
         row = read_row(folder)
         read.append(row)
         require_whole(row, registry.task(row.protocol.task))
@@ -97,6 +102,14 @@ class _Court:
             except ArtefactError as error:
                 raise ArtefactError(f"seed {figures.seed}, {error}") from error
         return Verdict(what=row.name, episodes=episodes, unshown=(*NOT_VOUCHED, *self._alike(row)))
+
+    def _motion_env(self, row: MotionRow) -> gymnasium.Env[Any, Any]:
+        """The environment of a row of continuous control, made once for each world."""
+        of = row.protocol
+        world = (of.task, of.appearance, of.placement)
+        if world not in self._motion_envs:
+            self._motion_envs[world] = self._scope.enter_context(closing(of.make(observation="state")))
+        return self._motion_envs[world]
 
     def _replays(self, row: Row) -> Replays:
         """The environments of a row's world, made once."""

@@ -12,7 +12,6 @@ import hashlib
 import json
 import zlib
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -324,18 +323,20 @@ def read_motions(folder: Path) -> MotionRow:
     return MotionRow(name=folder.name, protocol=protocol, vouched=vouched, claimed=claimed, motions=motions)
 
 
-def check_motions(row: MotionRow) -> int:
-    """Play every test of a row again; returns how many. Raises ArtefactError: a claim does not hold."""
+def check_motions(row: MotionRow, env: gymnasium.Env[Any, Any]) -> int:
+    """Play every test of a row again, in an environment of its protocol; returns how many.
+
+    Raises ArtefactError: a claim does not hold.
+    """
     tests = row.protocol.tests
     require(len(row.motions) == tests, f"it has {len(row.motions)} tests, and its protocol {tests}.")
     figures = MotionFigures.of(row.motions)
     for name, found in vars(figures).items():
         claimed = getattr(row.vouched, name)
         require(claimed == found, f"{name} is {found:g}, and {claimed:g} was kept.")
-    with closing(row.protocol.make(observation="state")) as env:
-        unwrapped: Any = env.unwrapped
-        for test, kept in enumerate(row.motions):
-            _compare(f"test {test}", kept, _played(unwrapped, row.protocol.start(test), kept.commands))
+    unwrapped: Any = env.unwrapped
+    for test, kept in enumerate(row.motions):
+        _compare(f"test {test}", kept, _played(unwrapped, row.protocol.start(test), kept.commands))
     return tests
 
 
