@@ -187,7 +187,7 @@ class _Stage:
             found.numbers.append(numbers_of(observation))
             found.instructions.append(GO_BACK if done else instruction)
             found.commands.append(command)
-            found.hand_m.append(env.controls.hand_pose(command[:-1])[0].astype(np.float32))
+            found.hand_m.append(env.controls.hand_pose(command[:-1].astype(np.float64))[0].astype(np.float32))
             told = command.copy()
             if disturbed:
                 off_rad = NOISE_KEPT * off_rad + rng.normal(0.0, NOISE_RAD, len(off_rad))

@@ -144,7 +144,7 @@ class ChunkPolicy(nn.Module):
                 seen.append(points if moved is None else points - moved.repeat(self.layout.heat_maps))
         if self.place is None:
             return torch.cat(seen, dim=1) if seen else words[:, :0]
-        return self.place(torch.cat([*seen, words], dim=1))  # type: ignore[no-any-return]
+        return self.place(torch.cat([*seen, words], dim=1))
 
     def act(self, looked: Tensor, numbers: Tensor, words: Tensor) -> Tensor:
         """The next commands, as :meth:`forward`, from all that :meth:`look` gave."""
