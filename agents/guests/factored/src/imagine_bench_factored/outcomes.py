@@ -188,8 +188,8 @@ class OutcomeModel:
         codes = np.array(list(starts), dtype=np.int64).reshape(-1, len(self.conjunctions.next.strides))
         numbers = self.conjunctions.next.numbers(codes)
         times = np.repeat(np.array(list(starts.values()), dtype=np.float64), numbers.shape[1])
-        begun: Floats = np.bincount(numbers.ravel(), times, minlength=len(self.conjunctions.group))
-        return begun
+        found = np.bincount(numbers.ravel(), times, minlength=len(self.conjunctions.group))
+        return np.asarray(found, dtype=np.float64)
 
     def fit(self) -> None:
         """Learn the causes anew from everything seen; whichever outcome explains it best is the default."""
