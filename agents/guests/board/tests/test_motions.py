@@ -226,6 +226,13 @@ def test_forged_rows_are_refused_in_one_line(
     assert "\n" not in str(found) and "Traceback" not in str(found)
 
 
+def test_a_copied_row_is_said_to_be_one(row: Path) -> None:
+    shutil.copytree(row, row.with_name("z-copy"))
+    first, second = check(row.parents[1])
+    assert "another player" not in str(first)
+    assert str(second).endswith(f", whether it is another player than that of {row.name}")
+
+
 @pytest.mark.parametrize("value", ["0", False])
 def test_a_figure_of_another_type_is_named(row: Path, value: object) -> None:
     card = json.loads((row / CARD).read_text())

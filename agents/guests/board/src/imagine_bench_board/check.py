@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import functools
+<<<<<<< HEAD
 from contextlib import ExitStack, closing
+=======
+import hashlib
+from contextlib import ExitStack
+>>>>>>> aef4cfd0 (A copied row of continuous control is said to be one)
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,8 +91,13 @@ class _Court:
         if read_card(folder).get("format") == motions.FORMAT:
             moved = motions.read_motions(folder)
             read.append(moved)
+<<<<<<< HEAD
             played = motions.check_motions(moved, self._motion_env(moved))
             return Verdict(what=moved.name, episodes=played, unshown=NOT_VOUCHED)
+=======
+            episodes = motions.check_motions(moved)
+            return Verdict(what=moved.name, episodes=episodes, unshown=(*NOT_VOUCHED, *self._moved_alike(moved)))
+>>>>>>> aef4cfd0 (A copied row of continuous control is said to be one)
         row = read_row(folder)
         read.append(row)
         require_whole(row, registry.task(row.protocol.task))
@@ -134,6 +144,17 @@ class _Court:
         require(row.protocol.evaluation_episodes == tests, wanted)
         require(len(row.protocol.budgets) == 1, "a row of a round has the tests of one budget, the last.")
         return seed
+
+    def _moved_alike(self, row: MotionRow) -> tuple[str, ...]:
+        """Other rows that have all commands of one of this row's tests, from the same start."""
+        alike = dict[str, None]()
+        for test, motion in enumerate(row.motions):
+            commands = hashlib.sha256(motion.commands.tobytes()).hexdigest()
+            key = f"{row.world} {row.protocol.start(test)} {commands}"
+            name, _ = self._owners.setdefault(key, (row.name, test))
+            if name != row.name:
+                alike[f"whether it is another player than that of {name}"] = None
+        return tuple(alike)
 
     def _alike(self, row: Row) -> tuple[str, ...]:
         """Runs of other rows that failed in the same tests in the same ways as this row's run of the same seed.
