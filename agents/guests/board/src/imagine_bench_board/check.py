@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import functools
-<<<<<<< HEAD
-from contextlib import ExitStack, closing
-=======
 import hashlib
-from contextlib import ExitStack
->>>>>>> aef4cfd0 (A copied row of continuous control is said to be one)
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,13 +87,8 @@ class _Court:
         if read_card(folder).get("format") == motions.FORMAT:
             moved = motions.read_motions(folder)
             read.append(moved)
-<<<<<<< HEAD
-            played = motions.check_motions(moved, self._motion_env(moved))
-            return Verdict(what=moved.name, episodes=played, unshown=NOT_VOUCHED)
-=======
-            episodes = motions.check_motions(moved)
+            episodes = motions.check_motions(moved, self._motion_env(moved))
             return Verdict(what=moved.name, episodes=episodes, unshown=(*NOT_VOUCHED, *self._moved_alike(moved)))
->>>>>>> aef4cfd0 (A copied row of continuous control is said to be one)
         row = read_row(folder)
         read.append(row)
         require_whole(row, registry.task(row.protocol.task))
