@@ -218,7 +218,8 @@ def test_a_window_of_gymnasium_s_ends_no_environment_s_drawing(desktop):
     """
     after = "frame = other.step(1)[0]; shown.close(); frame = other.step(0)[0]"
     command = ["xvfb-run", "-a"] if desktop else []
-    done = run_script(_FRAME.format(before=before, after=after), *command, XDG_RUNTIME_DIR="/tmp")
+    folders = {"XDG_RUNTIME_DIR": "/tmp", "TMPDIR": "/tmp"}  # xvfb-run takes no folder with a space
+    done = run_script(_FRAME.format(before=before, after=after), *command, **folders)
     assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "True", "")
 
 

@@ -106,7 +106,7 @@ def test_wrong_words_get_one_line(
     words: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert exit_code(["board", *words.replace("HERE", str(tmp_path)).split()]) == 2
+    assert exit_code(["board", *(word.replace("HERE", str(tmp_path)) for word in words.split())]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("imagine-bench: ") and sentence.replace("HERE", str(tmp_path)) in line
     assert not (tmp_path / "winter").exists()

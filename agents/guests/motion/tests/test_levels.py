@@ -65,8 +65,8 @@ def test_an_agents_own_settings_reach_it() -> None:
 
 def test_a_kept_file_names_its_clone_and_its_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "tries.json"
-    words = f"motion try {BUNDLED} --count 1 --seed 5 --appearances mild --placement 0 --out {out}"
-    monkeypatch.setattr(sys, "argv", words.split())
+    words = "--count 1 --seed 5 --appearances mild --placement 0 --out".split()
+    monkeypatch.setattr(sys, "argv", ["motion", "try", str(BUNDLED), *words, str(out)])
     main()
     kept = json.loads(out.read_text())
     asked = {name: kept[name] for name in ("count", "seed", "appearances", "family", "placement", "swapped")}
