@@ -1,4 +1,4 @@
-"""Deaths and kills while motions are written and judged; what is left is whole, and the same command goes on."""
+"""Deaths and kills while motions are written and judged; the folders that are left are whole; the command goes on."""
 
 from __future__ import annotations
 

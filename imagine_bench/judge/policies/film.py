@@ -1,4 +1,4 @@
-"""A model's belief beside the truth: the likeliest courses of an episode of the policy that it overrates most."""
+"""A model's belief beside the truth: the likeliest episodes of the policy that it overrates most."""
 
 from __future__ import annotations
 

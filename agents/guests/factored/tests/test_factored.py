@@ -258,7 +258,7 @@ def test_r_max_values_only_enough_of_the_unknown_at_the_best_reward(unknown: flo
     ("value", "r_max", "explores_by"),
     [(30.0, 40.0, "r_max"), (30.0, 30.0, "r_max"), (10.0, 10.0, "novelty"), (10.0, 12.0, "r_max")],
 )
-def test_it_is_curious_only_where_nothing_promises_more_and_the_goal_is_far(
+def test_it_is_curious_only_where_nothing_unknown_may_earn_more_and_the_goal_is_far(
     value: float, r_max: float, explores_by: str
 ) -> None:
     """50 is the best reward seen; after the 20 macro-actions of a plan it is worth 17.9."""

@@ -1,4 +1,4 @@
-"""Random network distillation: what was seen often pays little, and nothing else about an environment changes."""
+"""Random network distillation: an observation that was seen often pays little; nothing else changes."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ class MotionRow:
 
 
 class _Tally:
-    """What is known of an episode while it is played."""
+    """The facts of an episode while it is played."""
 
     def __init__(self, info: Info) -> None:
         self.total_reward = 0.0
@@ -309,7 +309,7 @@ def _motion_of(columns: dict[str, Any]) -> Motion:
 
 
 def read_motions(folder: Path) -> MotionRow:
-    """Read a row; nothing is played. Raises ArtefactError: it is damaged, or not what a row may hold."""
+    """Read a row; nothing is played. Raises ArtefactError: it is damaged, or holds parts that no row has."""
     card = read_card(folder)
     with reading(folder / CARD, f"a card of the format {FORMAT!r}"):
         protocol: MotionProtocol = unpack(MotionProtocol, card["protocol"], {})

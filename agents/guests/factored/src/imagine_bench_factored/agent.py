@@ -103,7 +103,7 @@ class CodeAgent:
     def _exploring_values(self, code: Code) -> Floats:
         """Values (A,) that it acts by in training.
 
-        By R-max, as long as something unknown promises more than all that is known, or the best reward seen is known to
+        By R-max, as long as something unknown may earn more than all that is known, or the best reward seen is known to
         be within reach. Elsewhere it goes where most is unknown, until nothing is left; then it acts greedily.
         """
         planning = self.settings.planning

@@ -68,7 +68,7 @@ class PlanningSettings:
     branches: int = setting(8, COUNT)  #: most next codes of one action
     least_probability: float = setting(0.02, PROBABILITY)  #: less likely ones are not followed, but for the likeliest
     states: int = setting(400, between(1, 1_000_000))  #: most codes that one plan visits
-    #: ``"r_max"`` values all that is unknown enough at the best reward seen, and is curious where that promises
+    #: ``"r_max"`` values all that is unknown enough at the best reward seen, and is curious where that offers
     #: nothing. ``"curiosity"`` goes where most is unknown, ``"optimism"`` weighs the best reward seen by how much is
     #: unknown, ``"random"`` acts greedily but for random actions (the last three are ablations).
     exploration: str = setting("r_max", ("r_max", "curiosity", "optimism", "random"))

@@ -48,7 +48,7 @@ SB3_PPO_RND_LATENTS = AgentEntry(
     settings="imagine_bench_peers.sb3_settings:CURIOUS",
     external_training_loop=True,
     title="SB3 PPO + RND (latents)",
-    description="The same PPO, with a bonus for what was seldom seen: random network distillation.",
+    description="The same PPO, with a bonus for observations that were seldom seen: random network distillation.",
 )
 SB3_DQN_IMAGINED = AgentEntry(
     make="imagine_bench_peers.sb3:make_imagining_dqn",

@@ -1,8 +1,8 @@
 """A bonus for observations that were seldom seen: random network distillation (RND).
 
 Burda et al. 2018, "Exploration by Random Network Distillation", arXiv:1810.12894. A network with fixed random weights
-gives each observation an output, and a second network learns to predict it from what was visited. Its squared error is
-large where little was visited, and is paid beside the reward.
+gives each observation an output, and a second network learns to predict it from the visited observations. Its squared
+error is large where little was visited, and is paid beside the reward.
 
 Two things differ from the paper. The learner has one value function for both rewards, where the paper has two. So the
 bonus ends with the episode, and both rewards have one discount.

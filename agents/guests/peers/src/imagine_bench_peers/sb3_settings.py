@@ -94,7 +94,7 @@ class MixSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class CuriousSettings(LibrarySettings):
-    """Those with a bonus for what was seldom seen."""
+    """Those with a bonus for observations that were seldom seen."""
 
     novelty: NoveltySettings = field(default_factory=NoveltySettings)
 

@@ -39,11 +39,11 @@ _CHANGES = "LIMIT_CPU_S = 0.1\nCALIBRATION_CPU_S = 1000.0\n"
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("session")
-    (folder / "conftest.py").write_text((Path(__file__).parent / "conftest.py").read_text() + "\n" + _CHANGES)
+    (folder / "conftest.py").write_text((Path(__file__).parents[1] / "conftest.py").read_text() + "\n" + _CHANGES)
     (folder / "test_it.py").write_text(_TESTS)
     (folder / "its_library.py").write_text("from test_it import burn\nimport its_part\nburn(0.6)\n")
     (folder / "its_part.py").write_text("")
-    options = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
+    options = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
     again = shlex.split(options["addopts"].partition("--reruns")[2])
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--rootdir", str(folder), str(folder), "-q"]
     command += ["--reruns", *again]
