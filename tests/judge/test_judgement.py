@@ -496,6 +496,5 @@ def test_a_judged_model_whose_encoder_reads_few_frames_is_marked_in_its_row(said
         write_json(path, sealed({**cell, "encoder_reads": 0.115}))
     assert "(encoder reads 11.5%)" in judgement_page(judged(folder, _of("nearest", "copy"))).summary
     spec = registry.task("arrow_puzzle")
-    index = RenderedFrameIndex(spec, "strong")
-    cost = source_of("structured", spec, index, "strong", SeedTree(1000)).cost
+    cost = source_of("structured", spec, RenderedFrameIndex(spec, "strong"), "strong", SeedTree(1000)).cost
     assert cost["encoder_reads"] == pytest.approx(0.115, abs=1e-3)
