@@ -97,7 +97,7 @@ doctor: ready  ## Describe this machine, and name each fault of it in words
 	@$(BIN)/imagine-bench doctor
 
 test: ready  ## Run the tests, but for those that take minutes each; ARGS goes to pytest
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST) $(ARGS)
+	@env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST) $(ARGS)
 
 test-slow: ready  ## Run the tests that take minutes each
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow $(PYTEST) $(ARGS)

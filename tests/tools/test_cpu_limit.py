@@ -22,18 +22,18 @@ def burn(seconds):
 
 @pytest.fixture(scope="module")
 def trained():
-    burn(0.5)
+    burn(0.3)
 
 def test_cheap(trained): pass
 def test_over(): burn(0.15)
-def test_far_over(): burn(0.6)
-def test_disturbed_once(times=[0.6, 0.0]): burn(times.pop(0))
+def test_far_over(): burn(0.3)
+def test_disturbed_once(times=[0.3, 0.0]): burn(times.pop(0))
 def test_wrong_once(results=[False, True]): assert results.pop(0)
 def test_first_import(): import its_library
 @pytest.mark.slow
-def test_marked_slow(): burn(0.6)
+def test_marked_slow(): burn(0.3)
 """
-_CHANGES = "LIMIT_CPU_S = 0.1\nCALIBRATION_CPU_S = 1000.0\n"
+_CHANGES = "LIMIT_CPU_S = 0.1\nslowness = lambda: 1.0\n"
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("session")
     (folder / "conftest.py").write_text((Path(__file__).parents[1] / "conftest.py").read_text() + "\n" + _CHANGES)
     (folder / "test_it.py").write_text(_TESTS)
-    (folder / "its_library.py").write_text("from test_it import burn\nimport its_part\nburn(0.6)\n")
+    (folder / "its_library.py").write_text("from test_it import burn\nimport its_part\nburn(0.3)\n")
     (folder / "its_part.py").write_text("")
     options = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
     again = shlex.split(options["addopts"].partition("--reruns")[2])

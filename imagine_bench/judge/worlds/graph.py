@@ -11,7 +11,7 @@ Shapes: ``A`` macro-actions, ``M`` coordinates, ``P`` learned factors, ``N`` fra
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy  # its parts load, slowly, when they are first used
 
 from imagine_bench.arrays import Bools, Floats, Ints
 from imagine_bench.exact.factors import factor_graph, machine, numbered
@@ -50,7 +50,7 @@ def _places(values: Ints, coordinates: Ints) -> Ints:
     shared = np.array([[_information(own, true) for true in coordinates.T] for own in values.T])
     place = coordinates.shape[1] + np.arange(values.shape[1])
     if shared.size:
-        rows, columns = linear_sum_assignment(-shared)
+        rows, columns = scipy.optimize.linear_sum_assignment(-shared)
         known = shared[rows, columns] > 0.0
         place[rows[known]] = columns[known]
     return place
