@@ -57,13 +57,18 @@ def worlds_learned(what: str) -> str:
 
 
 def _behind(nuisance: str) -> list[dict[str, Any]]:
-    """The kept runs behind a nuisance."""
+    """The kept runs of ``factored`` behind nuisances joined by ``+``; of another agent after ``AGENT behind``."""
+    agent, _, appearance = nuisance.rpartition(" behind ")
+    wanted = (agent or "factored", appearance.replace("+", ","))
     kept: list[dict[str, Any]] = json.loads(_NUISANCES.read_text())
-    return [run for run in kept if run["appearance"] == nuisance]
+    runs = [run for run in kept if (run["agent"], run["appearance"]) == wanted]
+    if not runs:
+        raise ValueError(f"No run of {wanted[0]} behind {wanted[1]} is kept.")
+    return runs
 
 
 def behind(column: str, episodes: str, nuisance: str) -> str:
-    """A column of the runs behind a nuisance after so many episodes: mean [lowest, highest seed]; shares in %."""
+    """A column of the runs behind nuisances after so many episodes: mean [lowest, highest seed]; shares in %."""
     runs = _behind(nuisance)
     values = np.array([run[column][run["episodes"].index(int(episodes))] for run in runs])
     if column == "solved":
