@@ -397,26 +397,28 @@ def evidence() -> None:
     """Total variation of each judged fit, and its exploit with the upper bound, by the size of its data."""
     with (RESULTS / "arrow_puzzle_clockwise-levels-judge" / "scores.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["exploit"]]
+    models = list(dict.fromkeys(row["model"] for row in rows))
     sizes = sorted({int(row["transitions"]) for row in rows})
-    plot, axes = plt.subplots(figsize=(8, 4.4), layout="constrained")
-    for place, model in enumerate(dict.fromkeys(row["model"] for row in rows), 2):
-        style = {"color": figures.COLORS[place % 8], "marker": figures.MARKERS[place % 7], "alpha": 0.7}
-        for row in (row for row in rows if row["model"] == model):
-            away, low, high = (float(row[name]) for name in ("total_variation", "exploit", "exploit_bound"))
-            area = 25 * 3 ** sizes.index(int(row["transitions"]))
-            axes.vlines(away, low, high, color=style["color"])
-            axes.scatter(away, low, s=area, **style)
-        for place_of_size, size in enumerate(sizes):
-            axes.scatter([], [], s=25 * 3**place_of_size, label=f"{model}, {size} transitions", **style)
-    axes.set_xscale("symlog", linthresh=0.01)
-    axes.set_xlim(-0.001, 1.1)
-    axes.set_xticks([0.0, 0.01, 0.1, 1.0], ["0", "0.01", "0.1", "1"])
-    axes.set_xlabel("total variation after one macro-action, L1 (scale: linear below 0.01, then logarithmic)")
-    axes.set_ylabel("exploit, L7 (units of reward)\nmark: found; line: to the upper bound")
-    axes.set_title("arrows:cubes=3,goal=clockwise: each mark is one training of a model", fontsize=10)
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(loc="upper right", frameon=False, labelspacing=0.9)
+    plot, panels = plt.subplots(1, len(models), figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained")
+    for axes, model in zip(panels, models, strict=True):
+        for place, size in enumerate(sizes, 2):
+            fits = [row for row in rows if row["model"] == model and int(row["transitions"]) == size]
+            away, low, high = (
+                [float(row[name]) for row in fits] for name in ("total_variation", "exploit", "exploit_bound")
+            )
+            style = {"color": figures.COLORS[place % 8], "marker": figures.MARKERS[place % 7]}
+            axes.vlines(away, low, high, color=style["color"], alpha=0.6)
+            axes.scatter(away, low, s=60, label=f"{size} transitions", **style)
+        axes.set_title(model, fontsize=11)
+        axes.set_xscale("symlog", linthresh=0.01)
+        axes.set_xlim(-0.001, 1.1)
+        axes.set_xticks([0.0, 0.01, 0.1, 1.0], ["0", "0.01", "0.1", "1"])
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("exploit, L7 (units of reward)\nmark: found; line: to the upper bound")
+    panels[0].legend(loc="upper right", frameon=False)
+    plot.supxlabel("total variation after one macro-action, L1 (linear below 0.01, then logarithmic)", fontsize=10)
+    plot.suptitle("arrows:cubes=3,goal=clockwise: each mark is one training of a world model", fontsize=10)
     plot.savefig(HERE / "evidence.png", dpi=100)
 
 

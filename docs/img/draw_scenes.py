@@ -35,6 +35,7 @@ def scene(env_id: str, options: Mapping[str, Any], macrostate: tuple[int, ...], 
     image = Image.fromarray(film[len(film) // 2]).resize(CELL_PX, Image.Resampling.LANCZOS)
     inset = Image.fromarray(np.pad(frame, ((1, 1), (1, 1), (0, 0)), constant_values=255))
     image.paste(inset, (CELL_PX[0] - 66, CELL_PX[1] - 66))
+    ImageDraw.Draw(image).text((CELL_PX[0] - 88, CELL_PX[1] - 82), "agent's frame", "white", font())
     return image
 
 
@@ -43,6 +44,7 @@ def toy_function() -> Image.Image:
     data = toy_regression.training("high_noise", np.random.default_rng(0))
     figure, axes = plt.subplots(figsize=(3.2, 2.4), layout="constrained")
     axes.scatter(data.inputs[:, 0], data.targets[:, 0], s=4, color=figures.COLORS[2])
+    axes.set_title("three functions of x, noisy in the middle", fontsize=8)
     axes.set(xlabel="x", ylabel="y")
     axes.spines[["top", "right"]].set_visible(False)
     return as_image(figure)
@@ -64,6 +66,7 @@ def planar_arm() -> Image.Image:
     for which, color in zip(misses.argsort()[[0, 3, 9, 12]], (2, 4, 5, 7), strict=True):
         axes.plot(*joints_in_plane(angles[which]).T, "o-", color=figures.COLORS[color], linewidth=3, markersize=5)
     axes.plot(*target, "*", color=figures.INK, markersize=14, zorder=5)
+    axes.set_title("four postures reach one point (star)", fontsize=8)
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
     axes.spines[["top", "right"]].set_visible(False)
     return as_image(figure)
