@@ -301,9 +301,6 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
         ArtefactError: A file is damaged or foreign; it is left untouched.
     """
     folder = bench_folder(root, wanted)
-    artefacts = [path for kind, path in paths.items() if kind != "dataset"]
-    for words in filter(None, map(encoders.doubt, artefacts)):
-        print(f"Note: agents see through {words}.")
     if isinstance(wanted, Protocol) and wanted.code and not folder.exists():
         for other in with_other_code(folder, wanted):
             print(f"Note: the code of an agent was changed since {other}, which stays as it is; all runs begin anew.")
@@ -331,6 +328,7 @@ def carry_out(
         The runs that failed, and how many were missing before. Raises as :func:`bench`, but for runs that fail.
     """
     require_modules("matplotlib", "PIL", "rerun")  # torch only where an agent is made of it
+    _say_doubts(paths for _, paths in planned)
     with ExitStack() as held:
         work = list[_Bench]()
         missing = 0
@@ -349,6 +347,13 @@ def carry_out(
         jobs = [job for store, paths in work for job in _jobs(store, paths)]
         with ProgressBar([job.spec for job in jobs]) as show:
             return list(launcher.launch(jobs, show)) if jobs else [], missing
+
+
+def _say_doubts(needed: Iterable[Encoders]) -> None:
+    """Say of each encoder once, through which agents see, if few frames are read right from it."""
+    artefacts = {path for paths in needed for kind, path in paths.items() if kind != "dataset" and path is not None}
+    for words in filter(None, map(encoders.doubt, sorted(artefacts))):
+        print(f"Note: agents see through {words}.")
 
 
 @functools.cache

@@ -169,3 +169,12 @@ def test_who_cannot_carry_over_starts_anew():
     (alone, _), *_ = plan_level(TINY, level, "table")
     (carried, _), *_ = plan_level(TINY, level, "factored:given")
     assert (alone.after, carried.after) == ((), ("arrow_puzzle",))
+
+
+def test_a_suite_names_an_encoder_that_misreads(tmp_path, capsys):
+    """The bundled codes of the strongest look read a ninth of its frames; two seeds see through them."""
+    level = Level(name="strong", task="arrow_puzzle", episodes=1, protocol={"appearance": "strong"})
+    shaken = Experiment(name="appearance", dial="appearance", question="?", levels=(level,))
+    suite = dataclasses.replace(TINY, experiments=(shaken,), evaluation_episodes=1, seeds=(0, 1))
+    run_suite(suite, ("factored:given",), root=tmp_path, launcher=Inline())
+    assert capsys.readouterr().out.count("reads only 11.5% of new frames right") == 1
