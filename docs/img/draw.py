@@ -346,8 +346,8 @@ CHALLENGES = ("unseen_goal", "changed_rule", "late_frames")
 
 def separating() -> None:
     """Success in the world that separates and in the open challenges, beside chance: a panel each, a dot a seed."""
-    folders = [RESULTS / f"separating-{name}" for name in ("world", *(f"{name}-450" for name in CHALLENGES))]
-    figure, every = plt.subplots(1, len(folders), figsize=(3.1 * len(folders), 3.2), sharey=True, layout="constrained")
+    folders = [RESULTS / f"separating-{name}" for name in ("world-453", *(f"{name}-450" for name in CHALLENGES))]
+    figure, every = plt.subplots(1, len(folders), figsize=(3.4 * len(folders), 3.4), sharey=True, layout="constrained")
     for axes, folder in zip(every, folders, strict=True):
         kept = json.loads((folder / "bench.json").read_text())
         protocol = kept["protocol"]
@@ -359,7 +359,8 @@ def separating() -> None:
             axes.plot([place] * len(values), values, ".", color=figures.INK)
         axes.axhline(100 * kept["certificate"]["chance_level"], color=CAUSE_COLORS[4], linestyle="--", label="chance")
         axes.axhline(100 * kept["certificate"]["optimum"], color=CAUSE_COLORS[0], label="optimum")
-        axes.set_xticks(range(len(agents)), [agent.replace("_", "\n") for agent in agents], fontsize=8)
+        lines = [agent.replace("_", "\n").replace(":", ":\n") for agent in agents]
+        axes.set_xticks(range(len(agents)), lines, fontsize=8)
         before = protocol["after_episodes"] if protocol["after"] else 0
         name = folder.name.split("-")[1].replace("_", " ").replace("world", "separating")
         axes.set_title(f"{name}: {before + last:,} episodes", fontsize=9.5)
