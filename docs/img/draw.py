@@ -347,9 +347,12 @@ CHALLENGES = ("unseen_goal", "changed_rule", "late_frames")
 def separating() -> None:
     """Success in the world that separates and in the open challenges, beside chance: a panel each, a dot a seed."""
     folders = [RESULTS / f"separating-{name}" for name in ("world-453", *(f"{name}-450" for name in CHALLENGES))]
-    figure, every = plt.subplots(1, len(folders), figsize=(3.4 * len(folders), 3.4), sharey=True, layout="constrained")
-    for axes, folder in zip(every, folders, strict=True):
-        kept = json.loads((folder / "bench.json").read_text())
+    benches = [json.loads((folder / "bench.json").read_text()) for folder in folders]
+    widths = [len(kept["protocol"]["agents"]) for kept in benches]
+    figure, every = plt.subplots(
+        1, len(folders), figsize=(13.6, 3.4), width_ratios=widths, sharey=True, layout="constrained"
+    )
+    for axes, folder, kept in zip(every, folders, benches, strict=True):
         protocol = kept["protocol"]
         last = protocol["budgets"][-1]
         agents = sorted(agent_label(agent, protocol) for agent in protocol["agents"])

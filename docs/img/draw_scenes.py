@@ -148,5 +148,5 @@ def tasks() -> None:
     for place, (name, image) in enumerate(cells.items()):
         left, top = (width + 8) * (place % 3), (height + 28) * (place // 3)
         ImageDraw.Draw(canvas).text((left + 2, top + 7), name, figures.INK, font(bold=True))
-        canvas.paste(image.quantize(160).convert("RGB"), (left, top + 26))
-    canvas.save(HERE / "tasks.png", optimize=True)
+        canvas.paste(image, (left, top + 26))
+    canvas.quantize(256, dither=Image.Dither.NONE).save(HERE / "tasks.png", optimize=True)
