@@ -9,7 +9,7 @@ from typing import TypedDict
 
 from imagine_bench.arrays import Frame
 from imagine_bench.interfaces.capabilities import Imaginer
-from imagine_bench.judge.causes import MOST_STATES, beliefs, frames_to_ask_with
+from imagine_bench.judge.causes import beliefs, can_be_asked, frames_to_ask_with
 from imagine_bench.judge.open_loop import (
     OPEN_LOOP_DEPTH,
     examples,
@@ -20,7 +20,6 @@ from imagine_bench.judge.open_loop import (
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, ProtocolData
-from imagine_bench.rules import states_of
 from imagine_bench.running.run_state import Run, make_env
 from imagine_bench.running.runner import AtBudget, AtEnd, RunObserver
 from imagine_bench.seeding import Purpose, SeedTree, evaluation_split
@@ -60,7 +59,7 @@ class BenchObserver(RunObserver):
                 run.tell("imagining", at_once=True)
                 seeds = SeedTree(run.spec.seed).child("open_loop", budget)
                 found["open_loop"] = open_loop(run.agent, self._questions, seeds)
-        if run.entry.learns and run.task.sight is None and len(states_of(run.task.rules)) <= MOST_STATES:
+        if run.entry.learns and can_be_asked(run.task):
             if self._frames is None:  # likewise
                 self._frames = frames_to_ask_with(run.agent, run.task, **_in_tests(run))
             rng = SeedTree(run.spec.seed).child("beliefs", budget).generator()

@@ -254,6 +254,11 @@ def memory_suffices(spec: TaskSpec) -> bool:
     return True
 
 
+def can_be_asked(spec: TaskSpec) -> bool:
+    """Whether an agent is asked about every macrostate, so that its failures have causes."""
+    return len(states_of(spec.rules)) <= MOST_STATES and memory_suffices(spec)
+
+
 def drawn_by(number: float, outcomes: Sequence[Outcome]) -> Outcome:
     """The outcome that a number in [0, 1) draws, as environments do."""
     ends = list(itertools.accumulate(outcome.probability for outcome in outcomes))
@@ -339,8 +344,10 @@ def causes_of(trained: Trained) -> tuple[Tested, ...]:
     def attribution_at(row: Checkpoint) -> Attribution:
         if run.tried is None:
             raise ArtefactError(f"{trained.folder} keeps no test episodes; run its bench anew, elsewhere.")
-        if row.beliefs is None:
+        if row.beliefs is None and not can_be_asked(spec):
             raise InvalidValueError(f"{spec.id} has too many macrostates to ask an agent about each.")
+        if row.beliefs is None:
+            raise ArtefactError(f"{trained.folder} keeps no answers about macrostates; run its bench anew, elsewhere.")
         tried = run.tried[run.tried[:, -1] < row.episodes, :-1].astype(np.int64)
         return Attribution(spec, row.beliefs, tried, readable)
 

@@ -14,7 +14,7 @@ from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.cli import observers
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, Rules, State
 from imagine_bench.interfaces.capabilities import FrameReader
 from imagine_bench.judge import causes as why
@@ -56,6 +56,8 @@ def asked(root: Path, agent: str, task: str, **changes: Any) -> tuple[Checkpoint
         ("wrong_model", "model", "arrows:cubes=2"),
         pytest.param("wrong_model", "model", "pick_place", marks=pytest.mark.slow),
         ("timid", "unexperienced", "arrows:cubes=2"),
+        ("forgetful", "forgotten", "arrows:gesture=first"),
+        ("bad", "values", "arrows:cubes=2,gesture=first"),
         ("timid_modeller", "unexperienced", "arrows:cubes=2"),
     ],
 )
@@ -115,8 +117,14 @@ def test_what_cannot_be_asked_is_a_sentence(tmp_path: Path, monkeypatch: pytest.
         trained: Any = SimpleNamespace(spec=spec, task=registry.task(task))
         with pytest.raises(InvalidValueError, match=words):
             why.causes_of(trained)
-    monkeypatch.setattr(observers, "MOST_STATES", 31)
+    monkeypatch.setattr(why, "MOST_STATES", 31)
     with pytest.raises(InvalidValueError, match="too many macrostates"):
+        asked(tmp_path, "bad", "arrows:cubes=2", evaluation_episodes=2, budgets=(1,))
+
+
+def test_a_run_from_before_is_to_be_run_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(observers, "can_be_asked", lambda spec: False)
+    with pytest.raises(ArtefactError, match="keeps no answers about macrostates; run its bench anew"):
         asked(tmp_path, "bad", "arrows:cubes=2", evaluation_episodes=2, budgets=(1,))
 
 

@@ -140,9 +140,23 @@ class HalfBlind(Blind):
         return read
 
 
+class Forgetful(Bad):
+    """Plays perfectly on the first frame of an episode, and never again."""
+
+    begun = True
+
+    def begin_episode(self) -> None:
+        self.begun = True
+
+    def plays(self, row: int) -> int:
+        first, self.begun = self.begun, False
+        return int((self.best if first else self.bad)[row])
+
+
 FLAWED = {
     "sound": Sound, "bad": Bad, "not_greedy": NotGreedy, "wrong_model": WrongModel, "timid": Timid,
     "timid_modeller": TimidModeller, "blind": Blind, "half_blind": HalfBlind,
+    "forgetful": Forgetful,
 }  # fmt: skip
 for name, kind in FLAWED.items():
     AGENTS[name] = AgentEntry(make=f"flawed_agents:{kind.__name__}", needs_encoder=False, privileged=True)
