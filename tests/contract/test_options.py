@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 
 import imagine_bench.agents.dqn  # noqa: F401 - loads torch, which no test's time holds
@@ -44,9 +45,15 @@ def test_every_field_of_a_protocol_has_a_row_or_a_reason() -> None:
     require_every_field()
 
 
+@functools.cache
+def checked_options(agent: str) -> CheckedOptions:
+    """The options of an agent, whose run without any is carried out once."""
+    return CheckedOptions(agent, TASK)
+
+
 def refusals(agent: str, options: Iterable[str]) -> set[str]:
     """The options that are refused; InvalidValueError for one that is not, and changes nothing."""
-    checked, refused = CheckedOptions(agent, TASK), set[str]()
+    checked, refused = checked_options(agent), set[str]()
     for option in options:
         try:
             checked.check(option)

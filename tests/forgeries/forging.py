@@ -6,9 +6,11 @@ level: the table, the checkpoint, the mark of a finished run, the protocol in ea
 
 from __future__ import annotations
 
+import atexit
 import functools
 import itertools
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,6 +78,15 @@ def honest_bench(root: Path, launcher: Remembering, **changes: Any) -> Path:
     }
     wanted, encoders = plan("arrow_puzzle", "smoke", **{**few, **changes})
     return bench(wanted, encoders, root=root, launcher=launcher).folder
+
+
+@functools.cache
+def shared_bench() -> tuple[Path, Remembering]:
+    """An honest bench that no test changes, and the launcher that knows its runs; made once a process."""
+    root = Path(tempfile.mkdtemp(prefix="honest_bench_"))
+    atexit.register(shutil.rmtree, root, ignore_errors=True)
+    launcher = Remembering(root / "trained")
+    return honest_bench(root / "honest", launcher), launcher
 
 
 @functools.cache

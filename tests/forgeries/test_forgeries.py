@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from forging import Forger, Remembering, honest_bench
+from forging import Forger, shared_bench
 from kinds import KINDS, Donors
 
 from imagine_bench.errors import ArtefactError, CheckFailedError, ImagineBenchError
@@ -25,8 +25,7 @@ class Court:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.launcher = Remembering(root / "trained")
-        self.honest = honest_bench(root / "honest", self.launcher)
+        self.honest, self.launcher = shared_bench()
         self.donors = Donors(root / "donors")
         self.reasons: list[str] = []
 

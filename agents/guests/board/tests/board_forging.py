@@ -13,7 +13,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from forging import Hand, Remembering, honest_bench, tests_by
+from forging import Hand, shared_bench, tests_by
 from imagine_bench_board import rounds
 from imagine_bench_board.rows import CARD, EPISODES
 from imagine_bench_board.submit import file_agents, submit
@@ -46,7 +46,7 @@ def with_round(bench: Path, board: Path, secret: Path) -> None:
 
 def honest_board(root: Path) -> Path:
     """A board of the rows of a bench, with open starts and with those of a round."""
-    bench = honest_bench(root / "runs", Remembering(root / "trained"))
+    bench, _ = shared_bench()
     board = root / "board"
     submit(bench, board / "rows", author="a founder", round_folder=None, encoder=None)
     with_round(bench, board, root / "secret.json")

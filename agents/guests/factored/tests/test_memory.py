@@ -122,7 +122,7 @@ def watched(learner: LearnedPerceptionAgent, episodes: range, *, covered: bool =
 @pytest.fixture(scope="module")
 def rememberer() -> LearnedPerceptionAgent:
     learner = agent(seed=0)
-    watched(learner, range(56), covered=True)
+    watched(learner, range(42), covered=True)
     return learner
 
 
