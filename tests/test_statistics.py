@@ -31,6 +31,13 @@ def test_running_means_by_hand() -> None:
     assert means == pytest.approx(np.array([[0.225, 10.75 / 30.0], [0.1, 0.1]]), abs=1e-12)
 
 
+@pytest.mark.parametrize("trials", [1, 7, 200])
+def test_one_run_s_interval_is_wilson_s(trials: int) -> None:
+    for successes in {0, 1, trials // 3, trials}:
+        wanted = stats.binomtest(successes, trials).proportion_ci(method="wilson")
+        assert statistics.wilson(successes, trials) == pytest.approx((wanted.low, wanted.high), abs=1e-12)
+
+
 FIVE, OTHERS = [0.2, 0.5, 0.55, 0.6, 0.9], [0.1, 0.15, 0.3, 0.2, 0.8, 0.25, 0.2, 0.35]
 
 
@@ -189,6 +196,21 @@ def test_a_gain_over_perhaps_nothing_has_no_interval_and_over_nothing_no_value()
     value, low, high, _ = statistics.gain([0.3, 0.4, 0.5, 0.3, 0.5], [0.0, 0.0, 0.1, 0.0, 0.0])
     assert value == pytest.approx(19.0) and math.isnan(low) and math.isnan(high)
     assert math.isnan(statistics.gain([0.1, 0.2], [0.0, 0.0]).value)
+
+
+@pytest.mark.parametrize("paired", [False, True])
+def test_a_ratio_has_ends_exactly_where_its_base_is_clear_of_zero(paired: bool) -> None:
+    rng, clear = np.random.default_rng(0), []
+    for a, b in rng.uniform(0.2, 0.8, (100, 2, 4)) - [[0.0], [0.25]]:
+        if paired:
+            freedom = 3.0
+        else:
+            freedom = stats.ttest_ind(a, b, equal_var=False).df
+        least, most = stats.t.interval(0.95, freedom, b.mean(), stats.sem(b))
+        clear.append(least > 0.0 or most < 0.0)
+        found = statistics.ratio(a, b, paired=paired)
+        assert math.isnan(found.low) == math.isnan(found.high) == (not clear[-1])
+    assert 20 < sum(clear) < 80
 
 
 def test_a_success_that_is_lost_again_does_not_last() -> None:

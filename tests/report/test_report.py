@@ -247,6 +247,8 @@ def test_the_first_line_says_what_equal_updates_leave_of_a_gain(tmp_path: Path, 
     ]
     assert [each.found.p for each in data.headlines] == statistics.holm(raw).tolist(), "for one another alone"
     assert data.of("imagination")[-1]["p_holm"] == data.headlines[0].found.p
+    others = sum("p" in record for record in data.records) - sum(each.base == "dqn" for each in data.headlines)
+    assert data.cells == others, "all other comparisons with DQN, each once"
 
 
 def test_an_undecided_headline_names_a_command_that_adds_seeds_itself(tmp_path: Path) -> None:

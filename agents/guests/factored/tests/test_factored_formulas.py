@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 
 import numpy as np
@@ -183,6 +184,18 @@ def by_noisy_or(model: FactoredModel, code: Code, action: int, following: Code) 
     rate = causes.cause_rate.sum(axis=0)[model.outcomes.conjunctions.group[active]]
     tested = np.prod(1.0 - rate * pseudo / (pseudo + causes.tests[active]))
     return {outcome: share / sum(chance.values()) for outcome, share in chance.items()}, float(1.0 - tested) * none
+
+
+def test_where_a_step_leads_is_as_probable_as_its_factors_say_and_without_a_trial_not_at_all(
+    model: FactoredModel,
+) -> None:
+    following, sure = model.likeliest(np.array(CODES))
+    for (row, code), action in itertools.product(enumerate(CODES), range(ACTIONS)):
+        expected = [predicted(factor, code, action)[0].expected for factor in range(2)]
+        assert following[row, action].tolist() == [int(each.argmax()) for each in expected]
+        assert sure[row, action] == pytest.approx(math.prod(float(each.max()) for each in expected))
+    untried = FactoredModel(SIZES, ACTIONS, SETTINGS)
+    assert not untried.likeliest(np.array(CODES))[1].any()
 
 
 def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
