@@ -21,6 +21,7 @@ from doc_cells import ROOT
 from doc_tables import PAGES
 from matplotlib import pyplot
 from small_runs import do
+from worlds import draw_quickly
 
 import imagine_bench
 from imagine_bench import registry
@@ -100,6 +101,7 @@ def test_commands_could_be_carried_out(page: Path) -> None:
 def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
+    draw_quickly(monkeypatch)
     if "import lerobot" in code or "from lerobot" in code:
         pytest.importorskip("lerobot", reason="LeRobot is large, and no dependency of the tests")
     variables: dict[str, object] = {}

@@ -180,7 +180,8 @@ def test_a_display_that_is_missing_is_named_like_missing_gl(world, monkeypatch):
 _FRAME = """
     {before}
     import gymnasium, imagine_bench
-    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", render_mode="rgb_array")
+    options = {{"execution": "kinematic", "render_mode": "rgb_array", "width": 64, "height": 48}}
+    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", **options)
     frame, _ = env.reset(seed=0)
     image = env.render()
     {after}
@@ -212,7 +213,7 @@ def test_a_window_of_gymnasium_s_ends_no_environment_s_drawing(desktop):
     from gymnasium.wrappers import HumanRendering
     make = lambda **options: gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic", **options)
     other = make()
-    shown = HumanRendering(make(render_mode="rgb_array"))
+    shown = HumanRendering(make(render_mode="rgb_array", width=64, height=48))
     other.reset(seed=0)
     shown.reset(seed=0)
     """
