@@ -1,4 +1,4 @@
-"""Rules for every test: a limit on CPU time, and a cache folder that holds nothing when the session starts.
+"""Rules for every test: a limit on CPU time, a cache folder that is empty at first, and no waiting for the disk.
 
 A fast test uses at most about 3 seconds of CPU time: one that uses more is named, one that uses twice as much fails.
 
@@ -148,10 +148,26 @@ class OwnCache:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
+class NoFlush:
+    """The pytest plugin that lets nobody of this process wait for the disk: tests kill processes, none cuts the power.
+
+    Child processes wait as usual.
+    """
+
+    def __init__(self) -> None:
+        self._real = os.fsync
+        os.fsync = lambda handle: None
+
+    def pytest_unconfigure(self) -> None:
+        """Wait again."""
+        os.fsync = self._real
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Hold every test of the session to the rules, plug-ins' tests too."""
     config.pluginmanager.register(CpuLimit(), "cpu-limit")
     config.pluginmanager.register(OwnCache(), "own-cache")
+    config.pluginmanager.register(NoFlush(), "no-flush")
 
 
 @pytest.fixture

@@ -68,8 +68,8 @@ def guest_packages() -> dict[str, set[str]]:
     """The installed packages that offer anything, by name, and where their entries lie: names of top modules."""
     found: dict[str, set[str]] = {}
     everything = entry_points()
-    for group in everything.groups:
+    for group in (each for each in everything.groups if each.startswith("imagine_bench.")):
         for point in everything.select(group=group):
-            if point.dist and group.startswith("imagine_bench."):
+            if point.dist:
                 found.setdefault(point.dist.name, set()).add(point.module.partition(".")[0])
     return dict(sorted(found.items()))
