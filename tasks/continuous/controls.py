@@ -93,8 +93,8 @@ class HandControl:
             low, high = -np.ones(len(self.names) - 1), np.ones(len(self.names) - 1)
         return gymnasium.spaces.Box(np.append(low, -1.0).astype(np.float32), np.append(high, 1.0).astype(np.float32))
 
-    def checked(self, action: Motion) -> Floats:
-        """An action as float64, within its space; values beyond are taken for the nearest within.
+    def checked(self, action: Motion, count: int | None = None) -> Floats:
+        """An action, or ``count`` in rows, as float64 within the space; values beyond are taken for the nearest within.
 
         Raises:
             InvalidValueError: Another shape, no numbers, NaN, or a quaternion of zeros.
@@ -106,9 +106,10 @@ class HandControl:
         if given.dtype.kind not in "biuf" or (isinstance(action, np.ma.MaskedArray) and np.ma.is_masked(action)):
             raise self._refused(action, "has parts that are no real numbers")
         given = given.astype(np.float64)
-        if given.shape != (len(self.names),) or not all(map(math.isfinite, given.tolist())):
+        shape = (len(self.names),) if count is None else (count, len(self.names))
+        if given.shape != shape or not all(map(math.isfinite, given.ravel().tolist())):
             raise self._refused(action, "has another shape or a value that is not finite")
-        if self.control == "pose" and not given[3:7].any():
+        if self.control == "pose" and not given[..., 3:7].any(axis=-1).all():
             raise InvalidValueError("The quaternion of the action is all zeros; give (1, 0, 0, 0) for no rotation.")
         return np.minimum(np.maximum(given, self._low), self._high)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
@@ -12,7 +13,7 @@ import mujoco
 import numpy as np
 
 from imagine_bench.appearance import FACTORS
-from imagine_bench.arrays import Floats, Info, Ints, Observed, State
+from imagine_bench.arrays import Floats, Floats32, Info, Ints, Observed, State
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import PhysicsSettings, TaskSpec
 from imagine_bench.values import Json
@@ -49,8 +50,9 @@ class Period(NamedTuple):
     reward: float
     terminated: bool
     truncated: bool
-    success: bool
-    fault: str | None  #: why a change was no macro-action, or how the simulation ended, in words
+    success: bool = False
+    reached: State | None = None  #: the macrostate after its event
+    fault: str | None = None  #: why a change was no macro-action, or how the simulation ended, in words
 
 
 @dataclass
@@ -252,35 +254,31 @@ class MotionEnv(SceneEnv):
         Raises:
             InvalidValueError: As :meth:`step`.
         """
-        period = self.advance(action)
+        self._require_begun()
+        (servos,), (limited,) = self._servo_commands([self.checked(action)])
+        period = self._advance(servos, limited)
+        self.world.update()
         info = self._info(success=period.success, fault=period.fault)
         return period.reward, period.terminated, period.truncated, info
 
-    def advance(self, action: Motion) -> Period:
-        """As :meth:`act`, for replays that read no information: it makes none.
+    def carry_out(self, actions: Floats32) -> list[Period]:
+        """Carry out actions (N, n) as :meth:`act` does, until they or the episode are over; the periods in turn.
+
+        This is quicker than the same actions one by one. The servos' commands follow from the actions alone, so all are
+        computed before the first step. The positions that follow from the joints are brought up to date at the end.
 
         Raises:
-            InvalidValueError: As :meth:`step`.
+            InvalidValueError: As :meth:`step`; then nothing has moved.
         """
-        if not self.begun:
-            raise InvalidValueError("There is no episode to go on with; call reset() first.")
-        self._simulate(self.checked(action))
-        self.episode.periods += 1
-        if blew_up(self.data):
-            self.begun = False
-            return Period(0.0, terminated=False, truncated=True, success=False, fault="the simulation blew up")
-        event = self._judge()
+        self._require_begun()
+        actions = actions[: max(0, math.ceil(self.time_limit_s / self.period_s) - self.episode.periods)]
+        periods: list[Period] = []
+        for servos, limited in zip(*self._servo_commands(self.controls.checked(actions, len(actions))), strict=True):
+            periods.append(self._advance(servos, limited))
+            if periods[-1].terminated or periods[-1].truncated:
+                break
         self.world.update()
-        reward = 0.0 if event is None else float(event.outcome.reward)
-        terminated = event is not None and event.outcome.terminated
-        if self._potential is not None:
-            before = self.episode.potential
-            self.episode.potential = 0.0 if terminated else self._potential(self.episode.macrostate)
-            reward += self.episode.potential - before
-        truncated = self.elapsed_s >= self.time_limit_s - self.period_s / 2
-        success = event is not None and event.outcome.success
-        fault = None if event is None else event.fault
-        return Period(reward, terminated=terminated, truncated=truncated, success=success, fault=fault)
+        return periods
 
     def tell_servos(self, action: Motion) -> None:
         """Set the servos' commands to those at the end of a period of an action; nothing is simulated.
@@ -288,7 +286,8 @@ class MotionEnv(SceneEnv):
         Raises:
             InvalidValueError: As :meth:`step`.
         """
-        self.data.ctrl[self._columns.ctrl] = self._servo_commands(self.checked(action))[-1]
+        (servos,), (self.episode.limited,) = self._servo_commands([self.checked(action)])
+        self.data.ctrl[self._columns.ctrl] = servos[-1]
 
     def observe(self, envs: Sequence[MotionEnv]) -> list[Observed]:
         """The observations of :meth:`reset` and :meth:`step` for environments like this, by its cameras; once a
@@ -362,27 +361,63 @@ class MotionEnv(SceneEnv):
 
     # --- details -------------------------------------------------------------------------------------------------
 
-    def _simulate(self, action: Floats) -> None:
-        """Move the servos' commands to where the action says, in equal steps, and simulate the period."""
-        model = self.model
-        data = self.data
-        servos = data.ctrl
+    def _require_begun(self) -> None:
+        if not self.begun:
+            raise InvalidValueError("There is no episode to go on with; call reset() first.")
+
+    def _servo_commands(self, actions: Sequence[Floats] | Floats) -> tuple[Floats, list[str]]:
+        """The servos' commands at each step of the periods of some actions, and the limit that changed each, or empty.
+
+        From the commands before to where an action says, in equal steps: joints, then fingers. Shape (N, steps, 9).
+        """
+        n_arm = len(ARM_JOINTS)
+        starts = np.empty((len(actions) + 1, len(self._columns.ctrl)))  # of each period, and the last one's end
+        starts[0] = self.data.ctrl[self._columns.ctrl]
+        changes = np.empty((len(actions), len(self._columns.ctrl)))
+        limits = []
+        for action, before, change, after in zip(actions, starts[:-1], changes, starts[1:], strict=True):
+            command = self.controls.command(action, before[:n_arm], float(before[-1]))
+            change[:n_arm] = command.joints_rad
+            change[n_arm:] = command.opening_m
+            np.subtract(change, before, out=change)
+            np.add(before, change, out=after)
+            limits.append(command.limited)
+        return starts[:-1, None] + self._ramp * changes[:, None], limits
+
+    def _advance(self, servos: Floats, limited: str) -> Period:
+        """Simulate one control period with the servos' commands at each of its steps (steps, 9), and judge it.
+
+        Positions that follow from the joints are those of before the last step.
+        """
+        episode = self.episode
+        episode.limited = limited
+        episode.periods += 1
+        self._simulate(servos)
+        if blew_up(self.data):
+            self.begun = False
+            episode.latest = None
+            return Period(0.0, terminated=False, truncated=True, fault="the simulation blew up")
+        event = self._judge()
+        reward = 0.0 if event is None else float(event.outcome.reward)
+        terminated = event is not None and event.outcome.terminated
+        if self._potential is not None:
+            self.world.update()
+            before = episode.potential
+            episode.potential = 0.0 if terminated else self._potential(episode.macrostate)
+            reward += episode.potential - before
+        truncated = self.elapsed_s >= self.time_limit_s - self.period_s / 2
+        if event is None:
+            return Period(reward, terminated, truncated)
+        return Period(reward, terminated, truncated, event.outcome.success, episode.macrostate, event.fault)
+
+    def _simulate(self, servos: Floats) -> None:
+        """Simulate the steps of a control period, each with its commands to the servos. Shape (steps, 9)."""
+        model, data, ctrl = self.model, self.data, self.data.ctrl
         columns = self._columns.ctrl
         step = mujoco.mj_step
-        for ctrl in self._servo_commands(action):
-            servos[columns] = ctrl
+        for commands in servos:
+            ctrl[columns] = commands
             step(model, data)
-
-    def _servo_commands(self, action: Floats) -> Floats:
-        """The servos' commands at each step of a period: joints (7,) and fingers, by equal steps."""
-        before = self.data.ctrl[self._columns.ctrl]
-        n_arm = len(ARM_JOINTS)
-        command = self.controls.command(action, before[:n_arm], float(before[-1]))
-        after = np.empty_like(before)
-        after[:n_arm] = command.joints_rad
-        after[n_arm:] = command.opening_m
-        self.episode.limited = command.limited
-        return before + self._ramp * (after - before)
 
     def _judge(self) -> Event | None:
         """The event of the period that is over, with all that it changes in the scene."""

@@ -21,7 +21,8 @@ GRIPPED = _LEFT | _RIGHT
 """Bits of the parts that touch an object: either finger, and the rest of the arm."""
 _STILL_M_S = 0.01
 _STILL_RAD_S = 0.2
-"""An object that moves and turns more slowly is at rest."""
+_STILL = np.array([_STILL_M_S] * 3 + [_STILL_RAD_S] * 3)
+"""An object that moves and turns more slowly, along and about each axis, is at rest."""
 _FALLEN_M = TABLE_HEIGHT_M - 0.05
 
 
@@ -46,8 +47,8 @@ class Touch:
         touched = np.zeros(self._count + 1, dtype=np.int64)
         geoms = self._data.contact.geom
         robot = self._robot[geoms]
-        if robot.any():
-            np.bitwise_or.at(touched, self._object[geoms], robot[:, ::-1])
+        for contact, side in np.transpose(robot.nonzero()).tolist():
+            touched[self._object[geoms[contact, 1 - side]]] |= robot[contact, side]
         return touched[:-1]
 
 
@@ -98,8 +99,8 @@ class Referee:
         stands = (macrostate, poses.tobytes())
         if stands == self._at_rest:  # nothing has moved since it was found to be so
             return None
-        touched = self.touched()
-        moving = self._moving()
+        touched = self.touched().tolist()
+        moving = self._moving().tolist()
         objects = list(macrostate[:-1])
         changed = []
         problems = []
@@ -122,7 +123,7 @@ class Referee:
                 changed.append(index)
                 objects[index] = value
         if not changed and not problems:
-            self._at_rest = None if touched.any() or moving.any() else stands
+            self._at_rest = None if any(touched) or any(moving) else stands
             return None
         at_once = [self._world.object_names[index] for index in sorted({*changed, *disturbed})]
         if not problems and len(at_once) > 1:
@@ -131,7 +132,7 @@ class Referee:
 
     def _moving(self) -> NDArray[np.bool_]:
         speeds: Floats = np.abs(self._world.data.qvel[self._speeds])
-        return (speeds[:, :3].max(axis=1) > _STILL_M_S) | (speeds[:, 3:].max(axis=1) > _STILL_RAD_S)
+        return np.asarray((speeds > _STILL).any(axis=1))
 
     def _judged(self, before: State, objects: State, problems: Sequence[str], rng: np.random.Generator) -> Event:
         if not problems:

@@ -67,7 +67,7 @@ def at_rest(model: mujoco.MjModel) -> tuple[Floats, Floats]:
 def blew_up(data: mujoco.MjData) -> bool:
     """Whether a simulation has seen NaN, infinity or runaway speed since its data were reset."""
     speeds = data.qvel
-    slow = speeds @ speeds < _RUNAWAY_RAD_S**2 or np.abs(speeds).max() < _RUNAWAY_RAD_S
+    slow = speeds.dot(speeds) < _RUNAWAY_RAD_S**2 or np.abs(speeds).max() < _RUNAWAY_RAD_S
     return not slow or any(data.warning.number.tolist()[_BAD_STATE])
 
 

@@ -171,11 +171,10 @@ class PickWorld(World):
         spec = OBJECTS[index]
         name = self.object_names[index]
         position_m = pose[:3]
-        palm_m = self.data.mocap_pos[self._palm].tolist()
-        tcp_m = self.data.site_xpos[self._tcp].tolist()
         in_the_air = position_m[2] > TABLE_HEIGHT_M + _IN_THE_AIR_M
-        if in_the_air and math.dist(position_m, tcp_m) < MAX_OFF_GRIP_M:
+        if in_the_air and math.dist(position_m, self.data.site_xpos[self._tcp].tolist()) < MAX_OFF_GRIP_M:
             return PICKED, None
+        palm_m = self.data.mocap_pos[self._palm].tolist()
         in_palm = math.dist(position_m[:2], palm_m[:2]) < PALM_REACH_M
         if in_palm and abs(position_m[2] - palm_m[2] - spec.grip_height_m) < MAX_LIFT_OFF_M:
             return HANDED_OVER, self._tipped(index, pose) if spec.upright else None

@@ -398,18 +398,16 @@ def _compare(where: str, kept: Motion, played: Motion | None) -> None:
 def _played(env: MotionEnv, seed: int, commands: Floats32) -> Motion | None:
     """The episode of some commands, None where it does not end with the last of them, give or take the slack."""
     env.restart(seed=seed)
-    episode = env.episode
-    tally = _Tally(episode.macrostate)
-    for period in range(len(commands) + SLACK_PERIODS):
-        found = env.advance(commands[min(period, len(commands) - 1)])
+    tally = _Tally(env.episode.macrostate)
+    after_last = np.repeat(commands[-1:], SLACK_PERIODS, axis=0)
+    periods = env.carry_out(np.concatenate([commands, after_last]))
+    for each in periods:
         tally.add(
-            found.reward,
-            over=found.terminated or found.truncated,
-            success=found.success,
-            fault=found.fault is not None,
-            reached=None if episode.latest is None else episode.macrostate,
+            each.reward,
+            over=each.terminated or each.truncated,
+            success=each.success,
+            fault=each.fault is not None,
+            reached=each.reached,
         )
-        if tally.over:
-            is_near = period + 1 >= len(commands) - SLACK_PERIODS
-            return tally.motion(commands) if is_near else None
-    return None
+    is_near = len(periods) >= len(commands) - SLACK_PERIODS
+    return tally.motion(commands) if tally.over and is_near else None

@@ -1,0 +1,112 @@
+"""Several actions that are carried out at once do as one by one, to the bit."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from imagine_bench.tasks.continuous import env as module
+from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
+from imagine_bench.tasks.continuous.env import MotionEnv, Period
+from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
+
+from imagine_bench.arrays import Floats32
+from imagine_bench.errors import InvalidValueError
+
+FAMILIES = {"arrows": make_arrows, "pick_place": make_pick_place}
+
+
+def experts(env: MotionEnv, seed: int, count: int) -> Floats32:
+    """Actions of the expert in an episode; every eleventh goes astray, so that objects are pushed."""
+    rng = np.random.default_rng(seed)
+    env.restart(seed=seed)
+    expert = Expert(env, env.another_world())
+    actions = []
+    while len(actions) < count:
+        if expert.is_done:
+            expert.begin(env.task.rules.optimal_action(env.episode.macrostate))
+        drawn = rng.uniform(env.action_space.low, env.action_space.high)
+        actions.append(np.asarray(drawn if len(actions) % 11 == 10 else expert.act(), dtype=np.float32))
+        _, terminated, truncated, _ = env.act(actions[-1])
+        if terminated or truncated:
+            break
+    return np.stack(actions)
+
+
+def one_by_one(env: MotionEnv, actions: Floats32) -> list[Period]:
+    """The periods of actions, by :meth:`MotionEnv.act`."""
+    periods = []
+    for action in actions:
+        reward, terminated, truncated, info = env.act(action)
+        reached = tuple(info["macrostate"].tolist()) if info["event"] else None
+        fault = info["fault_reason"] or None
+        periods.append(Period(reward, terminated, truncated, bool(info["success"]), reached, fault))
+    return periods
+
+
+@pytest.mark.parametrize("options", [{}, {"reward": "dense", "placement": 0.02, "appearance": "strong"}])
+@pytest.mark.parametrize("control", CONTROL_NAMES)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_actions_at_once_do_as_one_by_one_to_the_bit(family: str, control: str, options: dict[str, Any]) -> None:
+    env = FAMILIES[family](control=control, observation="proprio", slip=0.3, **options)
+    actions = experts(env, 540, 120)
+    assert env.episode.events > 0
+    env.restart(seed=540)
+    expected = one_by_one(env, actions)
+    after = pickle.dumps(env.get_state())
+    positions = env.data.xpos.tobytes()
+    env.restart(seed=540)
+    assert env.carry_out(actions) == expected
+    assert pickle.dumps(env.get_state()) == after
+    assert env.data.xpos.tobytes() == positions
+
+
+def test_nothing_is_carried_out_after_the_end_and_only_that_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make_arrows(control="joint", observation="proprio", time_limit_s=1.0)
+    env.reset(seed=541)
+    computed = []
+    command = env.controls.command
+    monkeypatch.setattr(env.controls, "command", lambda *given: computed.append(0) or command(*given))
+    still = np.append(env.servo_targets()[:-1], 1.0).astype(np.float32)
+    periods = env.carry_out(np.tile(still, (10_000, 1)))
+    assert len(periods) == len(computed) == env.episode.periods == 25
+    assert [each.truncated for each in periods] == [False] * 24 + [True]
+    assert env.carry_out(np.tile(still, (3, 1))) == []
+
+
+@pytest.mark.parametrize(
+    ("control", "wrong"),
+    [("joint", [np.nan] * 8), ("joint", [0.0] * 7), ("pose", [0.6, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 1.0])],
+)
+def test_a_wrong_action_among_several_is_refused_before_anything_moves(control: str, wrong: list[float]) -> None:
+    env = make_arrows(control=control, observation="proprio")
+    good = experts(env, 541, 3)
+    env.reset(seed=541)
+    before = pickle.dumps(env.get_state())
+    actions = np.array([*good, wrong]) if len(wrong) == good.shape[1] else np.array([wrong] * 3)
+    with pytest.raises(InvalidValueError, match=r"has another shape or a value that is not finite|quaternion"):
+        env.carry_out(actions.astype(np.float32))
+    assert pickle.dumps(env.get_state()) == before
+
+
+def test_one_action_is_no_row_of_actions() -> None:
+    env = make_arrows(control="joint", observation="proprio")
+    env.reset(seed=541)
+    with pytest.raises(InvalidValueError, match="has another shape"):
+        env.step(np.zeros((1, 8), dtype=np.float32))
+
+
+def test_a_simulation_that_blows_up_after_an_event_has_no_second_event(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make_arrows(control="twist", observation="proprio")
+    actions = experts(env, 541, 120)
+    env.reset(seed=541)
+    env.carry_out(actions[:-1])
+    assert env.act(actions[-1])[3]["event"]
+    monkeypatch.setattr(module, "blew_up", lambda data: True)
+    *_, truncated, info = env.act(np.zeros(7, dtype=np.float32))
+    assert (truncated, bool(info["event"]), info["fault_reason"]) == (True, False, "the simulation blew up")
+    with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
+        env.carry_out(actions)
