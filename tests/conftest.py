@@ -178,3 +178,17 @@ def guests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Guests]:
     installed = Guests(tmp_path / "site", monkeypatch)
     yield installed
     installed.forget()
+
+
+@pytest.fixture
+def without_shadows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views for people drawn without shadows and soft edges, which cost a software renderer 0.1 s each."""
+    from imagine_bench.tasks import observations, scene_reader
+    from imagine_bench.tasks.rendering.cameras import DRAWN_GROUPS
+    from imagine_bench.tasks.rendering.renderer import View
+
+    def view(camera: str, width: int, height: int, *, quick: bool = False) -> View:
+        return View(camera=camera, width=width, height=height, groups=DRAWN_GROUPS)
+
+    for module in (observations, scene_reader):
+        monkeypatch.setattr(module, "human_camera_view", view)

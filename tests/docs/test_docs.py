@@ -21,7 +21,6 @@ from doc_cells import ROOT
 from doc_tables import PAGES
 from matplotlib import pyplot
 from small_runs import do
-from worlds import draw_quickly
 
 import imagine_bench
 from imagine_bench import registry
@@ -97,11 +96,11 @@ def test_commands_could_be_carried_out(page: Path) -> None:
             command.planned()
 
 
+@pytest.mark.usefixtures("without_shadows")
 @pytest.mark.parametrize(("page", "code"), [block for block in BLOCKS if block not in SCRIPTS], ids=name)
 def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
-    draw_quickly(monkeypatch)
     if "import lerobot" in code or "from lerobot" in code:
         pytest.importorskip("lerobot", reason="LeRobot is large, and no dependency of the tests")
     variables: dict[str, object] = {}
@@ -146,6 +145,7 @@ def notebook() -> list[str]:
     return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
 
 
+@pytest.mark.usefixtures("without_shadows")
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))

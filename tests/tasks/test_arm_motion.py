@@ -10,17 +10,13 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.scenes.constants import TIMESTEP_S
-from worlds import draw_quickly
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import ArmReader
 
-
-@pytest.fixture(autouse=True)
-def without_shadows(monkeypatch):
-    draw_quickly(monkeypatch)
+pytestmark = pytest.mark.usefixtures("without_shadows")
 
 
 def make(task="arrow_puzzle", **options):

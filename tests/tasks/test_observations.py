@@ -5,7 +5,7 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
-from worlds import WORLDS, draw_quickly
+from worlds import WORLDS
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
@@ -15,9 +15,7 @@ KINEMATIC = {"execution": "kinematic"}
 ALL = "frame,human,state,proprio"
 
 
-@pytest.fixture(autouse=True)
-def without_shadows(monkeypatch):
-    draw_quickly(monkeypatch)
+pytestmark = pytest.mark.usefixtures("without_shadows")
 
 
 def make(task="arrow_puzzle", **options):

@@ -11,7 +11,6 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
-from worlds import draw_quickly
 
 from imagine_bench import registry
 from imagine_bench.errors import SetupError
@@ -19,9 +18,7 @@ from imagine_bench.errors import SetupError
 pygame = pytest.importorskip("pygame")  # of the extra play
 
 
-@pytest.fixture(autouse=True)
-def without_shadows(monkeypatch):
-    draw_quickly(monkeypatch)
+pytestmark = pytest.mark.usefixtures("without_shadows")
 
 
 def make(**options):

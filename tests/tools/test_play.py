@@ -14,7 +14,6 @@ import pytest
 from fake_agents import FakeImaginer
 from imagine_bench_motion.control.keyboard import HandGame, keys_to_commands
 from PIL import Image, ImageSequence
-from worlds import draw_quickly
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
@@ -28,9 +27,7 @@ WAIT = 6
 START = (1, 2, 0, 1)
 
 
-@pytest.fixture(autouse=True)
-def without_shadows(monkeypatch):
-    draw_quickly(monkeypatch)
+pytestmark = pytest.mark.usefixtures("without_shadows")
 
 
 def game_of(imaginer=None, seed=0, **options):
