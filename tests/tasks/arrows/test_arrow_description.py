@@ -158,6 +158,28 @@ def test_bad_worlds_end_with_one_sentence(said, complaint):
         assert complaint in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("cubes", 1, 6),
+        ("shuffle", 0, 4_294_967_295),
+        ("horizon", 1, 1000),
+        ("slip", 0.0, 0.99),
+        ("goal_change", 0.0, 1.0),
+        ("gesture", 0.0, 1.0),
+        ("lag", 0, 10),
+        ("distractors", 0, 4),
+    ],
+)
+def test_a_number_of_a_world_may_be_either_end_of_its_range_and_nothing_beyond(name, low, high):
+    beyond = 1 if isinstance(low, int) else 0.001
+    for value in (low, high):
+        assert getattr(Arrows(**{name: value}), name) == value
+    for value in (low - beyond, high + beyond):
+        with pytest.raises(InvalidValueError, match=f"^{name} is {value}; give an? (integer|number) from "):
+            Arrows(**{name: value})
+
+
 def test_names_of_other_tasks_are_refused():
     with pytest.raises(UnknownNameError, match=r"No task 'arows'. Did you mean 'arrows'"):
         registry.task("arows:cubes=3")
