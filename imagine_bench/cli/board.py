@@ -43,23 +43,26 @@ class Board:
     """The leaderboard: check its rows, write its page, and its rounds: open, file, reveal.
 
     check FOLDER plays every episode of a board, or of one row, again. page FOLDER does so too, and writes a page.
-    open ROUND promises secret starts. file RUN files trained agents for them. reveal ROUND publishes the starts.
+    open ROUND makes the folder of a round and draws its secret starts. file RUN --round ROUND files the trained agents
+    of a run or a bench; file POLICY_FILE --round ROUND files a policy of continuous control. reveal ROUND publishes the
+    starts, from the closing day on.
     """
 
     action: Annotated[str, tyro.conf.Positional, one_of(*_ACTIONS)]
     """The part of the board's work."""
     path: Annotated[Path, tyro.conf.Positional]
-    """A board's folder such as docs/board, or that of a row, a round or a run, as the action needs."""
+    """check, page: the folder of a board, such as docs/board, or of a row. open, reveal: of a round. file: the folder
+    of a run or a bench, or the file of a policy."""
     out: Path = Path("build/board")
     """With page: the folder of the page."""
     closes: Word = None
     """With open: the day from which nothing more is filed, such as 2026-12-24."""
     tests: int = 100
-    """With open: test episodes of each run."""
+    """With open: test episodes of each run or policy."""
     secret: Path = Path("secret.json")
     """With open and reveal: the file that holds seed and salt until they are published."""
     round: File = None
-    """With file: the round's folder."""
+    """With file: the folder of the round, which is open."""
 
     def __call__(self) -> None:
         """Do it."""

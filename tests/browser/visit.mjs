@@ -18,7 +18,8 @@ page.on('dialog', (dialog) => errors.push(`a dialog opened: ${dialog.message()}`
 const began = Date.now();
 await page.goto(`${address}/index.html?${world}`);
 await page.waitForSelector('body[data-ready]', { timeout: 60_000 });
-const ready = (Date.now() - began) / 1000;
+await page.evaluate(() => new Promise((shown) => requestAnimationFrame(() => requestAnimationFrame(shown))));
+const ready = (Date.now() - began) / 1000; // keys work, and the first image is drawn
 for (const key of keys.split(' ').filter(Boolean)) {
   await page.keyboard.press(key);
   await page.waitForFunction(() => document.body.dataset.moving !== 'yes', null, { timeout: 60_000 });
