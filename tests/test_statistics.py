@@ -260,6 +260,19 @@ def test_a_detectable_difference_of_pairs_is_found_as_often(pairs: int, alone: i
     assert 0.7 < np.mean(found) < 0.9
 
 
+def test_a_table_without_other_cells_is_as_strict_as_one_with_a_single_cell() -> None:
+    pairs = statistics.PairedTests(40, 20, 1.0)
+    least, one = (
+        (
+            statistics.detectable(FIVE, OTHERS, cells=cells),
+            statistics.detectable_paired(pairs, 400, cells=cells),
+            statistics.more_seeds(FIVE, OTHERS, cells=cells),
+        )
+        for cells in (0, 1)
+    )
+    assert least == one and min(one) > 0.0
+
+
 def test_auroc_and_the_probability_of_improvement_count_pairs() -> None:
     rng = np.random.default_rng(0)
     scores = rng.integers(0, 6, 60).astype(float)

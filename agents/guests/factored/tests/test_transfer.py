@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
+from unittest import mock
 
 import fake_codes
 import numpy as np
 import pytest
 from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live, starts
+from imagine_bench_factored import agent as own
 from imagine_bench_factored.agent import FactoredAgent
 from imagine_bench_factored.dynamics import Dynamics
 from imagine_bench_factored.factors import CodeTransition
@@ -45,6 +48,24 @@ def test_the_dynamics_stay_and_the_outcomes_begin_anew(experienced: FactoredAgen
     assert learner.model.outcomes.causes is None
     assert not learner.q_values(Observation(frame=frame((0, 1, 0)))).any(), "nothing is known of the new task"
     assert learner.diagnostics()["real_transitions"] == 0
+
+
+def test_rewards_of_a_task_are_classed_as_often_as_those_of_the_first() -> None:
+    """Each time of all its transitions, of nothing earlier, which have become a fifth more."""
+    learner = agent(3)
+    with mock.patch.object(own, "reward_classes", side_effect=own.reward_classes) as classed:
+        live(learner, range(20), np.random.default_rng(3))
+        first = [len(call.args[0]) for call in classed.call_args_list]
+        seen = len(learner.replay)
+        classed.reset_mock()
+        learner.reset_for_new_task()
+        live(learner, range(20, 40), np.random.default_rng(4))
+        second = [len(call.args[0]) for call in classed.call_args_list]
+    wanted = [1]
+    while wanted[-1] < max(seen, len(learner.replay) - seen):
+        wanted.append(math.ceil(1.2 * wanted[-1]))
+    for found, count in ((first, seen), (second, len(learner.replay) - seen)):
+        assert found == [each for each in wanted if each <= count] and len(found) > 8
 
 
 def test_an_earlier_outcome_is_believed_as_far_as_its_tested_causes_hold() -> None:
