@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ from imagine_bench.cli import observers
 from imagine_bench.errors import ArtefactError, DivergedError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.data import RunSpec
-from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts
-from imagine_bench.running.run_state import Counters
+from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts, start_from
+from imagine_bench.running.run_state import Counters, make_env
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
 from imagine_bench.store.run_folder import load_newest
 
@@ -45,6 +46,14 @@ def test_a_macro_action_that_is_tried_again_keeps_the_episode_of_its_first_time(
     counters.try_out((0, 3), 1)
     counters.try_out((0, 3), 2)
     assert counters.tried == {"0 3 1": 0, "0 3 2": 1}
+
+
+def test_an_episode_begins_where_its_seed_says_unless_a_start_is_asked_for() -> None:
+    starts, elsewhere = [(0, 1, 2, 1), (1, 2, 0, 1)], {"macrostate": (1, 2, 3, 0)}
+    with closing(start_from(make_env(small(), "arrow_puzzle"), starts)) as env:
+        one, other = ([tuple(env.reset(seed=seed)[1]["macrostate"]) for seed in range(12)] for _ in range(2))
+        assert one == other and set(one) == set(starts)
+        assert tuple(env.reset(seed=0, options=elsewhere)[1]["macrostate"]) == elsewhere["macrostate"]
 
 
 def test_tests_have_starts_and_looks_that_training_never_saw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
