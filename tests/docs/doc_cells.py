@@ -321,10 +321,11 @@ def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
 
 
 def caused(agent: str, episodes: str, cause: str) -> str:
-    """Failed tests of all seeds, or the share of them that has a cause, %."""
+    """Failed tests of all seeds, or the share of them that has a cause, %. A folder may stand before the agent."""
+    folder, _, agent = agent.rpartition("/")
     runs = [
         run["failures"][episodes]
-        for run in _json("arrow_puzzle-mild-why/why.json")["runs"]
+        for run in _json(f"{folder or 'arrow_puzzle-mild-why'}/why.json")["runs"]
         if label_today(run["agent"]) == agent
     ]
     count = sum(sum(run.values()) for run in runs)
