@@ -18,6 +18,7 @@ from imagine_bench.rules import (
     greedy,
     horizon_optimum,
     optimal_policy,
+    require_macrostates,
     shortest_plans,
     states_of,
     states_of_play,
@@ -41,6 +42,17 @@ def test_an_episode_goes_on_wherever_its_goal_is_not_met(name, all_of_them, goin
     rules = registry.task(name).rules
     assert (len(states_of(rules)), len(states_of_play(rules))) == (all_of_them, going_on)
     assert set(rules.start_states) <= set(states_of_play(rules))
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 3), (2, 5), (1, 4, 1)])
+def test_macrostates_of_another_shape_are_refused(shape):
+    rules = registry.task("arrow_puzzle").rules
+    with pytest.raises(InvalidValueError, match=r"^Macrostates must be integers of shape \(N, 4\), not int64 of shape"):
+        require_macrostates(rules, np.zeros(shape, dtype=np.int64))
+    assert require_macrostates(rules, [rules.states[5], rules.states[9]]).tolist() == [
+        list(rules.states[5]),
+        list(rules.states[9]),
+    ]
 
 
 @pytest.mark.parametrize("name", TASKS)
