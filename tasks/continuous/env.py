@@ -255,8 +255,9 @@ class MotionEnv(SceneEnv):
             InvalidValueError: As :meth:`step`.
         """
         self._require_begun()
-        (servos,), (limited,) = self._servo_commands([self.checked(action)])
-        period = self._advance(servos, limited)
+        before = self.data.ctrl[self._columns.ctrl]
+        change, limited = self._servo_change(self.checked(action), before)
+        period = self._advance(before + self._ramp * change, limited)
         self.world.update()
         info = self._info(success=period.success, fault=period.fault)
         return period.reward, period.terminated, period.truncated, info
@@ -272,8 +273,16 @@ class MotionEnv(SceneEnv):
         """
         self._require_begun()
         actions = actions[: max(0, math.ceil(self.time_limit_s / self.period_s) - self.episode.periods)]
+        before = self.data.ctrl[self._columns.ctrl]
+        commands = []
+        limits = []
+        for action in self.controls.checked(actions, len(actions)):
+            change, limited = self._servo_change(action, before)
+            commands.append(before + self._ramp * change)
+            limits.append(limited)
+            before = before + change
         periods: list[Period] = []
-        for servos, limited in zip(*self._servo_commands(self.controls.checked(actions, len(actions))), strict=True):
+        for servos, limited in zip(commands, limits, strict=True):
             periods.append(self._advance(servos, limited))
             if periods[-1].terminated or periods[-1].truncated:
                 break
@@ -286,8 +295,9 @@ class MotionEnv(SceneEnv):
         Raises:
             InvalidValueError: As :meth:`step`.
         """
-        (servos,), (self.episode.limited,) = self._servo_commands([self.checked(action)])
-        self.data.ctrl[self._columns.ctrl] = servos[-1]
+        before = self.data.ctrl[self._columns.ctrl]
+        change, self.episode.limited = self._servo_change(self.checked(action), before)
+        self.data.ctrl[self._columns.ctrl] = before + change
 
     def observe(self, envs: Sequence[MotionEnv]) -> list[Observed]:
         """The observations of :meth:`reset` and :meth:`step` for environments like this, by its cameras; once a
@@ -365,24 +375,14 @@ class MotionEnv(SceneEnv):
         if not self.begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
 
-    def _servo_commands(self, actions: Sequence[Floats] | Floats) -> tuple[Floats, list[str]]:
-        """The servos' commands at each step of the periods of some actions, and the limit that changed each, or empty.
-
-        From the commands before to where an action says, in equal steps: joints, then fingers. Shape (N, steps, 9).
-        """
+    def _servo_change(self, action: Floats, before: Floats) -> tuple[Floats, str]:
+        """The change of the servos' commands in an action's period: joints, then fingers (9,); and the limit met."""
         n_arm = len(ARM_JOINTS)
-        starts = np.empty((len(actions) + 1, len(self._columns.ctrl)))  # of each period, and the last one's end
-        starts[0] = self.data.ctrl[self._columns.ctrl]
-        changes = np.empty((len(actions), len(self._columns.ctrl)))
-        limits = []
-        for action, before, change, after in zip(actions, starts[:-1], changes, starts[1:], strict=True):
-            command = self.controls.command(action, before[:n_arm], float(before[-1]))
-            change[:n_arm] = command.joints_rad
-            change[n_arm:] = command.opening_m
-            np.subtract(change, before, out=change)
-            np.add(before, change, out=after)
-            limits.append(command.limited)
-        return starts[:-1, None] + self._ramp * changes[:, None], limits
+        command = self.controls.command(action, before[:n_arm], float(before[-1]))
+        after = np.empty_like(before)
+        after[:n_arm] = command.joints_rad
+        after[n_arm:] = command.opening_m
+        return after - before, command.limited
 
     def _advance(self, servos: Floats, limited: str) -> Period:
         """Simulate one control period with the servos' commands at each of its steps (steps, 9), and judge it.
