@@ -241,18 +241,20 @@ def test_pages_of_environments_say_what_their_rules_say(page: Path) -> None:
         (
             "README.md",
             "`dqn_more_updates` {dqn_more_updates}, `imagination` {imagination}, `dqn` {dqn}, "
-            "each other agent {random}",
+            "`imagination_uncertainty` one, each other agent {random}",
         ),
         (
             "docs/reference/agents.md",
             "{dqn_more_updates} seeds of `dqn_more_updates`, {imagination} of `imagination`, {dqn} of `dqn`, "
-            "{random} of each other agent",
+            "one of `imagination_uncertainty`, {random} of each other agent",
         ),
     ],
 )
 def test_pages_say_how_many_seeds_the_default_bench_has(page: str, sentence: str) -> None:
-    words = {2: "two", 6: "six", 7: "seven", 15: "fifteen"}
-    seeds = {agent: words[number] for agent, number in PRESETS["quick"]["few_seeds"].items()}
+    words = {2: "two", 5: "five", 6: "six", 8: "eight"}
+    few = PRESETS["quick"]["few_seeds"]
+    assert few["imagination_uncertainty"] == 1, "the pages say that it has one seed"
+    seeds = {agent: words[number] for agent, number in few.items() if number > 1}
     assert sentence.format(**seeds) in (ROOT / page).read_text()
 
 
