@@ -27,7 +27,7 @@ PAIRS: Sequence[tuple[str, str]] = PRESETS["quick"]["headlines"]
 _DEFAULT = protocol("arrow_puzzle")
 COUNTS = {agent: len(_DEFAULT.seeds_of(agent)) for pair in PAIRS for agent in pair}
 """Seeds of each agent in the default bench."""
-LOOKS = stages(len(_DEFAULT.seeds), 14)
+LOOKS = stages(len(_DEFAULT.seeds), 18)
 """Seeds of each agent at each look of --until-decided."""
 _LEVEL = 1.0 - statistics.LEVEL
 
