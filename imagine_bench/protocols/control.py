@@ -285,9 +285,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {
         "agents": ("random", "dqn", "dqn_more_updates", *_THESIS_AGENTS[1:], "factored:given", "oracle"),
-        "seeds": tuple(range(6)), "budgets": (250, 450), "evaluation_episodes": 100,
+        "seeds": tuple(range(6)), "budgets": (250, 550), "evaluation_episodes": 100,
         "few_seeds": {
-            "dqn_more_updates": 12, "imagination": 6, "dqn": 5,
+            "dqn_more_updates": 9, "imagination": 5, "dqn": 5,
             "imagination_uncertainty": 1, "factored:given": 2, "random": 2, "oracle": 2,
         },
         "open_loop_starts": 20, "recorded_seeds": 1,
