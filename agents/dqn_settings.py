@@ -104,9 +104,16 @@ def _with_updates(sets: _Sets, **updates: int) -> _Sets:
     return {name: {**sets[name], "controller.updates_per_step": Override(updates[name], reason)} for name in sets}
 
 
+_STEADY: dict[str, Override] = {
+    "controller.hidden": Override((256, 128), "half the CPU time; as good (imagination, its control)"),
+    "controller.target_rate": Override(0.05, "five updates a step diverge in some seeds without a target network"),
+}
+_MORE_5 = _with_updates(_SETS_5, minimal=5, fast=5, published=2)
+
 HYPERPARAMETERS = _hyperparameters(_SETS_3, _SETS_5)
 MORE_UPDATES = _hyperparameters(
-    _with_updates(_SETS_3, minimal=2, fast=2, published=2), _with_updates(_SETS_5, minimal=5, fast=5, published=2)
+    _with_updates(_SETS_3, minimal=2, fast=2, published=2),
+    {**_MORE_5, **{name: {**_MORE_5[name], **_STEADY} for name in ("minimal", "fast")}},
 )
 """Of the control ``dqn_more_updates``: as many updates a real step as ``imagination`` makes of its controller once it
 imagines, one on real transitions and N_I on imagined ones (four at ``fast`` and ``minimal`` of chapter 5, else one)."""
