@@ -333,7 +333,7 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         ({"set": "controller.discount=0.9"}, "give a mapping of names to values"),
         ({"physics": 3}, "give a mapping of names to values"),
         ({"agents": "dqnn"}, "No agent 'dqnn'"),
-        ({"until_decided": True, "most_seeds": 0}, "give at least 9"),
+        ({"until_decided": True, "most_seeds": 0}, "give at least 15"),
         ({"most_seeds": 3}, "--most-seeds goes with --until-decided"),
     ]
     for options, sentence in wrong:

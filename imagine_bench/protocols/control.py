@@ -287,7 +287,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "agents": ("random", "dqn", "dqn_more_updates", *_THESIS_AGENTS[1:], "factored:given", "oracle"),
         "seeds": tuple(range(6)), "budgets": (250, 550), "evaluation_episodes": 100,
         "few_seeds": {
-            "dqn_more_updates": 9, "imagination": 5, "dqn": 5,
+            "dqn_more_updates": 15, "imagination": 7, "dqn": 9,
             "imagination_uncertainty": 1, "factored:given": 2, "random": 2, "oracle": 2,
         },
         "open_loop_starts": 20, "recorded_seeds": 1,

@@ -251,7 +251,7 @@ def test_pages_of_environments_say_what_their_rules_say(page: Path) -> None:
     ],
 )
 def test_pages_say_how_many_seeds_the_default_bench_has(page: str, sentence: str) -> None:
-    words = {2: "two", 5: "five", 9: "nine"}
+    words = {2: "two", 7: "seven", 9: "nine", 15: "fifteen"}
     few = PRESETS["quick"]["few_seeds"]
     assert few["imagination_uncertainty"] == 1, "the pages say that it has one seed"
     seeds = {agent: words[number] for agent, number in few.items() if number > 1}

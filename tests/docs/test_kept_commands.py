@@ -28,7 +28,7 @@ from imagine_bench.running.control import resolved_settings
 COMMANDS = {row["folder"]: row for row in table("commands.csv")}
 NOT_OPTIONS = (
     *("encoder", "codes", "sampled_futures", "settings_digest", "agent_names", "dataset"),
-    *("headlines", "open_loop_starts", "recorded_episodes"),
+    *("headlines", "open_loop_starts", "recorded_episodes", "few_seeds"),
 )
 """Fields of a protocol that no option sets: their values are compared, and a difference is named in the file."""
 

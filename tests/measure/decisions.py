@@ -22,12 +22,12 @@ from imagine_bench.protocols.control import PRESETS, protocol
 from imagine_bench.running.headlines import stages
 from imagine_bench.store.loading import load_so_far
 
-KEPT = [interval_coverage.RESULTS / "arrow_puzzle-quick-seeds_552_to_563"]
+KEPT = [interval_coverage.RESULTS / f"arrow_puzzle-quick-{name}" for name in ("seeds_552_to_563", "too_few_seeds")]
 PAIRS: Sequence[tuple[str, str]] = PRESETS["quick"]["headlines"]
 _DEFAULT = protocol("arrow_puzzle")
 COUNTS = {agent: len(_DEFAULT.seeds_of(agent)) for pair in PAIRS for agent in pair}
 """Seeds of each agent in the default bench."""
-LOOKS = stages(len(_DEFAULT.seeds), 15)
+LOOKS = stages(len(_DEFAULT.seeds), 21)
 """Seeds of each agent at each look of --until-decided."""
 _LEVEL = 1.0 - statistics.LEVEL
 

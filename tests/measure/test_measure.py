@@ -60,9 +60,9 @@ def test_looking_again_and_again_claims_no_more() -> None:
 
 
 def test_a_repetition_has_as_many_seeds_of_each_agent_as_the_default_bench(tmp_path: Path) -> None:
-    """Of 19 seeds, two disjoint groups; agents that differ by 40 points are told apart in all of them."""
+    """Of 31 seeds, two disjoint groups; agents that differ by 40 points are told apart in all of them."""
     agents = ("dqn", "dqn_more_updates", "imagination")
-    protocol = Protocol(task="arrow_puzzle", preset="quick", agents=agents, seeds=tuple(range(19)), budgets=(500,))
+    protocol = Protocol(task="arrow_puzzle", preset="quick", agents=agents, seeds=tuple(range(31)), budgets=(500,))
     result = bench_result(tmp_path, protocol=protocol)
     levels = {"dqn": 100, "dqn_more_updates": 110, "imagination": 190}
 
