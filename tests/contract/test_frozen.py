@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -14,13 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_reader import BlindReader
+from fake_reader import read_nothing
 from guest_packages import Guests
 from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
-from imagine_bench.interfaces import TaskSpec
 from imagine_bench.judge import judgement
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.trained import load_trained
@@ -111,11 +109,6 @@ def test_the_frozen_agent_is_benched_with_what_it_imagines(learned: RunResult) -
 @pytest.fixture
 def _blind(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A reader that costs nothing and reads the same from every image."""
-
-    def read_nothing(spec: TaskSpec, appearance: str, folder: Path) -> BlindReader:
-        names = ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read")
-        (folder / "reader.json").write_text(json.dumps(dict.fromkeys(names, 0.0)))
-        return BlindReader(len(spec.macrostate_names))
 
     monkeypatch.setattr(judgement, "reader_in", read_nothing)
     yield

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import errno
-import json
 from pathlib import Path
 from typing import IO, Any
 
 import pytest
-from fake_reader import BlindReader
+from fake_reader import read_nothing
 
 from imagine_bench.judge import judgement
 from imagine_bench.judge.judgement import Judgement, judge, kept
 
 _ONE = Judgement(task="arrows:cubes=1", models=("copy",), sizes=(5, 20), seeds=(0,), samples=1)
-
-
-def _read_nothing(spec: object, appearance: str, folder: Path) -> BlindReader:
-    names = ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read")
-    (folder / "reader.json").write_text(json.dumps(dict.fromkeys(names, 0.0)))
-    return BlindReader(2)
 
 
 def test_a_fit_whose_log_finds_no_room_is_a_sentence_and_is_made_later(
@@ -32,7 +25,7 @@ def test_a_fit_whose_log_finds_no_room_is_a_sentence_and_is_made_later(
             raise OSError(errno.ENOSPC, "No space left on device")
         return real(path, *given, **named)
 
-    monkeypatch.setattr(judgement, "reader_in", _read_nothing)
+    monkeypatch.setattr(judgement, "reader_in", read_nothing)
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", full)
         folder, failed = judge(_ONE, tmp_path, workers=1)

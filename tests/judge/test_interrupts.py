@@ -13,6 +13,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from fake_reader import NO_ERRORS
 
 from imagine_bench import registry
 from imagine_bench.errors import BusyError
@@ -56,8 +57,7 @@ def _put_reader(root: Path) -> None:
     for parameter in reader.network.parameters():
         parameter.data.zero_()
     reader.references = parameter.new_zeros(1, 1024)
-    names = ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read")
-    (folder / "reader.json").write_text(json.dumps(dict.fromkeys(names, 0.0)))
+    (folder / "reader.json").write_text(json.dumps(NO_ERRORS))
     (folder / "reader.safetensors").write_bytes(reader.content())
 
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from doc_cells import ROOT
-from fake_reader import BlindReader
+from fake_reader import read_nothing
 from guest_packages import Guests
 from recordings import contents, times, view_names
 from small_runs import Inline, small
@@ -150,17 +150,11 @@ class Said(NamedTuple):
     err: str
 
 
-def _read_nothing(spec: object, appearance: str, folder: Path) -> BlindReader:
-    names = ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read")
-    (folder / "reader.json").write_text(json.dumps(dict.fromkeys(names, 0.0)))
-    return BlindReader(4)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _blind() -> Iterator[None]:
     """A reader that costs nothing, and few rollouts."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(judgement, "reader_in", _read_nothing)
+        patch.setattr(judgement, "reader_in", read_nothing)
         patch.setattr(questions, "ROLLOUTS", 16)
         yield
     judgement.prepare.cache_clear()

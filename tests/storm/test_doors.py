@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from fake_reader import NO_ERRORS
 from imagine_bench.agents.encoders.cli import retrain
 from imagine_bench.agents.encoders.encoder import Encoder
 from imagine_bench.agents.encoders.recipes import Recipe
@@ -131,9 +132,8 @@ def _cheap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         reader.references = parameter.new_zeros(1, 1024)
         return reader
 
-    names = ("misread", "refused", "black_read", "gray_read", "noise_read", "blends_read")
     monkeypatch.setattr(code, "train_reader", trained)
-    monkeypatch.setattr("imagine_bench.judge.reading.reader_errors", lambda *_: dict.fromkeys(names, 0.0))
+    monkeypatch.setattr("imagine_bench.judge.reading.reader_errors", lambda *_: NO_ERRORS)
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path / "cache"))
 
 
