@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from imagine_bench.appearance import FACTORS
-from imagine_bench.arrays import Floats, Floats32, Info, Ints, Observed, State
+from imagine_bench.arrays import Floats, Info, Ints, Observed, State
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import PhysicsSettings, TaskSpec
 from imagine_bench.values import Json
@@ -262,7 +262,7 @@ class MotionEnv(SceneEnv):
         info = self._info(success=period.success, fault=period.fault)
         return period.reward, period.terminated, period.truncated, info
 
-    def carry_out(self, actions: Floats32) -> list[Period]:
+    def carry_out(self, actions: Motion) -> list[Period]:
         """Carry out actions (N, n) as :meth:`act` does, until they or the episode are over; the periods in turn.
 
         This is quicker than the same actions one by one. The servos' commands follow from the actions alone, so all are
