@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import written
+from imagine_bench_programs.agent import LawsAgent
+from imagine_bench_programs.scores import Codes, score
+from imagine_bench_programs.symbol_rules import SymbolRules
+from imagine_bench_programs.symbols import Symbols
 from imagine_bench_programs.writing.delay import Row, changes, too_early
 from imagine_bench_programs.writing.laws import Laws, ends_of, simplest
 from imagine_bench_programs.writing.writer import Writer
+from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate
+from imagine_bench.interfaces import AgentContext, Frame, Outcome, State, TaskSpec
+from imagine_bench.seeding import SeedTree
 from imagine_bench.sweep.grid import LADDER
 
 KEPT = Path(__file__).parents[4] / "docs" / "results" / "programs" / "written.json"
@@ -168,6 +177,82 @@ def test_the_writer_is_exact_after_twice_the_cautious_learners_experience(name: 
     cost = certificate(spec).floor
     assert cost is not None
     assert written(spec, int(2 * cost.transitions), seed=7)["total_variation"] < 0.005
+
+
+@pytest.mark.slow  # an encoder reads hundreds of images, one at a time
+def test_the_writer_is_exact_from_codes_too() -> None:
+    found = written(registry.task("arrow_puzzle"), 224, seed=7, appearance="clean")
+    assert found["total_variation"] < 0.005 and found["ranking"] == found["fidelity"] == 1.0
+
+
+class ReversedCodes(Codes):
+    """The codes of macrostates are here the macrostates with the order of all values reversed."""
+
+    def __init__(self, spec: TaskSpec) -> None:
+        self.most = [len(values) - 1 for values in spec.macrostate_values]
+        self.symbols = ReversedSymbols(self)
+
+    def of(self, macrostate: State) -> State:
+        return tuple(most - value for most, value in zip(self.most, macrostate, strict=True))
+
+
+class ReversedSymbols(Symbols):
+    def __init__(self, codes: ReversedCodes) -> None:
+        self.codes = codes
+
+    def macrostates(self, states: Sequence[State]) -> NDArray[np.int64]:
+        return np.array([self.codes.of(state) for state in states])
+
+
+class ReversedTruth(SymbolRules):
+    def __init__(self, spec: TaskSpec, codes: ReversedCodes) -> None:
+        super().__init__(spec.n_actions)
+        self.rules = spec.rules
+        self.codes = codes
+
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
+        true = self.rules.outcomes(self.codes.of(macrostate), action)
+        return tuple(dataclasses.replace(each, macrostate=self.codes.of(each.macrostate)) for each in true)
+
+
+def test_rules_between_codes_are_scored_as_a_probe_reads_them() -> None:
+    spec = registry.task("arrows:cubes=2,slip=0.2")
+    codes = ReversedCodes(spec)
+    found = score(codes.read(ReversedTruth(spec, codes)), spec)
+    assert (found.total_variation, found.ranking) == (0.0, 1.0) and found.found == found.facts > 0
+
+
+class ByteSymbols(Symbols):
+    """The code of a frame is its first two bytes; a probe adds 10."""
+
+    def __init__(self) -> None:
+        self.sizes = (3, 2)
+
+    def read(self, frames: Frame) -> list[State]:
+        return [tuple(each) for each in frames[:, 0, 0, :2].tolist()]
+
+    def macrostates(self, states: Sequence[State]) -> NDArray[np.int64]:
+        return np.array(states) + 10
+
+
+def test_the_agents_expectations_are_those_of_its_laws() -> None:
+    context = AgentContext(n_actions=2, preprocessing="none", encoder=None, seeds=SeedTree(0))
+    agent = LawsAgent(ByteSymbols(), context)
+    every = [(a, b) for a in range(3) for b in range(2)]
+    rows = [row((a, b), ((a + 1) % 3, b), 0, reward=5.0 * b, ended=b == 1) for a, b in every]
+    flips = [(a, b, after) for a, b in every for after in range(2) for _ in range(5)]
+    rows += [row((a, b), (a, after), 1, reward=float(after)) for a, b, after in flips]
+    agent.writer.laws = Laws((3, 2), 2, rows)
+    frames = np.zeros((2, 64, 64, 3), dtype=np.uint8)
+    frames[1, 0, 0, :2] = (2, 1)
+    np.testing.assert_array_equal(agent.read_frames(frames), [[10, 10], [12, 11]])
+    found = agent.predict_outcomes(frames, np.random.default_rng(0))
+    places = [[tuple(each) for each in branches] for branches in found.macrostates.reshape(4, -1, 2).tolist()]
+    shares = found.p_continues.reshape(4, -1).tolist()
+    expected = [dict(zip(*each, strict=True)) for each in zip(places, shares, strict=True)]
+    expected = [{place: share for place, share in each.items() if share} for each in expected]
+    assert expected == [{(11, 10): 1.0}, {(10, 11): 0.5, (10, 10): 0.5}, {}, {(12, 10): 0.5, (12, 11): 0.5}]
+    np.testing.assert_array_equal(found.reward, [[0.0, 0.5], [5.0, 0.5]])
 
 
 def test_kept_programs_are_exact_in_at_least_nine_of_the_twelve_experiments() -> None:

@@ -18,9 +18,9 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.registry import task
 from imagine_bench.registry.machine import describe_environment
 
-from .experience import macro_actions_of, play, write_experience
+from .experience import itself, macro_actions_of, play, write_experience
 from .program import Program
-from .scores import Scores, efficiency, score
+from .scores import Codes, Scores, efficiency, score
 from .writing.writer import Writer
 
 _TIMES = 2.0
@@ -92,6 +92,12 @@ def _learner(spec: TaskSpec) -> float | None:
 def _add_write(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("tasks", nargs="+")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument(
+        "--codes",
+        metavar="APPEARANCE",
+        default="",
+        help="the writer reads codes of images of this appearance, such as clean; without it, it is shown macrostates",
+    )
     parser.add_argument("--times", type=float, default=_TIMES, help="macro-actions, times the cautious learner's")
     parser.add_argument(
         "--out", type=Path, help="a JSON file of all figures; the same command goes on where it stopped"
@@ -101,7 +107,7 @@ def _add_write(parser: argparse.ArgumentParser) -> None:
 
 def _write(given: argparse.Namespace) -> None:
     rows = json.loads(given.out.read_text())["rows"] if given.out is not None and given.out.exists() else []
-    done = {(row["task"], row["seed"], row["macro_actions"]) for row in rows}
+    done = {(row["task"], row["codes"], row["seed"], row["macro_actions"]) for row in rows}
     for name in given.tasks:
         spec = task(name)
         learner = _learner(spec)
@@ -110,19 +116,26 @@ def _write(given: argparse.Namespace) -> None:
                 f"The cautious learner does not end in {name}, so there is no budget; leave it out."
             )
         budget = int(given.times * learner)
-        for seed in [seed for seed in given.seeds if (name, seed, budget) not in done]:
-            rows.append({"task": name, "learner": learner, **written(spec, budget, seed)})
+        for seed in [seed for seed in given.seeds if (name, given.codes, seed, budget) not in done]:
+            found = written(spec, budget, seed, given.codes)
+            rows.append({"task": name, "codes": given.codes, "learner": learner, **found})
             print(*(f"{value:.4g}" if isinstance(value, float) else value for value in rows[-1].values()), flush=True)
             if given.out is not None:
                 given.out.write_text(json.dumps({"rows": rows, "environment": describe_environment()}, indent=1))
 
 
-def written(spec: TaskSpec, macro_actions: int, seed: int) -> dict[str, Any]:
-    """The scores of a writer that explored a task for so many macro-actions, and the laws that it found."""
+def written(spec: TaskSpec, macro_actions: int, seed: int, appearance: str = "") -> dict[str, Any]:
+    """The scores of a writer that explored a task for so many macro-actions, and the laws that it found.
+
+    Where an appearance is given, the writer reads the codes of images of it; else it is shown the macrostates.
+    """
     begun_s = time.process_time()
-    starts, choices = (np.random.default_rng([seed, each]) for each in range(2))
-    writer = Writer([len(values) for values in spec.macrostate_values], spec.n_actions, choices)
-    for row, last in play(spec, lambda symbols: writer.choose(symbols, explore=True), starts):
+    starts, choices, images = (np.random.default_rng([seed, each]) for each in range(3))
+    codes = Codes(spec, appearance, images) if appearance else None
+    sizes = [len(values) for values in spec.macrostate_values] if codes is None else codes.symbols.sizes
+    writer = Writer(sizes, spec.n_actions, choices)
+    see = itself if codes is None else codes.of
+    for row, last in play(spec, lambda symbols: writer.choose(symbols, explore=True), starts, see):
         writer.learn(row)
         if last:
             writer.begin_episode()
@@ -131,7 +144,7 @@ def written(spec: TaskSpec, macro_actions: int, seed: int) -> dict[str, Any]:
     writer.write()
     laws = writer.laws
     cpu_s = time.process_time() - begun_s
-    found = asdict(score(laws, spec))
+    found = asdict(score(laws if codes is None else codes.read(laws), spec))
     return {"seed": seed, "macro_actions": macro_actions, **found, "laws": laws.count, "cpu_s": round(cpu_s, 2)}
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from imagine_bench.agents import snapshot
 from imagine_bench.agents.meters import Meters
+from numpy.typing import NDArray
 
-from imagine_bench.interfaces import AgentContext, AgentState, Arrays, Observation, State, Transition
+from imagine_bench.interfaces import AgentContext, AgentState, Arrays, Frame, Observation, State, Transition
+from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 
 from .program import Program
 from .settings import HYPERPARAMETERS
@@ -90,6 +92,34 @@ class LawsAgent:
             self.writer.learn(Row(now, transition.action, then, transition.reward, transition.terminated, self._step))
             self._step += 1
         self.meters.count("time/model_s")
+
+    def read_frames(self, frames: Frame) -> NDArray[np.int64]:
+        """The reading of a probe; see :class:`imagine_bench.interfaces.capabilities.FrameReader`."""
+        return self.symbols.macrostates(self.symbols.read(frames))
+
+    def predict_outcomes(self, frames: Frame, rng: np.random.Generator) -> ExpectedOutcomes:
+        """The outcomes by its laws; see :class:`imagine_bench.interfaces.capabilities.OutcomePredictor`."""
+        del rng
+        n_actions = self.writer.n_actions
+        here = self.symbols.read(frames)
+        pairs = [self.writer.laws.outcomes(state, action) for state in here for action in range(n_actions)]
+        goes_on = [[each for each in outcomes if not each.terminated] for outcomes in pairs]
+        most = max([1, *map(len, goes_on)])
+        following = np.repeat(np.repeat(here, n_actions, axis=0)[:, None], most, axis=1)  # filled up with no change
+        p_continues = np.zeros(following.shape[:2])
+        for row, outcomes in enumerate(goes_on):
+            for column, each in enumerate(outcomes):
+                following[row, column] = each.macrostate
+                p_continues[row, column] = each.probability
+        different, which = np.unique(following.reshape(-1, len(self.symbols.sizes)), axis=0, return_inverse=True)
+        read = self.symbols.macrostates([tuple(row) for row in different.tolist()])[which.ravel()]
+        rewards = [sum(each.probability * each.reward for each in outcomes) for outcomes in pairs]
+        shape = (len(here), n_actions)
+        return ExpectedOutcomes(
+            macrostates=read.reshape(*shape, most, -1),
+            p_continues=p_continues.reshape(*shape, most),
+            reward=np.array(rewards).reshape(shape),
+        )
 
     def diagnostics(self) -> dict[str, float]:
         """CPU seconds a real step since the last call, and the counters now: real transitions, and laws."""

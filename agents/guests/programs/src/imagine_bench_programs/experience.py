@@ -16,27 +16,34 @@ from imagine_bench.registry import task
 from .writing.delay import Row
 
 Choose = Callable[[State], int]
+See = Callable[[State], State]
 _FILE = "experience.json"
 
 
-def play(spec: TaskSpec, choose: Choose, rng: np.random.Generator) -> Iterator[tuple[Row, bool]]:
+def itself(state: State) -> State:
+    """The same symbols."""
+    return state
+
+
+def play(spec: TaskSpec, choose: Choose, rng: np.random.Generator, see: See = itself) -> Iterator[tuple[Row, bool]]:
     """Macro-actions of one episode after another, without end, and whether each is the last of its episode.
 
-    A macro-action comes about as the task's rules say, which is the kinematic execution. Symbols are the macrostate
-    that the newest frame shows; of a coordinate that it hides, the value last seen in the episode, or -1.
+    A macro-action comes about as the task's rules say, which is the kinematic execution. ``see`` turns the content of a
+    frame, a macrostate with -1 where a coordinate is hidden, into symbols; without it they are that content. Where the
+    newest frame hides a symbol (-1), it is the value last seen in the episode, or -1.
     """
     rules = spec.rules
     lag = 0 if spec.sight is None else spec.sight.lag
     while True:
         state = rules.start_states[int(rng.integers(len(rules.start_states)))]
-        taken = [_seen(spec, state, 0, rng)]
+        taken = [see(_seen(spec, state, 0, rng))]
         now = taken[0]
         for step in range(1, spec.horizon + 1):
             action = choose(now)
             outcomes = rules.outcomes(state, action)
             outcome = outcomes[int(rng.choice(len(outcomes), p=[each.probability for each in outcomes]))]
             state = outcome.macrostate
-            taken.append(_seen(spec, state, step, rng))
+            taken.append(see(_seen(spec, state, step, rng)))
             shown = taken[max(0, step - lag)]
             then = tuple(old if new < 0 else new for new, old in zip(shown, now, strict=True))
             last = outcome.terminated or step == spec.horizon

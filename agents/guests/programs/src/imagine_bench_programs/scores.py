@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imagine_bench.exact.factors import FactorGraph, Machine, factor_graph, keys, machine, numbered
-from imagine_bench.interfaces import State, TaskSpec
+from imagine_bench.interfaces import AgentContext, Outcome, State, TaskSpec
 from imagine_bench.judge.truth import added_up, total_variation
+from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders
 
 from .symbol_rules import SymbolRules
+from .symbols import Symbols
 
 DISTRACTORS = 5
 """Macrostates among which a real next one is ranked."""
@@ -34,6 +37,62 @@ class Scores:
     ranking: float
     #: OneLife's fidelity: mean share of coordinates in which the macrostate that the rules hold likeliest next is right
     fidelity: float
+
+
+class Codes:
+    """Codes of a task's own images.
+
+    Args:
+        spec: The task.
+        appearance: How images vary, such as ``clean``.
+        rng: Draws how each image looks.
+    """
+
+    def __init__(self, spec: TaskSpec, appearance: str, rng: np.random.Generator) -> None:
+        self._spec = spec
+        self._appearance = appearance
+        self._rng = rng
+        context = AgentContext(
+            n_actions=spec.n_actions,
+            preprocessing=spec.preprocessing,
+            encoder=encoders.own(spec, appearance, "codes"),
+            seeds=SeedTree(0),
+        )
+        self.symbols = Symbols(context, "codes")
+
+    def of(self, macrostate: State) -> State:
+        """The code of a new image of a macrostate, whose hidden coordinates are -1."""
+        shown = np.array([macrostate], dtype=np.int64)
+        return self.symbols.read(self._spec.render_macrostates(shown, self._appearance, self._rng))[0]
+
+    def read(self, rules: SymbolRules) -> ReadRules:
+        """Rules between codes as rules between macrostates."""
+        return ReadRules(rules, self)
+
+
+class ReadRules(SymbolRules):
+    """Rules between codes as rules between macrostates: of a code that is expected a probe reads the macrostate."""
+
+    def __init__(self, rules: SymbolRules, codes: Codes) -> None:
+        super().__init__(rules.n_actions)
+        self._rules = rules
+        self._codes = codes
+        self._shown: dict[State, State] = {}
+        self._known: dict[tuple[State, int], tuple[Outcome, ...]] = {}
+
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
+        """The outcomes that the rules expect where an image of the macrostate is seen, one image for all actions."""
+        if macrostate not in self._shown:
+            self._shown[macrostate] = self._codes.of(macrostate)
+        key = (macrostate, action)
+        if key not in self._known:
+            expected = self._rules.outcomes(self._shown[macrostate], action)
+            read = self._codes.symbols.macrostates([each.macrostate for each in expected])
+            states = map(tuple, read.tolist())
+            self._known[key] = tuple(
+                replace(each, macrostate=state) for each, state in zip(expected, states, strict=True)
+            )
+        return self._known[key]
 
 
 def score(rules: SymbolRules, spec: TaskSpec) -> Scores:

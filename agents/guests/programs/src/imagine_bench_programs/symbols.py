@@ -52,6 +52,12 @@ class Symbols:
             self._codes.setdefault(state, code)
         return symbols
 
+    def macrostates(self, states: Sequence[State]) -> NDArray[np.int64]:
+        """The macrostates that the encoder's probe reads in N symbols. Shape (N, M)."""
+        if self._reads:
+            return np.array(states, dtype=np.int64).reshape(-1, len(self.sizes))
+        return self._encoder.read_macrostate(self._hot(states))
+
     def images(self, states: Sequence[State]) -> NDArray[np.uint8]:
         """Images of symbols, N of them; black where no code shows them. Shape (N, H, W) or (N, H, W, 3)."""
         if self._reads and not self._codes.keys() >= {*states} and math.prod(self._of_code) <= _MOST:
