@@ -13,6 +13,7 @@ from types import FunctionType
 from typing import Any
 
 import information_cells
+import judge_cells
 import numpy as np
 import speed_cells
 
@@ -23,7 +24,7 @@ from imagine_bench.registry.entries import agent_label, label_today
 from imagine_bench.report.page import over_seeds
 from imagine_bench.running.bench import read_protocol
 from imagine_bench.store import encoders
-from imagine_bench.sweep.grid import LADDER, STUDIES
+from imagine_bench.sweep.grid import STUDIES
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"
@@ -446,23 +447,6 @@ def by_hand(task: str, level: str, column: str) -> str:
     return columns[column]
 
 
-def written(experiment: str, column: str) -> str:
-    """A figure of the writer of laws in the worlds of an experiment of the benchmark suite."""
-    (levels,) = (each.levels for each in LADDER.experiments if each.name == experiment)
-    tasks = {level.task for level in levels}
-    rows = [row for row in _json("programs/written.json")["rows"] if row["task"] in tasks]
-    away = [row["total_variation"] for row in rows]
-    spent = [row["macro_actions"] for row in rows]
-    columns = {
-        "worlds": str(len({row["task"] for row in rows})),
-        "spent": f"{min(spent)}" if len({*spent}) == 1 else f"{min(spent)} to {max(spent)}",
-        "mean": f"{np.mean(away):.2f}",
-        "exact": f"{sum(each < 0.005 for each in away)} of {len(away)}",
-        "facts": f"{100 * sum(row['found'] for row in rows) / sum(row['facts'] for row in rows):.0f}",
-    }
-    return columns[column]
-
-
 def goals_and_starts(task: str) -> str:
     spec = registry.task(task)
     goals = [state for state in spec.rules.states if spec.rules.is_terminal(state) and spec.rules.is_legal(state)]
@@ -493,7 +477,7 @@ def certified(world: str, field: str) -> str:
 
 CELLS: dict[str, Callable[..., str | list[Compared]]] = {
     name: function
-    for name, function in {**vars(speed_cells), **vars(information_cells), **globals()}.items()
+    for name, function in {**vars(speed_cells), **vars(information_cells), **vars(judge_cells), **globals()}.items()
     if isinstance(function, FunctionType)
 }
-"""The words of comments: every function above and of the two modules."""
+"""The words of comments: every function above and of the three modules."""

@@ -163,7 +163,7 @@ def test_every_family_is_answered_as_by_brute_force(task: str) -> None:
     assert len(seen) == 8
 
 
-@pytest.mark.parametrize("task", ["arrow_puzzle", SLIPS, "pick_place", "arrow_puzzle_easy"])
+@pytest.mark.parametrize("task", ["arrow_puzzle", SLIPS, "pick_place", "arrow_puzzle_easy", "arrows:cubes=4"])
 def test_a_thousand_questions_cost_less_than_ten_cpu_seconds(task: str) -> None:
     begun_s = time.process_time()
     asked = asked_of(task, 1)

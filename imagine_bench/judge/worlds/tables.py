@@ -123,10 +123,11 @@ def coupled_pair(table: TransitionTable) -> tuple[int, int]:
     best = (0, 0)
     most = -1
     for other in range(n_actions):
-        both = table.mean @ _onward(table, other) > 0.0  # [S, A, T + 1]
+        both = table.mean[:, :, :n_states] @ table.mean[:, other]  # [S, A, T + 1]
+        both[:, :, n_states:] += table.mean[:, :, n_states:]
         for one in range(n_actions):
             alone = (table.mean[:, one] > 0.0) | (table.mean[:, other] > 0.0) | stays
-            elsewhere = int((~(both[:, one] & alone).any(axis=1)).sum())
+            elsewhere = int((~((both[:, one] > 0.0) & alone).any(axis=1)).sum())
             if one != other and elsewhere > most:
                 best = (one, other)
                 most = elsewhere

@@ -1,0 +1,57 @@
+"""Cells of the tables on programs and on questions about a whole world."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imagine_bench.report.page import over_seeds
+from imagine_bench.sweep.grid import LADDER
+
+_RESULTS = Path(__file__).parents[2] / "docs" / "results"
+_EXACT = 0.005
+"""Total variation below which a program is exact."""
+
+
+def _written(experiment: str, seen: str) -> list[dict[str, Any]]:
+    """The kept programs of an experiment's worlds whose writer was shown ``macrostates``, or read ``codes``."""
+    (levels,) = (each.levels for each in LADDER.experiments if each.name == experiment)
+    worlds = {(each.task, each.protocol.get("appearance", "clean") if seen == "codes" else "") for each in levels}
+    rows = json.loads((_RESULTS / "programs" / "written.json").read_text())["rows"]
+    return [row for row in rows if (row["task"], row["codes"]) in worlds]
+
+
+def written(experiment: str, seen: str, column: str) -> str:
+    """A figure of the writer of laws in the worlds of an experiment of the benchmark suite; a dash where none is."""
+    (levels,) = (each.levels for each in LADDER.experiments if each.name == experiment)
+    rows = _written(experiment, seen)
+    if not rows:
+        return "–"
+    away = [row["total_variation"] for row in rows]
+    spent = [row["macro_actions"] for row in rows]
+    columns = {
+        "worlds": f"{len({(row['task'], row['codes']) for row in rows})}",
+        "levels": f"{len({each.task for each in levels})}",
+        "spent": f"{min(spent)}" if len({*spent}) == 1 else f"{min(spent)} to {max(spent)}",
+        "mean": f"{np.mean(away):.2f}",
+        "exact": f"{sum(each < _EXACT for each in away)} of {len(away)}",
+        "facts": f"{100 * sum(row['found'] for row in rows) / sum(row['facts'] for row in rows):.0f}",
+    }
+    return columns[column]
+
+
+def asked(folder: str, model: str, transitions: str, family: str) -> str:
+    """Questions of a family that a model answers rightly, %: mean over seeds, with the lowest and the highest.
+
+    The columns ``chance``, ``copy`` and ``exact`` of the file can be given in place of a model.
+    """
+    with (_RESULTS / folder / "worlds.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["family"] == family and row["transitions"] == transitions]
+    if model in ("chance", "copy", "exact"):
+        return f"{100 * float(rows[0][model]):.0f}"
+    found = [float(row["right"]) for row in rows if row["model"] == model and row["right"]]
+    return over_seeds(found, lambda share: f"{100 * share:.0f}", share=True) if found else "–"
