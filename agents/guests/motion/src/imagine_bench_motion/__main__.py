@@ -1,4 +1,4 @@
-"""Commands: ``python -m imagine_bench_motion demonstrate | clone | try | flat | level | judge``, with ``--help``."""
+"""Commands: ``python -m imagine_bench_motion`` demonstrate, clone, try, record, flat, level, judge; with ``--help``."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ def main() -> None:
     _add_demonstrate(commands.add_parser("demonstrate", help="let the expert demonstrate single macro-actions"))
     _add_clone(commands.add_parser("clone", help="train a policy on demonstrations"))
     _add_try(commands.add_parser("try", help="count how often a policy carries out single macro-actions"))
+    record = commands.add_parser("record", help="record one try of a policy, with the expert's hand beside it")
+    _add_record(record)
     _add_flat(commands.add_parser("flat", help="train SAC of Stable-Baselines3 on one cube, without macro-actions"))
     _add_level(commands.add_parser("level", help="train an agent of macro-actions that planner or clone carry out"))
     add_judge(commands.add_parser("judge", help="judge models of motions by the simulator"))
@@ -138,6 +140,35 @@ def _try(given: argparse.Namespace) -> None:
         given.out.write_text(json.dumps(kept, indent=1) + "\n")
 
 
+def _add_record(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, help="the .rrd file to write")
+    parser.add_argument("--clone", type=Path, help="another file of a clone than the bundled one")
+    parser.add_argument("--macro-action", type=int, choices=range(6), default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of the start")
+    parser.add_argument("--appearance", choices=["clean", "mild", "strong"], default="clean")
+    parser.add_argument(
+        "--placement", type=float, default=PLACEMENT_M, help="metres that objects start off their slots"
+    )
+    parser.set_defaults(run=_record)
+
+
+def _record(given: argparse.Namespace) -> None:
+    from .cloned_env import BUNDLED  # noqa: PLC0415 - needs MuJoCo
+    from .control.beside_expert import record_beside_expert  # noqa: PLC0415 - needs Rerun
+
+    found = record_beside_expert(
+        given.recording,
+        Clone.load(given.clone or BUNDLED),
+        given.macro_action,
+        seed=given.seed,
+        appearance=given.appearance,
+        placement=given.placement,
+    )
+    for name, played in (("expert", found.expert), ("clone", found.clone)):
+        print(f"{name}: {'done' if played.done else 'not done'}, {played.periods} control periods")
+    print(f"their hands are at most {1e3 * found.apart_m.max():.0f} mm apart: {given.recording}")
+
+
 def _asked(given: argparse.Namespace) -> dict[str, Any]:
     """The options of a command by name, without paths of this machine."""
     left_out = ("run", "out", "file", "clone")
@@ -151,7 +182,8 @@ def kept_name(file: Path) -> str:
 
 def _add_flat(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="the .json file of the curve")
-    parser.add_argument("--steps", type=int, default=50_000)
+    parser.add_argument("--steps", type=int, default=50_000, help="commands of training")
+    parser.add_argument("--every", type=int, default=2_500, help="commands of training before each test")
     parser.add_argument("--reward", choices=["sparse", "dense"], default="sparse")
     parser.add_argument("--seed", type=int, default=0)
     parser.set_defaults(run=_flat)
@@ -163,11 +195,12 @@ def _flat(given: argparse.Namespace) -> None:
     def told(point: Point) -> None:
         print(point, flush=True)
         curve.append(asdict(point))
-        kept = {**_asked(given), "curve": curve}
+        kept = {**_asked(given), "commit": commit, "curve": curve}
         given.out.write_text(json.dumps(kept, indent=1) + "\n")
 
+    commit = describe_environment()["commit"]
     curve: list[dict[str, float]] = []
-    learn(given.steps, seed=given.seed, told=told, reward=given.reward)
+    learn(given.steps, seed=given.seed, every=given.every, told=told, reward=given.reward)
 
 
 def _add_level(parser: argparse.ArgumentParser) -> None:

@@ -1,0 +1,83 @@
+"""A recording of a clone and the expert: the same start, each one's own motion, and the distance of their hands."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench_motion.__main__ import main
+from imagine_bench_motion.cloned_env import BUNDLED
+from imagine_bench_motion.cloning import Clone
+from imagine_bench_motion.control.beside_expert import Compared, Played, record_beside_expert
+from imagine_bench_motion.skills import skill_env
+from imagine_bench_motion.trials import MOST_PERIODS
+from recordings import contents, times
+
+
+class Repeats(Clone):
+    """Gives the commands that it was given, and then its last one."""
+
+    def __init__(self, commands: list[Any]) -> None:
+        self.about = {"observation": "proprio,objects"}
+        self.commands = commands
+        self.seen: list[Any] = []
+
+    def begin(self, instruction: str) -> None:
+        self.instruction = instruction
+        self.due = list(self.commands)
+
+    def act(self, observation: Any) -> Any:
+        self.seen.append(observation["objects"].copy())
+        return self.due.pop(0) if len(self.due) > 1 else self.due[0]
+
+
+def test_a_clone_that_does_as_the_expert_has_its_hand_where_the_experts_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And one that does nothing is recorded for the longest time of a try, from the same start."""
+    commands: list[Any] = []
+    act = Expert.act
+
+    def kept(expert: Expert) -> Any:
+        commands.append(act(expert))
+        return commands[-1]
+
+    monkeypatch.setattr(Expert, "act", kept)
+    still = Repeats([np.append(skill_env("proprio").servo_targets()[:7], 1.0).astype(np.float32)])
+    found = record_beside_expert(tmp_path / "still.rrd", still, 3, seed=570, placement=0.03)
+    assert found.expert.done and not found.clone.done
+    assert found.clone.periods == MOST_PERIODS > found.expert.periods
+    assert found.apart_m.max() > 0.1
+    assert times(tmp_path / "still.rrd", "/motion/command/grip", "env_step") == set(range(MOST_PERIODS))
+
+    alike = Repeats(commands)
+    again = record_beside_expert(tmp_path / "alike.rrd", alike, 3, seed=570, placement=0.03)
+    assert again.clone.done
+    assert again.clone.periods == again.expert.periods == found.expert.periods
+    assert again.apart_m.max() < 1e-6
+    np.testing.assert_array_equal(alike.seen[0], still.seen[0])
+    assert alike.instruction == "turn the middle cube counter-clockwise"
+    shown = {"/scene/hand_target", "/scene/expert_hand_target", "/motion/distance/distance_from_the_expert_s_hand_mm"}
+    assert set(contents(tmp_path / "alike.rrd")) >= shown
+    assert len(times(tmp_path / "alike.rrd", "/scene/expert_hand_target", "env_step")) == again.clone.periods
+
+
+def test_hands_are_compared_in_the_periods_that_both_motions_have() -> None:
+    clone = Played(done=False, periods=3, hand_m=np.array([[0, 0, 0], [3, 4, 0], [9, 9, 9]]))
+    expert = Played(done=True, periods=2, hand_m=np.zeros((2, 3)))
+    assert Compared(clone=clone, expert=expert).apart_m.tolist() == [0.0, 5.0]
+
+
+def test_the_command_records_the_bundled_clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    path = tmp_path / "clone.rrd"
+    monkeypatch.setattr(sys, "argv", ["motion", "record", str(path), "--macro-action", "4", "--seed", "571"])
+    main()
+    printed = capsys.readouterr().out
+    assert BUNDLED.is_file()
+    assert "expert: done" in printed
+    assert "clone: done" in printed
+    assert "/motion/front" in contents(path)
