@@ -311,24 +311,30 @@ def margins() -> None:
 CAUSE_COLORS = ("#009e73", "#0072b2", "#7cc8f2", "#f0b400", "#d55e00", "#7a1f6b", "#9a9a9a", "#202020")
 
 
+def failures(kept: Path) -> dict[str, dict[str, Counter[str]]]:
+    """Failed tests of all seeds by agent, budget and cause; of a folder without causes, none."""
+    found: dict[str, dict[str, Counter[str]]] = {}
+    file = kept / "why.json"
+    for run in json.loads(file.read_text())["runs"] if file.exists() else ():
+        of_agent = found.setdefault(label_today(run["agent"]), {})
+        for budget, counts in run["failures"].items():
+            now = {FORMER_CAUSES.get(cause, cause): count for cause, count in counts.items()}
+            of_agent.setdefault(budget, Counter()).update(now)
+    return found
+
+
 def why() -> None:
     """Failures by cause: a panel an agent, a stacked bar a budget."""
     kept = RESULTS / "arrow_puzzle-mild-why"
-    tests = json.loads((kept / "bench.json").read_text())["protocol"]["evaluation_episodes"]
-    found: dict[str, dict[str, Counter[str]]] = {}
-    seeds: Counter[str] = Counter()
-    for run in json.loads((kept / "why.json").read_text())["runs"]:
-        agent = label_today(run["agent"])
-        seeds[agent] += 1
-        for budget, counts in run["failures"].items():
-            now = {FORMER_CAUSES.get(cause, cause): count for cause, count in counts.items()}
-            found.setdefault(agent, {}).setdefault(budget, Counter()).update(now)
+    protocol = json.loads((kept / "bench.json").read_text())["protocol"]
+    tests = protocol["evaluation_episodes"] * len(protocol["seeds"])
+    found = failures(kept)
     shown = [agent for agent in found if agent != "factored:given"]
     figure, both = plt.subplots(1, len(shown), figsize=(3.4 * len(shown), 3.4), sharey=True, layout="constrained")
     for axes, agent in zip(both, shown, strict=True):
         bottom = np.zeros(len(found[agent]))
         for cause, color in zip(CAUSES, CAUSE_COLORS, strict=True):
-            shares = np.array([100 * counts[cause] / (tests * seeds[agent]) for counts in found[agent].values()])
+            shares = np.array([100 * counts[cause] / tests for counts in found[agent].values()])
             if any(counts[cause] for each in shown for counts in found[each].values()):
                 axes.bar(list(found[agent]), shares, bottom=bottom, color=color, label=cause)
             bottom += shares
@@ -345,7 +351,10 @@ CHALLENGES = ("unseen_goal", "changed_rule", "late_frames")
 
 
 def separating() -> None:
-    """Success in the world that separates and in the open challenges, beside chance: a panel each, a dot a seed."""
+    """Success in the world that separates and in the open challenges, beside chance: a panel each, a dot a seed.
+
+    Failed tests stand above the solved ones, by cause, where causes are kept; those of all seeds that have them.
+    """
     folders = [RESULTS / f"separating-{name}" for name in ("world-453", *(f"{name}-450" for name in CHALLENGES))]
     benches = [json.loads((folder / "bench.json").read_text()) for folder in folders]
     widths = [len(kept["protocol"]["agents"]) for kept in benches]
@@ -358,19 +367,26 @@ def separating() -> None:
         agents = sorted(agent_label(agent, protocol) for agent in protocol["agents"])
         for place, agent in enumerate(agents):
             values = 100 * rates(folder.name, agent)[last]
-            axes.bar(place, values.mean(), width=0.6, color=CAUSE_COLORS[2])
+            bottom = values.mean()
+            axes.bar(place, bottom, width=0.6, color="#d9d9d9", label="solved" if agent == agents[0] else None)
+            counts = failures(folder).get(agent, {}).get(str(last), Counter())
+            for cause, color in zip(CAUSES, CAUSE_COLORS, strict=True):
+                share = (100 - values.mean()) * counts[cause] / max(1, counts.total())
+                axes.bar(place, share, bottom=bottom, width=0.6, color=color, label=cause if counts[cause] else None)
+                bottom += share
             axes.plot([place] * len(values), values, ".", color=figures.INK)
-        axes.axhline(100 * kept["certificate"]["chance_level"], color=CAUSE_COLORS[4], linestyle="--", label="chance")
-        axes.axhline(100 * kept["certificate"]["optimum"], color=CAUSE_COLORS[0], label="optimum")
+        axes.axhline(100 * kept["certificate"]["chance_level"], color=figures.INK, linestyle="--", label="chance")
+        axes.axhline(100 * kept["certificate"]["optimum"], color=figures.INK, linewidth=0.8, label="optimum")
         lines = [agent.replace("_", "\n").replace(":", ":\n") for agent in agents]
         axes.set_xticks(range(len(agents)), lines, fontsize=8)
-        before = protocol["after_episodes"] if protocol["after"] else 0
+        episodes = last + (protocol["after_episodes"] if protocol["after"] else 0)
         name = folder.name.split("-")[1].replace("_", " ").replace("world", "separating")
-        axes.set_title(f"{name}: {before + last:,} episodes", fontsize=9.5)
+        axes.set_title(f"{name}: {episodes:,} episodes", fontsize=9.5)
         axes.set_ylim(0, 104)
         axes.spines[["top", "right"]].set_visible(False)
     every[0].set_ylabel("test episodes solved (%)")
-    every[-1].legend(loc="center right", frameon=False)
+    named = dict(zip(*reversed(every[0].get_legend_handles_labels()), strict=True))
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=len(named), frameon=False)
     figure.savefig(HERE / "separating.png", dpi=120, facecolor="white")
 
 

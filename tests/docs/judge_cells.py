@@ -44,6 +44,11 @@ def written(experiment: str, seen: str, column: str) -> str:
     return columns[column]
 
 
+def _whole(share: float) -> str:
+    """Whole percent, but no share below 1 is 100."""
+    return f"{100 * share:.0f}" if share == 1.0 or share < 0.995 else f"{np.floor(1000 * share) / 10:.1f}"
+
+
 def asked(folder: str, model: str, transitions: str, family: str) -> str:
     """Questions of a family that a model answers rightly, %: mean over seeds, with the lowest and the highest.
 
@@ -52,6 +57,6 @@ def asked(folder: str, model: str, transitions: str, family: str) -> str:
     with (_RESULTS / folder / "worlds.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["family"] == family and row["transitions"] == transitions]
     if model in ("chance", "copy", "exact"):
-        return f"{100 * float(rows[0][model]):.0f}"
+        return _whole(float(rows[0][model]))
     found = [float(row["right"]) for row in rows if row["model"] == model and row["right"]]
-    return over_seeds(found, lambda share: f"{100 * share:.0f}", share=True) if found else "–"
+    return over_seeds(found, _whole, share=True) if found else "–"
