@@ -17,27 +17,30 @@ _EXACT = 0.005
 """Total variation below which a program is exact."""
 
 
-def _written(experiment: str, seen: str) -> list[dict[str, Any]]:
-    """The kept programs of an experiment's worlds whose writer was shown ``macrostates``, or read ``codes``."""
+def _worlds(experiment: str, seen: str) -> set[tuple[str, str]]:
+    """The worlds of an experiment, by task and, where the writer reads ``codes`` of images, by their appearance."""
     (levels,) = (each.levels for each in LADDER.experiments if each.name == experiment)
-    worlds = {(each.task, each.protocol.get("appearance", "clean") if seen == "codes" else "") for each in levels}
-    rows = json.loads((_RESULTS / "programs" / "written.json").read_text())["rows"]
-    return [row for row in rows if (row["task"], row["codes"]) in worlds]
+    return {(each.task, each.protocol.get("appearance", "clean") if seen == "codes" else "") for each in levels}
 
 
 def written(experiment: str, seen: str, column: str) -> str:
-    """A figure of the writer of laws in the worlds of an experiment of the benchmark suite; a dash where none is."""
-    (levels,) = (each.levels for each in LADDER.experiments if each.name == experiment)
-    rows = _written(experiment, seen)
+    """A figure of the writer of laws in the worlds of an experiment of the benchmark suite; a dash where none is.
+
+    The writer was shown ``macrostates``, or read ``codes``.
+    """
+    worlds = _worlds(experiment, seen)
+    kept: list[dict[str, Any]] = json.loads((_RESULTS / "programs" / "written.json").read_text())["rows"]
+    rows = [row for row in kept if (row["task"], row["codes"]) in worlds]
+    measured = {(row["task"], row["codes"]) for row in rows}
+    if column == "worlds":
+        return f"{len(measured)} of {len(worlds)}"
     if not rows:
         return "–"
     away = [row["total_variation"] for row in rows]
     spent = [row["macro_actions"] for row in rows]
     columns = {
-        "worlds": f"{len({(row['task'], row['codes']) for row in rows})}",
-        "levels": f"{len({each.task for each in levels})}",
-        "spent": f"{min(spent)}" if len({*spent}) == 1 else f"{min(spent)} to {max(spent)}",
-        "mean": f"{np.mean(away):.2f}",
+        "spent": f"{min(spent):,}" if len({*spent}) == 1 else f"{min(spent):,} to {max(spent):,}",
+        "mean": f"{np.mean(away):.3f}",
         "exact": f"{sum(each < _EXACT for each in away)} of {len(away)}",
         "facts": f"{100 * sum(row['found'] for row in rows) / sum(row['facts'] for row in rows):.0f}",
     }

@@ -256,8 +256,9 @@ def test_the_agents_expectations_are_those_of_its_laws() -> None:
 
 
 def test_kept_programs_are_exact_in_at_least_nine_of_the_twelve_experiments() -> None:
-    rows = json.loads(KEPT.read_text())["rows"]
-    assert all(each["macro_actions"] <= 2 * each["learner"] for each in rows)
+    every = json.loads(KEPT.read_text())["rows"]
+    assert all(each["macro_actions"] <= 2 * each["learner"] for each in every)
+    rows = [each for each in every if not each["codes"]]
     exact = {}
     for experiment in LADDER.experiments:
         of_levels = [each for level in experiment.levels for each in rows if each["task"] == level.task]
