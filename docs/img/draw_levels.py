@@ -7,6 +7,7 @@ from typing import Any
 import matplotlib as mpl
 
 from imagine_bench import registry
+from imagine_bench.exact import motion
 
 mpl.use("agg")
 from matplotlib import pyplot as plt
@@ -43,8 +44,10 @@ def curves(cubes: int) -> list[dict[str, Any]]:
 
 
 def draw(axes: plt.Axes, cubes: int) -> None:
-    """Curves of one world, its chance level and its optimum."""
-    facts = registry.task("arrow_puzzle" if cubes == 3 else f"arrows:cubes={cubes},horizon=10").facts()
+    """Curves of one world, its chance level, its optimum, and the success that planned motions were shown to reach."""
+    spec = registry.task("arrow_puzzle" if cubes == 3 else f"arrows:cubes={cubes},horizon=10")
+    facts = spec.facts()
+    measured = motion.measured(spec.id).get("appearances", {})
     for curve in curves(cubes):
         color, marker = AGENTS[curve["agent"]]
         line, word = LINES[curve["execution"]]
@@ -55,6 +58,9 @@ def draw(axes: plt.Axes, cubes: int) -> None:
         axes.plot(minutes, shares, line, color=color, marker=marker, markerfacecolor=face, markersize=6, label=label)
     axes.axhline(100 * facts.chance_level, color="#9a9a9a", linestyle=":", label="chance, macro-actions at random")
     axes.axhline(100, color="#4daf4a", linestyle=":", label="optimum of the rules")
+    if "clean" in measured:
+        shown = 100 * motion.certificate(spec, measured["clean"]).shown
+        axes.axhline(shown, color="#e69f00", linestyle="--", label=f"shown reachable at 25 Hz, {shown:.1f} %")
     axes.set_xscale("log")
     axes.set_xticks(MINUTES, [f"{each:g}" for each in MINUTES])
     axes.minorticks_off()

@@ -227,7 +227,7 @@ def _level(given: argparse.Namespace) -> None:
 
     world = {"cubes": given.cubes, "slip": given.slip, "clone": given.clone}
     env, test_env = (environment(given.execution, **world) for _ in range(2))
-    kept: dict[str, Any] = {**_asked(given), "curve": []}
+    kept: dict[str, Any] = {**_asked(given), "commit": describe_environment()["commit"], "curve": []}
     if given.execution == "clone":
         kept["clone"] = kept_name(given.clone or BUNDLED)
     rules, horizon = env.rules, env.horizon
