@@ -413,64 +413,6 @@ def suite() -> None:
     figure.savefig(HERE / "suite.png", dpi=110, facecolor="white")
 
 
-def evidence() -> None:
-    """Total variation of each judged fit, and its exploit with the upper bound, by the size of its data."""
-    with (RESULTS / "arrow_puzzle_clockwise-levels-judge" / "scores.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["exploit"]]
-    models = list(dict.fromkeys(row["model"] for row in rows))
-    sizes = sorted({int(row["transitions"]) for row in rows})
-    plot, panels = plt.subplots(1, len(models), figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained")
-    for axes, model in zip(panels, models, strict=True):
-        for place, size in enumerate(sizes, 2):
-            fits = [row for row in rows if row["model"] == model and int(row["transitions"]) == size]
-            away, low, high = (
-                [float(row[name]) for row in fits] for name in ("total_variation", "exploit", "exploit_bound")
-            )
-            style = {"color": figures.COLORS[place % 8], "marker": figures.MARKERS[place % 7]}
-            axes.vlines(away, low, high, color=style["color"], alpha=0.6)
-            axes.scatter(away, low, s=60, label=f"{size} transitions", **style)
-        axes.set_title(model, fontsize=11)
-        axes.set_xscale("symlog", linthresh=0.01)
-        axes.set_xlim(-0.001, 1.1)
-        axes.set_xticks([0.0, 0.01, 0.1, 1.0], ["0", "0.01", "0.1", "1"])
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel("exploit, L7 (units of reward)\nmark: found; line: to the upper bound")
-    panels[0].legend(loc="upper right", frameon=False)
-    plot.supxlabel("total variation after one macro-action, L1 (linear below 0.01, then logarithmic)", fontsize=10)
-    plot.suptitle("arrows:cubes=3,goal=clockwise: each mark is one training of a world model", fontsize=10)
-    plot.savefig(HERE / "evidence.png", dpi=100)
-
-
-def promise() -> None:
-    """Shares that are accepted though wrong, by uncertainty and distribution; a mark is a fit."""
-    with (RESULTS / "arrow_puzzle-signals-judge" / "scores.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    where = {
-        "on_data": "on its data (guaranteed: at most 5 %)",
-        "rare": "where its data is rare",
-        "policies": "under other policies, mean",
-        "worst_policy": "under the worst policy",
-    }
-    models = list(dict.fromkeys(row["model"] for row in rows))
-    plot, axes = plt.subplots(figsize=(8, 3.8), layout="constrained")
-    for place, (name, label) in enumerate(where.items()):
-        across = [models.index(row["model"]) + 0.16 * (place - 1.5) for row in rows]
-        shares = [100.0 * float(row[f"conformal_wrong_{name}"]) for row in rows]
-        style = {"color": figures.COLORS[place % 8], "marker": figures.MARKERS[place % 7]}
-        axes.scatter(across, shares, s=36, alpha=0.8, label=label, **style)
-    axes.axhline(5.0, color="gray", linewidth=1, linestyle=":")
-    axes.set_xticks(range(len(models)), models, fontsize=8)
-    axes.set_ylabel("accepted though wrong (% of transitions)")
-    axes.set_title("One training of each model; each mark is one exact share", fontsize=10)
-    axes.grid(axis="y", alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper left")
-    top = max(100.0 * float(row["conformal_wrong_worst_policy"]) for row in rows)
-    axes.set_ylim(0.0, 1.35 * top)
-    plot.savefig(HERE / "promise.png", dpi=100)
-
-
 FIGURES = (
     peers,
     ladder,
@@ -481,19 +423,22 @@ FIGURES = (
     why,
     separating,
     suite,
-    evidence,
-    promise,
 )
-OF_SCENES = ("parameters", "nuisances", "tasks")
-"""Pictures of ``draw_scenes.py``."""
+ELSEWHERE = {
+    "draw_scenes.py": ("parameters", "nuisances", "tasks"),
+    "draw_judged.py": ("evidence", "promise", "ranking"),
+}
+"""Pictures of other files."""
 
 
-def of_scenes(name: str) -> None:
-    """Draw a picture of scenes."""
-    runpy.run_path(str(HERE / "draw_scenes.py"))[name]()
+def draw_elsewhere(file: str, name: str) -> None:
+    """Draw a picture of another file."""
+    runpy.run_path(str(HERE / file))[name]()
 
 
-PICTURES = {each.__name__: each for each in FIGURES} | {name: partial(of_scenes, name) for name in OF_SCENES}
+PICTURES = {each.__name__: each for each in FIGURES} | {
+    name: partial(draw_elsewhere, file, name) for file, names in ELSEWHERE.items() for name in names
+}
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or PICTURES:
