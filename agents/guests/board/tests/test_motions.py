@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench_board import motions
 from imagine_bench_board.check import NOT_VOUCHED, check
-from imagine_bench_board.motions import SLACK_PERIODS, MotionTests, read_motions
+from imagine_bench_board.motions import SLACK_PERIODS, MotionRow, MotionTests, read_motions
 from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import CARD, EPISODES, LONGEST
 
@@ -196,10 +197,33 @@ def too_many(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
     card["protocol"]["tests"] = 10**9
 
 
+def hidden(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    """A failure said to be a success that depends on rounding."""
+    solved_everywhere(card, parts)
+    parts[1]["reproducible"] = False
+
+
 FORGERIES = [
     solved_everywhere, dearer, other_fingerprint, swapped, copied, dropped, cut, longer, another_seed, another_world,
-    no_numbers, no_commands, a_file_s_world, no_flag, too_many,
+    no_numbers, no_commands, a_file_s_world, no_flag, too_many, hidden,
 ]  # fmt: skip
+
+
+def seal(row: Path, card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
+    """Write a row with digest and figures brought up to date."""
+    content = json.dumps(parts).encode()
+    card["episodes_sha256"] = hashlib.sha256(content).hexdigest()
+    sure = [part for part in parts if part["reproducible"]]
+    failed = [min(part["total_reward"], -5.0) for part in parts if not part["reproducible"]]
+    card["vouched"] = {
+        "successes": sum(part["solved"] is True for part in sure),
+        "faults": sum(part["fault"] for part in sure),
+        "mean_return": float(np.mean([part["total_reward"] for part in sure] + failed)),
+        "mean_periods": float(np.mean([len(part["commands"]) * 3 // 4 // 32 for part in parts])),
+        "not_reproducible": len(failed),
+    }
+    (row / EPISODES).write_bytes(content)
+    (row / CARD).write_text(json.dumps(card))
 
 
 @pytest.mark.parametrize("forgery", FORGERIES)
@@ -210,20 +234,54 @@ def test_forged_rows_are_refused_in_one_line(
     card = json.loads((row / CARD).read_text())
     parts = json.loads((row / EPISODES).read_text())
     forgery(card, parts)
-    content = json.dumps(parts).encode()
-    card["episodes_sha256"] = hashlib.sha256(content).hexdigest()
-    lengths = [len(part["commands"]) * 3 // 4 // 32 for part in parts]
-    card["vouched"] = {
-        "successes": sum(part["solved"] is True for part in parts),
-        "faults": sum(part["fault"] for part in parts),
-        "mean_return": float(np.mean([part["total_reward"] for part in parts])),
-        "mean_periods": float(np.mean(lengths)),
-    }
-    (row / EPISODES).write_bytes(content)
-    (row / CARD).write_text(json.dumps(card))
+    seal(row, card, parts)
     (found,) = check(row)
     assert found.row is None and found.verdict.complaint
     assert "\n" not in str(found) and "Traceback" not in str(found)
+
+
+def test_a_row_sealed_again_without_a_change_holds(row: Path) -> None:
+    """So the refusals above are for the forged parts."""
+    seal(row, json.loads((row / CARD).read_text()), json.loads((row / EPISODES).read_text()))
+    assert "holds" in str(check(row)[0])
+
+
+CHAOS_RAD = 0.05
+"""A disturbance so large that the expert's commands do not end as before, in place of one like rounding."""
+
+
+def test_a_test_that_depends_on_rounding_is_marked_by_its_author(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Resting tests end as before even so: nothing happens in them."""
+    monkeypatch.setattr(motions, "DISTURBANCE", CHAOS_RAD)
+    folder = played(tmp_path, control="joint")
+    read = read_motions(folder)
+    assert [each.reproducible for each in read.motions] == [False, True, False, True]
+    assert (read.vouched.successes, read.vouched.not_reproducible) == (0, 2)
+    assert read.vouched.mean_return == (-5.0 + 0.0 - 5.0 + 0.0) / 4
+    monkeypatch.undo()
+    (found,) = check(folder)
+    assert "holds" in str(found) and "4 episodes played again, 2 not reproducible and counted as failed;" in str(found)
+    page = write_board([found], tmp_path / "page").with_name(f"{folder.name}.html").read_text()
+    assert page.count("no, so it counts as failed") == 2
+
+
+def test_a_test_that_ends_in_another_way_is_excused_only_if_disturbed_replays_do_so_too(
+    row: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card = json.loads((row / CARD).read_text())
+    parts = json.loads((row / EPISODES).read_text())
+    other_fingerprint(card, parts[1:])  # test 2, which the expert solves
+    seal(row, card, parts)
+    (found,) = check(row)
+    assert "refused: test 2: its fingerprint is" in str(found)
+    monkeypatch.setattr(motions, "DISTURBANCE", CHAOS_RAD)
+    (found,) = check(row)
+    assert "4 episodes played again, 1 not reproducible and counted as failed;" in str(found)
+    assert isinstance(found.row, MotionRow)
+    assert [each.reproducible for each in found.row.motions] == [True, True, False, True]
+    assert found.row.vouched.successes == card["vouched"]["successes"] - 1 == 1
 
 
 def test_a_copied_row_is_said_to_be_one(row: Path) -> None:

@@ -47,6 +47,8 @@ class Checked:
             return f"{self.verdict.what}: refused: {self.verdict.complaint}"
         claims = ", ".join(self.verdict.unshown)
         played = f"{self.verdict.episodes:,} episodes played again"
+        if isinstance(self.row, MotionRow) and self.row.vouched.not_reproducible:
+            played += f", {self.row.vouched.not_reproducible:,} not reproducible and counted as failed"
         return f"{self.row.name}: holds in {self.row.world}; {self.row.starts}; {played}; not vouched: {claims}"
 
 
@@ -90,7 +92,8 @@ class _Court:
             start_seed = self._starts(folder, moved, moved.protocol.tests)
             of_round = start_seed is None or moved.protocol.seed == start_seed
             require(of_round, f"its seed is not that of the round {moved.round}.")
-            episodes = motions.check_motions(moved, self._motion_env(moved))
+            read[0] = motions.check_motions(moved, self._motion_env(moved))
+            episodes = moved.protocol.tests
             return Verdict(what=moved.name, episodes=episodes, unshown=(*NOT_VOUCHED, *self._moved_alike(moved)))
         row = read_row(folder)
         read.append(row)

@@ -108,6 +108,7 @@ def _motion_cells(row: MotionRow) -> dict[str, str]:
         "return": decimals(row.vouched.mean_return),
         "robot seconds a test": decimals(row.vouched.mean_periods / RATE_HZ),
         "faults": f"{row.vouched.faults:,}",
+        "not reproducible": f"{row.vouched.not_reproducible:,}",
         "tests": f"{tests:,}",
         "starts": row.starts,
         "seen beforehand (claimed)": row.claimed.seen_beforehand,
@@ -117,7 +118,10 @@ def _motion_cells(row: MotionRow) -> dict[str, str]:
 def _motion_section(world: str, rows: Sequence[MotionRow]) -> Section:
     """The table of a world of continuous control."""
     best_first = sorted(rows, key=lambda row: -row.vouched.mean_return)
-    words = "Each command, 25 a second, was carried out again. The columns that are marked so are claimed."
+    words = (
+        "Each command, 25 a second, was carried out again. A test is not reproducible if its end depends on how a "
+        "processor rounds; it counts as failed. The columns that are marked so are claimed."
+    )
     table = Table.of(f"table-{file_name(world)}", [_motion_cells(row) for row in best_first], "", "not said")
     return Section(world, [words], tables=[table])
 
@@ -189,6 +193,7 @@ def motion_page(row: MotionRow, verdict: str) -> Page:
             "return": printed(each.total_reward, "g"),
             "solved": "yes" if each.solved else "no",
             "fault": "yes" if each.fault else "no",
+            "reproducible": "yes" if each.reproducible else "no, so it counts as failed",
         }
         for test, each in enumerate(row.motions)
     ]
