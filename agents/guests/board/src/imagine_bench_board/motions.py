@@ -341,8 +341,9 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         facts = {"commit": str(machine["commit"]), "command": one_line(machine["command"])}
         claimed = Claims(agent=agent, **{**facts, **claims})
         with closing(self.protocol.make(observation="state")) as env:
+            unwrapped: Any = env.unwrapped
             motions = [
-                dataclasses.replace(each, reproducible=_is_reproducible(env.unwrapped, self.protocol.start(test), each))
+                dataclasses.replace(each, reproducible=_is_reproducible(unwrapped, self.protocol.start(test), each))
                 for test, each in enumerate(self.motions)
             ]
         episodes = json.dumps([_columns(each) for each in motions], separators=(",", ":")).encode()
