@@ -116,6 +116,7 @@ def success(learner: FactoredAgent, horizon: int = 6) -> float:
     """Share of starts from which the greedy agent ends well."""
     solved = 0
     for start in starts():
+        learner.begin_episode()
         code = start
         for _ in range(horizon):
             code, reward, ended = step(code, learner.act(Observation(frame=frame(code)), explore=False))

@@ -280,3 +280,56 @@ def test_a_likely_transition_is_still_a_surprise_while_unknown() -> None:
 
     assert surprises(0.0) == 1.0, "nothing is ever wholly known"
     assert surprises(0.5) == 0.0, "after fifty times it is expected"
+
+
+def _visits(learner: FactoredAgent, start: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """The codes that the greedy agent reaches in one episode of six macro-actions."""
+    learner.begin_episode()
+    code = start
+    visited = []
+    for _ in range(6):
+        code, _, _ = fake_codes.step(code, learner.act(Observation(frame=frame(code)), explore=False))
+        visited.append(code)
+    return visited
+
+
+def test_a_test_does_not_hope_again_for_a_reward_that_did_not_come() -> None:
+    learner = agent()
+    for code in starts():
+        for action in range(ACTIONS):
+            if code[2] == 1:  # nothing is seen under a dark lamp
+                learner.begin_episode()
+                learner.observe(fake_codes.transition(code, action), episode=0)
+    start = (0, 1, 0)
+    observation = Observation(frame=frame(start))
+    learner.begin_episode()
+    before = learner.q_values(observation)
+    visited = _visits(learner, start)
+    assert visited.count((2, 1, 0)) == 1, "under the dark lamp these wheels end nothing"
+    assert not np.array_equal(learner.q_values(observation), before), "it knows this until the episode is over"
+    learner.begin_episode()
+    assert np.array_equal(learner.q_values(observation), before), "and nothing is learned"
+    assert _visits(learner, start) == visited
+
+
+def test_only_an_unlikely_going_on_after_an_unseen_transition_is_news() -> None:
+    model = FactoredModel((3, 3, 2), ACTIONS, FactoredSettings())
+    for row in rows(starts()):
+        if row.following != (2, 1, 0) and (row.code, row.action) != ((1, 0, 0), 0):
+            model.add(row)
+    model.add(CodeTransition((0, 1, 0), 1, (2, 1, 0), 10.0, True))  # by chance
+    outcomes = model.outcomes
+    outcomes.fit()
+    assert not outcomes.goes_on((2, 0, 1), 2, (2, 1, 1)), "seen: chance decides"
+    assert not outcomes.goes_on((1, 0, 0), 0, (2, 0, 0)), "it is expected to go on"
+    assert outcomes.goes_on((2, 0, 0), 2, (2, 1, 0))
+    codes, nexts = np.array([(2, 0, 0), (0, 1, 0)]), np.array([(2, 1, 0)] * 2)
+    probability, _ = outcomes.predict(codes, np.array([2, 1]), nexts)
+    assert probability.sum(axis=1) == pytest.approx(1.0)
+    unseen, seen = (probability @ outcomes.ends).tolist()
+    assert unseen == 0.0
+    assert seen > 0.9, "an end that was seen may come again"
+    assert outcomes.forget_going_on()
+    assert not outcomes.forget_going_on()
+    probability, _ = outcomes.predict(codes, np.array([2, 1]), nexts)
+    assert (probability @ outcomes.ends).min() > 0.9

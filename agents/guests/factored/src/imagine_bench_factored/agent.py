@@ -43,6 +43,8 @@ class CodeAgent:
     perception: CodePerception | LearnedPerception
     _observed = 0
     """Transitions of this episode that it was shown, its own or another's."""
+    _chosen: tuple[Code, int] | None = None
+    """The last code of this episode and the macro-action that was chosen in it, where it is not shown the result."""
 
     def __init__(
         self,
@@ -76,6 +78,9 @@ class CodeAgent:
     def begin_episode(self) -> None:
         """The next frame is the first of an episode; see :class:`.capabilities.EpisodeRememberer`."""
         self._observed = 0
+        self._chosen = None
+        if self.model.outcomes.forget_going_on():
+            self.planner.learned()
 
     @property
     def _ready(self) -> bool:
@@ -96,9 +101,22 @@ class CodeAgent:
             return int(self.rng.integers(self.n_actions)) if explore else 0
         code = self.perception.code(observation.frame)
         if not explore:
-            return int(self._values(code).argmax())
+            return self._act_greedily(code)
+        self._chosen = None
         values = self._exploring_values(code)
         return int(self.rng.choice(np.flatnonzero(values >= values.max() - TIE)))
+
+    def _act_greedily(self, code: Code) -> int:
+        """The action of the largest value.
+
+        Nothing is learned in a test. But an unseen transition after which this episode went on ends no episode: without
+        this, an agent that expects a reward there in vain would try the same again and again.
+        """
+        if self._chosen is not None and self.model.outcomes.goes_on(*self._chosen, code):
+            self.planner.learned()
+        action = int(self._values(code).argmax())
+        self._chosen = (code, action)
+        return action
 
     def _exploring_values(self, code: Code) -> Floats:
         """Values (A,) that it acts by in training.
@@ -129,6 +147,7 @@ class CodeAgent:
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Keep the transition; if it was unexpected, learn from all since the last one, and plan anew."""
+        self._chosen = None
         with self.meters.cpu_time("time/model_s"):
             code = self.perception.code(transition.observation.frame)
             following = self.perception.code(transition.next_observation.frame)

@@ -32,6 +32,8 @@ _LARGEST_TEMPLATE = 1 << 15
 """Sets of factors with more joint values are no candidates."""
 _CERTAIN = 1.0 - 1e-6
 _LEAST = 1e-6
+_SURPRISING = 0.1
+"""Probability of an end above which it is a surprise that an episode goes on."""
 _ACTIVE = 0.5
 """Probability above which a cause is held to be active where causes of two outcomes are."""
 
@@ -168,6 +170,8 @@ class OutcomeModel:
         """Reward of each outcome that causes were learned of. Shape (O,)."""
         self.ends: Floats = np.zeros(0)
         """1 for each of them that ends the episode, else 0. Shape (O,)."""
+        self._going_on: set[float] = set()
+        """Numbers of codes in which the present episode went on."""
 
     def add(self, row: CodeTransition) -> None:
         """Take in one transition; :meth:`fit` learns from it."""
@@ -270,7 +274,33 @@ class OutcomeModel:
         pairs = _pairs(choices, nexts)
         place = np.minimum(np.searchsorted(self._seen, pairs), len(self._seen) - 1)
         probability += self._brought[np.where(self._seen[place] == pairs, place, -1)]
+        if self._going_on:
+            unseen = self._seen[place] != pairs
+            went_on = unseen & np.isin(nexts, list(self._going_on))
+            probability[went_on[:, None] & (self.ends > 0.0)] = 0.0
         return probability / probability.sum(axis=1, keepdims=True), unknown
+
+    def goes_on(self, code: Code, action: int, following: Code) -> bool:
+        """An episode went on after a transition: believe that nothing unseen that leads there ends it.
+
+        Returns whether that changes predictions. It does not where the transition was seen before, because then chance
+        decides, nor where its end was improbable.
+        """
+        codes, actions, nexts = np.array([code]), np.array([action]), np.array([following])
+        probability, _ = self.predict(codes, actions, nexts)
+        ends = float(probability[0] @ self.ends)
+        choices = np.column_stack([codes, actions]) @ self.conjunctions.choice.strides
+        numbers = nexts @ self.conjunctions.next.strides
+        if _pairs(choices, numbers)[0] in self._seen or not _SURPRISING < ends < 1.0:
+            return False
+        self._going_on.add(float(numbers[0]))
+        return True
+
+    def forget_going_on(self) -> bool:
+        """Forget what :meth:`goes_on` was told; returns whether that changes predictions."""
+        told = bool(self._going_on)
+        self._going_on.clear()
+        return told
 
     def _spared_by(self, conjunctions: _Templates, codes: Ints) -> tuple[Ints, Floats]:
         """The numbers of codes (N, P), and the sums of :attr:`_spared` over the conjunctions that hold in them, (N, O +
