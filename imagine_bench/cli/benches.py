@@ -47,7 +47,7 @@ from imagine_bench.sweep.run import run_study, run_suite
 if TYPE_CHECKING:
     from imagine_bench.report.page import Page
 
-_MOST_SEEDS = 21
+_MOST_SEEDS = 19
 """Where --until-decided stops."""
 
 
@@ -117,7 +117,7 @@ class Budget:
     until_decided: bool = False
     """Add seeds, three at a time, until every headline of the preset is decided; p-values allow for all looks."""
     most_seeds: Count = None
-    """With --until-decided: seeds an agent at most; 21 by default."""
+    """With --until-decided: seeds an agent at most; 19 by default."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,7 +200,7 @@ def carry_out(
         root: The folder of all benches.
         launcher: Carries out the runs.
         until: Whether seeds are added until the headlines are decided.
-        most: With it, seeds an agent at most; 21 by default.
+        most: With it, seeds an agent at most; 19 by default.
         track: Tool for which metrics are also written, as the runs go.
 
     Returns:

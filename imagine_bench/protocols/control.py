@@ -285,10 +285,10 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {
         "agents": ("random", "dqn", "dqn_more_updates", *_THESIS_AGENTS[1:], "factored:given", "oracle"),
-        "seeds": tuple(range(6)), "budgets": (250, 550), "evaluation_episodes": 100,
+        "seeds": tuple(range(6)), "budgets": (250, 400), "evaluation_episodes": 100,
         "few_seeds": {
-            "dqn_more_updates": 15, "imagination": 7, "dqn": 9,
-            "imagination_uncertainty": 1, "factored:given": 2, "random": 2, "oracle": 2,
+            "dqn_more_updates": 10, "imagination": 7, "dqn": 6,
+            "imagination_uncertainty": 1, "factored:given": 1, "random": 1, "oracle": 1,
         },
         "open_loop_starts": 20, "recorded_seeds": 1,
         "headlines": (("imagination", "dqn"), ("imagination", "dqn_more_updates")),

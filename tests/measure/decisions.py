@@ -21,13 +21,14 @@ from imagine_bench.interfaces import Floats
 from imagine_bench.protocols.control import PRESETS, protocol
 from imagine_bench.running.headlines import stages
 from imagine_bench.store.loading import load_so_far
+from imagine_bench.store.results import BenchResult
 
-KEPT = [interval_coverage.RESULTS / f"arrow_puzzle-quick-{name}" for name in ("seeds_552_to_563", "too_few_seeds")]
+KEPT = (interval_coverage.RESULTS / "arrow_puzzle-quick-seeds_570_to_593",)
 PAIRS: Sequence[tuple[str, str]] = PRESETS["quick"]["headlines"]
 _DEFAULT = protocol("arrow_puzzle")
 COUNTS = {agent: len(_DEFAULT.seeds_of(agent)) for pair in PAIRS for agent in pair}
 """Seeds of each agent in the default bench."""
-LOOKS = stages(len(_DEFAULT.seeds), 21)
+LOOKS = stages(len(_DEFAULT.seeds), 19)
 """Seeds of each agent at each look of --until-decided."""
 _LEVEL = 1.0 - statistics.LEVEL
 
@@ -41,11 +42,8 @@ def decided(scores: Mapping[str, Floats], trials: int) -> list[bool]:
 def repetitions(benches: Sequence[Path], draws: int, rng: np.random.Generator) -> dict[str, list[list[bool]]]:
     """Which headlines each repetition decides, of groups that share no seed and of groups drawn with replacement."""
     results = [load_so_far(bench) for bench in benches]
-    trials = results[0].protocol.evaluation_episodes
-    scores = {
-        agent: rng.permutation(np.concatenate([result.success_rates(agent)[:, -1] for result in results]))
-        for agent in COUNTS
-    }
+    trials = min(result.protocol.evaluation_episodes for result in results)
+    scores = {agent: rng.permutation(scores_of(agent, results)) for agent in COUNTS}
     apart = min(len(scores[agent]) // count for agent, count in COUNTS.items())
     groups = {
         "disjoint": [
@@ -57,8 +55,16 @@ def repetitions(benches: Sequence[Path], draws: int, rng: np.random.Generator) -
     return {name: [decided(group, trials) for group in each] for name, each in groups.items()}
 
 
+def scores_of(agent: str, results: Sequence[BenchResult]) -> Floats:
+    """Success rates (seeds,) of an agent after as many episodes as the default bench has, of all benches with it."""
+    with_agent = [result for result in results if agent in result.protocol.agents]
+    last = _DEFAULT.budgets[-1]
+    columns = [result.success_rates(agent)[:, result.protocol.budgets.index(last)] for result in with_agent]
+    return np.concatenate(columns)
+
+
 def cpu_seconds(benches: Sequence[Path]) -> dict[str, float]:
-    """CPU seconds that a run of each agent takes on average, for training and tests."""
+    """CPU seconds that a run of each agent takes on average, for all its training and tests."""
     results = [load_so_far(bench) for bench in benches]
     spent: dict[str, list[float]] = {agent: [] for agent in COUNTS}
     for run in (run for result in results for run in result.runs if run.agent in COUNTS):
