@@ -240,8 +240,7 @@ def test_pages_of_environments_say_what_their_rules_say(page: Path) -> None:
     [
         (
             "README.md",
-            "`dqn_more_updates` {dqn_more_updates}, `imagination` {imagination}, `dqn` {dqn}, "
-            "each other agent one",
+            "`dqn_more_updates` {dqn_more_updates}, `imagination` {imagination}, `dqn` {dqn}, each other agent one",
         ),
         (
             "docs/reference/agents.md",
