@@ -285,6 +285,20 @@ def test_a_test_that_ends_in_another_way_is_excused_only_if_disturbed_replays_do
     assert found.row.vouched.successes == card["vouched"]["successes"] - 1 == 1
 
 
+def test_a_refusal_says_where_another_mujoco_played(row: Path) -> None:
+    card = json.loads((row / CARD).read_text())
+    parts = json.loads((row / EPISODES).read_text())
+    here = card["mujoco"]
+    seal(row, {**card, "mujoco": "3.1.0"}, parts)
+    assert "holds" in str(check(row)[0]), "another version alone is no reason"
+    other_fingerprint(card, parts)
+    seal(row, {**card, "mujoco": "3.1.0"}, parts)
+    hint = f" It was made with MuJoCo '3.1.0', and this is {here}; check it with that version."
+    assert check(row)[0].verdict.complaint.endswith(hint)
+    seal(row, card, parts)
+    assert check(row)[0].verdict.complaint.endswith(" was kept.")
+
+
 def test_a_copied_row_is_said_to_be_one(row: Path) -> None:
     shutil.copytree(row, row.with_name("z-copy"))
     first, second = check(row.parents[1])

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -154,6 +155,7 @@ class MotionRow:
     name: str  #: That of its folder
     protocol: MotionProtocol
     policy_sha256: str = ""  #: In a round, the digest of the policy's file
+    mujoco: str  #: The version of MuJoCo that played, as its author says it
     vouched: MotionFigures
     claimed: Claims
     motions: tuple[Motion, ...] = field(repr=False)
@@ -351,6 +353,7 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
             "format": FORMAT,
             "protocol": dataclasses.asdict(self.protocol),
             "policy_sha256": self._policy_sha256,
+            "mujoco": metadata.version("mujoco"),
             "vouched": dataclasses.asdict(MotionFigures.of(motions)),
             "claimed": dataclasses.asdict(claimed),
             "episodes_sha256": hashlib.sha256(episodes).hexdigest(),
@@ -387,10 +390,12 @@ def read_motions(folder: Path) -> MotionRow:
         vouched: MotionFigures = unpack(MotionFigures, card["vouched"], {})
         claimed: Claims = unpack(Claims, card["claimed"], {})
         policy_sha256 = str(card.get("policy_sha256", ""))
+        mujoco = str(card["mujoco"])
     return MotionRow(
         name=folder.name,
         protocol=protocol,
         policy_sha256=policy_sha256,
+        mujoco=mujoco,
         vouched=vouched,
         claimed=claimed,
         motions=read_episodes(folder, card, _motion_of),
@@ -418,9 +423,17 @@ def check_motions(row: MotionRow, env: gymnasium.Env[Any, Any]) -> MotionRow:
         played = _played(unwrapped, start, kept.commands)
         complaint = _difference(kept, played)
         if complaint and _same_whatever_rounding(unwrapped, start, kept.commands, played):
-            raise ArtefactError(f"test {test}: {complaint}")
+            raise ArtefactError(f"test {test}: {complaint}{_other_mujoco(row)}")
         motions.append(dataclasses.replace(kept, reproducible=False) if complaint else kept)
     return dataclasses.replace(row, motions=tuple(motions), vouched=MotionFigures.of(motions))
+
+
+def _other_mujoco(row: MotionRow) -> str:
+    """A sentence where a row says that another version of MuJoCo played, which can be the reason for a difference."""
+    here = metadata.version("mujoco")
+    if row.mujoco == here:
+        return ""
+    return f" It was made with MuJoCo {brief(row.mujoco)}, and this is {here}; check it with that version."
 
 
 def _difference(kept: Motion, played: Motion | None) -> str:
