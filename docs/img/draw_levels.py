@@ -24,7 +24,7 @@ AGENTS = {
 LINES = {"planner": ("-", "planned"), "clone": ("--", "cloned")}
 """Line of planner and clone, and the word for macro-actions that they carry out."""
 MINUTES = (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
-NOT_RUN = {1: "not run: a clone of one cube; SAC for longer", 3: "not run: SAC on three cubes;\ndqn with today's clone"}
+NOT_RUN = {1: "not run: a clone of one cube; SAC for longer", 3: "not run: SAC on three cubes"}
 FLAT = ("#9a9a9a", "^")
 
 
@@ -48,12 +48,15 @@ def draw(axes: plt.Axes, cubes: int) -> None:
     spec = registry.task("arrow_puzzle" if cubes == 3 else f"arrows:cubes={cubes},horizon=10")
     facts = spec.facts()
     measured = motion.measured(spec.id).get("appearances", {})
+    labels = set()
     for curve in curves(cubes):
         color, marker = AGENTS[curve["agent"]]
         line, word = LINES[curve["execution"]]
         minutes = [point["robot_s"] / 60 for point in curve["curve"]]
         shares = [100 * point["successes"] / point["tests"] for point in curve["curve"]]
         label = f"{curve['agent']}, {word} macro-actions"
+        label = f"_{label}" if label in labels else label  # of several seeds the legend names one
+        labels.add(label)
         face = color if curve["execution"] == "planner" else "white"
         axes.plot(minutes, shares, line, color=color, marker=marker, markerfacecolor=face, markersize=6, label=label)
     axes.axhline(100 * facts.chance_level, color="#9a9a9a", linestyle=":", label="chance, macro-actions at random")
