@@ -315,8 +315,9 @@ def failures(kept: Path) -> dict[str, dict[str, Counter[str]]]:
     """Failed tests of all seeds by agent, budget and cause; of a folder without causes, none."""
     found: dict[str, dict[str, Counter[str]]] = {}
     file = kept / "why.json"
-    for run in json.loads(file.read_text())["runs"] if file.exists() else ():
-        of_agent = found.setdefault(label_today(run["agent"]), {})
+    why = json.loads(file.read_text()) if file.exists() else {"runs": ()}
+    for run in why["runs"]:
+        of_agent = found.setdefault(agent_label(run["agent"], why), {})
         for budget, counts in run["failures"].items():
             now = {FORMER_CAUSES.get(cause, cause): count for cause, count in counts.items()}
             of_agent.setdefault(budget, Counter()).update(now)

@@ -322,16 +322,17 @@ def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
 
 
 def caused(agent: str, episodes: str, cause: str) -> str:
-    """Failed tests of all seeds, or the share of them that has a cause, %. A folder may stand before the agent."""
+    """Failed tests of all seeds, or the share of them that has a cause, %; or the number of seeds.
+
+    A folder may stand before the agent.
+    """
     folder, _, agent = agent.rpartition("/")
-    runs = [
-        run["failures"][episodes]
-        for run in _json(f"{folder or 'arrow_puzzle-mild-why'}/why.json")["runs"]
-        if label_today(run["agent"]) == agent
-    ]
+    kept = _json(f"{folder or 'arrow_puzzle-mild-why'}/why.json")
+    own = [run["failures"] for run in kept["runs"] if agent_label(run["agent"], kept) == agent]
+    runs = [failures[episodes] for failures in own if episodes in failures]
     count = sum(sum(run.values()) for run in runs)
-    if cause == "all":
-        return f"{count:,}"
+    if cause in ("all", "seeds"):
+        return f"{count:,}" if cause == "all" else f"{len(runs)}"
     return percent(sum(run.get(cause, 0) for run in runs) / count) if count else "–"
 
 
