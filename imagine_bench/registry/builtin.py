@@ -61,7 +61,7 @@ AGENTS: dict[str, AgentEntry] = {
         learns=False,
         needs_encoder=False,
         observes=OBSERVATIONS,
-        description="Picks every macro-action by chance: the floor.",
+        description="Picks every macro-action by chance.",
     ),
     "oracle": AgentEntry(
         make="imagine_bench.agents.baselines:make_oracle",
