@@ -80,6 +80,11 @@ MOVED_NAMES = {
     "imagine_bench.agents.factored_own.agent:OwnPerceptionAgent": (
         "imagine_bench_factored.learned:LearnedPerceptionAgent"
     ),
+    "imagine_bench.entrants:Entrant": "imagine_bench.registry.entries:AgentConfiguration",
+    "imagine_bench.entrants:entrant": "imagine_bench.registry.entries:parse_configuration",
+    "imagine_bench.interfaces:Sight": "imagine_bench.interfaces:ObservationModel",
+    "imagine_bench.registry:Entrant": "imagine_bench.registry:AgentConfiguration",
+    "imagine_bench.registry:entrant": "imagine_bench.registry:parse_configuration",
     "imagine_bench.registry:OBSERVERS": "imagine_bench.cli.observers:OBSERVERS",
     "imagine_bench.registry:TASK_TYPES": "imagine_bench.running.bench:TASK_TYPES",
     "imagine_bench.store.archive:load_archive": "imagine_bench.store.loading:load_so_far",

@@ -27,7 +27,7 @@ from imagine_bench.errors import ImagineBenchError, UnknownNameError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 from imagine_bench.protocols.control import protocol
 from imagine_bench.registry import AGENTS, TASKS, WORLD_MODELS
-from imagine_bench.registry.entries import Entrant, entrant
+from imagine_bench.registry.entries import AgentConfiguration, parse_configuration
 from imagine_bench.running.bench import task_types
 from imagine_bench.running.launchers.jobs import LAUNCHERS
 from imagine_bench.store.bench_folder import newest_bench
@@ -293,7 +293,7 @@ def test_describe_says_what_every_setting_means(
             default = dotted(dataclasses.asdict(settings.resolve("fast", {}, group)))
             for head, value in heads:
                 typed = f"{name}{',' if ':' in name else ':'}{head}={value}"
-                assert str(entrant(typed)) == str(Entrant(name, {head: default[head]})), typed
+                assert str(parse_configuration(typed)) == str(AgentConfiguration(name, {head: default[head]})), typed
     assert "controller.epsilon_decay = 0.003 (preset thesis: 0.03; pick_place: 0.001;" in describe("dqn")
     capsys.readouterr()
     assert main(["describe", "dqm"]) == 2

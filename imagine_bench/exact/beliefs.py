@@ -18,7 +18,7 @@ from typing import Any, cast
 import numpy as np
 
 from imagine_bench.errors import ImagineBenchError
-from imagine_bench.interfaces import Outcome, Rules, Sight, State, TaskSpec
+from imagine_bench.interfaces import ObservationModel, Outcome, Rules, State, TaskSpec
 from imagine_bench.rules import RuleTables, horizon_optimum, states_of_play, tabulate
 
 Window = tuple[State, ...]
@@ -37,7 +37,7 @@ class TooManyBeliefsError(ImagineBenchError):
     """There are too many beliefs to enumerate."""
 
 
-def last_step_that_matters(sight: Sight, states: Iterable[State], horizon: int) -> int:
+def last_step_that_matters(sight: ObservationModel, states: Iterable[State], horizon: int) -> int:
     """The first step from which on frames show the same of a macrostate, whichever step it is."""
     states = tuple(states)
     final = [sight.seen(state, horizon) for state in states]
@@ -58,7 +58,7 @@ class BeliefRules:
 
     states = None
 
-    def __init__(self, rules: Rules, sight: Sight, horizon: int) -> None:
+    def __init__(self, rules: Rules, sight: ObservationModel, horizon: int) -> None:
         self._rules = rules
         self._sight = sight
         self.n_actions = rules.n_actions
@@ -153,7 +153,7 @@ class OptimalPolicy:
     macrostates if all is seen from then on (Littman, Cassandra and Kaelbling 1995, QMDP).
     """
 
-    def __init__(self, rules: Rules, sight: Sight | None, horizon: int) -> None:
+    def __init__(self, rules: Rules, sight: ObservationModel | None, horizon: int) -> None:
         self._rules = rules
         self._horizon = horizon
         self._tables = tabulate(rules)

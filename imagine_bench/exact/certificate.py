@@ -15,7 +15,7 @@ from imagine_bench.exact.bound import SHARE, lower_bound
 from imagine_bench.exact.factors import FactorGraph, Machine, Scope, factor_graph, machine
 from imagine_bench.exact.learner import LearnerRun, learn
 from imagine_bench.exact.memoryless import best_without_memory
-from imagine_bench.interfaces import Floats, Rules, Sight, TaskSpec
+from imagine_bench.interfaces import Floats, ObservationModel, Rules, TaskSpec
 from imagine_bench.rules import evaluate, horizon_optimum, shortest_plans, tabulate
 
 _LARGE = 5_000
@@ -164,7 +164,7 @@ def _percent(share: float) -> str:
     return f"{np.floor(share * 1e4 + 1e-3) / 100:.2f} %"
 
 
-def _with_memory(rules: Rules, sight: Sight, horizon: int, seen_optimum: float) -> tuple[float, int | None]:
+def _with_memory(rules: Rules, sight: ObservationModel, horizon: int, seen_optimum: float) -> tuple[float, int | None]:
     """The optimum with memory and the number of beliefs, or the bound that everything seen at once gives."""
     beliefs = BeliefRules(rules, sight, horizon)
     known = beliefs.tables()

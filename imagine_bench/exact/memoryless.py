@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imagine_bench.arrays import Floats, Ints
-from imagine_bench.interfaces import Rules, Sight, State
+from imagine_bench.interfaces import ObservationModel, Rules, State
 
 _Seen = tuple[tuple[State, ...], State]
 """The macrostates whose frames are still to come, the newest last, and the one that is shown now."""
@@ -55,7 +55,7 @@ class _Table:
     following: int  # situations of the next layer
 
 
-def _layers(rules: Rules, sight: Sight, horizon: int) -> Iterator[_Layer]:
+def _layers(rules: Rules, sight: ObservationModel, horizon: int) -> Iterator[_Layer]:
     most: dict[_Seen, float] = defaultdict(float)
     for start in rules.start_states:
         for share, shown in sight.seen(start, 0):
@@ -81,7 +81,7 @@ def _layers(rules: Rules, sight: Sight, horizon: int) -> Iterator[_Layer]:
         most = {then: min(weight, 1.0) for then, weight in after.items()}
 
 
-def _next(rules: Rules, sight: Sight, now: _Seen, action: int, step: int) -> Iterator[tuple[float, _Seen]]:
+def _next(rules: Rules, sight: ObservationModel, now: _Seen, action: int, step: int) -> Iterator[tuple[float, _Seen]]:
     window, shown = now
     frame = step + 1 - sight.lag
     for outcome in rules.outcomes(window[-1], action):
@@ -95,7 +95,7 @@ def _next(rules: Rules, sight: Sight, now: _Seen, action: int, step: int) -> Ite
                 yield outcome.probability * share, (longer[1:] if sight.lag else longer, what)
 
 
-def best_without_memory(rules: Rules, sight: Sight, horizon: int, *, bound: float) -> Memoryless:
+def best_without_memory(rules: Rules, sight: ObservationModel, horizon: int, *, bound: float) -> Memoryless:
     """Solve the programme, or say after :data:`NODES` of the search the best policy found and the bound proved.
 
     ``bound`` is the optimum with memory: a policy without it that reaches it is the best, and where the programme is

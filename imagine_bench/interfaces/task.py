@@ -71,7 +71,7 @@ class PhysicsSettings:
         return cls(**{name: value.item() if isinstance(value, np.generic) else value for name, value in given.items()})
 
 
-class Sight(Protocol):
+class ObservationModel(Protocol):
     """The content of frames for the macrostates of a task, exactly."""
 
     @property
@@ -135,7 +135,7 @@ class TaskSpec:
     success_threshold: float = 0.95  #: success rate, in (0, 1], at which the task counts as learned
     #: the limits that ``check --physics`` compares it with; None for a task whose scene another one measures
     targets: PerformanceTargets | None = None
-    sight: Sight | None = None  #: the content of frames; None: each the whole macrostate of its own moment
+    sight: ObservationModel | None = None  #: the content of frames; None: each the whole macrostate of its own moment
     executions: tuple[str, ...] = EXECUTIONS  #: how macro-actions can happen, the usual way first
 
     def execution(self, asked: str | None) -> str:

@@ -31,7 +31,7 @@ from imagine_bench.interfaces.model import (
 )
 from imagine_bench.judge.predictions import call, imagined_by
 from imagine_bench.judge.reading import RenderedFrameIndex
-from imagine_bench.registry.entries import WorldModelEntry, agent_label, entrant
+from imagine_bench.registry.entries import WorldModelEntry, agent_label, parse_configuration
 from imagine_bench.registry.loading import importable
 from imagine_bench.running.isolation import Isolated
 from imagine_bench.running.trained import KeptAgent, agent_of, imaginer_of, kept_entry, read_agent
@@ -218,8 +218,8 @@ def source_of(
         encoder=path,
         seeds=seeds,
         config_group=spec.config_group,
-        overrides=entrant(name).settings,
-        argument=entrant(name).argument,
+        overrides=parse_configuration(name).settings,
+        argument=parse_configuration(name).argument,
     )
     return ModelSource(name=name, make=entry.make, given=(context,), privileged=False, encoder=path)
 
@@ -303,7 +303,7 @@ def model_entry(model: str) -> WorldModelEntry:
 
 def one_name(model: str) -> str:
     """The same text for the same model, however its settings or the path of its runs were written."""
-    return str(Path(model).resolve()) if runs_of(model) else str(entrant(model))
+    return str(Path(model).resolve()) if runs_of(model) else str(parse_configuration(model))
 
 
 def _visited(run: Path) -> set[tuple[State, int]]:

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from imagine_bench.arrays import Floats, Frame, Ints, State, read_only
-from imagine_bench.interfaces import Sight, TaskSpec
+from imagine_bench.interfaces import ObservationModel, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Imaginer, begin_episode
 from imagine_bench.judge.questions import EvalSet, some_starts
 from imagine_bench.judge.truth import added_up, expected_reward, shares
@@ -95,7 +95,7 @@ def surviving_actions(
     return EvalSet(states=tuple(chosen), frames=frames[:, None], actions=actions, truth=tuple(truth))
 
 
-def _clearest_look(sight: Sight | None, state: State) -> State:
+def _clearest_look(sight: ObservationModel | None, state: State) -> State:
     """The content of an episode's first frame where it hides as little as it can; -1 for the hidden."""
     if sight is None:
         return state
@@ -260,7 +260,7 @@ def imagine_sampled_rollouts(
     return _first_moments(spec, [start], appearance, rng)[0].sampled(agent, seeds)
 
 
-def _in_frames(sight: Sight | None, states: Sequence[State], rng: np.random.Generator) -> Sequence[State]:
+def _in_frames(sight: ObservationModel | None, states: Sequence[State], rng: np.random.Generator) -> Sequence[State]:
     """The content of the agent's frame in each macrostate of an episode; -1 for a hidden coordinate."""
     if sight is None:
         return states

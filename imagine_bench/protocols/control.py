@@ -25,8 +25,8 @@ from imagine_bench.interfaces import (
     appearance_of_tests,
 )
 from imagine_bench.protocols.data import (
-    LATER,
     MOST,
+    OPTIONAL_IN_HASH,
     ProtocolData,
     RunSpec,
     require_different,
@@ -42,7 +42,7 @@ from imagine_bench.registry import (
 )
 from imagine_bench.registry import task_name as canonical
 from imagine_bench.registry.by_value import CodeByValue
-from imagine_bench.registry.entries import entrant
+from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.seeding import SeedTree
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
@@ -76,12 +76,12 @@ class WorldSection:
     appearance: str = "clean"  #: As :func:`imagine_bench.appearance.appearance_name` gives it
     #: The physics of grasping: settings of :class:`.PhysicsSettings` that are not the scene's own, as sorted
     #: (name, value) pairs.
-    physics: tuple[tuple[str, float | str], ...] = field(default=(), metadata=LATER)
+    physics: tuple[tuple[str, float | str], ...] = field(default=(), metadata=OPTIONAL_IN_HASH)
     #: The observation of agents: parts of :data:`.interfaces.OBSERVATIONS`, separated by commas.
-    observation: str = field(default=OBSERVATIONS[0], metadata=LATER)
-    observation_size: int = field(default=FRAME_PX, metadata=LATER)  #: Edge of its images in pixels
+    observation: str = field(default=OBSERVATIONS[0], metadata=OPTIONAL_IN_HASH)
+    observation_size: int = field(default=FRAME_PX, metadata=OPTIONAL_IN_HASH)  #: Edge of its images in pixels
     #: Training and tests start from different macrostates, ``"plan_length=2@<12 hex digits>"``: see :mod:`.splits`.
-    split: str | None = field(default=None, metadata=LATER)
+    split: str | None = field(default=None, metadata=OPTIONAL_IN_HASH)
 
     def _check_world(self) -> None:
         """Write each choice in one way. Raises InvalidValueError or UnknownNameError for a value out of range."""
@@ -129,7 +129,7 @@ class LearnerSection:
     #: That of the encoder for the agents that see codes of parts; None if there is no such agent.
     codes: str | None = None
     #: Digest of the code of each agent that was registered as a class or a function (:mod:`.by_value`), by its name.
-    code: tuple[tuple[str, str], ...] = field(default=(), metadata=LATER)
+    code: tuple[tuple[str, str], ...] = field(default=(), metadata=OPTIONAL_IN_HASH)
 
     def encoder_of(self, kind: str) -> str | None:
         """Return the identity of the encoder for the agents that take this kind."""
@@ -148,19 +148,19 @@ class BudgetSection:
     after_episodes: int = _AFTER_EPISODES  #: Real training episodes on each of them
     #: Whether learners are not told that another task begins: the rules change within one run, and episodes are counted
     #: on. No knowledge is carried over on purpose, so any learner takes it.
-    unannounced: bool = field(default=False, metadata=LATER)
+    unannounced: bool = field(default=False, metadata=OPTIONAL_IN_HASH)
     #: Training episodes, the first ones, that the bench's demonstrator plays while learners merely observe; they are
     #: real episodes as any, and budgets count them.
     demonstrations: int = 0
     queries: int = 0  #: Most oracle queries of a learner in a training episode
     #: The first training episodes are those of a dataset, ``"<policy>-<episodes>@<12 hex digits of its content>"``;
     #: they are real episodes as any, and budgets count them.
-    dataset: str | None = field(default=None, metadata=LATER)
+    dataset: str | None = field(default=None, metadata=OPTIONAL_IN_HASH)
     #: Reward on top of the world's own for a macro-action of its own that an optimal agent could have chosen, and less
     #: for another: a teacher's feedback in training. Demonstrations and earlier tasks get none.
-    feedback: float = field(default=0.0, metadata=LATER)
+    feedback: float = field(default=0.0, metadata=OPTIONAL_IN_HASH)
     #: Probability with which the teacher says the opposite, at most 0.5.
-    feedback_error: float = field(default=0.0, metadata=LATER)
+    feedback_error: float = field(default=0.0, metadata=OPTIONAL_IN_HASH)
 
     def _check_budget(self) -> None:
         """Raise InvalidValueError for a value out of range, and for two that exclude each other."""
@@ -192,21 +192,21 @@ class EvaluationSection:
 
     evaluation_episodes: int = 200  #: Greedy test episodes at each budget, the same starts for every agent
     #: Appearance of the tests where it is another one than the training's.
-    test_appearance: str | None = field(default=None, metadata=LATER)
+    test_appearance: str | None = field(default=None, metadata=OPTIONAL_IN_HASH)
     #: Real frames from which open-loop imagination is compared with the rules at each budget.
     open_loop_starts: int = 100
     #: Futures that benches of before 2026-11-25 sampled; nothing reads it now.
     sampled_futures: int = 0
     recorded_episodes: int = 5  #: Real episodes in each recording; 0 records none
     #: Of how many seeds runs are recorded, the first ones; 0 for all
-    recorded_seeds: int = field(default=0, metadata=LATER)
+    recorded_seeds: int = field(default=0, metadata=OPTIONAL_IN_HASH)
     #: Comparisons declared beforehand: an agent, and the agent that it should beat at the last budget. Their p-values
     #: are corrected for one another alone.
-    headlines: tuple[tuple[str, str], ...] = field(default=(), metadata=LATER)
+    headlines: tuple[tuple[str, str], ...] = field(default=(), metadata=OPTIONAL_IN_HASH)
     #: How often the headlines are tested at most, with more seeds each time: see :mod:`.running.headlines`.
-    most_looks: int = field(default=1, metadata=LATER)
+    most_looks: int = field(default=1, metadata=OPTIONAL_IN_HASH)
     #: Agents of which fewer seeds are run, each with its last seed.
-    few_seeds: tuple[tuple[str, int], ...] = field(default=(), metadata=LATER)
+    few_seeds: tuple[tuple[str, int], ...] = field(default=(), metadata=OPTIONAL_IN_HASH)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,7 +217,7 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
     A new option is a field of one section, checked there. Files and hashes have all fields side by side.
     """
 
-    agents: tuple[str, ...] = _ALL_AGENTS  #: Entrants: agents, also with settings of their own (:mod:`.entries`)
+    agents: tuple[str, ...] = _ALL_AGENTS  #: Agents, also with settings of their own (:mod:`.entries`)
     seeds: tuple[int, ...] = (0, 1, 2)
 
     def __post_init__(self) -> None:
@@ -375,13 +375,13 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
 
 def registered_code(agents: Iterable[str]) -> tuple[tuple[str, str], ...]:
     """The digests of the agents' code, as :attr:`LearnerSection.code` has them."""
-    made_by = {entrant(agent).agent: agent_entry(agent).make for agent in agents}
+    made_by = {parse_configuration(agent).agent: agent_entry(agent).make for agent in agents}
     return tuple(sorted((name, make.digest) for name, make in made_by.items() if isinstance(make, CodeByValue)))
 
 
 def _require_same_code(agent: str, protocol: Protocol) -> None:
     """Raise ArtefactError if an agent's class is not the one of the protocol."""
-    name = entrant(agent).agent
+    name = parse_configuration(agent).agent
     wanted = dict(protocol.code).get(name)
     found = dict(registered_code([agent])).get(name)
     if wanted != found:
@@ -453,7 +453,7 @@ def context_of(spec: RunSpec[Protocol]) -> AgentContext:
         config_group=protocol.config_group,
         hyperparameters=protocol.hyperparameters,
         overrides=own_settings(spec.agent, dict(protocol.overrides)),
-        argument=entrant(spec.agent).argument,
+        argument=parse_configuration(spec.agent).argument,
         device=protocol.device,
         optimal_policy=optimal_policy_of(world) if entry.privileged else None,
         exact_world=ExactWorld.of(world, protocol.appearance) if entry.privileged else None,

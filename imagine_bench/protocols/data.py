@@ -20,14 +20,14 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import DEVICES
-from imagine_bench.registry.entries import FIRST, TODAY, agent_label, edition_of, entrant, name_in_edition_1
+from imagine_bench.registry.entries import FIRST, TODAY, agent_label, edition_of, name_in_edition_1, parse_configuration
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
 from imagine_bench.values import Json, Setting, has_switch, kind_in_words
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-LATER: Mapping[str, bool] = {"later": True}
+OPTIONAL_IN_HASH: Mapping[str, bool] = {"later": True}
 """Metadata of a field that protocols did not always have: at its default it changes no hash."""
 MOST = 10_000_000
 """Episodes, budgets and the like; a real robot lives to see a thousandth of it."""
@@ -56,7 +56,7 @@ class ProtocolData(ABC):
     device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it
     #: Edition of agents' names that files and the hash of this protocol have; ``agents`` are today's labels in any.
     #: A file says it only where names would be taken for older ones without it. See :mod:`.registry.entries`.
-    agent_names: int = field(default=TODAY, metadata=LATER)
+    agent_names: int = field(default=TODAY, metadata=OPTIONAL_IN_HASH)
 
     def __post_init__(self) -> None:
         """Lists become tuples, and agents and seeds are written in one way: the same comparison has one hash.
@@ -65,15 +65,15 @@ class ProtocolData(ABC):
             InvalidValueError: A value of another type than its field's, or out of range.
         """
         require_types(self)
-        object.__setattr__(self, "agents", tuple(str(entrant(agent)) for agent in self.agents))
+        object.__setattr__(self, "agents", tuple(str(parse_configuration(agent)) for agent in self.agents))
         require_known("device", self.device, DEVICES)
         require_seeds(self.seeds)
         object.__setattr__(self, "seeds", tuple(sorted(self.seeds)))
         require_different("agents", self.agents)
 
     def as_dict(self) -> dict[str, Json]:
-        """A JSON-serialisable copy; fields marked :data:`LATER` are in it where they say something."""
-        later = {field.name: field.default for field in dataclasses.fields(self) if field.metadata == LATER}
+        """A JSON-serialisable copy; fields marked :data:`OPTIONAL_IN_HASH` are in it where they say something."""
+        later = {field.name: field.default for field in dataclasses.fields(self) if field.metadata == OPTIONAL_IN_HASH}
         values = {n: value for n, value in dataclasses.asdict(self).items() if n not in later or value != later[n]}
         values.pop("agent_names", None)
         values["agents"] = [self.written_name(agent) for agent in self.agents]

@@ -16,13 +16,13 @@ from imagine_bench.interfaces.regression import RegressionSpec, Regressor, Regre
 from imagine_bench.registry.builtin import AGENTS, DEMONSTRATOR, PLAYERS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
 from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import (
+    AgentConfiguration,
     AgentEntry,
     EncoderEntry,
-    Entrant,
     RegressorEntry,
     TaskEntry,
     WorldModelEntry,
-    entrant,
+    parse_configuration,
     parse_options,
     read_mapping,
 )
@@ -177,18 +177,22 @@ def task_of_motion(name: str) -> str | None:
 
 
 def agent_entry(name: str) -> AgentEntry:
-    """The registry line of an agent, this suite's or an installed package's; an entrant's title says its settings.
+    """The registry line of an agent, this suite's or an installed package's; the title says the settings of its own.
 
     Raises:
         UnknownNameError: No such agent.
         InvalidValueError: The name is a prefix without an argument, or an argument follows that is none.
         SetupError: As :func:`task_entry`.
     """
-    return _entrant_entry(name, AGENTS, AGENT_GROUP)
+    return _configured_entry(name, AGENTS, AGENT_GROUP)
 
 
-def _entrant_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
-    one = entrant(name) if isinstance(name, str) and name not in offers(group) else Entrant(name, {})
+def _configured_entry(name: str, own: Mapping[str, Any], group: str) -> Any:
+    one = (
+        parse_configuration(name)
+        if isinstance(name, str) and name not in offers(group)
+        else AgentConfiguration(name, {})
+    )
     entry = _named_entry(one, own, group)
     if not one.settings:
         return entry
@@ -207,7 +211,7 @@ def _prefixes(group: str) -> Mapping[str, Any]:
     return {**offers(group), **(PLAYERS if group == AGENT_GROUP else {})}
 
 
-def _named_entry(one: Entrant, own: Mapping[str, Any], group: str) -> Any:
+def _named_entry(one: AgentConfiguration, own: Mapping[str, Any], group: str) -> Any:
     """The entry of a name; of a prefix and an argument its title says both."""
     known = {**own, **_prefixes(group)}
     prefix, colon, argument = one.agent.partition(":") if isinstance(one.agent, str) else (one.agent, "", "")
@@ -235,7 +239,7 @@ def spelled(name: str, group: str) -> str:
     """
     if not isinstance(name, str) or ":" not in name:
         return name
-    one = entrant(name)
+    one = parse_configuration(name)
     prefix = one.agent.partition(":")[0]
     target = getattr(_prefixes(group).get(prefix), "argument", "")
     if not target:
@@ -251,12 +255,12 @@ def setting_names(agent: str) -> frozenset[str]:
 
 
 def own_settings(agent: str, overrides: Mapping[str, Setting]) -> dict[str, Setting]:
-    """Those of a protocol's overrides that this agent has settings for, and above them those of an entrant's own.
+    """Those of a protocol's overrides that this agent has settings for, and above them those in the agent's name.
 
     Raises:
-        UnknownNameError: The agent has no setting that the entrant's name gives it.
+        UnknownNameError: The agent has no setting that its name gives it.
     """
-    own = entrant(agent).settings
+    own = parse_configuration(agent).settings
     names = setting_names(agent) if overrides or own else frozenset()
     for name in own:
         require_known("setting", name, sorted(names))
@@ -329,8 +333,8 @@ def regression(name: str) -> RegressionSpec:
 
 
 def regressor_entry(name: str) -> RegressorEntry:
-    """The registry line of a regressor; an entrant's title says its settings. Raises as :func:`agent_entry`."""
-    return _entrant_entry(name, REGRESSORS, REGRESSOR_GROUP)
+    """The registry line of a regressor; the title says the settings of its own. Raises as :func:`agent_entry`."""
+    return _configured_entry(name, REGRESSORS, REGRESSOR_GROUP)
 
 
 def world_models() -> dict[str, WorldModelEntry]:
@@ -346,8 +350,8 @@ def world_model_entry(name: str) -> WorldModelEntry:
         InvalidValueError: It takes no settings and is given some.
         SetupError: As :func:`task_entry`.
     """
-    entry: WorldModelEntry = _entrant_entry(name, WORLD_MODELS, WORLD_MODEL_GROUP)
-    one = entrant(name)
+    entry: WorldModelEntry = _configured_entry(name, WORLD_MODELS, WORLD_MODEL_GROUP)
+    one = parse_configuration(name)
     if one.settings and not entry.settings:
         raise InvalidValueError(
             f"World model {one.agent} takes no settings; leave out {brief(name[len(one.agent) :])}."

@@ -1,9 +1,9 @@
-"""Registry entries; and entrants of a bench: an agent, ``dqn``, or ``dqn:controller.discount=0.99``.
+"""Registry entries; and the agent configurations of a bench: an agent, ``dqn``, or ``dqn:controller.discount=0.99``.
 
 An agent that comes in variants has a registered name for each, such as ``factored:given``; settings follow after a
 comma: ``factored:given,planning.depth=1``. A package may offer a prefix, after which an argument follows, such as
-``program:FILE.py``. The text is an entrant's name in protocols, tables and files; one agent, regressor or world model
-may enter with several settings.
+``program:FILE.py``. The text is the configuration's name in protocols, tables and files; one agent, regressor or world
+model may enter with several settings.
 """
 
 from __future__ import annotations
@@ -133,14 +133,14 @@ class WorldModelEntry:
         return f"{plain(self.title)} (privileged)" if self.privileged else plain(self.title)
 
 
-class Entrant(NamedTuple):
+class AgentConfiguration(NamedTuple):
     """An agent and the settings that it alone has in a bench."""
 
     agent: str  #: registered name, or a registered prefix, a colon and an argument
     settings: Mapping[str, Setting]  #: by dotted name, in the order of names
 
     def __str__(self) -> str:
-        """The one name of this entrant, however its settings were written."""
+        """The one name of this parse_configuration, however its settings were written."""
         if not self.settings:
             return self.agent
         settings = ",".join(f"{name}={_text(value)}" for name, value in self.settings.items())
@@ -159,13 +159,13 @@ class Entrant(NamedTuple):
         return ", ".join(f"{name} {_text(value)}" for name, value in zip(names, self.settings.values(), strict=True))
 
 
-def entrant(text: str) -> Entrant:
-    """Undo ``str(entrant)``. Raises InvalidValueError: settings that are none, or one that is given twice."""
+def parse_configuration(text: str) -> AgentConfiguration:
+    """Undo ``str(configuration)``. Raises InvalidValueError: settings that are none, or one that is given twice."""
     agent, colon, rest = text.partition(":")
     words = _BETWEEN.split(rest) if colon else []
     if words and words[0] and "=" not in words[0]:
         agent = f"{agent}:{words.pop(0)}"
-    return Entrant(agent, dict(parse_settings(words, f"Agent {text!r}:")))
+    return AgentConfiguration(agent, dict(parse_settings(words, f"Agent {text!r}:")))
 
 
 def players_named(name: str, description: str) -> dict[str, AgentEntry]:
@@ -230,7 +230,7 @@ def _texts(pairs: Sequence[str], where: str) -> dict[str, str]:
 
 
 def file_name(text: str) -> str:
-    """An entrant's name as a file or folder may have it on any system; of different entrants, different ones."""
+    """A configuration's name as a file or folder may have it on any system; of different ones, different names."""
     safe = re.sub(r"[^\w.,=-]", "-", text, flags=re.ASCII)
     if safe == text.replace(":", "-", 1) and len(safe) <= _LONGEST:
         return safe
@@ -281,5 +281,5 @@ def agent_label(name: str, protocol: Mapping[str, object]) -> str:
 
 
 def _renamed(name: str, table: Mapping[str, str]) -> str:
-    one = entrant(name)
-    return str(Entrant(table.get(one.agent, one.agent), one.settings))
+    one = parse_configuration(name)
+    return str(AgentConfiguration(table.get(one.agent, one.agent), one.settings))

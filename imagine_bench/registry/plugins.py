@@ -17,7 +17,7 @@ from imagine_bench.registry.entries import (
     RegressorEntry,
     TaskEntry,
     WorldModelEntry,
-    entrant,
+    parse_configuration,
 )
 from imagine_bench.registry.loading import fault, load
 from imagine_bench.registry.packages import (
@@ -124,12 +124,12 @@ def offered(name: str, own: Mapping[str, Any], group: str) -> Any:
 def installed_of(names: Sequence[str], group: str = AGENT_GROUP) -> tuple[tuple[str, ...], str]:
     """The names of a default, without those of this suite's guests that are not installed, and a sentence about these.
 
-    Of the names of an entrant, its agent counts. The sentence is empty where nothing is left out.
+    Of a configuration, its agent counts. The sentence is empty where nothing is left out.
     """
     absent = {}
     for name in names:
-        guest = guest_with(group, entrant(name).agent)
-        if guest is not None and entrant(name).agent not in offers(group):
+        guest = guest_with(group, parse_configuration(name).agent)
+        if guest is not None and parse_configuration(name).agent not in offers(group):
             absent[name] = guest
     installs = "; ".join(dict.fromkeys(guest.install for guest in absent.values()))
     note = f"Left out, as not installed: {', '.join(absent)}. To install: {installs}" if absent else ""

@@ -10,7 +10,7 @@ from typing import Any
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, require_known
 from imagine_bench.protocols.data import ProtocolData, digest, require_different
-from imagine_bench.registry.entries import entrant
+from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.values import Setting
 
 
@@ -51,8 +51,8 @@ class RegressionProtocol(ProtocolData):
         return 110 * len(self.variants)
 
     def overrides_of(self, agent: str) -> dict[str, Setting]:
-        """The settings that replace those of the set for one regressor: the protocol's, above them the entrant's."""
-        return {**dict(self.overrides), **entrant(agent).settings}
+        """The settings that replace those of the set for one regressor: the protocol's, above them its name's."""
+        return {**dict(self.overrides), **parse_configuration(agent).settings}
 
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
@@ -82,7 +82,7 @@ def plan(task: str, preset: str, **changes: Any) -> tuple[RegressionProtocol, di
         given = wanted.overrides_of(agent)
         if target:
             offered[target] = registry.load(target)
-            group = entrant(agent).agent
+            group = parse_configuration(agent).agent
             groups = offered[target].groups
             offered[target].resolve(wanted.hyperparameters, given, group if group in groups else next(iter(groups)))
         elif given:

@@ -193,7 +193,7 @@ def _misread(data: ReportData) -> list[str]:
     """A line an agent whose encoder reads few frames right."""
     lines = []
     for agent in data.result.protocol.agents:
-        words = encoders.doubt(_encoder(data, agent))
+        words = encoders.reading_warning(_encoder(data, agent))
         if words:
             lines.append(f"“{agent}” sees through {words}.")
     return lines

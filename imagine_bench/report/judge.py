@@ -117,7 +117,7 @@ _WORDS = {
     f"chosen on transitions from the data's distribution, so that at most {ALPHA:.0%} are accepted though wrong, in "
     "the mean (conformal risk control). The true shares are enumerated: on the data's distribution, for which this "
     "is proved; for every macro-action in the quarter of the macrostates that the data's policy reaches least; and "
-    "for the transitions of about 40 other policies, in the mean and for the worst. For them nothing is promised.",
+    "for the transitions of about 40 other policies, in the mean and for the worst. For them there is no guarantee.",
     "Does it notice?": f"Random transitions until a detector of surprise says that every macro-action slips with "
     f"probability {SLIP}, or that one also has another's effect, at false alarms in {FALSE_ALARMS:.0%} of "
     f"unchanged streams of {LENGTH}; {LENGTH}: never. Counterfactuals: its imagination of two macro-actions with the "

@@ -352,7 +352,7 @@ def carry_out(
 def _say_doubts(needed: Iterable[Encoders]) -> None:
     """Say of each encoder once, through which agents see, if few frames are read right from it."""
     artefacts = {path for paths in needed for kind, path in paths.items() if kind != "dataset" and path is not None}
-    for words in filter(None, map(encoders.doubt, sorted(artefacts))):
+    for words in filter(None, map(encoders.reading_warning, sorted(artefacts))):
         print(f"Note: agents see through {words}.")
 
 

@@ -14,7 +14,7 @@ from imagine_bench.data.folder import read_dataset, require_fits
 from imagine_bench.errors import InvalidValueError, UnknownNameError, brief, plain
 from imagine_bench.protocols.control import PRESETS, Protocol, context_of, protocol, usual_agents
 from imagine_bench.protocols.data import Encoders, RunSpec, TaskType, digest
-from imagine_bench.registry.entries import entrant
+from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.rules import states_of
 from imagine_bench.running import runner
 from imagine_bench.running.run_state import make_env, require_able
@@ -82,7 +82,7 @@ def _require_sound(wanted: Protocol) -> None:
 def _rests_on_others(agent: str) -> bool:
     """Whether code decides that may not be there: a library that is an extra, or a package that offers the agent."""
     entry = registry.agent_entry(agent)
-    is_script = entrant(agent).agent in registry.AGENTS and isinstance(entry.make, str)
+    is_script = parse_configuration(agent).agent in registry.AGENTS and isinstance(entry.make, str)
     return entry.external_training_loop or not (is_script or registry.is_ours(entry.make))
 
 

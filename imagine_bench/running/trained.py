@@ -14,7 +14,7 @@ from imagine_bench.interfaces.capabilities import Imaginer, ModelOnlyTrainer
 from imagine_bench.protocols.control import Protocol, context_of
 from imagine_bench.protocols.data import Result, RunSpec
 from imagine_bench.registry.by_value import CodeByValue
-from imagine_bench.registry.entries import AgentEntry, agent_label, entrant
+from imagine_bench.registry.entries import AgentEntry, agent_label, parse_configuration
 from imagine_bench.registry.loading import importable
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, is_archive, read_control
@@ -110,7 +110,7 @@ def read_agent(folder: Path, *, encoder: str | None = None) -> KeptAgent:
     snapshot = load_newest(folder / run_folder.CHECKPOINTS)
     if snapshot is None:
         raise ArtefactError(f"{folder} has no checkpoint; finish its bench first.")
-    as_it_ran = registry.own_settings(entrant(name).agent, settings)  # whatever presets say by now
+    as_it_ran = registry.own_settings(parse_configuration(name).agent, settings)  # whatever presets say by now
     context = dataclasses.replace(context_of(spec), overrides=as_it_ran)
     if isinstance(make, str):
         make = importable(make)

@@ -188,7 +188,7 @@ def mark(share: float | None) -> str:
     return "" if share is None else f" (encoder reads {share:.1%})"
 
 
-def doubt(path: Path | None) -> str:
+def reading_warning(path: Path | None) -> str:
     """A warning about an encoder from which few frames are read right; empty where its card does not say so."""
     share = low_share(path)
     if path is None or share is None:

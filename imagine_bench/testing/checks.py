@@ -26,7 +26,7 @@ from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge.models import source_of
 from imagine_bench.judge.predictions import call, imagined_by
 from imagine_bench.judge.reading import RenderedFrameIndex
-from imagine_bench.registry.entries import entrant
+from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.rules import facts, states_of
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.evaluation import play
@@ -217,7 +217,7 @@ def checked_agent(name: str, task: str) -> CheckedAgent:
         config_group=spec.config_group,
         hyperparameters="minimal",
         overrides=registry.own_settings(name, {}),
-        argument=entrant(name).argument,
+        argument=parse_configuration(name).argument,
         optimal_policy=optimal_policy_of(spec) if entry.privileged else None,
         exact_world=ExactWorld.of(spec, "clean") if entry.privileged else None,
     )

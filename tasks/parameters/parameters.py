@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 
 from imagine_bench.errors import InvalidValueError, UnknownKeywordError, brief
-from imagine_bench.interfaces import Outcome, Rules, Sight, State
+from imagine_bench.interfaces import ObservationModel, Outcome, Rules, State
 from imagine_bench.rules import optimal_policy, tabulate
 from imagine_bench.values import Setting
 
@@ -52,7 +52,7 @@ class GestureObservation:
     always_shown: Callable[[State], bool]
 
     def seen(self, macrostate: State, step: int) -> tuple[tuple[float, State], ...]:
-        """The content of a frame taken after ``step`` macro-actions may show, as :meth:`.Sight.seen`."""
+        """The content of a frame taken after ``step`` macro-actions may show, as :meth:`.ObservationModel.seen`."""
         shown = self.gesture
         if isinstance(shown, str):
             shown = float(shown == "always" or step == 0)
@@ -62,7 +62,7 @@ class GestureObservation:
         return tuple((share, what) for share, what in both if share)
 
 
-def hides(sight: Sight, macrostate: State, step: int, rng: np.random.Generator) -> bool:
+def hides(sight: ObservationModel, macrostate: State, step: int, rng: np.random.Generator) -> bool:
     """Whether a frame hides the gesture, drawn where that is a matter of chance."""
     seen = sight.seen(macrostate, step)
     which = 0 if len(seen) == 1 else int(rng.random() >= seen[0][0])

@@ -203,7 +203,7 @@ def test_a_verdict_s_p_is_of_the_budgets_that_it_names(many: BenchResult) -> Non
 def test_each_agent_that_sees_through_a_doubtful_encoder_is_named(
     result: BenchResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(encoders, "doubt", lambda path: "fog" if path is None else "a window")
+    monkeypatch.setattr(encoders, "reading_warning", lambda path: "fog" if path is None else "a window")
     said = [line for line in verdict(collect(result)) if " sees through " in line]
     assert [line.split("”")[0][1:] for line in said] == list(result.protocol.agents)
 

@@ -71,7 +71,7 @@ def test_three_cubes_have_the_bundled_one(trained, name):
 def test_an_encoder_that_reads_few_frames_right_is_named(tmp_path, share, doubted):
     path = tmp_path / "theirs.safetensors"
     save_file({"a": np.zeros(1)}, path, {"card": json.dumps({"probe": {"mlp": share}})})
-    words = encoders.doubt(path)
+    words = encoders.reading_warning(path)
     assert bool(words) == doubted
     assert encoders.mark(encoders.low_share(path)) == (f" (encoder reads {share:.1%})" if doubted else "")
     assert not doubted or (f"reads only {share:.1%} of new frames right" in words and "theirs" in words)

@@ -46,7 +46,7 @@ def course(
 
 @dataclass(frozen=True, kw_only=True)
 class Film:
-    """The courses from the start where the model's return and the true one differ most."""
+    """The rollouts from the start where the model's return and the true one differ most."""
 
     start: State
     returns: tuple[float, float]  #: expected in the model and in the truth

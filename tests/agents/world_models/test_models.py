@@ -16,7 +16,7 @@ from imagine_bench import registry
 from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.interfaces.model import Imagined, WorldModel, require_imagined
-from imagine_bench.registry.entries import entrant
+from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
@@ -36,7 +36,7 @@ def made(name: str, task: str = "arrow_puzzle") -> WorldModel:
     path = None if entry.encoder_kind is None else encoders.own(spec, "clean", entry.encoder_kind)
     context = AgentContext(
         n_actions=spec.n_actions, preprocessing=spec.preprocessing, encoder=path, seeds=SeedTree(1000).child("models"),
-        config_group=spec.config_group, overrides=entrant(name).settings,
+        config_group=spec.config_group, overrides=parse_configuration(name).settings,
     )  # fmt: skip
     model: WorldModel = registry.load(entry.make)(context)
     return model

@@ -87,7 +87,7 @@ COUNT_TABLE_OWN = AgentEntry(
     make="imagine_bench_controls.tabular.own:make",
     settings="imagine_bench_controls.tabular.settings:OWN",
     needs_encoder=False,
-    title="count table, own eyes",
+    title="count table, learned perception",
     description="A control: like count table, directed, but it learns to see from its own frames as factored.",
 )
 ELIMINATION = AgentEntry(

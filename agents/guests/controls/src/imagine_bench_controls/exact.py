@@ -33,7 +33,7 @@ _RELATIVE = 0.1
 """An imagined reward may be off by so much, or by that share, and is still right."""
 
 
-class Gallery:
+class LatentCache:
     """Latents of macrostates: frames of them, rendered when first asked for, as the encoder sees them."""
 
     def __init__(self, world: ExactWorld, perception: Perception, seeds: SeedTree) -> None:
@@ -71,7 +71,7 @@ class ExactImaginationAgent(DQN):
         node = seeds.child("imagination")
         self._rules = world.rules
         self._known: dict[tuple[State, int], Sequence[Outcome]] = {}
-        self._gallery = Gallery(world, perception, node.child("gallery"))
+        self._gallery = LatentCache(world, perception, node.child("gallery"))
         self._draws = torch.Generator(device).manual_seed(node.child("rollouts").integer())
         self.visited: deque[State] = deque(maxlen=settings.memory.real)
         self.imagined = ImaginedMemory(settings.memory.imagined, perception.latent_size, device)

@@ -17,7 +17,7 @@ import numpy as np
 from imagine_bench import registry
 from imagine_bench.interfaces import Agent, AgentContext, Observation, TaskSpec, Transition
 from imagine_bench.interfaces.capabilities import FrameReader, OutcomePredictor
-from imagine_bench.registry.entries import entrant
+from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.rules import Rules
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
@@ -89,7 +89,7 @@ def make_agent(name: str, spec: TaskSpec, seed: int, appearance: str = "clean") 
         seeds=SeedTree(seed).child("agent"),
         config_group=spec.config_group,
         overrides=registry.own_settings(name, {}),
-        argument=entrant(name).argument,
+        argument=parse_configuration(name).argument,
     )
     return registry.make_agent(name, context)
 

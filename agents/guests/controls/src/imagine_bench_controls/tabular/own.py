@@ -23,20 +23,20 @@ class OwnCountTableAgent(CountTableAgent):
     settings: OwnCountTableSettings
 
     def __init__(self, n_actions: int, settings: OwnCountTableSettings, seeds: SeedTree) -> None:
-        self.eyes = LearnedPerception(settings.perception, factored=False)
+        self.perception = LearnedPerception(settings.perception, factored=False)
         super().__init__(self._see, n_actions, settings, seeds, directed=True)
         self._happened: list[tuple[float, bool]] = []
         """Reward and end of every remembered transition."""
 
     def _see(self, observation: Observation) -> int:
-        return self.eyes.code(observation.frame)[0]
+        return self.perception.code(observation.frame)[0]
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Remember the frame, find factors anew if that is due, and count."""
-        eyes = self.eyes
-        if not eyes.full:
-            eyes.remember(transition.observation.frame, transition.action, transition.next_observation.frame)
-            if eyes.renew():
+        perception = self.perception
+        if not perception.full:
+            perception.remember(transition.observation.frame, transition.action, transition.next_observation.frame)
+            if perception.renew():
                 self._recount()
             self._happened.append((transition.reward, transition.terminated))
         super().observe(transition, episode=episode)
@@ -45,31 +45,31 @@ class OwnCountTableAgent(CountTableAgent):
         """Count every remembered transition by the codes that its frames have now."""
         self.table.clear()
         self._plans.clear()
-        eyes = self.eyes
-        codes, _ = eyes.codes(np.stack(eyes.frames))
-        happened = zip(eyes.transitions, eyes.actions, self._happened, strict=False)
+        perception = self.perception
+        codes, _ = perception.codes(np.stack(perception.frames))
+        happened = zip(perception.transitions, perception.actions, self._happened, strict=False)
         for (before, after), action, (reward, terminated) in happened:
             self.table.add(codes[before][0], action, codes[after][0], reward, terminated)
 
     def diagnostics(self) -> dict[str, float]:
         """Also its perception."""
-        return {**super().diagnostics(), **self.eyes.diagnostics()}
+        return {**super().diagnostics(), **self.perception.diagnostics()}
 
     def state(self) -> AgentState:
         """A snapshot: also the frames that it remembers."""
         common = super().state()
         happened: Arrays = {
-            "replay/action": np.array(self.eyes.actions, dtype=np.int64),
+            "replay/action": np.array(self.perception.actions, dtype=np.int64),
             "replay/reward": np.array([reward for reward, _ in self._happened], dtype=np.float64),
             "replay/terminated": np.array([ended for _, ended in self._happened], dtype=np.bool_),
         }
-        arrays: Arrays = {**common.arrays, **self.eyes.arrays(), **happened}
-        return AgentState(arrays=arrays, values={**common.values, **self.eyes.values()})
+        arrays: Arrays = {**common.arrays, **self.perception.arrays(), **happened}
+        return AgentState(arrays=arrays, values={**common.values, **self.perception.values()})
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         super().restore(state)
-        self.eyes.load(state)
+        self.perception.load(state)
         columns = (state.arrays[f"replay/{name}"].tolist() for name in ("reward", "terminated"))
         self._happened = list(zip(*columns, strict=True))
 

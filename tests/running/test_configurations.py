@@ -10,7 +10,7 @@ from small_runs import Inline
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.protocols.control import protocol
-from imagine_bench.registry.entries import entrant, file_name
+from imagine_bench.registry.entries import file_name, parse_configuration
 from imagine_bench.report import summary_table
 from imagine_bench.report.figures import color
 from imagine_bench.running.bench import bench, plan
@@ -30,9 +30,9 @@ _FEW = {"budgets": (2,), "evaluation_episodes": 3, "execution": "kinematic", "re
         ('dqn:a.x="0.5",a.y=null', 'dqn:a.x="0.5",a.y=null', 'x "0.5", y null'),
     ],
 )
-def test_an_entrant_has_one_name(text: str, name: str, words: str) -> None:
-    one = entrant(text)
-    assert (str(one), one.words) == (name, words) and entrant(name) == one
+def test_a_configuration_has_one_name(text: str, name: str, words: str) -> None:
+    one = parse_configuration(text)
+    assert (str(one), one.words) == (name, words) and parse_configuration(name) == one
 
 
 @pytest.mark.parametrize("text", ["dqn:", "dqn:controller.discount", "dqn:a=1,a=2"])
@@ -48,7 +48,7 @@ def test_folders_are_safe_and_differ() -> None:
     assert all(len(each) < 120 and not set(each) & set('/\\:*?"<>|[] ') for each in folders)
 
 
-def test_an_entrants_settings_are_its_own_and_checked() -> None:
+def test_a_configurations_settings_are_its_own_and_checked() -> None:
     wanted = protocol("arrow_puzzle", agents=("dqn", SLOW), overrides=(("controller.discount", 0.5),))
     found = resolved_settings(wanted)
     assert found["dqn"]["controller"]["discount"] == 0.5 and found[SLOW]["controller"]["discount"] == 0.99
