@@ -14,6 +14,7 @@ from imagine_bench_factored.settings import HYPERPARAMETERS
 from torch.nn import functional
 
 from imagine_bench.interfaces import Frame, Observation, Transition
+from imagine_bench.interfaces.capabilities import begin_episode
 from imagine_bench.seeding import SeedTree
 
 SIZES = (3, 3, 2)
@@ -116,7 +117,7 @@ def success(learner: FactoredAgent, horizon: int = 6) -> float:
     """Share of starts from which the greedy agent ends well."""
     solved = 0
     for start in starts():
-        learner.begin_episode()
+        begin_episode(learner)
         code = start
         for _ in range(horizon):
             code, reward, ended = step(code, learner.act(Observation(frame=frame(code)), explore=False))
