@@ -100,15 +100,18 @@ def _curves(rows: Sequence[Row]) -> Figure:
 def _motion_cells(row: MotionRow) -> dict[str, str]:
     """The cells of a row of continuous control."""
     tests = row.protocol.tests
-    address = f"{row.name}.html#tests"
-    solved = percent(row.vouched.successes / tests)
-    return {
-        "player (claimed)": row.claimed.agent,
-        "solved, %": Markup('<a href="{}">{}</a>').format(address, solved),
+    vouched = {
+        "solved, %": percent(row.vouched.successes / tests),
         "return": decimals(row.vouched.mean_return),
         "robot seconds a test": decimals(row.vouched.mean_periods / RATE_HZ),
         "faults": f"{row.vouched.faults:,}",
         "not reproducible": f"{row.vouched.not_reproducible:,}",
+    }
+    address = f"{row.name}.html#tests"
+    linked = {name: Markup('<a href="{}">{}</a>').format(address, number) for name, number in vouched.items()}
+    return {
+        "player (claimed)": row.claimed.agent,
+        **linked,
         "tests": f"{tests:,}",
         "starts": row.starts,
         "seen beforehand (claimed)": row.claimed.seen_beforehand,
