@@ -25,6 +25,8 @@ def converted(card: dict[str, Any], logs: list[dict[str, Any]]) -> dict[str, obj
 
     The states after each macro-action follow from the rules, since nothing is drawn.
     """
+    if "motions" in card.get("format", ""):  # rows of continuous control have no macro-actions
+        return None
     spec: TaskSpec = registry.task(card["protocol"]["task"])
     rules = spec.rules
     world = getattr(rules, "world", None)

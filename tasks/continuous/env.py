@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -40,6 +41,16 @@ of planned motions in the arrow puzzle from wherever the hand may be, and twice 
 """
 _LET_GO_M = 0.003
 """A grip is over when each finger is told to be so much further apart than before, and touches nothing."""
+
+
+class Period(NamedTuple):
+    """The outcome of one control period."""
+
+    reward: float
+    terminated: bool
+    truncated: bool
+    success: bool
+    fault: str | None  #: why a change was no macro-action, or how the simulation ended, in words
 
 
 @dataclass
@@ -241,13 +252,23 @@ class MotionEnv(SceneEnv):
         Raises:
             InvalidValueError: As :meth:`step`.
         """
+        period = self.advance(action)
+        info = self._info(success=period.success, fault=period.fault)
+        return period.reward, period.terminated, period.truncated, info
+
+    def advance(self, action: Motion) -> Period:
+        """As :meth:`act`, for replays that read no information: it makes none.
+
+        Raises:
+            InvalidValueError: As :meth:`step`.
+        """
         if not self.begun:
             raise InvalidValueError("There is no episode to go on with; call reset() first.")
         self._simulate(self.checked(action))
         self.episode.periods += 1
         if blew_up(self.data):
             self.begun = False
-            return 0.0, False, True, self._info(success=False, fault="the simulation blew up")
+            return Period(0.0, terminated=False, truncated=True, success=False, fault="the simulation blew up")
         event = self._judge()
         self.world.update()
         reward = 0.0 if event is None else float(event.outcome.reward)
@@ -259,7 +280,7 @@ class MotionEnv(SceneEnv):
         truncated = self.elapsed_s >= self.time_limit_s - self.period_s / 2
         success = event is not None and event.outcome.success
         fault = None if event is None else event.fault
-        return reward, terminated, truncated, self._info(success=success, fault=fault)
+        return Period(reward, terminated=terminated, truncated=truncated, success=success, fault=fault)
 
     def tell_servos(self, action: Motion) -> None:
         """Set the servos' commands to those at the end of a period of an action; nothing is simulated.
@@ -347,9 +368,10 @@ class MotionEnv(SceneEnv):
         data = self.data
         servos = data.ctrl
         columns = self._columns.ctrl
+        step = mujoco.mj_step
         for ctrl in self._servo_commands(action):
             servos[columns] = ctrl
-            mujoco.mj_step(model, data)
+            step(model, data)
 
     def _servo_commands(self, action: Floats) -> Floats:
         """The servos' commands at each step of a period: joints (7,) and fingers, by equal steps."""

@@ -233,6 +233,8 @@ def test_rows_of_the_board_are_converted(tmp_path: Path) -> None:
     assert found["episodes"][0] == {"start": [3, 1, 2, 0], "actions": [0], "states": [[0, 1, 2, 0]], "success": True}
     assert found["episodes"][1]["states"] == [[2, 1, 2, 0], [1, 1, 2, 0]]
     assert json.loads((tmp_path / "out" / "index.json").read_text()) == [["dqn-1", found["title"]]]
+    moved = {**card, "format": "imagine_bench board motions 1", "vouched": {"successes": 2}}
+    assert rows.converted(moved, [{}]) is None
     card["protocol"] = {"task": "arrow_puzzle:slip=0.1"}
     assert rows.converted(card, [{}, log, {}]) is None
 

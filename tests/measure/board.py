@@ -2,8 +2,10 @@
 
     python tests/measure/board.py docs/board
 
-CPU time inside ``mj_step`` is taken at each call. All else that a check does counts beside it: files, the making of the
-environment, servo commands, the macrostate, rewards. (Rows of macro-actions: ``make speed`` has the ratio of one.)
+All that a check does counts: files, the making of the environment, servo commands, the macrostate, rewards. The check
+runs as it is, and again with the CPU time inside ``mj_step`` taken at each call. Reading the clock takes about 1 us, a
+tenth of a step, so the first run has no clock, and the clock's own time is taken off the second's. Both run several
+times by turns, and the least of each counts. (Rows of macro-actions: ``make speed`` has the ratio of one.)
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import argparse
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -25,15 +28,17 @@ from imagine_bench.store.files import read_json
 
 MOST = 1.3
 """The largest ratio that is asked."""
+TIMES = 3
+CLOCK_CALLS = 100_000
 
 
 class StepTime:
     """CPU seconds of this thread in ``mj_step``, and the number of calls."""
 
-    def __init__(self) -> None:
+    def __init__(self, step: Callable[..., None] = mujoco.mj_step) -> None:
         self.cpu_s = 0.0
         self.calls = 0
-        self._step = mujoco.mj_step
+        self._step = step
 
     def __call__(self, *given: Any, **more: Any) -> None:
         begun = time.thread_time()
@@ -47,13 +52,27 @@ def is_of_motions(folder: Path) -> bool:
     return bool(read_json(folder / CARD, "the card of a row")["format"] == FORMAT)
 
 
-def measure(board: Path) -> tuple[list[Checked], float, StepTime]:
-    """The check of a board, its CPU seconds, and those of its steps."""
+def clock_s() -> float:
+    """CPU seconds that :class:`StepTime` counts for a step that does nothing."""
+    nothing = StepTime(lambda *_: None)
+    for _ in range(CLOCK_CALLS):
+        nothing(None, None)
+    return nothing.cpu_s / nothing.calls
+
+
+def check_s(board: Path) -> tuple[list[Checked], float]:
+    """The check of a board, and its CPU seconds."""
+    begun = time.thread_time()
+    found = check(board)
+    return found, time.thread_time() - begun
+
+
+def steps_s(board: Path) -> float:
+    """CPU seconds of ``mj_step`` in the check of a board, without the clock's."""
     steps = StepTime()
     with mock.patch.object(mujoco, "mj_step", steps):
-        begun = time.thread_time()
-        found = check(board)
-        return found, time.thread_time() - begun, steps
+        check(board)
+    return steps.cpu_s - steps.calls * clock_s()
 
 
 def main() -> int:
@@ -65,12 +84,16 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         for row in rows:
             shutil.copytree(row, Path(folder) / ROWS / row.name)
-        found, cpu_s, steps = measure(Path(folder))
+        whole_s = []
+        stepping_s = []
+        for _ in range(TIMES):
+            found, cpu_s = check_s(Path(folder))
+            whole_s.append(cpu_s)
+            stepping_s.append(steps_s(Path(folder)))
     episodes = sum(each.verdict.episodes for each in found)
-    ratio = cpu_s / steps.cpu_s
-    print(
-        f"{len(found)} rows, {episodes:,} episodes, {cpu_s:.1f} CPU s, {ratio:.2f} times mj_step alone; {MOST:g} asked"
-    )
+    ratio = min(whole_s) / min(stepping_s)
+    cost = f"{min(whole_s):.1f} CPU s, {ratio:.2f} times mj_step alone; {MOST:g} asked"
+    print(f"{len(found)} rows, {episodes:,} episodes, {cost}")
     return int(ratio > MOST)
 
 

@@ -25,12 +25,12 @@ WORLD = "arrows:cubes=1"
 TESTS = 4
 
 
-def played(root: Path, **options: Any) -> Path:
+def played(root: Path, name: str = "expert-and-nobody", **options: Any) -> Path:
     """A row whose even tests the expert plays and whose odd ones nobody does: there the hand stays where it is."""
-    env = MotionTests(WORLD, observation="proprio", tests=TESTS, seed=30, **options)
+    env = MotionTests(WORLD, observation="proprio", **{"tests": TESTS, "seed": 30, **options})
     motion: Any = env.unwrapped
     expert = Expert(motion)
-    for test in range(TESTS):
+    for test in range(env.protocol.tests):
         env.reset()
         over = False
         while not over:
@@ -39,7 +39,7 @@ def played(root: Path, **options: Any) -> Path:
             target = expert.act() if test % 2 == 0 else np.append(motion.servo_targets()[:-1], 1.0)
             _, _, terminated, truncated, _ = env.step(target)
             over = terminated or truncated
-    return env.write(root, "expert-and-nobody", agent="expert", author="a founder")
+    return env.write(root, name, agent="expert", author="a founder")
 
 
 @pytest.fixture(scope="module")

@@ -87,12 +87,17 @@ class _Court:
         if read_card(folder).get("format") == motions.FORMAT:
             moved = motions.read_motions(folder)
             read.append(moved)
+            start_seed = self._starts(folder, moved, moved.protocol.tests)
+            of_round = start_seed is None or moved.protocol.seed == start_seed
+            require(of_round, f"its seed is not that of the round {moved.round}.")
             episodes = motions.check_motions(moved, self._motion_env(moved))
             return Verdict(what=moved.name, episodes=episodes, unshown=(*NOT_VOUCHED, *self._moved_alike(moved)))
         row = read_row(folder)
         read.append(row)
         require_whole(row, registry.task(row.protocol.task))
-        starts = self._starts(folder, row)
+        starts = self._starts(folder, row, row.protocol.evaluation_episodes)
+        last_alone = starts is None or len(row.protocol.budgets) == 1
+        require(last_alone, "a row of a round has the tests of one budget, the last.")
         episodes = 0
         for place, figures in enumerate(row.vouched):
             purpose: Purpose = evaluation_split(figures.seed) if starts is None else "board"
@@ -119,21 +124,15 @@ class _Court:
             self._worlds[row.world] = Replays(*self._scope.enter_context(environments(row.protocol, **unseen)))
         return self._worlds[row.world]
 
-    def _starts(self, folder: Path, row: Row) -> int | None:
+    def _starts(self, folder: Path, row: Row | MotionRow, n_tests: int) -> int | None:
         """The seed of the row's round, None without one. Raises ArtefactError: the row is not of that round."""
         if not row.round:
             return None
         round_folder = folder.absolute().parents[1] / rounds.ROUNDS / row.round
         seed, filed = rounds.revealed_seed(round_folder, row.name)
-        agents = {
-            str(figures.seed): price.agent_sha256
-            for figures, price in zip(row.vouched, row.claimed.prices, strict=True)
-        }
-        require(agents == filed, f"its agents are not those that were filed in the round {row.round}.")
+        require(row.agents == filed, f"its agents are not those that were filed in the round {row.round}.")
         tests = rounds.read_round(round_folder).tests
-        wanted = f"it has {row.protocol.evaluation_episodes} tests, and the round {row.round} has {tests}."
-        require(row.protocol.evaluation_episodes == tests, wanted)
-        require(len(row.protocol.budgets) == 1, "a row of a round has the tests of one budget, the last.")
+        require(n_tests == tests, f"it has {n_tests} tests, and the round {row.round} has {tests}.")
         return seed
 
     def _moved_alike(self, row: MotionRow) -> tuple[str, ...]:

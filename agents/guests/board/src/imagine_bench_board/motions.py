@@ -28,10 +28,11 @@ from imagine_bench.errors import ArtefactError, InvalidValueError, brief, requir
 from imagine_bench.protocols.data import require_types
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.seeding import SEEDS, episode_seed
-from imagine_bench.store.files import make_folder, reading, write_bytes, write_json
+from imagine_bench.store.files import make_folder, reading, sha256, write_bytes, write_json
 from imagine_bench.values import Json, unpack
 
-from .rows import CARD, EPISODES, LARGEST, NAME, OPEN, Claims, one_line, read_card
+from .rounds import POLICY, policy_row, read_round, revealed_seed
+from .rows import CARD, EPISODES, LARGEST, NAME, Claims, one_line, read_card, read_episodes, starts_words
 
 if TYPE_CHECKING:
     from imagine_bench.tasks.continuous.env import MotionEnv
@@ -59,19 +60,21 @@ class MotionProtocol:
     placement: float = 0.0  #: How far, in m, objects start off their slots
     seed: int = 0  #: Decides the starts of all tests
     tests: int = 100
+    round: str = ""  #: The round whose starts the tests have; empty for starts that everybody knows
 
     def __post_init__(self) -> None:
         require_types(self)
         if not 1 <= self.tests <= MOST_TESTS or not 0 <= self.seed < SEEDS:
             allowed = f"1 to {MOST_TESTS:,} tests and a seed from 0 to {SEEDS - 1:,}"
             raise InvalidValueError(f"tests is {self.tests} and seed {self.seed}; give {allowed}.")
+        require(not self.round or bool(NAME.fullmatch(self.round)), f"its round is {brief(self.round)}.")
         require("@" not in self.task, "its task names a file; write the world out in one line.")
         object.__setattr__(self, "task", registry.task_name(self.task))
         object.__setattr__(self, "appearance", appearance_name(self.appearance))
 
     def start(self, test: int) -> int:
         """The environment's seed of a test."""
-        return episode_seed("evaluation", self.seed, test)
+        return episode_seed("board" if self.round else "evaluation", self.seed, test)
 
     def make(self, **options: Any) -> gymnasium.Env[Any, Any]:
         """The environment, controlled by joints. Raises whatever :func:`gymnasium.make` does for a wrong value."""
@@ -131,12 +134,25 @@ class MotionRow:
 
     name: str  #: That of its folder
     protocol: MotionProtocol
+    policy_sha256: str = ""  #: In a round, the digest of the policy's file
     vouched: MotionFigures
     claimed: Claims
     motions: tuple[Motion, ...] = field(repr=False)
 
-    starts = OPEN
-    """Rounds have no tests of motions."""
+    @property
+    def round(self) -> str:
+        """The round whose starts its tests have; empty for starts that everybody knows."""
+        return self.protocol.round
+
+    @property
+    def starts(self) -> str:
+        """The kind of starts of its tests."""
+        return starts_words(self.round)
+
+    @property
+    def agents(self) -> dict[str, str]:
+        """The digest of its policy, as a round has it."""
+        return {POLICY: self.policy_sha256}
 
     @property
     def world(self) -> str:
@@ -147,23 +163,23 @@ class MotionRow:
 class _Tally:
     """The facts of an episode while it is played."""
 
-    def __init__(self, info: Info) -> None:
+    def __init__(self, start: Sequence[int]) -> None:
         self.total_reward = 0.0
         self.solved = self.fault = self.over = False
         self.fingerprint = 0
-        self._sign(info, 0.0)
+        self._sign(start, 0.0)
 
-    def add(self, reward: float, terminated: bool, truncated: bool, info: Info) -> None:
-        """Count a control period."""
+    def add(self, reward: float, *, over: bool, success: bool, fault: bool, reached: Sequence[int] | None) -> None:
+        """Count a control period, and the macrostate that its event reached, if there was one."""
         self.total_reward += reward
-        self.solved |= bool(info["is_success"])
-        self.fault |= bool(info["fault"])
-        self.over = terminated or truncated
-        if info["event"]:
-            self._sign(info, reward)
+        self.solved |= success
+        self.fault |= fault
+        self.over = over
+        if reached is not None:
+            self._sign(reached, reward)
 
-    def _sign(self, info: Info, reward: float) -> None:
-        signed = json.dumps([info["macrostate"].tolist(), reward]).encode()
+    def _sign(self, macrostate: Sequence[int], reward: float) -> None:
+        signed = json.dumps([list(map(int, macrostate)), reward]).encode()
         self.fingerprint = zlib.crc32(signed, self.fingerprint)
 
     def motion(self, commands: Floats32) -> Motion:
@@ -193,9 +209,12 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         placement: How far, in m, objects start off their slots.
         seed: Decides the starts of all tests.
         tests: How many tests the row has.
+        round_folder: The folder of a round whose seed is published; ``seed`` and ``tests`` are then those of the round.
+        policy: With a round, the policy's file, as it was filed.
 
     Raises:
         UnknownNameError, InvalidValueError: A value that the environment does not take, or more tests than a row holds.
+        ArtefactError: The seed of the round is not published, or this policy was not filed before.
     """
 
     def __init__(
@@ -210,13 +229,27 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         placement: float = 0.0,
         seed: int = 0,
         tests: int = 100,
+        round_folder: Path | str | None = None,
+        policy: Path | str | None = None,
     ) -> None:
+        self._policy_sha256 = ""
+        self._row = ""
+        if round_folder is not None and policy is not None:
+            folder = Path(round_folder)
+            self._policy_sha256 = sha256(Path(policy))
+            self._row = policy_row(folder, Path(policy))
+            seed, filed = revealed_seed(folder, self._row)
+            require(filed == {POLICY: self._policy_sha256}, f"{policy} is not the file that was filed as {self._row}.")
+            tests = read_round(folder).tests
+        elif round_folder is not None or policy is not None:
+            raise InvalidValueError("A round needs round_folder and policy; give both, or none.")
         self.protocol = MotionProtocol(
             task=registry.task_name(task),
             appearance=appearance_name(appearance),
             placement=placement,
             seed=seed,
             tests=tests,
+            round=Path(round_folder).name if round_folder is not None else "",
         )
         super().__init__(self.protocol.make(observation=observation, size=size, told=told))
         self._motion: MotionEnv = self.env.unwrapped  # type: ignore[assignment]
@@ -235,7 +268,7 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._tally is not None and self._commands:
             raise InvalidValueError(f"Test {len(self.motions)} was left before its end. Make a new MotionTests.")
         observation, info = self.env.reset(seed=self.protocol.start(len(self.motions) % self.protocol.tests))
-        self._tally = _Tally(info) if len(self.motions) < self.protocol.tests else None
+        self._tally = _Tally(info["macrostate"]) if len(self.motions) < self.protocol.tests else None
         self._commands = []
         return observation, info
 
@@ -248,7 +281,13 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, reward, terminated, truncated, info = self.env.step(joints)
         if self._tally is not None:
             self._commands.append(joints)
-            self._tally.add(float(reward), terminated, truncated, info)
+            self._tally.add(
+                float(reward),
+                over=terminated or truncated,
+                success=bool(info["is_success"]),
+                fault=bool(info["fault"]),
+                reached=info["macrostate"] if info["event"] else None,
+            )
             if self._tally.over:
                 self.motions.append(self._tally.motion(np.stack(self._commands)))
                 self._tally = None
@@ -259,7 +298,7 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
 
         Args:
             out: The folder of rows, such as ``docs/board/rows``.
-            name: Of the row.
+            name: Of the row; in a round, the policy file's name without its ending, ``-`` and the round's name.
             agent: Who played.
             **claims: Further fields of :class:`.rows.Claims`: ``author``, ``seen_beforehand``, ``frames_beforehand``.
 
@@ -271,6 +310,8 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         if not NAME.fullmatch(name):
             allowed = "at most 80 of a-z, 0-9 and _.,=-, a letter or digit first, and not index"
             raise InvalidValueError(f"A row cannot be called {brief(name)}; give {allowed}.")
+        if self._row and name != self._row:
+            raise InvalidValueError(f"The policy was filed as {self._row}; give this name.")
         where = Path(out) / name
         if where.exists():
             raise InvalidValueError(f"{where} exists; remove it, or give another name.")
@@ -281,6 +322,7 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         card: dict[str, Json] = {
             "format": FORMAT,
             "protocol": dataclasses.asdict(self.protocol),
+            "policy_sha256": self._policy_sha256,
             "vouched": dataclasses.asdict(MotionFigures.of(self.motions)),
             "claimed": dataclasses.asdict(claimed),
             "episodes_sha256": hashlib.sha256(episodes).hexdigest(),
@@ -315,12 +357,15 @@ def read_motions(folder: Path) -> MotionRow:
         protocol: MotionProtocol = unpack(MotionProtocol, card["protocol"], {})
         vouched: MotionFigures = unpack(MotionFigures, card["vouched"], {})
         claimed: Claims = unpack(Claims, card["claimed"], {})
-    content = (folder / EPISODES).read_bytes()
-    found = hashlib.sha256(content).hexdigest()
-    require(found == card["episodes_sha256"], f"{EPISODES} has the digest {found}, and its card says another.")
-    with reading(folder / EPISODES, "the episodes of a row"):
-        motions = tuple(map(_motion_of, json.loads(content)))
-    return MotionRow(name=folder.name, protocol=protocol, vouched=vouched, claimed=claimed, motions=motions)
+        policy_sha256 = str(card.get("policy_sha256", ""))
+    return MotionRow(
+        name=folder.name,
+        protocol=protocol,
+        policy_sha256=policy_sha256,
+        vouched=vouched,
+        claimed=claimed,
+        motions=read_episodes(folder, card, _motion_of),
+    )
 
 
 def check_motions(row: MotionRow, env: gymnasium.Env[Any, Any]) -> int:
@@ -352,10 +397,18 @@ def _compare(where: str, kept: Motion, played: Motion | None) -> None:
 
 def _played(env: MotionEnv, seed: int, commands: Floats32) -> Motion | None:
     """The episode of some commands, None where it does not end with the last of them, give or take the slack."""
-    _, info = env.reset(seed=seed)
-    tally = _Tally(info)
+    env.restart(seed=seed)
+    episode = env.episode
+    tally = _Tally(episode.macrostate)
     for period in range(len(commands) + SLACK_PERIODS):
-        tally.add(*env.act(commands[min(period, len(commands) - 1)]))
+        found = env.advance(commands[min(period, len(commands) - 1)])
+        tally.add(
+            found.reward,
+            over=found.terminated or found.truncated,
+            success=found.success,
+            fault=found.fault is not None,
+            reached=None if episode.latest is None else episode.macrostate,
+        )
         if tally.over:
             is_near = period + 1 >= len(commands) - SLACK_PERIODS
             return tally.motion(commands) if is_near else None

@@ -194,7 +194,7 @@ def motion_page(row: MotionRow, verdict: str) -> Page:
     ]
     title = f"{row.vouched.successes:,} of {len(episodes):,} tests solved"
     tests = Section(title, answers=[verdict], tables=[Table.of("tests", episodes)])
-    return _page_of(row.name, row.world, [tests], row.claimed, asdict(row.protocol), "")
+    return _page_of(row.name, row.world, [tests], row.claimed, asdict(row.protocol), row.round)
 
 
 def row_page(row: Row, verdict: str) -> Page:

@@ -8,6 +8,7 @@ were there at their time is shown by the history of the repository in which the 
 from __future__ import annotations
 
 import hashlib
+import re
 import secrets
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -26,6 +27,8 @@ ROUNDS = "rounds"
 _ROUND = "round.json"
 _FILED = "filed"
 _REVEALED = "revealed.json"
+POLICY = "policy"
+"""The key of the digest of a policy of continuous control, which is one file; agents of benches have their seeds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,8 +91,11 @@ def read_round(folder: Path) -> Round:
         return Round(**values)
 
 
-def file_agents(folder: Path, row: str, agents: Mapping[int, str]) -> Path:
-    """File the digests of a row's agents, by seed. Raises InvalidValueError: the round is closed, or they are filed."""
+def file_agents(folder: Path, row: str, agents: Mapping[int, str] | Mapping[str, str]) -> Path:
+    """File the digests of a row's agents, by seed, or of its policy's file, as :data:`POLICY`.
+
+    Raises InvalidValueError: the round is closed, or they are filed.
+    """
     closes = read_round(folder).closes
     if today() >= day_of(closes):
         raise InvalidValueError(f"The round {folder.name} closed on {closes}; file in a later one.")
@@ -98,6 +104,11 @@ def file_agents(folder: Path, row: str, agents: Mapping[int, str]) -> Path:
         raise InvalidValueError(f"{path} exists: these agents are filed already.")
     write_json(path, {str(seed): digest for seed, digest in agents.items()})
     return path
+
+
+def policy_row(folder: Path, policy: Path) -> str:
+    """The name of the row of a policy's file in a round: that of the file without its ending, and the round's."""
+    return f"{re.sub('[^a-z0-9_.,=-]', '-', policy.stem.lower())[:60]}-{folder.name}"
 
 
 def reveal(folder: Path, secret: Path) -> str:

@@ -13,10 +13,10 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from imagine_bench.errors import InvalidValueError, brief, require
 from imagine_bench.interfaces import TaskSpec
@@ -26,6 +26,8 @@ from imagine_bench.running.evaluation import EpisodeLog
 from imagine_bench.store.files import make_folder, read_json, reading, write_bytes, write_json
 from imagine_bench.store.results import Checkpoint, KeptEpisodes
 from imagine_bench.values import Json, unpack
+
+T = TypeVar("T")
 
 FORMAT = "imagine_bench board row 1"
 CARD = "card.json"
@@ -126,12 +128,23 @@ class Row:
     @property
     def starts(self) -> str:
         """The kind of starts of its tests."""
-        return f"round {self.round}" if self.round else OPEN
+        return starts_words(self.round)
+
+    @property
+    def agents(self) -> dict[str, str]:
+        """The digest of the agent of each seed, as a round has them."""
+        both = zip(self.vouched, self.claimed.prices, strict=True)
+        return {str(figures.seed): price.agent_sha256 for figures, price in both}
 
     @property
     def world(self) -> str:
         """The world of its tests in words; rows of equal words stand in one table."""
         return world_words(self.protocol)
+
+
+def starts_words(round_name: str) -> str:
+    """The kind of starts of tests: those of a round, or, without one, open starts."""
+    return f"round {round_name}" if round_name else OPEN
 
 
 def one_line(text: object) -> str:
@@ -205,6 +218,15 @@ def read_card(folder: Path) -> dict[str, Any]:
     return card
 
 
+def read_episodes(folder: Path, card: Mapping[str, Any], unpacked: Callable[[dict[str, Any]], T]) -> tuple[T, ...]:
+    """The episodes of a row, each part unpacked. Raises ArtefactError: they are damaged, or not those of the card."""
+    content = (folder / EPISODES).read_bytes()
+    found = hashlib.sha256(content).hexdigest()
+    require(found == card["episodes_sha256"], f"{EPISODES} has the digest {found}, and its card says another.")
+    with reading(folder / EPISODES, "the episodes of a row"):
+        return tuple(map(unpacked, json.loads(content)))
+
+
 def read_row(folder: Path) -> Row:
     """Read a row; nothing is played. Raises ArtefactError: it is damaged, or holds more than a row may."""
     card = read_card(folder)
@@ -218,11 +240,7 @@ def read_row(folder: Path) -> Row:
             require_types(each)
         round_name = str(card["round"])
         require(not round_name or bool(NAME.fullmatch(round_name)), f"its round is {brief(round_name)}.")
-    content = (folder / EPISODES).read_bytes()
-    found = hashlib.sha256(content).hexdigest()
-    require(found == card["episodes_sha256"], f"{EPISODES} has the digest {found}, and its card says another.")
-    with reading(folder / EPISODES, "the episodes of a row"):
-        logs = tuple(map(_log, json.loads(content)))
+    logs = read_episodes(folder, card, _log)
     return Row(name=folder.name, protocol=protocol, round=round_name, vouched=vouched, claimed=claimed, logs=logs)
 
 

@@ -19,6 +19,7 @@ from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, is_archive, read_control
+from imagine_bench.store.files import sha256
 from imagine_bench.store.results import Checkpoint
 
 from . import rounds
@@ -178,7 +179,12 @@ def submit(path: Path, out: Path, *, author: str, round_folder: Path | None, enc
 
 
 def file_agents(path: Path, round_folder: Path) -> list[Path]:
-    """File the agents of a run or a bench in a round. Errors as of :func:`.rounds.file_agents`."""
+    """File the agents of a run or a bench, or the file of a policy of continuous control, in a round.
+
+    Errors as of :func:`.rounds.file_agents`.
+    """
+    if path.is_file():
+        return [rounds.file_agents(round_folder, rounds.policy_row(round_folder, path), {rounds.POLICY: sha256(path)})]
     return [
         rounds.file_agents(round_folder, f"{each.name}-{round_folder.name}", each.digests())
         for each in submitters(path)
