@@ -319,12 +319,16 @@ def evaluate(tables: RuleTables, policy: Floats, horizon: int) -> PolicyValues:
 
 
 def ending(info: Info, *, terminated: bool) -> str:
-    """How an episode ended, in words; ``info`` and ``terminated`` are of its last step."""
+    """How an episode ended, in words; ``info`` and ``terminated`` are of its last step.
+
+    A package's environment need not say why a macro-action went wrong.
+    """
     if info["is_success"]:
         return "solved"
     if terminated:
         return "lost, because the rules forbid the result of the last macro-action"
-    return f"lost, because {info['fault_reason'] or 'no macro-actions are left'}"
+    reason = info.get("fault_reason") or ("of a fault" if info.get("fault") else "no macro-actions are left")
+    return f"lost, because {reason}"
 
 
 def is_random(rules: Rules) -> bool:

@@ -333,7 +333,7 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         ({"set": "controller.discount=0.9"}, "give a mapping of names to values"),
         ({"physics": 3}, "give a mapping of names to values"),
         ({"agents": "dqnn"}, "No agent 'dqnn'"),
-        ({"until_decided": True, "most_seeds": 0}, "give at least 15"),
+        ({"until_decided": True, "most_seeds": 0}, "give at least 10"),
         ({"most_seeds": 3}, "--most-seeds goes with --until-decided"),
     ]
     for options, sentence in wrong:
@@ -394,12 +394,28 @@ def test_an_interrupted_call_says_that_it_goes_on(tmp_path: Path) -> None:
         imagine_bench.bench("arrow_puzzle", agents=[Stopped], out=tmp_path, **_FEW)
 
 
+def test_a_class_without_a_method_is_named_before_anything_is_played(tmp_path: Path) -> None:
+    class Half:
+        def __init__(self, context: Any) -> None: ...
+
+        def act(self, observation: Any, *, explore: bool) -> int:
+            raise RuntimeError("played")
+
+        def observe(self, transition: Any, *, episode: int) -> None: ...
+
+        def state(self) -> None: ...
+
+    sentence = "Half has no method diagnostics and no restore; an agent has act, observe, diagnostics, state, restore."
+    with pytest.raises(ImagineBenchError, match=sentence):
+        imagine_bench.bench("arrow_puzzle", agents=[Half], out=tmp_path, **_FEW)
+
+
 def test_a_class_that_fails_is_named_and_its_log(tmp_path: Path) -> None:
     class Failing(Shifting):
         def act(self, observation: Any, *, explore: bool) -> int:
             raise RuntimeError("boom")
 
-    with pytest.raises(RunFailedError, match=r"Failing seed 0 in arrow_puzzle: RuntimeError: boom Log: .*log.txt"):
+    with pytest.raises(RunFailedError, match=r"Failing seed 0 in arrow_puzzle: RuntimeError: boom. Log: .*log.txt"):
         imagine_bench.bench("arrow_puzzle", agents=[Failing], out=tmp_path, **_FEW)
     with pytest.raises(InvalidValueError, match="cannot be called '<lambda>'"):
         imagine_bench.bench("arrow_puzzle", agents=[lambda context: Shifting(context).act], out=tmp_path, **_FEW)

@@ -261,7 +261,7 @@ class Failure:
 
     def __str__(self) -> str:
         spec = self.job.spec
-        return f"{spec.agent} seed {spec.seed} in {spec.protocol.task}: {self.reason} Log: {self.job.log}"
+        return f"{spec.agent} seed {spec.seed} in {spec.protocol.task}: {self.reason.rstrip('.')}. Log: {self.job.log}"
 
     @property
     def progress(self) -> Progress:

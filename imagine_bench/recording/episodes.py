@@ -135,7 +135,7 @@ class _EpisodeRecorder:
             rewards.append(float(reward))
             done = terminated or truncated
             step = step + 1
-            fault = f" Fault: {info['fault_reason']}." if info["fault"] else ""
+            fault = f" Fault: {info.get('fault_reason', 'not named')}." if info["fault"] else ""
             outcome = f"Done: {names[action]}. Reward {float(reward):+.0f}.{fault}"
             heading = f"### Episode {episode}, after macro-action {step}\n\n{outcome}"
         end = ending(info, terminated=terminated)

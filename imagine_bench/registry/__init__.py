@@ -88,6 +88,9 @@ __all__ = [
     "vector_id",
 ]
 
+_METHODS = ("act", "observe", "diagnostics", "state", "restore")
+"""Of every agent."""
+
 
 def tasks() -> dict[str, TaskEntry]:
     """All control tasks by name, also those of installed packages, without those that cannot be loaded."""
@@ -316,8 +319,18 @@ def task(name: str) -> TaskSpec:
 
 
 def make_agent(name: str, context: AgentContext) -> Agent:
-    """A new agent by its registered name. Raises SetupError: that of a package cannot be made."""
-    return made(f"Agent {name}", agent_entry(name).make, context)
+    """A new agent by its registered name.
+
+    Raises SetupError: that of a package cannot be made, or lacks a method of :class:`~.interfaces.Agent`.
+    """
+    agent: Agent = made(f"Agent {name}", agent_entry(name).make, context)
+    lacking = [method for method in _METHODS if not callable(getattr(agent, method, None))]
+    if lacking:
+        raise SetupError(
+            f"Agent {name} has no method {' and no '.join(lacking)}; an agent has {', '.join(_METHODS)}. A class that "
+            "inherits from imagine_bench.agents.baselines.RandomAgent has them all."
+        )
+    return agent
 
 
 def made(what: str, target: str | CodeByValue, *given: Any) -> Any:

@@ -441,7 +441,7 @@ def walk(spec: TaskSpec, sense: str) -> dict[str, Any]:
             drift_m = max(drift_m, float(np.linalg.norm(off_m[standing, :2], axis=1).max(initial=0.0)))
         lengths.append(length)
         if info["fault"]:
-            faults.append(info["fault_reason"])
+            faults.append(info.get("fault_reason", "not named"))
     env.close()
     done = {"sense": sense, "actions": sum(lengths), "as_ruled": sum(lengths) - len(faults)}
     return {**done, "lengths": lengths, "faults": faults, "drift_mm": 1e3 * drift_m}

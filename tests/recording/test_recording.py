@@ -294,6 +294,8 @@ def test_every_series_has_its_name(imagined: Path) -> None:
         ({"is_success": True}, True, "solved"),
         ({"is_success": False}, True, "lost, because the rules forbid the result of the last macro-action"),
         ({"is_success": False, "fault_reason": ""}, False, "lost, because no macro-actions are left"),
+        ({"is_success": False, "fault": False}, False, "lost, because no macro-actions are left"),
+        ({"is_success": False, "fault": True}, False, "lost, because of a fault"),
         (
             {"is_success": False, "fault_reason": "the simulation blew up"},
             False,

@@ -335,7 +335,7 @@ CALLS = [
     call("bench arrow_puzzle", f"{_BENCHES}.bench", mock.ANY, mock.ANY, root=RUNS, launcher=mock.ANY),
     call("bench arrow_puzzle --out here", f"{_BENCHES}.bench", mock.ANY, mock.ANY, root=HERE, launcher=mock.ANY),
     call("bench arrow_puzzle --track wandb", f"{_BENCHES}.Tracked", mock.ANY, "wandb", "arrow_puzzle"),
-    call("bench arrow_puzzle --until-decided", f"{_BENCHES}.until_decided", mock.ANY, mock.ANY, most=21, root=RUNS),
+    call("bench arrow_puzzle --until-decided", f"{_BENCHES}.until_decided", mock.ANY, mock.ANY, most=19, root=RUNS),
     call(
         "bench arrow_puzzle --until-decided --most-seeds 9 --out here",
         f"{_BENCHES}.until_decided",
