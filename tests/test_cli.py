@@ -212,7 +212,7 @@ def test_a_failing_seed_fails_the_command_and_names_its_log(
     folder = newest_bench(tmp_path)
     assert capsys.readouterr().err.splitlines()[-2:] == [
         "imagine-bench: 1 of 2 runs failed; the same command tries them again and keeps the others.",
-        f"  failing seed 1 in arrow_puzzle: this agent breaks on purpose Log: {folder}/failing/seed_1/log.txt",
+        f"  failing seed 1 in arrow_puzzle: this agent breaks on purpose. Log: {folder}/failing/seed_1/log.txt",
     ]
     assert len(inline.order) == 2
     assert (folder / "failing/seed_0/DONE").exists() and not (folder / "failing/seed_1/DONE").exists()

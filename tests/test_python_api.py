@@ -410,6 +410,31 @@ def test_a_class_without_a_method_is_named_before_anything_is_played(tmp_path: P
         imagine_bench.bench("arrow_puzzle", agents=[Half], out=tmp_path, **_FEW)
 
 
+@pytest.mark.parametrize(("action", "said"), [([1], "[1]"), (1.0, "1.0"), (None, "None")])
+def test_an_action_that_is_no_integer_is_refused(action: object, said: str, tmp_path: Path) -> None:
+    """An array of one number or a float would go through some parts of a bench and stop others."""
+
+    class Odd(Shifting):
+        def act(self, observation: Any, *, explore: bool) -> Any:
+            return np.array(action) if isinstance(action, list) else action
+
+    with pytest.raises(RunFailedError, match=r"The agent gave .* as an action. An action is one integer") as found:
+        imagine_bench.bench("arrow_puzzle", agents=[Odd], out=tmp_path, **_FEW)
+    assert said in str(found.value)
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.uint8, np.array])
+def test_any_single_integer_is_an_action(kind: Callable[[int], Any], tmp_path: Path) -> None:
+    class Wrapped(Shifting):
+        def act(self, observation: Any, *, explore: bool) -> Any:
+            return kind(super().act(observation, explore=explore))
+
+        def observe(self, transition: Any, *, episode: int) -> None:
+            assert type(transition.action) is int
+
+    imagine_bench.bench("arrow_puzzle", agents=[Wrapped], out=tmp_path, **_FEW)
+
+
 def test_a_class_that_fails_is_named_and_its_log(tmp_path: Path) -> None:
     class Failing(Shifting):
         def act(self, observation: Any, *, explore: bool) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import operator
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.arrays import Action, Info, Ints, Observed, State
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.interfaces import Agent, Observation, Rules, Transition
 from imagine_bench.interfaces.capabilities import Label, QueryingAgent, begin_episode
 from imagine_bench.interfaces.environments import Env, Wrapper
@@ -158,7 +159,7 @@ def play(
     while not over:
         if before_acting is not None:
             before_acting(before, info)
-        action = agent.act(before, explore=explore)
+        action = _integer(agent.act(before, explore=explore))
         frame, reward, terminated, truncated, info = env.step(action)
         _require_sound(env, frame, reward)
         after = Observation.of(frame, info, privileged=privileged)
@@ -173,6 +174,16 @@ def play(
         yield transition, info
         before = after
         over = terminated or truncated
+
+
+def _integer(action: int) -> int:
+    """An agent's action as a plain integer. Raises InvalidValueError: it is none, such as a float or an array of one."""
+    try:
+        return operator.index(action)
+    except TypeError as error:
+        raise InvalidValueError(
+            f"The agent gave {brief(action)} as an action. An action is one integer; int(...) makes one."
+        ) from error
 
 
 def _require_sound(env: Env, seen: Observed, reward: SupportsFloat) -> None:
