@@ -313,13 +313,13 @@ def test_the_program_says_which_version_it_is(capsys: pytest.CaptureFixture[str]
     assert capsys.readouterr().out == f"imagine-bench {__version__}\n"
 
 
-def test_who_stops_reading_gets_no_traceback() -> None:
+def test_who_stops_reading_gets_no_traceback_and_no_verdict() -> None:
     command = [sys.executable, "-m", "imagine_bench", "describe"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stderr is not None
         process.stdout.close()
         assert process.stderr.read() == b""
-    assert process.returncode == 0
+    assert process.returncode == 141
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,8 @@ from imagine_bench.version import __version__
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
+CUT_OFF = 141
+"""Exit code where nobody reads the output any more, as shells have it: no verdict was given, so 0 would be false."""
 
 Command = (
     Bench
@@ -291,6 +293,7 @@ def _of_torch(function: str) -> None:
 
 def _carried_out(words: list[str]) -> int:
     command: Command | None = None
+    code = 0
     try:
         if sys.stdout is None:
             raise SetupError("Standard output is closed; open it, or send it to a file or /dev/null.")
@@ -305,6 +308,7 @@ def _carried_out(words: list[str]) -> int:
         return _say(error, error.exit_code)
     except BrokenPipeError:  # the reader has seen enough, as `| head` does; nothing more can be said to it
         _discard_output()
+        code = CUT_OFF
     except OSError as error:
         where = error.filename or "standard output"
         return _say(f"{where} cannot be read or written: {reason(error)}.")
@@ -314,7 +318,7 @@ def _carried_out(words: list[str]) -> int:
         resumes = isinstance(command, Bench | Judge | Sweep)
         then = "goes on from the last checkpoints" if resumes else "begins anew"
         return _say(f"interrupted; the same command {then}.", INTERRUPTED)
-    return 0
+    return code
 
 
 def _words(error: Exception) -> object:

@@ -197,7 +197,8 @@ def _sentence(progress: Progress, spec: RunSpec[ProtocolData]) -> str:
     if progress.phase == "training":
         return f"{who}: {doing}" + (f", last {RECENT} solved {solved}" if solved else "")
     at = f" at {doing}" if progress.episode and progress.phase != "done" else ""
-    return f"{who}: {progress.phase}{at}" + (f", solved {solved}" if solved and at else "")
+    of_tests = solved and at and progress.phase == "testing"
+    return f"{who}: {progress.phase}{at}" + (f", solved {solved}" if of_tests else "")
 
 
 _CHECK_DEVICE = "imagine_bench.agents.encoders.perception:prepare_torch"

@@ -177,7 +177,7 @@ def play(
 
 
 def _integer(action: int) -> int:
-    """An agent's action as a plain integer. Raises InvalidValueError: it is none, such as a float or an array of one."""
+    """An agent's action as a plain integer. Raises InvalidValueError: it is none, such as a float or an array."""
     try:
         return operator.index(action)
     except TypeError as error:

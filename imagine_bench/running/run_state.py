@@ -257,7 +257,7 @@ class Run:
         counters = self.counters
         solved = counters.test.solved if counters.test else ""
         tested = len(counters.rows) if self.entry.learns else min(1, len(counters.rows))
-        recent = [each == "1" for each in solved] or counters.success[-RECENT:]
+        recent = [each == "1" for each in solved] if phase == "testing" else counters.success[-RECENT:]
         where = Progress(
             agent=self.spec.agent,
             seed=self.spec.seed,

@@ -55,6 +55,20 @@ def test_a_minute_shows_each_run_and_its_curve(now_s: list[float], capsys: pytes
     assert curve == "  █▅ table seed 0: training, each 50 episodes"
 
 
+@pytest.mark.parametrize(
+    ("phase", "words"),
+    [("testing", "testing at episode 6 of 9, solved 40 %"), ("recording", "recording at episode 6 of 9")],
+)
+def test_a_share_that_is_solved_is_of_tests_alone(
+    phase: Phase, words: str, now_s: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """While a run is recorded, the share of its last training episodes would look like one of tests."""
+    with ProgressBar(SPECS) as show:
+        now_s[0] = 20.0
+        show(far(0, 4, phase, episode=6, success=0.4))
+    assert capsys.readouterr().err.splitlines()[-1].endswith(words)
+
+
 def test_what_is_counted_says_the_time_gone_and_the_time_left(
     now_s: list[float], capsys: pytest.CaptureFixture[str]
 ) -> None:
