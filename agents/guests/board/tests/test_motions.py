@@ -16,11 +16,12 @@ import pytest
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_board import motions
 from imagine_bench_board.check import NOT_VOUCHED, check
+from imagine_bench_board.commands import board
 from imagine_bench_board.motions import SLACK_PERIODS, MotionRow, MotionTests, read_motions
 from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import CARD, EPISODES, LONGEST
 
-from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.errors import CheckFailedError, InvalidValueError, UnknownNameError
 
 WORLD = "arrows:cubes=1"
 TESTS = 4
@@ -289,18 +290,62 @@ def test_a_test_that_ends_in_another_way_is_excused_only_if_disturbed_replays_do
     assert found.row.vouched.successes == card["vouched"]["successes"] - 1 == 1
 
 
-def test_a_refusal_says_where_another_mujoco_played(row: Path) -> None:
+@pytest.mark.parametrize("version", ["4.0.0", "3.16.0", "3.17.1", "999.0.0"])
+def test_a_row_of_another_mujoco_is_not_vouched_for_and_never_holds(
+    row: Path, version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether the card tells the truth, lies, or names a version that does not exist."""
     card = json.loads((row / CARD).read_text())
     parts = json.loads((row / EPISODES).read_text())
     here = card["mujoco"]
-    seal(row, {**card, "mujoco": "3.1.0"}, parts)
+    seal(row, {**card, "mujoco": version}, parts)
     assert "holds" in str(check(row)[0]), "another version alone is no reason"
     other_fingerprint(card, parts)
-    seal(row, {**card, "mujoco": "3.1.0"}, parts)
-    hint = f" It was made with MuJoCo '3.1.0', and this is {here}; check it with that version."
-    assert check(row)[0].verdict.complaint.endswith(hint)
+    seal(row, {**card, "mujoco": version}, parts)
+    (found,) = check(row)
+    assert found.row is None
+    assert str(found) == (
+        f"{row.name}: not vouched: made with MuJoCo {version}, checked with {here}, where it does not play again; "
+        f"check it with {version} (pip install mujoco=={version})."
+    )
+    page = write_board([found], tmp_path / "page")
+    assert "0 of 1 rows hold" in page.read_text() and not page.with_name(f"{row.name}.html").exists()
+    with pytest.raises(CheckFailedError, match="0 of 1 rows are refused, and 1 cannot be vouched for with this MuJoCo"):
+        board(action="check", path=row, out=tmp_path, closes=None, tests=1, secret=tmp_path, round=None)
+    assert "not vouched: made with" in capsys.readouterr().out
+    monkeypatch.setattr("imagine_bench_board.check.installed_mujoco", lambda: version)
+    (found,) = check(row)
+    assert found.is_refused and ": refused: test 1: its fingerprint is" in str(found), "as before, with its version"
+
+
+@pytest.mark.parametrize("version", ["4.0.0", "999.0.0"])
+@pytest.mark.parametrize("forgery", FORGERIES)
+def test_a_forger_gains_nothing_by_naming_another_mujoco(
+    row: Path, forgery: Callable[[dict[str, Any], list[dict[str, Any]]], None], version: str
+) -> None:
+    card = json.loads((row / CARD).read_text()) | {"mujoco": version}
+    parts = json.loads((row / EPISODES).read_text())
+    forgery(card, parts)
     seal(row, card, parts)
-    assert check(row)[0].verdict.complaint.endswith(" was kept.")
+    (found,) = check(row)
+    assert found.row is None and "holds" not in str(found)
+
+
+def test_what_needs_no_replay_is_refused_whatever_mujoco_made_it(row: Path) -> None:
+    card = json.loads((row / CARD).read_text()) | {"mujoco": "4.0.0"}
+    card["vouched"]["successes"] += 1
+    (row / CARD).write_text(json.dumps(card))
+    assert ": refused: successes is 2, and 3 was kept." in str(check(row)[0])
+
+
+@pytest.mark.parametrize(
+    "version", ["", "4", "4.0", "3.017.0", "3.17.0.0", "4.0.0; rm -r .", "4.0.0\n", "v4.0.0", None]
+)
+def test_a_version_is_written_as_pip_writes_it(row: Path, version: str | None) -> None:
+    card = json.loads((row / CARD).read_text()) | {"mujoco": version}
+    (row / CARD).write_text(json.dumps(card))
+    (found,) = check(row)
+    assert found.is_refused and "and no version such as 3.17.0." in str(found)
 
 
 def test_a_copied_row_is_said_to_be_one(row: Path) -> None:

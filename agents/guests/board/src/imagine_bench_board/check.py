@@ -6,6 +6,7 @@ import functools
 import hashlib
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -35,21 +36,36 @@ NEVER_SHOWN = (
 )
 
 
+class OtherMujoco(Verdict):
+    """That on a row that does not play again here, and whose card names another version of MuJoCo."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Checked:
     """A row and its verdict."""
 
     verdict: Verdict
-    row: Row | MotionRow | None = None  #: None where it was refused
+    row: Row | MotionRow | None = None  #: None where it was refused, or is not vouched for with this MuJoCo
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether it is wrong whatever version of MuJoCo made it, or by the version that its card names."""
+        return self.row is None and not isinstance(self.verdict, OtherMujoco)
 
     def __str__(self) -> str:
         if self.row is None:
-            return f"{self.verdict.what}: refused: {self.verdict.complaint}"
+            kind = "refused" if self.is_refused else "not vouched"
+            return f"{self.verdict.what}: {kind}: {self.verdict.complaint}"
         claims = ", ".join(self.verdict.unshown)
         played = f"{self.verdict.episodes:,} episodes played again"
         if isinstance(self.row, MotionRow) and self.row.vouched.not_reproducible:
             played += f", {self.row.vouched.not_reproducible:,} not reproducible and counted as failed"
         return f"{self.row.name}: holds in {self.row.world}; {self.row.starts}; {played}; not vouched: {claims}"
+
+
+def installed_mujoco() -> str:
+    """The version of MuJoCo that plays here."""
+    return metadata.version("mujoco")
 
 
 def row_folders(board: Path) -> list[Path]:
@@ -92,7 +108,15 @@ class _Court:
             start_seed = self._starts(folder, moved, moved.protocol.tests)
             of_round = start_seed is None or moved.protocol.seed == start_seed
             require(of_round, f"its seed is not that of the round {moved.round}.")
-            read[0] = motions.check_motions(moved, self._motion_env(moved))
+            try:
+                read[0] = motions.check_motions(moved, self._motion_env(moved))
+            except motions.ReplayError:
+                here = installed_mujoco()
+                if moved.mujoco == here:
+                    raise
+                made = f"made with MuJoCo {moved.mujoco}, checked with {here}"
+                remedy = f"check it with {moved.mujoco} (pip install mujoco=={moved.mujoco})."
+                return OtherMujoco(what=moved.name, complaint=f"{made}, where it does not play again; {remedy}")
             episodes = moved.protocol.tests
             return Verdict(what=moved.name, episodes=episodes, unshown=(*NOT_VOUCHED, *self._moved_alike(moved)))
         row = read_row(folder)

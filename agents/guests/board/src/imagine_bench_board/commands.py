@@ -28,7 +28,7 @@ def board(
     """Carry out an action on a board, a row or a round, and print its result.
 
     Raises:
-        CheckFailedError: A row is refused.
+        CheckFailedError: A row is refused, or was made with another MuJoCo and does not play again with this one.
         InvalidValueError: The action needs an option that was not given.
     """
     match action:
@@ -54,9 +54,11 @@ def _check(path: Path, page: Path | None) -> None:
     print(*found, NEVER_SHOWN, cost(verdicts, time.process_time() - begun_s), sep="\n")
     if page is not None:
         print(f"Page: {write_board(found, page)}")
-    refused = sum(bool(each.complaint) for each in verdicts)
-    if refused:
-        raise CheckFailedError(f"{refused} of {len(verdicts)} rows are refused; see above.")
+    refused = sum(each.is_refused for each in found)
+    elsewhere = sum(each.row is None for each in found) - refused
+    if refused or elsewhere:
+        more = f", and {elsewhere} cannot be vouched for with this MuJoCo" if elsewhere else ""
+        raise CheckFailedError(f"{refused} of {len(verdicts)} rows are refused{more}; see above.")
 
 
 def daily(date: str | None, secret: str) -> str:

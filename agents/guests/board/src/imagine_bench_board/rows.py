@@ -38,6 +38,8 @@ ROWS = "rows"
 """The folder of a board that holds its rows."""
 LARGEST = {CARD: 1 << 18, EPISODES: 1 << 24}
 """The files of a row, and the most bytes that each may have."""
+VERSION = re.compile(r"(0|[1-9][0-9]{0,3})(\.(0|[1-9][0-9]{0,3})){2}(\.(dev|post)[1-9][0-9]{0,11})?")
+"""A release of MuJoCo, in the one way that pip writes it."""
 NAME = re.compile(r"(?!index$)[a-z0-9][a-z0-9_.,=-]{0,79}")
 """Names of rows and rounds: of characters that every file system and every address on the web takes as they are. The
 page of a row called index would replace that of the board."""
