@@ -1,11 +1,19 @@
-"""Rows of the board as the page plays them: the test episodes of each row's first run at its largest budget."""
+"""Rows of the board as the page plays them: the test episodes of each row's first run at its largest budget.
+
+A row of continuous control is played again in physics. Each of its events is a turn of the rules, and is shown as one.
+"""
 
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from imagine_bench.tasks.continuous.env import MotionEnv
+from imagine_bench_board import motions
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Rules, TaskSpec
@@ -20,17 +28,20 @@ def _after(rules: Rules, state: tuple[int, ...], action: int) -> tuple[int, ...]
     return outcome.macrostate
 
 
+def has_scene(spec: TaskSpec) -> bool:
+    """Whether the page has a scene of a task, in which nothing is drawn by chance."""
+    world = getattr(spec.rules, "world", None)
+    return spec.id.startswith(FAMILIES) and not world.slip and not world.goal_change
+
+
 def converted(card: dict[str, Any], logs: list[dict[str, Any]]) -> dict[str, object] | None:
-    """A row for the page; None of a task that it has no scene of, or one whose results are drawn by chance.
+    """A row of macro-actions for the page; None of a task that it has no scene of.
 
     The states after each macro-action follow from the rules, since nothing is drawn.
     """
-    if "motions" in card.get("format", ""):  # rows of continuous control have no macro-actions
-        return None
     spec: TaskSpec = registry.task(card["protocol"]["task"])
     rules = spec.rules
-    world = getattr(rules, "world", None)
-    if not spec.id.startswith(FAMILIES) or world.slip or world.goal_change:
+    if not has_scene(spec):
         return None
     first = card["vouched"][0]["seed"]
     which = max(
@@ -48,13 +59,59 @@ def converted(card: dict[str, Any], logs: list[dict[str, Any]]) -> dict[str, obj
     return {"title": title, "world": spec.id, "episodes": episodes}
 
 
+def _turns(env: MotionEnv, row: motions.MotionRow, test: int) -> dict[str, object]:
+    """A test of continuous control, carried out again: the macro-action and the macrostate of each event.
+
+    A fault is no macro-action, so the turns end before it. An event may come some periods later than in the file.
+    """
+    commands = row.motions[test].commands
+    env.restart(seed=row.protocol.start(test))
+    start = [int(value) for value in env.episode.macrostate]
+    actions: list[int] = []
+    states: list[list[int]] = []
+    success = False
+    for command in np.concatenate([commands, np.repeat(commands[-1:], motions.SLACK_PERIODS, axis=0)]):
+        (period,) = env.carry_out(command[np.newaxis])
+        event = env.episode.latest
+        success |= period.success
+        if event is not None and event.fault is None:
+            actions.append(int(event.action))
+            states.append([int(value) for value in event.outcome.macrostate])
+        if period.terminated or period.truncated:
+            break
+    return {"start": start, "actions": actions, "states": states, "success": success}
+
+
+def moved(folder: Path) -> dict[str, object] | None:
+    """A row of continuous control for the page; None of a task that it has no scene of.
+
+    Raises:
+        ArtefactError: The row is damaged, or does not play again.
+    """
+    row = motions.read_motions(folder)
+    spec: TaskSpec = registry.task(row.protocol.task)
+    if not has_scene(spec):
+        return None
+    with closing(row.protocol.make(observation="state")) as env:
+        checked = motions.check_motions(row, env)
+        unwrapped = env.unwrapped
+        assert isinstance(unwrapped, MotionEnv)
+        episodes = [_turns(unwrapped, checked, test) for test in range(row.protocol.tests)]
+    solved = f"{checked.vouched.successes} of {row.protocol.tests} solved"
+    title = f"{row.claimed.agent}, continuous control, each turn as the planned movement: {solved}"
+    return {"title": title, "world": spec.id, "episodes": episodes}
+
+
 def write(folder: Path, board: Path = BOARD) -> None:
     """Write every row of a board into a folder, and ``index.json``: names and titles."""
     folder.mkdir(parents=True, exist_ok=True)
     index = []
     for path in sorted(board.glob("*/card.json")):
-        episodes = path.with_name("episodes.json").read_text()
-        row = converted(json.loads(path.read_text()), json.loads(episodes))
+        card = json.loads(path.read_text())
+        if card.get("format") == motions.FORMAT:
+            row = moved(path.parent)
+        else:
+            row = converted(card, json.loads(path.with_name("episodes.json").read_text()))
         if row is not None:
             index.append([path.parent.name, row["title"]])
             (folder / f"{path.parent.name}.json").write_text(json.dumps(row, separators=(",", ":")))

@@ -9,14 +9,16 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from imagine_bench_board.motions import SLACK_PERIODS, read_motions
 
 from imagine_bench import registry
-from imagine_bench.errors import ImagineBenchError
+from imagine_bench.errors import ArtefactError, ImagineBenchError
 
 ROOT = Path(__file__).parents[2]
 BROWSER = ROOT / "docs" / "browser"
@@ -233,10 +235,69 @@ def test_rows_of_the_board_are_converted(tmp_path: Path) -> None:
     assert found["episodes"][0] == {"start": [3, 1, 2, 0], "actions": [0], "states": [[0, 1, 2, 0]], "success": True}
     assert found["episodes"][1]["states"] == [[2, 1, 2, 0], [1, 1, 2, 0]]
     assert json.loads((tmp_path / "out" / "index.json").read_text()) == [["dqn-1", found["title"]]]
-    moved = {**card, "format": "imagine_bench board motions 1", "vouched": {"successes": 2}}
-    assert rows.converted(moved, [{}]) is None
     card["protocol"] = {"task": "arrow_puzzle:slip=0.1"}
     assert rows.converted(card, [{}, log, {}]) is None
+
+
+EXPERT_TURNS = 56
+"""Events of the expert's 20 tests."""
+
+
+@needs_node
+@pytest.mark.parametrize(
+    ("name", "solved", "turns", "faults"),
+    [("expert-motion-arrow_puzzle", 20, EXPERT_TURNS, 0), ("random-motion-arrow_puzzle", 0, 0, 13)],
+)
+@pytest.mark.usefixtures("made")
+def test_turns_of_continuous_control_are_the_events_of_the_replay(
+    name: str, solved: int, turns: int, faults: int
+) -> None:
+    """Each command is one step of the environment here, and infos are read; the page's script reads events."""
+    import rows
+
+    found = json.loads(json.dumps(rows.moved(rows.BOARD / name)))
+    agent, _, _ = name.partition("-")
+    title = f"{agent}, continuous control, each turn as the planned movement: {solved} of 20 solved"
+    assert found["title"] == title and found["world"] == "arrow_puzzle"
+    kept = read_motions(rows.BOARD / name)
+    ended_by_fault = 0
+    with closing(kept.protocol.make(observation="state")) as env:
+        for test, (motion, episode) in enumerate(zip(kept.motions, found["episodes"], strict=True)):
+            _, info = env.reset(seed=kept.protocol.start(test))
+            assert episode["start"] == info["macrostate"].tolist()
+            states = []
+            actions = []
+            for command in np.concatenate([motion.commands, np.repeat(motion.commands[-1:], SLACK_PERIODS, axis=0)]):
+                _, _, terminated, truncated, info = env.step(command)
+                if info["event"] and not info["fault"]:
+                    states.append(info["macrostate"].tolist())
+                    actions.append(int(info["macro_action"]))
+                if terminated or truncated:
+                    break
+            assert terminated or truncated
+            ended_by_fault += bool(info["fault"])
+            assert (episode["states"], episode["actions"]) == (states, actions)
+            assert episode["success"] == info["is_success"]
+            assert not motion.reproducible or episode["success"] == motion.solved
+    assert sum(len(each["actions"]) for each in found["episodes"]) == turns
+    assert ended_by_fault >= faults
+    assert ask([{"kind": "row", "row": found}]) == [20], "the page takes it"
+
+
+@pytest.mark.usefixtures("made")
+def test_rows_of_continuous_control_are_on_the_page_where_it_has_their_scene(tmp_path: Path) -> None:
+    import rows
+
+    board = tmp_path / "board"
+    for name in ("expert-motion-arrow_puzzle", "expert-motion-pick_place"):
+        shutil.copytree(rows.BOARD / name, board / name)
+    rows.write(tmp_path / "out", board)
+    ((name, title),) = json.loads((tmp_path / "out" / "index.json").read_text())
+    assert name == "expert-motion-arrow_puzzle" and title.endswith("20 of 20 solved")
+    episodes = board / name / "episodes.json"
+    episodes.write_text(episodes.read_text().replace('"solved":true', '"solved":false', 1))
+    with pytest.raises(ArtefactError):
+        rows.write(tmp_path / "again", board)
 
 
 @needs_node

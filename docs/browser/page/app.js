@@ -349,7 +349,8 @@ class Page {
     this.game.reset([...episode.start]);
     this.#begin();
     this.queue = episode.actions.map((action, at) => ({ action, reached: episode.states[at] }));
-    this.#say({ text: `Playing the episode of ${this.row.title}.`, tone: '' });
+    const still = episode.actions.length === 0 ? ' No arrow was turned in it, so the arm stands still here.' : '';
+    this.#say({ text: `Playing the episode of ${this.row.title}.${still}`, tone: '' });
     this.#update();
   }
 }

@@ -83,5 +83,5 @@ export function readRow(given) {
   const world = readWorld(line);
   const rules = new Rules(world);
   episodes.forEach((episode, index) => checkEpisode(rules, episode, index));
-  return { title: title.slice(0, 80), world, episodes };
+  return { title: title.slice(0, 120), world, episodes };
 }
