@@ -163,6 +163,12 @@ class NoFlush:
         os.fsync = self._real
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """One worker more than there are cores: tests that wait for a process of their own leave a core idle."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return cores + 1
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Hold every test of the session to the rules, plug-ins' tests too."""
     config.pluginmanager.register(CpuLimit(), "cpu-limit")
