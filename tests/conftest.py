@@ -27,6 +27,7 @@ import pytest
 
 if TYPE_CHECKING:
     from guest_packages import Guests
+    from whole_outputs import Expected
 
 LIMIT_CPU_S = 3.0
 """CPU seconds that a fast test may use on the machine whose calibration loop takes the seconds below."""
@@ -174,6 +175,19 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(CpuLimit(), "cpu-limit")
     config.pluginmanager.register(OwnCache(), "own-cache")
     config.pluginmanager.register(NoFlush(), "no-flush")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The option that keeps whole outputs as they are now."""
+    parser.addoption("--write-expected", action="store_true", help="write tests/whole/expected again")
+
+
+@pytest.fixture
+def expected(request: pytest.FixtureRequest) -> Expected:
+    """Compares a whole output with the kept one."""
+    from whole_outputs import Expected
+
+    return Expected(write=bool(request.config.getoption("--write-expected")))
 
 
 @pytest.fixture

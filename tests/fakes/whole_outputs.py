@@ -1,0 +1,93 @@
+"""Whole outputs compared with kept files, and the same files written again.
+
+A test of ``tests/whole`` makes the whole output of a command or of a pipeline, as text, and compares it with
+``tests/whole/expected/NAME.txt``. ``make test ARGS='tests/whole --write-expected'`` writes the files again; read the
+difference with git before you commit it, for a file says what was, and only a reader says whether it is right.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+KEPT = Path(__file__).parents[1] / "whole" / "expected"
+DECIMAL = re.compile(r"-?\d+\.\d+")
+
+
+def matches(found: str, kept: str) -> bool:
+    """Whether two lines are equal, but for one unit in the last digit of numbers that have a decimal point.
+
+    Processors round differently: 0.1235 may be 0.1234 on another.
+    """
+    if DECIMAL.sub("#", found) != DECIMAL.sub("#", kept):
+        return False
+    for one, other in zip(DECIMAL.findall(found), DECIMAL.findall(kept), strict=True):
+        digits = len(one.partition(".")[2])
+        if digits != len(other.partition(".")[2]) or abs(float(one) - float(other)) > 1.001 * 10**-digits:
+            return False
+    return True
+
+
+def difference(found: str, kept: str, *, exactly: bool = True) -> str:
+    """A unified difference of two texts, empty where they match."""
+    ours, theirs = found.splitlines(), kept.splitlines()
+    if not exactly and len(ours) == len(theirs):
+        ours = [old if matches(new, old) else new for new, old in zip(ours, theirs, strict=True)]
+    return "\n".join(difflib.unified_diff(theirs, ours, "kept", "found", lineterm="", n=2))
+
+
+class Expected:
+    """Compares a text with the kept one of a name, or keeps it."""
+
+    def __init__(self, write: bool, folder: Path = KEPT) -> None:
+        self._write = write
+        self._folder = folder
+
+    def __call__(self, name: str, text: str, *, exactly: bool = True) -> None:
+        """Fail with the difference; ``exactly=False`` lets the last digit of decimal numbers be one off."""
+        file = self._folder / f"{name}.txt"
+        text = "\n".join(line.rstrip() for line in text.splitlines()) + "\n"
+        if self._write:
+            if not file.exists() or difference(text, file.read_text(encoding="utf-8"), exactly=exactly):
+                file.write_text(text, encoding="utf-8")
+            return
+        if not file.exists():
+            pytest.fail(f"{file} is missing; write it with --write-expected", pytrace=False)
+        if found := difference(text, file.read_text(encoding="utf-8"), exactly=exactly):
+            pytest.fail(
+                f"another output than {file.name} has; if it is right: --write-expected\n{found}", pytrace=False
+            )
+
+
+def short(text: str) -> str:
+    """A text whose decimal numbers have at most five significant digits, of which processors agree."""
+    return re.sub(r"-?\d+\.\d{5,}(e-?\d+)?", lambda found: f"{float(found[0]):.5g}", text)
+
+
+def rounded(value: object, digits: int = 3) -> str:
+    """Numbers with so many significant digits; arrays and sequences in brackets; all else as text."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, bool | np.bool_):
+        return str(bool(value))
+    if isinstance(value, float | np.floating):
+        number = 0.0 if abs(value) < 10**-9 else float(value)
+        return f"{number:.{digits}g}" if np.isfinite(number) else str(number)
+    if isinstance(value, dict):
+        return ", ".join(f"{name}: {rounded(each, digits)}" for name, each in value.items())
+    if isinstance(value, list | tuple):
+        return "[" + " ".join(rounded(each, digits) for each in value) + "]"
+    return str(value)
+
+
+def tabulated(rows: Iterable[Iterable[object]], digits: int = 3) -> str:
+    """Rows as lines, their cells rounded and separated by two spaces or more."""
+    cells = [[rounded(cell, digits) for cell in row] for row in rows]
+    count = max((len(row) for row in cells), default=0)
+    widths = [max((len(row[place]) for row in cells if place < len(row)), default=0) for place in range(count)]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=False)) for row in cells)

@@ -1,0 +1,76 @@
+"""The words of the command line: what it lists, how it describes things, and its answers to wrong words.
+
+The figures of described worlds are computed otherwise in ``tests/exact`` and by hand below; the numbers of settings
+beside the thesis' own in ``tests/agents/test_settings.py``.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from whole_outputs import KEPT, Expected
+
+from imagine_bench import registry
+from imagine_bench.cli import exit_code as main
+from imagine_bench.registry import AGENTS, TASKS
+from imagine_bench.tools.describe import describe
+
+WORLDS = {"arrow_puzzle_hard": 180, "arrow_puzzle_easy": 4, "arrows:slip=0.1,lag=1": 165, "ArrowPuzzleMotion": 165}
+"""Described worlds, and the macrostates that come up: 3 x (4 x 3 x 2) legal ones and those with which episodes end."""
+SEVERAL = {**WORLDS, "toy_regression": 0, "robot_ik": 0}
+
+
+@pytest.fixture(autouse=True)
+def _ours_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Agents that other tests have registered in this process are not listed."""
+    for entries in (registry.AGENTS, registry.WORLD_MODELS):
+        for name in [name for name, entry in entries.items() if not entry.make.startswith("imagine_bench")]:
+            monkeypatch.delitem(entries, name)
+
+
+def test_list(expected: Expected, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
+    listed = capsys.readouterr().out
+    assert all(f"\n  {name} " in listed for name in (*TASKS, *AGENTS))
+    expected("list", listed)
+
+
+@pytest.mark.parametrize("name", SEVERAL)
+def test_described_worlds(name: str, expected: Expected) -> None:
+    page = describe(name)
+    assert not WORLDS.get(name) or f"\nmacrostates     {WORLDS[name]} can come up" in page
+    expected(f"describe_{re.sub('[^a-zA-Z]+', '_', name)}", page)
+
+
+def learners() -> dict[str, object]:
+    return {**registry.agents(), **registry.world_models(), **registry.regressors()}
+
+
+def test_described_learners(expected: Expected) -> None:
+    """Each with its settings in all presets, but for those lines that the one before it has too."""
+    before: set[str] = set()
+    pages = []
+    for name in learners():
+        if ":ARGUMENT" in name:
+            continue
+        head, _, settings = describe(name).partition("\nSettings of")
+        each = re.split(r"\n(?=  \S)", settings)
+        new = [text for text in each[1:] if text not in before]
+        before |= set(each)
+        pages.append("\n".join([f"$ describe {name}", head.rstrip(), each[0], *new, f"({len(each) - 1} settings)"]))
+    expected("describe_learners", "\n\n".join(pages))
+
+
+def test_answers_to_wrong_words(tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: Expected) -> None:
+    """One line each, exit code 2, and nothing is written; the words stand in the kept file, HERE is an empty folder."""
+    kept = (KEPT / "wrong_words.txt").read_text(encoding="utf-8")
+    answers = []
+    for words in re.findall(r"^\$ (.*)$", kept, re.MULTILINE):
+        code = main([word.replace("HERE", str(tmp_path)) for word in words.split()])
+        said = capsys.readouterr()
+        assert (code, said.out, len(said.err.splitlines())) == (2, "", 1), words
+        answers += [f"$ {words}", said.err.replace(str(tmp_path), "HERE")]
+    assert not list(tmp_path.iterdir())
+    expected("wrong_words", "\n".join(answers))

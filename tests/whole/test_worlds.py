@@ -1,0 +1,151 @@
+"""Whole worlds: exact facts of the suite's experiments, and episodes, step by step.
+
+Each step of an episode is held to the rules, and facts to those that kept results have; the rules themselves are
+worked out by hand in ``tests/tasks``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+from collections import Counter
+
+import gymnasium
+import numpy as np
+import pytest
+from doc_cells import RESULTS
+from whole_outputs import Expected, rounded, tabulated
+
+from imagine_bench import registry
+from imagine_bench.rules import evaluate, horizon_optimum, shortest_plans, tabulate
+from imagine_bench.sweep.grid import LADDER, SEPARATING
+
+LARGE = 1_500  # macrostates, as of more than four cubes: they take seconds
+EPISODES = (
+    "arrow_puzzle",
+    "arrow_puzzle_hard",
+    "arrow_puzzle_toward",
+    "arrow_puzzle_clockwise",
+    "arrow_puzzle_easy",
+    "pick_place",
+    "arrows:slip=0.3,goal_change=0.4",
+    "arrows:cubes=4,goal=0123,forbid=none,coupling=neighbour",
+    "arrows:cubes=2,goal=all,forbid=none",
+    "arrows:shuffle=7,goal=toward_agent,horizon=5",
+    "arrows:lag=2,gesture=0.5",
+    "arrows:gesture=first,distractors=2",
+    "pick_place:slip=0.2,fickle=0.5",
+    "pick_place:gesture=first,lag=1",
+)
+
+
+def test_exact_facts_of_all_experiments(expected: Expected) -> None:
+    with (RESULTS / "suite" / "levels.csv").open() as file:
+        kept = {(row["task"], round(float(row["chance"]), 9)) for row in csv.DictReader(file)}
+    rows: list[list[object]] = [
+        ["world", "macrostates", "ends", "starts", "horizon", "chance", "seen", "return", "plans: starts"]
+    ]
+    compared = 0
+    experiments = (*LADDER.experiments, *SEPARATING.experiments)
+    for task in sorted({level.task for experiment in experiments for level in experiment.levels}):
+        spec = registry.task(task)
+        tables = tabulate(spec.rules)
+        if len(tables.index) > LARGE:
+            continue
+        chance = evaluate(tables, np.full(tables.reward.shape, 1.0 / spec.n_actions), spec.horizon)
+        best = horizon_optimum(tables, spec.horizon)
+        level, most = (float(each.success[tables.starts].mean()) for each in (chance, best))
+        compared += (task, round(level, 9)) in kept  # levels of a split have another
+        lengths = Counter(shortest_plans(tables)[tables.starts].tolist())
+        plans = " ".join(f"{length}:{lengths[length]}" for length in sorted(lengths))
+        ends = sum(map(spec.rules.is_terminal, tables.index))
+        returns = float(best.returns[tables.starts].mean())
+        sizes = [len(tables.index), ends, len(tables.starts), spec.horizon]
+        rows.append([spec.id, *sizes, f"{level:.5f}", f"{most:.5f}", f"{returns:.3f}", plans])
+    assert compared > 20
+    expected("facts_of_experiments", tabulated(rows), exactly=False)
+
+
+def test_episodes_step_by_step(expected: Expected) -> None:
+    """Of macro-actions, optimal or random: each outcome is one that the rules have, and is rewarded as they say."""
+    expected("episodes", "\n\n".join(map(episodes, EPISODES)))
+
+
+def episodes(task: str) -> str:
+    """Three episodes of a task as a table."""
+    spec = registry.task(task)
+    rng = np.random.default_rng(5)
+    lines: list[list[object]] = [["action", "macrostate", "shown", "reward", "end"]]
+    with contextlib.closing(
+        gymnasium.make(spec.env_id, execution="kinematic", observation="state", disable_env_checker=True)
+    ) as env:
+        for seed in range(3):
+            state, info = env.reset(seed=seed)
+            lines.append(["reset", info["macrostate"], info["shown"], "", np.flatnonzero(state)])
+            ended = False
+            while not ended:
+                before = tuple(info["macrostate"].tolist())
+                action = spec.rules.optimal_action(before) if rng.random() < 0.6 else int(rng.integers(spec.n_actions))
+                state, reward, terminated, truncated, info = env.step(action)
+                after = tuple(info["macrostate"].tolist())
+                (outcome,) = (each for each in spec.rules.outcomes(before, action) if each.macrostate == after)
+                found = (reward, terminated, bool(info["is_success"]))
+                assert found == (outcome.reward, outcome.terminated, outcome.success)
+                ended = terminated or truncated
+                words = "success" if info["is_success"] else "failure" if terminated else "cut" if truncated else ""
+                lines.append([action, info["macrostate"], info["shown"], reward, words])
+    return f"{spec.id}: {spec.description}\n{tabulated(lines)}"
+
+
+VIEWS = ("clean", "mild", "strong", "patched", "harsh", "light=0.5,camera=0.2")
+
+
+@pytest.mark.parametrize("task", ["ArrowPuzzle", "PickPlace"])
+def test_frames_in_coarse_cells(task: str, expected: Expected) -> None:
+    """Each channel of a frame in four by four cells, as tenths of a gray level of 25; renderers differ by less."""
+    lines = []
+    for appearance in VIEWS:
+        options = {"execution": "kinematic", "appearance": appearance, "disable_env_checker": True}
+        with contextlib.closing(gymnasium.make(f"imagine_bench/{task}-v0", **options)) as env:
+            frame, _ = env.reset(seed=4)
+            for _ in range(2):
+                frame, *_ = env.step(1)
+        assert frame.shape == (64, 64, 3)
+        cells = frame.reshape(4, 16, 4, 16, 3).mean(axis=(1, 3)) / 25.0
+        lines += [appearance, *(" ".join(f"{each:4.1f}" for each in row) for row in cells.reshape(4, 12))]
+    expected(f"frames_{task}", "\n".join(lines), exactly=False)
+
+
+def test_lanes_of_a_vector_environment(expected: Expected) -> None:
+    """Two lanes of each task; one that ended begins again in the same step, and keeps the end's observation."""
+    lines: list[list[object]] = []
+    for task in ("ArrowPuzzle", "PickPlace"):
+        options = {"num_envs": 3, "execution": "kinematic", "observation": "state"}
+        with contextlib.closing(gymnasium.make_vec(f"imagine_bench/{task}-v0", **options)) as lanes:
+            _, info = lanes.reset(seed=2)
+            lines += [[task, lanes.metadata["autoreset_mode"].value], ["reset", info["macrostate"]]]
+            actions = np.random.default_rng(0).integers(lanes.single_action_space.n, size=(8, 3))
+            for given in actions:
+                _, reward, terminated, truncated, info = lanes.step(given)
+                ends = info["final_info"]["macrostate"] if "final_info" in info else ""
+                lines.append([given, info["macrostate"], reward, terminated | truncated, ends])
+    expected("lanes", "\n".join("  ".join(map(rounded, line)) for line in lines))
+
+
+@pytest.mark.parametrize(("task", "actions"), [("ArrowPuzzle", (0, 2, 5)), ("PickPlace", (2, 2, 1))])
+def test_macro_actions_in_contact_physics(task: str, actions: tuple[int, ...], expected: Expected) -> None:
+    """How long each takes, where the hand ends and how far objects are from where they should be."""
+    lines: list[list[object]] = [["action", "macrostate", "fault", "s", "hand m", "objects: x y z m"]]
+    with contextlib.closing(
+        gymnasium.make(f"imagine_bench/{task}-v0", observation="state", disable_env_checker=True)
+    ) as env:
+        env.reset(seed=8)
+        for action in actions:
+            *_, info = env.step(action)
+            scene = env.unwrapped
+            names = [scene.model.body(index).name for index in range(scene.model.nbody)]
+            moved = [name for name in names if name.startswith(("cube", "ball", "car", "cup"))]
+            places = [rounded(np.round(scene.data.body(name).xpos, 3)) for name in moved]
+            hand = rounded(np.round(scene.data.body(next(each for each in names if "hand" in each)).xpos, 3))
+            lines.append([action, info["macrostate"], info["fault_reason"], f"{info['sim_time_s']:.2f}", hand, *places])
+    expected(f"physics_{task}", tabulated(lines), exactly=False)
