@@ -54,6 +54,19 @@ def test_a_single_value_may_also_need_a_partner() -> None:
     assert found == {state: None if state[1] == 2 else USUAL for state in EVERY}
 
 
+def test_a_pair_stays_a_cause_where_another_outcome_needs_three_values() -> None:
+    """Every triple around a forbidden pair is as suspect as the pair; only the pair is asked about."""
+    forbidden: Outcome = (-5.0, True)
+    unseen = (0, 0, 2)
+    model = EliminationModel()
+    for state in EVERY:
+        if state != unseen:
+            model.add(state, 0, state, forbidden if state[:2] == (0, 0) else outcome(state, CAUSES["a triple"]))
+    assert model.most == 3, "otherwise nothing is tested"
+    assert model.outcome(unseen) == forbidden
+    assert model.outcome((1, 1, 2)) == PAID
+
+
 def test_an_unseen_triple_is_unknown() -> None:
     """Where all three values together decide, no other macrostate tells anything of a triple."""
     model = taught(CAUSES["a triple"], (0, 0, 0))

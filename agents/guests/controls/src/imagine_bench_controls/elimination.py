@@ -3,9 +3,9 @@
 A table holds, for each action, coordinate and value of the coordinate, how often each next value came; the most
 frequent one is expected. One outcome (reward and end) is the usual one: the most frequent that does not end the
 episode. Any other outcome has a cause: a set of at most two values of the next macrostate that was never seen with the
-usual outcome. If the data rule out every such set for some macrostate, sets of one value more are allowed. Whatever is
-unknown is worth the largest reward seen (R-max, Brafman & Tennenholtz 2002; elimination of conjunctions as in DOORmax,
-Diuk, Cohen & Littman 2008).
+usual outcome. If the data rule out every such set for some macrostate, sets of one value more are allowed, wherever no
+smaller set is left. Whatever is unknown is worth the largest reward seen (R-max, Brafman & Tennenholtz 2002;
+elimination of conjunctions as in DOORmax, Diuk, Cohen & Littman 2008).
 
 It is told the true macrostate, so it needs no perception. It knows beforehand that a coordinate's next value depends on
 this coordinate and the action alone, and that outcomes depend on the next macrostate.
@@ -81,8 +81,12 @@ class EliminationModel:
         return None if suspects else self.usual
 
     def _suspects(self, following: State) -> list[Values]:
-        """The sets of values that were never seen with the usual outcome."""
-        return [each for each in value_sets(following, self.most) if each not in self._cleared]
+        """The sets of values that were never seen with the usual outcome; larger ones only where no smaller is left."""
+        for most in range(min(_FEWEST, len(following)), self.most + 1):
+            found = [each for each in value_sets(following, most) if each not in self._cleared]
+            if found:
+                return found
+        return []
 
     def _eliminate(self) -> None:
         """Allow as few values a cause as the data permit, and find the causes that are alone under suspicion."""
