@@ -27,8 +27,8 @@ def matches(found: str, kept: str) -> bool:
     if DECIMAL.sub("#", found) != DECIMAL.sub("#", kept):
         return False
     for one, other in zip(DECIMAL.findall(found), DECIMAL.findall(kept), strict=True):
-        digits = len(one.partition(".")[2])
-        if digits != len(other.partition(".")[2]) or abs(float(one) - float(other)) > 1.001 * 10**-digits:
+        digits = max(len(each.partition(".")[2]) for each in (one, other))
+        if abs(float(one) - float(other)) > 1.001 * 10**-digits:
             return False
     return True
 

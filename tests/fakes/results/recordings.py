@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rerun.chunk import RrdReader
 
 
@@ -45,3 +49,40 @@ def view_names(path: Path) -> set[str]:
         for names in chunk.to_record_batch().column(column).to_pylist()
         for name in names or ()
     }
+
+
+CLOCKS = {"episode", "env_step", "imagined_depth", "depth", "sim_time"}
+FORMS = ("format", "media_type", "fill_mode", "RowId")
+
+
+def as_text(path: Path) -> str:
+    """The whole recording: a line for each column of an entity, its values in the order of time, and names of views."""
+    rows: dict[str, list[tuple[str, str]]] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        lines = sorted(CLOCKS & set(chunk.timeline_names))
+        clocks = [batch.column(name).to_pylist() for name in lines]
+        times = [" ".join(map(_clock, each)) for each in zip(*clocks, strict=True)]
+        for name in set(batch.schema.names) - set(chunk.timeline_names):
+            if not chunk.entity_path.startswith("/__") and not name.endswith(FORMS):
+                words = [_in_words(name, value) for value in batch.column(name).to_pylist()]
+                key = f"{chunk.entity_path} {name} by {' '.join(lines) or 'no clock'}"
+                rows.setdefault(key, []).extend(zip(times or [""] * len(words), words, strict=True))
+    text = []
+    for key, found in sorted(rows.items()):
+        values = [f"{clock}: {words}" if clock else words for clock, words in sorted(found)]
+        text.append(f"{key}\n  " + " | ".join(values))
+    return "\n".join([*text, "views", *(f"  {name}" for name in sorted(view_names(path)))])
+
+
+def _clock(at: object) -> str:
+    return f"{at.total_seconds():05.2f}s" if isinstance(at, timedelta) else f"{at:02d}" if isinstance(at, int) else "-"
+
+
+def _in_words(column: str, value: Any) -> str:
+    """A value as a short text: the mean of an image as a tenth of the brightest, the number of points of a mesh."""
+    if column.endswith("buffer"):
+        return f"{np.mean(value[0]) / 25.5:.1f}"
+    if column.endswith(("blob", "vertex_positions", "triangle_indices", "vertex_normals")):
+        return "image" if column.endswith("blob") else f"{len(value)} rows"
+    return re.sub(r"-?\d+\.\d+(e[-+]?\d+)?", lambda found: f"{float(f'{float(found[0]):.3f}') + 0.0:g}", str(value))
