@@ -1,6 +1,7 @@
 """Rows of the board as the page plays them: the test episodes of each row's first run at its largest budget.
 
-A row of continuous control is played again in physics. Each of its events is a turn of the rules, and is shown as one.
+A row of continuous control is played again in physics. Each of its events is a macro-action of the rules, and is shown
+as one.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from imagine_bench import registry
 from imagine_bench.interfaces import Rules, TaskSpec
 
 BOARD = Path(__file__).parents[1] / "board" / "rows"
-FAMILIES = ("arrows", "arrow_puzzle")
-"""Tasks whose scenes the page has."""
+ARROWS = ("arrows", "arrow_puzzle")
+PICK_PLACE = "pick_place"
+"""Beginnings of the names of tasks whose scenes the page has."""
 
 
 def _after(rules: Rules, state: tuple[int, ...], action: int) -> tuple[int, ...]:
@@ -29,19 +31,24 @@ def _after(rules: Rules, state: tuple[int, ...], action: int) -> tuple[int, ...]
 
 
 def has_scene(spec: TaskSpec) -> bool:
-    """Whether the page has a scene of a task, in which nothing is drawn by chance."""
+    """Whether the page has a scene of a task."""
+    return spec.id.startswith((*ARROWS, PICK_PLACE))
+
+
+def is_certain(spec: TaskSpec) -> bool:
+    """Whether each macro-action of a task has one outcome, so that starts and actions say all."""
     world = getattr(spec.rules, "world", None)
-    return spec.id.startswith(FAMILIES) and not world.slip and not world.goal_change
+    return spec.id.startswith(ARROWS) and not world.slip and not world.goal_change
 
 
 def converted(card: dict[str, Any], logs: list[dict[str, Any]]) -> dict[str, object] | None:
-    """A row of macro-actions for the page; None of a task that it has no scene of.
+    """A row of macro-actions for the page; None of a task that it has no scene of, or in which outcomes are drawn.
 
-    The states after each macro-action follow from the rules, since nothing is drawn.
+    The states after each macro-action follow from the rules.
     """
     spec: TaskSpec = registry.task(card["protocol"]["task"])
     rules = spec.rules
-    if not has_scene(spec):
+    if not is_certain(spec):
         return None
     first = card["vouched"][0]["seed"]
     which = max(
@@ -59,10 +66,10 @@ def converted(card: dict[str, Any], logs: list[dict[str, Any]]) -> dict[str, obj
     return {"title": title, "world": spec.id, "episodes": episodes}
 
 
-def _turns(env: MotionEnv, row: motions.MotionRow, test: int) -> dict[str, object]:
+def _events(env: MotionEnv, row: motions.MotionRow, test: int) -> dict[str, object]:
     """A test of continuous control, carried out again: the macro-action and the macrostate of each event.
 
-    A fault is no macro-action, so the turns end before it. An event may come some periods later than in the file.
+    A fault is no macro-action, so the events end before it. An event may come some periods later than in the file.
     """
     commands = row.motions[test].commands
     env.restart(seed=row.protocol.start(test))
@@ -96,9 +103,9 @@ def moved(folder: Path) -> dict[str, object] | None:
         checked = motions.check_motions(row, env)
         unwrapped = env.unwrapped
         assert isinstance(unwrapped, MotionEnv)
-        episodes = [_turns(unwrapped, checked, test) for test in range(row.protocol.tests)]
+        episodes = [_events(unwrapped, checked, test) for test in range(row.protocol.tests)]
     solved = f"{checked.vouched.successes} of {row.protocol.tests} solved"
-    title = f"{row.claimed.agent}, continuous control, each turn as the planned movement: {solved}"
+    title = f"{row.claimed.agent}, continuous control in {spec.id}, each event as a planned movement: {solved}"
     return {"title": title, "world": spec.id, "episodes": episodes}
 
 

@@ -37,8 +37,8 @@ _PITCH_RAD = math.radians(5.5)
 """Wide, and tilted toward the tool: the frame shows the row, the hands, and at its bottom the object in the gripper."""
 
 
-@functools.cache
-def _compiled(distractors: int, control: bool) -> mujoco.MjModel:
+def pick_scene_spec(distractors: int = 0, *, control: bool = False) -> mujoco.MjSpec:
+    """The specification of the scene, as :func:`compile_pick_scene`."""
     spec = arm_spec()  # the scene is added to the arm's own specification, so that every name stays without a prefix
     spec.modelname = "pick_place"
     timestep_s = CONTROL_TIMESTEP_S if control else TIMESTEP_S
@@ -56,7 +56,12 @@ def _compiled(distractors: int, control: bool) -> mujoco.MjModel:
     camera.alt.xyaxes = (0.0, 1.0, 0.0, math.cos(_PITCH_RAD), 0.0, math.sin(_PITCH_RAD))
     if control:
         add_control_views(spec)
-    return spec.compile()
+    return spec
+
+
+@functools.cache
+def _compiled(distractors: int, control: bool) -> mujoco.MjModel:
+    return pick_scene_spec(distractors, control=control).compile()
 
 
 def compile_pick_scene(distractors: int = 0, *, control: bool = False) -> mujoco.MjModel:

@@ -6,7 +6,7 @@ import { pathToFileURL } from 'node:url';
 const [folder] = process.argv.slice(2);
 const from = (name) => import(pathToFileURL(`${folder}/${name}.js`).href);
 const { readWorld, WorldError } = await from('world');
-const { Rules } = await from('rules');
+const { rulesOf } = await from('families');
 const { factsOf } = await from('facts');
 const { readRow, rowFile } = await from('rows');
 const { WorldModel } = await from('model');
@@ -25,14 +25,15 @@ function tried(ask) {
 const model = { path: null, found: null };
 const kinds = {
   world: ({ line }) => {
-    const rules = new Rules(readWorld(line));
-    return { turns: rules.turns, horizon: rules.horizon, starts: rules.starts.map((row) => rules.stateOf(row)) };
+    const rules = rulesOf(readWorld(line));
+    const starts = rules.starts.map((row) => rules.stateOf(row));
+    return { turns: rules.turns, states: rules.states, horizon: rules.horizon, starts };
   },
   outcomes: ({ line, asked }) => {
-    const rules = new Rules(readWorld(line));
+    const rules = rulesOf(readWorld(line));
     return asked.map(([state, action]) => rules.outcomes(state, action));
   },
-  facts: ({ line }) => factsOf(new Rules(readWorld(line))),
+  facts: ({ line }) => factsOf(rulesOf(readWorld(line))),
   percent: ({ share }) => percent(share),
   rowFile: ({ name }) => rowFile(name),
   row: ({ row }) => readRow(row).episodes.length,

@@ -1,4 +1,6 @@
 // A visit to the page in a headless Chromium, with the network off but for the local server: what happened, as JSON.
+// Keys are names, one after another; or a table from macrostates to keys, pressed until the episode ends; or "watch",
+// which presses none and waits for the end of the episode that the page plays.
 
 import { createRequire } from 'node:module';
 
@@ -20,9 +22,23 @@ await page.goto(`${address}/index.html?${world}`);
 await page.waitForSelector('body[data-ready]', { timeout: 60_000 });
 await page.evaluate(() => new Promise((shown) => requestAnimationFrame(() => requestAnimationFrame(shown))));
 const ready = (Date.now() - began) / 1000; // keys work, and the first image is drawn
-for (const key of keys.split(' ').filter(Boolean)) {
+const pressed = [];
+const press = async (key) => {
+  pressed.push(key);
   await page.keyboard.press(key);
   await page.waitForFunction(() => document.body.dataset.moving !== 'yes', null, { timeout: 60_000 });
+};
+if (keys === 'watch') {
+  await page.selectOption('#speed', '1000');
+  await page.waitForFunction(() => document.body.dataset.end, null, { timeout: 120_000 });
+} else if (keys.startsWith('{')) {
+  const table = JSON.parse(keys);
+  for (let seen = await page.evaluate(() => ({ ...document.body.dataset })); !seen.end;) {
+    await press(table[seen.state]);
+    seen = await page.evaluate(() => ({ ...document.body.dataset }));
+  }
+} else {
+  for (const key of keys.split(' ').filter(Boolean)) await press(key);
 }
 const seen = await page.evaluate(() => ({
   ...document.body.dataset,
@@ -33,4 +49,4 @@ const seen = await page.evaluate(() => ({
 await page.waitForTimeout(1000);
 await page.screenshot({ path: picture, fullPage: true });
 await browser.close();
-process.stdout.write(JSON.stringify({ ...seen, ready_s: ready, outside, errors }));
+process.stdout.write(JSON.stringify({ ...seen, pressed, ready_s: ready, outside, errors }));

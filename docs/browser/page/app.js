@@ -1,20 +1,25 @@
 // The page: it reads the address, loads the physics, and joins keys and buttons to the game.
 
+import { ArrowScene } from './arrow_scene.js';
+import { ArrowControls } from './controls.js';
 import { Dream } from './dream.js';
+import { elementOf } from './elements.js';
+import { rulesOf } from './families.js';
 import { Game, generator } from './game.js';
+import { PickControls } from './pick_controls.js';
+import { PickScene } from './pick_scene.js';
 import { readRow, rowFile } from './rows.js';
-import { Rules } from './rules.js';
-import { Motions, Scene } from './scene.js';
+import { Motions } from './scene.js';
 import { View } from './view.js';
-import { ARROWS, goalOf, happened, oddities, percent } from './words.js';
+import { percent } from './words.js';
 import { readWorld, WorldError } from './world.js';
 
 const EXAMPLES = [
   ['plain', 'arrow_puzzle'], ['hard', 'arrow_puzzle_hard'], ['four cubes that slip', 'arrows:cubes=4,slip=0.1'],
   ['six cubes', 'arrows:cubes=6'], ['turns in pairs', 'arrows:coupling=neighbour,forbid=none'],
   ['a hand that moves on', 'arrows:goal_change=0.3'], ['keys in another order', 'arrows:shuffle=7'],
+  ['pick-and-place', 'pick_place'], ['pick-and-place that slips', 'pick_place:slip=0.1'],
 ];
-const ORDINALS = ['first', 'second', 'third', 'fourth', 'fifth', 'sixth'];
 const LEAST_FRAME_S = 1 / 240;
 const MOST_FRAME_S = 0.1;
 
@@ -34,7 +39,6 @@ async function fetched(file) {
 /** The page with everything that it holds. */
 class Page {
   constructor() {
-    this.chosen = 0;
     this.moving = null;
     this.waiting = null;
     this.queue = [];
@@ -50,7 +54,7 @@ class Page {
       this.row = readRow(await (await fetched(rowFile(rowName))).json());
     }
     const world = this.row?.world ?? readWorld(address.get('world') ?? 'arrow_puzzle');
-    this.rules = new Rules(world);
+    this.rules = rulesOf(world);
     const seed = Number(address.get('seed') ?? NaN);
     this.game = new Game(this.rules, Number.isInteger(seed) ? generator(seed) : Math.random);
     this.#describe();
@@ -63,15 +67,20 @@ class Page {
     requestAnimationFrame((now) => this.#frame(now));
     if (this.row) this.#offerEpisodes(Number(address.get('episode') ?? 1));
     this.#offerRows();
-    if (world.cubes === 3) this.#loadDream().catch((error) => console.warn(error.message));
+    if (world.cubes === 3 && !world.isPickPlace) this.#loadDream().catch((error) => console.warn(error.message));
   }
 
   #describe() {
     const { world } = this.rules;
-    find('goal').textContent = [goalOf(this.rules), oddities(world)].join(' ').trim();
+    const Controls = world.isPickPlace ? PickControls : ArrowControls;
+    this.controls = new Controls(this.rules, (action) => this.#ask(action), () => this.#update());
+    document.title = `${this.controls.title} · imagine_bench`;
+    find('title').textContent = this.controls.title;
+    find('goal').textContent = this.controls.goal;
+    find('keys').replaceChildren(...this.controls.keys);
     find('world').value = world.line;
-    find('last').textContent = String(world.cubes);
-    find('cubes').style.gridTemplateColumns = `repeat(${world.cubes > 3 ? Math.ceil(world.cubes / 2) : world.cubes}, 1fr)`;
+    find('cubes').style.gridTemplateColumns = `repeat(${this.controls.columns}, 1fr)`;
+    find('cubes').replaceChildren(...this.controls.cards.map((card) => card.box));
     find('chips').replaceChildren(...EXAMPLES.map(([name, line]) => {
       const link = document.createElement('a');
       link.href = `?world=${encodeURIComponent(line)}`;
@@ -79,43 +88,8 @@ class Page {
       if (line === world.line) link.setAttribute('aria-current', 'page');
       return link;
     }));
-    this.cards = Array.from({ length: world.cubes }, (_, cube) => this.#card(cube));
-    find('cubes').replaceChildren(...this.cards.map((card) => card.box));
-    this.tags = this.cards.map((_, cube) => {
-      const tag = document.createElement('span');
-      tag.textContent = String(cube + 1);
-      return tag;
-    });
+    this.tags = Array.from({ length: this.controls.nObjects }, (_, index) => elementOf('span', '', String(index + 1)));
     find('tags').replaceChildren(...this.tags);
-  }
-
-  /**
-   * @param {number} cube
-   */
-  #card(cube) {
-    const box = document.createElement('div');
-    box.className = 'cube';
-    const part = (kind, name, text) => {
-      const element = document.createElement(kind);
-      element.className = name;
-      element.textContent = text;
-      return element;
-    };
-    const arrow = part('span', 'arrow', '');
-    const asked = part('span', 'asked', '');
-    const turns = part('span', 'turns', '');
-    for (const [clockwise, sign, words] of [[false, '↺', 'counter-clockwise'], [true, '↻', 'clockwise']]) {
-      const button = part('button', '', sign);
-      button.type = 'button';
-      button.setAttribute('aria-label', `Turn the ${ORDINALS[cube]} cube ${words}`);
-      button.addEventListener('click', () => {
-        this.#choose(cube);
-        this.#ask(cube, clockwise);
-      });
-      turns.append(button);
-    }
-    box.append(part('span', 'name', `cube ${cube + 1}`), document.createElement('br'), arrow, asked, turns);
-    return { box, arrow, asked, buttons: [...turns.children] };
   }
 
   #askForFacts() {
@@ -129,14 +103,17 @@ class Page {
   }
 
   async #loadScene() {
-    const { cubes } = this.rules.world;
+    const { cubes, isPickPlace } = this.rules.world;
+    const scene = isPickPlace ? 'data/scene_pick_place' : `data/scene_${cubes}`;
+    const motions = isPickPlace ? 'data/motions_pick_place' : 'data/motions';
     const text = async (file) => (await fetched(file)).text();
     const json = async (file) => (await fetched(file)).json();
     const [{ default: load }, xml, facts, index, rows] = await Promise.all([
-      import('./mujoco/mujoco.js'), text(`data/scene_${cubes}.xml`), json(`data/scene_${cubes}.json`),
-      json('data/motions.json'), fetched('data/motions.bin').then((answer) => answer.arrayBuffer()),
+      import('./mujoco/mujoco.js'), text(`${scene}.xml`), json(`${scene}.json`),
+      json(`${motions}.json`), fetched(`${motions}.bin`).then((answer) => answer.arrayBuffer()),
     ]);
     const mujoco = await load();
+    const Scene = isPickPlace ? PickScene : ArrowScene;
     this.scene = new Scene(mujoco, xml, facts, new Motions(index, rows));
     this.view = new View(find('view'));
     this.view.show(this.scene);
@@ -177,24 +154,15 @@ class Page {
   #key(event) {
     const inField = event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement;
     if (inField || event.ctrlKey || event.metaKey || event.altKey) return;
-    const cube = Number(event.key) - 1;
-    if (cube >= 0 && cube < this.rules.world.cubes) this.#choose(cube);
-    else if (event.key === 'ArrowRight') this.#ask(this.chosen, true);
-    else if (event.key === 'ArrowLeft') this.#ask(this.chosen, false);
-    else if (event.key.toLowerCase() === 'n') this.#anew();
-    else return;
+    if (event.key.toLowerCase() === 'n') this.#anew();
+    else if (!this.controls.key(event.key)) return;
     event.preventDefault();
-  }
-
-  /** @param {number} cube */
-  #choose(cube) {
-    this.chosen = cube;
-    this.#update();
   }
 
   #anew() {
     this.queue = [];
     this.moving = null;
+    this.waiting = null;
     this.game.reset();
     this.#begin();
   }
@@ -203,34 +171,32 @@ class Page {
     this.scene.place(this.game.state);
     this.view.hidesHand = !this.game.shown;
     this.dream?.look(this.rules.rowOf(this.game.state));
-    this.#say({ text: `Your turn. The hand points at cube ${this.game.state.at(-1) + 1}.`, tone: '' });
+    this.#say({ text: this.controls.opening(this.game.state), tone: '' });
     this.#update();
   }
 
   /**
-   * Turn a cube, or wait until the arm is free.
-   * @param {number} cube
-   * @param {boolean} clockwise
+   * Carry out a macro-action, or wait until the arm is free.
+   * @param {number} action
    */
-  #ask(cube, clockwise) {
+  #ask(action) {
     if (this.moving) {
-      this.waiting = [cube, clockwise];
+      this.waiting = action;
       return;
     }
     if (this.game.over || this.queue.length > 0) return;
-    const action = this.game.actionOf(cube, clockwise);
-    const { outcome, slips } = this.game.intend(action);
-    this.#move(action, outcome.macrostate, slips);
+    this.#move(action, this.game.intend(action));
   }
 
   /**
    * @param {number} action
    * @param {number[]} intended
-   * @param {boolean} slips
    */
-  #move(action, intended, slips) {
+  #move(action, intended) {
+    const { state } = this.game;
+    const slips = this.rules.slips(state, action, intended);
     this.moving = { action, intended, slips };
-    this.scene.begin(this.rules.turns[action], slips);
+    this.scene.begin(this.rules, state, action, slips);
     document.body.dataset.moving = 'yes';
     this.#say({ text: 'The arm is moving …', tone: '' });
     this.#update();
@@ -246,7 +212,7 @@ class Page {
       if (!moves) this.#arrive();
     } else if (this.queue.length > 0) {
       const next = this.queue.shift();
-      this.#move(next.action, next.reached, this.game.slips(next.action, next.reached));
+      this.#move(next.action, next.reached);
     }
     if (this.#looksNew()) {
       this.view.draw();
@@ -267,20 +233,20 @@ class Page {
   #arrive() {
     const { action, intended, slips } = this.moving;
     this.moving = null;
-    const { macrostate, fault } = this.scene.read(intended.at(-1));
-    const outcome = this.game.reach(macrostate);
+    const { macrostate, fault } = this.scene.read(intended);
+    const outcome = this.game.reach(action, macrostate);
     const asIntended = macrostate.join() === intended.join();
-    const why = fault ?? (asIntended ? null : `the cubes read ${macrostate.join(' ')}, the rules say ${intended.join(' ')}`);
-    this.scene.point(macrostate.at(-1));
+    const why = fault ?? (asIntended ? null : `the objects read ${macrostate.join(' ')}, the rules say ${intended.join(' ')}`);
+    this.scene.gesture(macrostate);
     this.view.hidesHand = !this.game.shown;
     this.dream?.follow(this.rules.turns[action], this.rules.rowOf(macrostate), outcome);
-    this.#say(happened(this.game, outcome, slips, why));
+    this.#say(this.controls.happened(this.game, outcome, slips, why));
     document.body.dataset.moving = 'no';
     document.body.dataset.end = this.game.over ? (outcome.success ? 'solved' : 'lost') : '';
     this.#update();
     const next = this.waiting;
     this.waiting = null;
-    if (next && this.queue.length === 0) this.#ask(...next);
+    if (next !== null && this.queue.length === 0) this.#ask(next);
   }
 
   /** @param {{text: string, tone: string}} said */
@@ -291,16 +257,10 @@ class Page {
 
   #update() {
     this.version += 1;
-    const { state, left, over, shown, played, solved } = this.game;
-    const pointed = state.at(-1);
-    this.cards.forEach((card, cube) => {
-      card.box.classList.toggle('chosen', cube === this.chosen);
-      card.arrow.textContent = ARROWS[state[cube]];
-      card.asked.textContent = shown && cube === pointed ? 'pointed at' : '';
-      card.buttons.forEach((button) => { button.disabled = over || this.queue.length > 0; });
-    });
-    this.tags.forEach((tag, cube) => tag.classList.toggle('chosen', cube === this.chosen));
-    find('left').textContent = `${left} ${left === 1 ? 'turn' : 'turns'} left`;
+    const { state, left, over, played, solved } = this.game;
+    this.controls.update(this.game, over || this.queue.length > 0);
+    this.tags.forEach((tag, index) => tag.classList.toggle('chosen', index === this.controls.chosen));
+    find('left').textContent = `${left} ${this.controls.unit[Number(left !== 1)]} left`;
     find('yours').textContent = `${solved} of ${played}`;
     document.body.dataset.state = state.join();
     document.body.dataset.left = String(left);
@@ -308,8 +268,8 @@ class Page {
 
   #placeTags() {
     const { data, facts } = this.scene;
-    this.tags.forEach((tag, cube) => {
-      const at = facts.cube_qpos[cube];
+    this.tags.forEach((tag, index) => {
+      const at = facts.object_qpos[index];
       const { x, y } = this.view.project([data.qpos[at], data.qpos[at + 1], data.qpos[at + 2] - 0.045]);
       tag.style.left = `${100 * x}%`;
       tag.style.top = `calc(${100 * y}% + 12px)`;
@@ -349,7 +309,7 @@ class Page {
     this.game.reset([...episode.start]);
     this.#begin();
     this.queue = episode.actions.map((action, at) => ({ action, reached: episode.states[at] }));
-    const still = episode.actions.length === 0 ? ' No arrow was turned in it, so the arm stands still here.' : '';
+    const still = episode.actions.length === 0 ? ` ${this.controls.still}` : '';
     this.#say({ text: `Playing the episode of ${this.row.title}.${still}`, tone: '' });
     this.#update();
   }

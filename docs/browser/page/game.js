@@ -18,7 +18,7 @@ export function generator(seed) {
 /** The game in a world. */
 export class Game {
   /**
-   * @param {import('./rules.js').Rules} rules
+   * @param {import('./families.js').Rules} rules
    * @param {() => number} random
    */
   constructor(rules, random) {
@@ -31,7 +31,7 @@ export class Game {
 
   /**
    * Begin an episode.
-   * @param {import('./rules.js').State} [start] drawn if it is left out
+   * @param {import('./outcomes.js').State} [start] drawn if it is left out
    */
   reset(start) {
     const { starts } = this.rules;
@@ -51,33 +51,22 @@ export class Game {
   }
 
   /**
-   * The outcome that a macro-action shall have.
+   * The macrostate that a macro-action shall lead to.
    * @param {number} action
-   * @returns {{outcome: import('./rules.js').Outcome, slips: boolean}}
+   * @returns {import('./outcomes.js').State}
    */
   intend(action) {
-    const outcome = this.rules.draw(this.state, action, this.random());
-    return { outcome, slips: this.slips(action, outcome.macrostate) };
-  }
-
-  /**
-   * Whether the fingers open too early on the way to a macrostate.
-   * @param {number} action
-   * @param {import('./rules.js').State} reached
-   * @returns {boolean}
-   */
-  slips(action, reached) {
-    const { cube } = this.rules.turns[action][0];
-    return reached[cube] === this.state[cube];
+    return this.rules.draw(this.state, action, this.random()).macrostate;
   }
 
   /**
    * Take in the macrostate that was read from the scene.
-   * @param {import('./rules.js').State} reached
-   * @returns {import('./rules.js').Outcome}
+   * @param {number} action
+   * @param {import('./outcomes.js').State} reached
+   * @returns {import('./outcomes.js').Outcome}
    */
-  reach(reached) {
-    const outcome = this.rules.judge(reached);
+  reach(action, reached) {
+    const outcome = this.rules.judged(this.state, action, reached);
     this.state = reached;
     this.steps += 1;
     this.left -= 1;
@@ -88,15 +77,5 @@ export class Game {
       this.solved += Number(outcome.success);
     }
     return outcome;
-  }
-
-  /**
-   * The macro-action that turns a cube, alone or with the next one.
-   * @param {number} cube
-   * @param {boolean} clockwise
-   * @returns {number}
-   */
-  actionOf(cube, clockwise) {
-    return this.rules.turns.findIndex(([own]) => own.cube === cube && own.clockwise === clockwise);
   }
 }

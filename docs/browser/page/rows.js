@@ -1,7 +1,7 @@
 // Kept episodes of an agent, to be played again by the arm. They are read from this folder alone, and everything in
 // them is checked against the rules before anything moves.
 
-import { Rules } from './rules.js';
+import { rulesOf } from './families.js';
 import { brief, readWorld, WorldError } from './world.js';
 
 const NAME = /^[a-z0-9][a-z0-9_.,=-]{0,79}$/;
@@ -37,30 +37,19 @@ function areIntegers(numbers, least, below) {
 }
 
 /**
- * @param {Rules} rules
- * @param {unknown} state
- * @returns {boolean}
- */
-function isState(rules, state) {
-  const { cubes } = rules.world;
-  return areIntegers(state, 0, 4) && state.length === cubes + 1
-    && areIntegers([state[cubes]], 0, cubes);
-}
-
-/**
- * @param {Rules} rules
+ * @param {import('./families.js').Rules} rules
  * @param {any} episode
  * @param {number} index
  */
 function checkEpisode(rules, episode, index) {
   const fail = (why) => { throw new WorldError(`Episode ${index + 1} of this row ${why}; it is not played.`); };
-  if (!isState(rules, episode?.start)) fail('starts in no macrostate of its world');
+  if (!rules.isState(episode?.start)) fail('starts in no macrostate of its world');
   const { actions, states } = episode;
   if (!areIntegers(actions, 0, rules.nActions) || actions.length > rules.horizon) fail('has macro-actions of no such world');
   if (!Array.isArray(states) || states.length !== actions.length) fail('does not say where each macro-action led');
   let before = episode.start;
   actions.forEach((action, at) => {
-    if (!isState(rules, states[at])) fail('reaches no macrostate of its world');
+    if (!rules.isState(states[at])) fail('reaches no macrostate of its world');
     if (rules.isGoal(before) || !rules.isLegal(before)) fail('goes on after its end');
     const possible = rules.outcomes(before, action).some((outcome) => outcome.macrostate.join() === states[at].join());
     if (!possible) fail(`claims a result of macro-action ${at + 1} that the rules do not allow`);
@@ -81,7 +70,7 @@ export function readRow(given) {
   }
   if (episodes.length > MOST_EPISODES) throw new WorldError(`This row has more than ${MOST_EPISODES} episodes.`);
   const world = readWorld(line);
-  const rules = new Rules(world);
+  const rules = rulesOf(world);
   episodes.forEach((episode, index) => checkEpisode(rules, episode, index));
   return { title: title.slice(0, 120), world, episodes };
 }

@@ -1,7 +1,8 @@
 // The rules of a world: which turns a macro-action makes, where it leads, its reward and whether the episode ends.
 // They know no physics. Python's tests compare them with the package's own rules, outcome by outcome.
 
-import { FAMILY } from './constants.js';
+import { ARROW_PUZZLE } from './constants.js';
+import { drawn, varied } from './outcomes.js';
 import { permutation } from './permutation.js';
 import { WorldError } from './world.js';
 
@@ -9,33 +10,28 @@ import { WorldError } from './world.js';
  * A quarter turn of one cube, as the robot's camera sees it.
  * @typedef {{cube: number, clockwise: boolean}} Turn
  *
- * A macrostate: the direction of each arrow, and the cube that the human points at.
- * @typedef {number[]} State
+ * @typedef {import('./outcomes.js').Outcome} Outcome
  *
- * @typedef {object} Outcome
- * @property {number} probability
- * @property {State} macrostate
- * @property {number} reward
- * @property {boolean} terminated
- * @property {boolean} success
+ * A macrostate: the direction of each arrow, and the cube that the human points at.
+ * @typedef {import('./outcomes.js').State} State
  */
 
-const DIRECTIONS = FAMILY.directions.length;
+const DIRECTIONS = ARROW_PUZZLE.directions.length;
 
-/** The macrostate machine of a world. */
-export class Rules {
+/** The macrostate machine of a world of the arrow puzzle. */
+export class ArrowRules {
   /** @param {import('./world.js').World} world */
   constructor(world) {
     this.world = world;
     this.turns = this.#turns();
     this.nActions = this.turns.length;
     const pattern = world.goal === 'all' ? '0'.repeat(world.cubes) : world.goal;
-    const named = Object.hasOwn(FAMILY.goals, world.goal) ? FAMILY.goals[world.goal] : null;
+    const named = Object.hasOwn(ARROW_PUZZLE.goals, world.goal) ? ARROW_PUZZLE.goals[world.goal] : null;
     /** @type {number[]} */
     this.pattern = named ? [] : [...pattern].map(Number);
     /** @type {number|null} */
     this.pointed = named ? named.pointed : null;
-    this.absent = [...(named ? named.absent : []), ...(world.forbidden.includes('agent') ? [FAMILY.towardAgent] : [])];
+    this.absent = [...(named ? named.absent : []), ...(world.forbidden.includes('agent') ? [ARROW_PUZZLE.towardAgent] : [])];
     this.nStates = DIRECTIONS ** world.cubes * world.cubes;
     this.planLengths = this.#planLengths();
     /** Rows of the macrostates in which an episode may start. */
@@ -44,7 +40,7 @@ export class Rules {
       throw new WorldError('The goal of this world cannot be reached from anywhere; give another goal or forbid less.');
     }
     const longest = this.planLengths.reduce((most, each) => Math.max(most, each), 0);
-    this.horizon = world.horizon ?? Math.max(FAMILY.shortestHorizon, FAMILY.plansInHorizon * longest);
+    this.horizon = world.horizon ?? Math.max(ARROW_PUZZLE.shortestHorizon, ARROW_PUZZLE.plansInHorizon * longest);
   }
 
   /** @returns {Turn[][]} */
@@ -175,11 +171,45 @@ export class Rules {
    * @returns {Outcome}
    */
   judge(reached, probability = 1) {
-    const { goal, illegal, step } = FAMILY.rewards;
+    const { goal, illegal, step } = ARROW_PUZZLE.rewards;
     const outcome = { probability, macrostate: reached };
     if (!this.isLegal(reached)) return { ...outcome, reward: illegal, terminated: true, success: false };
     if (this.isGoal(reached)) return { ...outcome, reward: goal, terminated: true, success: true };
     return { ...outcome, reward: step, terminated: false, success: false };
+  }
+
+  /**
+   * The outcome of a macro-action that was read to have reached a macrostate.
+   * @param {State} state before
+   * @param {number} action
+   * @param {State} reached
+   * @returns {Outcome}
+   */
+  judged(state, action, reached) {
+    return this.judge(reached);
+  }
+
+  /**
+   * Whether the fingers open too early on the way to a macrostate.
+   * @param {State} state
+   * @param {number} action
+   * @param {State} reached
+   * @returns {boolean}
+   */
+  slips(state, action, reached) {
+    const { cube } = this.turns[action][0];
+    return reached[cube] === state[cube];
+  }
+
+  /**
+   * @param {unknown} state
+   * @returns {boolean} whether it is a macrostate of this world
+   */
+  isState(state) {
+    const { cubes } = this.world;
+    const isBelow = (each, limit) => Number.isInteger(each) && each >= 0 && each < limit;
+    return Array.isArray(state) && state.length === cubes + 1
+      && state.slice(0, cubes).every((each) => isBelow(each, DIRECTIONS)) && isBelow(state[cubes], cubes);
   }
 
   /**
@@ -189,43 +219,29 @@ export class Rules {
    * @returns {Outcome[]}
    */
   outcomes(state, action) {
-    const { slip, goal_change: change, cubes } = this.world;
-    let found = [this.judge(this.turned(state, action))];
-    if (slip > 0) found = [{ ...found[0], probability: 1 - slip }, this.judge([...state], slip)];
-    if (!(change > 0)) return found;
-    /** @type {Map<string, Outcome>} */
-    const merged = new Map();
-    const add = (outcome, probability) => {
-      const key = outcome.macrostate.join();
-      const before = merged.get(key)?.probability ?? 0;
-      merged.set(key, { ...outcome, probability: before + probability });
-    };
-    for (const outcome of found) {
-      const asked = outcome.macrostate[cubes];
-      const share = outcome.terminated ? 0 : change;
-      add(outcome, outcome.probability * (1 - share));
-      for (let cube = 0; share > 0 && cube < cubes; cube += 1) {
-        const other = [...outcome.macrostate.slice(0, -1), cube];
-        if (cube !== asked) add(this.judge(other), outcome.probability * (share / (cubes - 1)));
-      }
-    }
-    return [...merged.values()].filter((outcome) => outcome.probability > 0);
+    const found = [this.judge(this.turned(state, action))];
+    return varied(this.world, found, this.judge([...state]), (outcome) => this.#askedOtherwise(outcome));
+  }
+
+  /**
+   * The outcomes where the hand points at another cube.
+   * @param {Outcome} outcome
+   * @returns {Outcome[]}
+   */
+  #askedOtherwise({ macrostate }) {
+    const { cubes } = this.world;
+    const others = Array.from({ length: cubes }, (_, cube) => cube).filter((cube) => cube !== macrostate[cubes]);
+    return others.map((cube) => this.judge([...macrostate.slice(0, -1), cube]));
   }
 
   /**
    * One outcome, drawn by its probability.
    * @param {State} state
    * @param {number} action
-   * @param {number} drawn from 0 to 1
+   * @param {number} share from 0 to 1
    * @returns {Outcome}
    */
-  draw(state, action, drawn) {
-    const outcomes = this.outcomes(state, action);
-    let left = drawn;
-    for (const outcome of outcomes) {
-      left -= outcome.probability;
-      if (left < 0) return outcome;
-    }
-    return outcomes[outcomes.length - 1];
+  draw(state, action, share) {
+    return drawn(this.outcomes(state, action), share);
   }
 }

@@ -131,7 +131,7 @@ export class View {
     const { model } = scene;
     this.parts.forEach((part) => { gl.deleteVertexArray(part.array); gl.deleteBuffer(part.buffer); });
     this.scene = scene;
-    const hand = model.body('hand').id;
+    const hands = scene.facts.hands.map((name) => model.body(name).id);
     this.camera = model.cam('wrist').id;
     this.parts = [];
     for (let geom = 0; geom < model.ngeom; geom += 1) {
@@ -155,7 +155,7 @@ export class View {
         geom, array, buffer, group, isFloor,
         count: triangles.length / 6,
         color: Array.from(from.slice(4 * row, 4 * row + 4)),
-        isHand: model.geom_bodyid[geom] === hand,
+        isHand: hands.includes(model.geom_bodyid[geom]),
       });
     }
     gl.bindVertexArray(null);

@@ -1,6 +1,6 @@
 // The words of the page about a world and about its episodes.
 
-import { FAMILY } from './constants.js';
+import { ARROW_PUZZLE } from './constants.js';
 
 export const ARROWS = ['↑', '→', '↓', '←'];
 
@@ -15,12 +15,12 @@ export function percent(share) {
 
 /**
  * The goal in one sentence, and the forbidden turns.
- * @param {import('./rules.js').Rules} rules
+ * @param {import('./rules.js').ArrowRules} rules
  * @returns {string}
  */
 export function goalOf(rules) {
   const { world } = rules;
-  const toward = (direction) => `${FAMILY.directions[direction]} (${ARROWS[direction]})`;
+  const toward = (direction) => `${ARROW_PUZZLE.directions[direction]} (${ARROWS[direction]})`;
   let goal;
   if (rules.pointed !== null) goal = `Make the cube that the hand points at point ${toward(rules.pointed)}`;
   else goal = `Make the arrows point ${rules.pattern.map((each) => ARROWS[each]).join(' ')}, from left to right`;
@@ -38,8 +38,10 @@ export function goalOf(rules) {
 export function oddities(world) {
   const said = [];
   const often = (share) => `${Number((100 * share).toPrecision(4))} %`;
-  if (world.slip > 0) said.push(`The fingers slip in ${often(world.slip)} of the turns.`);
-  if (world.goal_change > 0) said.push(`The hand moves on after ${often(world.goal_change)} of the turns.`);
+  const moves = world.isPickPlace ? 'actions' : 'turns';
+  const changes = world.isPickPlace ? 'The human wants something else' : 'The hand moves on';
+  if (world.slip > 0) said.push(`The fingers slip in ${often(world.slip)} of the ${moves}.`);
+  if (world.goal_change > 0) said.push(`${changes} after ${often(world.goal_change)} of the ${moves}.`);
   if (world.coupling === 'neighbour') said.push('The next cube to the right turns along.');
   if (world.gesture === 'first') said.push('The hand is shown at the start alone.');
   else if (world.gesture !== 'always') said.push(`The hand is shown ${often(world.gesture)} of the time.`);
@@ -49,15 +51,23 @@ export function oddities(world) {
 }
 
 /**
+ * @param {import('./outcomes.js').Outcome} outcome
+ * @returns {string}
+ */
+export function rewardOf(outcome) {
+  return `Reward ${String(outcome.reward).replace('-', '−')}.`;
+}
+
+/**
  * @param {import('./game.js').Game} game
- * @param {import('./rules.js').Outcome} outcome
+ * @param {import('./outcomes.js').Outcome} outcome
  * @param {boolean} slipped
  * @param {string|null} fault
  * @returns {{text: string, tone: string}}
  */
 export function happened(game, outcome, slipped, fault) {
   const { world } = game.rules;
-  const reward = `Reward ${String(outcome.reward).replace('-', '−')}.`;
+  const reward = rewardOf(outcome);
   if (fault) return { text: `The physics went wrong: ${fault}.`, tone: 'bad' };
   if (outcome.success) return { text: `Solved in ${game.steps} ${game.steps === 1 ? 'turn' : 'turns'}. ${reward}`, tone: 'good' };
   if (outcome.terminated) {

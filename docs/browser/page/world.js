@@ -1,22 +1,25 @@
 // A world by its line, `arrows:cubes=4,slip=0.1`, checked as Python checks it. Names, ranges and defaults are generated.
 
-import { FAMILY } from './constants.js';
+import { ARROW_PUZZLE, PICK_PLACE } from './constants.js';
 
 /** A line that names no world; its message says how to write one. */
 export class WorldError extends Error {}
 
+const FAMILIES = [ARROW_PUZZLE, PICK_PLACE];
 const LONGEST_LINE = 200;
 const NUMBER = /^-?(0|[1-9]\d{0,15})(\.\d{1,17})?([eE][+-]?\d{1,3})?$/;
 const INTEGER = /^-?(0|[1-9]\d{0,15})$/;
 
 /**
+ * A world of the arrow puzzle or of pick-and-place; the first six parameters are the arrow puzzle's alone.
  * @typedef {object} World
- * @property {number} cubes
- * @property {string} goal
- * @property {string[]} forbidden
- * @property {string} coupling
- * @property {number|null} shuffle
- * @property {number|null} horizon
+ * @property {boolean} isPickPlace
+ * @property {number} [cubes]
+ * @property {string} [goal]
+ * @property {string[]} [forbidden]
+ * @property {string} [coupling]
+ * @property {number|null} [shuffle]
+ * @property {number|null} [horizon]
  * @property {number} slip
  * @property {number} goal_change
  * @property {string|number} gesture
@@ -46,12 +49,12 @@ function value(text) {
 }
 
 /**
+ * @param {[number, number, boolean]} range the lowest and the highest value, and whether they are integers
  * @param {string} name
  * @param {{text: string, number: number|null, integer: boolean}} given
  * @returns {number}
  */
-function numberOf(name, given) {
-  const [low, high, integer] = FAMILY.ranges[name];
+function numberOf([low, high, integer], name, given) {
   const right = given.number !== null && (!integer || given.integer);
   if (!right || given.number < low || given.number > high) {
     const kind = integer ? 'an integer' : 'a number';
@@ -75,10 +78,10 @@ function oneOf(name, text, allowed) {
  * @param {World} world
  */
 function checkGoal(world) {
-  if (FAMILY.goals[world.goal] !== undefined && Object.hasOwn(FAMILY.goals, world.goal)) return;
+  if (ARROW_PUZZLE.goals[world.goal] !== undefined && Object.hasOwn(ARROW_PUZZLE.goals, world.goal)) return;
   if (world.goal === 'all') return;
   if (!new RegExp(`^[0-3]{${world.cubes}}$`).test(world.goal)) {
-    const names = [...Object.keys(FAMILY.goals), 'all'].join(', ');
+    const names = [...Object.keys(ARROW_PUZZLE.goals), 'all'].join(', ');
     throw new WorldError(`goal is ${brief(world.goal)}; give ${names}, or ${world.cubes} digits from 0 to 3.`);
   }
 }
@@ -87,7 +90,7 @@ function checkGoal(world) {
  * @param {World} world
  */
 function checkForbidden(world) {
-  world.forbidden.forEach((part) => oneOf('forbid', part, FAMILY.forbids));
+  world.forbidden.forEach((part) => oneOf('forbid', part, ARROW_PUZZLE.forbids));
   const repeated = new Set(world.forbidden).size < world.forbidden.length;
   if (repeated || (world.forbidden.includes('none') && world.forbidden.length > 1)) {
     throw new WorldError(`forbid is ${brief(world.forbidden.join('+'))}, which contradicts itself; give each part once.`);
@@ -98,23 +101,39 @@ function checkForbidden(world) {
 }
 
 /**
+ * @param {Object<string, string>} spellings
  * @param {string[]} pairs
  * @returns {Map<string, {text: string, number: number|null, integer: boolean}>}
  */
-function readPairs(pairs) {
+function readPairs(spellings, pairs) {
   const given = new Map();
   for (const pair of pairs) {
     const at = pair.indexOf('=');
     const spelled = pair.slice(0, Math.max(at, 0));
-    if (!Object.hasOwn(FAMILY.spellings, spelled)) {
-      const names = Object.keys(FAMILY.spellings).join(', ');
+    if (!Object.hasOwn(spellings, spelled)) {
+      const names = Object.keys(spellings).join(', ');
       throw new WorldError(`${brief(pair)} sets no parameter; give name=value with one of ${names}.`);
     }
-    const name = FAMILY.spellings[spelled];
+    const name = spellings[spelled];
     if (given.has(name)) throw new WorldError(`${name} is given twice; give it once.`);
     given.set(name, value(pair.slice(at + 1)));
   }
   return given;
+}
+
+/**
+ * Check the parameters that the arrow puzzle alone has, and read the forbidden turns.
+ * @param {World} world
+ */
+function checkArrows(world) {
+  const usual = world.cubes < 4 ? 'equal' : 'neighbours';
+  world.forbidden = String(world.forbid ?? usual).split('+');
+  oneOf('coupling', world.coupling, ARROW_PUZZLE.couplings);
+  checkGoal(world);
+  checkForbidden(world);
+  if (world.cubes === 1 && (world.goal_change > 0 || world.coupling !== 'none')) {
+    throw new WorldError('goal_change and coupling need another cube; give at least 2 cubes.');
+  }
 }
 
 /**
@@ -129,25 +148,19 @@ export function readWorld(line) {
   }
   const colon = line.indexOf(':');
   const name = colon < 0 ? line : line.slice(0, colon);
-  if (!Object.hasOwn(FAMILY.named, name)) {
-    const names = Object.keys(FAMILY.named).join(', ');
+  const family = FAMILIES.find((each) => Object.hasOwn(each.named, name));
+  if (!family) {
+    const names = FAMILIES.flatMap((each) => Object.keys(each.named)).join(', ');
     throw new WorldError(`There is no world ${brief(name)}; give one of ${names}, or a line such as arrows:cubes=4,slip=0.1.`);
   }
-  const given = readPairs(colon < 0 ? [] : line.slice(colon + 1).split(','));
-  const world = { ...FAMILY.defaults, ...FAMILY.named[name], line };
+  const given = readPairs(family.spellings, colon < 0 ? [] : line.slice(colon + 1).split(','));
+  const world = { ...family.defaults, ...family.named[name], isPickPlace: family === PICK_PLACE, line };
   for (const [key, each] of given) {
-    if (key === 'gesture' && FAMILY.gestures.includes(each.text)) world.gesture = each.text;
-    else if (FAMILY.ranges[key]) world[key] = numberOf(key, each);
+    if (key === 'gesture' && family.gestures.includes(each.text)) world.gesture = each.text;
+    else if (family.ranges[key]) world[key] = numberOf(family.ranges[key], key, each);
     else if (each.number !== null && !/^0\d/.test(each.text)) throw new WorldError(`${key} is a number; write "${brief(each.text).slice(1, -1)}" in quotation marks.`);
     else world[key] = each.text;
   }
-  const usual = world.cubes < 4 ? 'equal' : 'neighbours';
-  world.forbidden = String(world.forbid ?? usual).split('+');
-  oneOf('coupling', world.coupling, FAMILY.couplings);
-  checkGoal(world);
-  checkForbidden(world);
-  if (world.cubes === 1 && (world.goal_change > 0 || world.coupling !== 'none')) {
-    throw new WorldError('goal_change and coupling need another cube; give at least 2 cubes.');
-  }
+  if (!world.isPickPlace) checkArrows(world);
   return world;
 }
