@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -17,7 +18,7 @@ from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_board import motions
 from imagine_bench_board.check import NOT_VOUCHED, check
 from imagine_bench_board.commands import board
-from imagine_bench_board.motions import SLACK_PERIODS, MotionRow, MotionTests, read_motions
+from imagine_bench_board.motions import SLACK_PERIODS, Motion, MotionRow, MotionTests, read_motions
 from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import CARD, EPISODES, LONGEST
 
@@ -319,7 +320,7 @@ def test_a_row_of_another_mujoco_is_not_vouched_for_and_never_holds(
 
 
 @pytest.mark.parametrize("version", ["4.0.0", "999.0.0"])
-@pytest.mark.parametrize("forgery", FORGERIES)
+@pytest.mark.parametrize("forgery", [each for each in FORGERIES if each is not hidden])
 def test_a_forger_gains_nothing_by_naming_another_mujoco(
     row: Path, forgery: Callable[[dict[str, Any], list[dict[str, Any]]], None], version: str
 ) -> None:
@@ -329,6 +330,46 @@ def test_a_forger_gains_nothing_by_naming_another_mujoco(
     seal(row, card, parts)
     (found,) = check(row)
     assert found.row is None and "holds" not in str(found)
+
+
+@pytest.mark.parametrize(("total_reward", "least"), [(50.0, -5.0), (-40.0, -40.0)])
+def test_a_marked_test_may_end_otherwise_with_another_mujoco_and_has_failed(
+    row: Path, total_reward: float, least: float
+) -> None:
+    """With the MuJoCo of the card the same row is refused."""
+    card = json.loads((row / CARD).read_text())
+    parts = json.loads((row / EPISODES).read_text())
+    honest = read_motions(row).vouched
+    hidden(card, parts)
+    parts[1]["total_reward"] = total_reward
+    seal(row, card, parts)
+    assert ": refused: test 1: its total reward is" in str(check(row)[0])
+    seal(row, card | {"mujoco": "4.0.0"}, parts)
+    (found,) = check(row)
+    assert isinstance(found.row, MotionRow) and "1 not reproducible and counted as failed" in str(found)
+    assert found.row.vouched.successes == honest.successes
+    assert found.row.vouched.mean_return == honest.mean_return + least / TESTS, "test 1 had a return of 0"
+    cut(card, parts)
+    seal(row, card | {"mujoco": "4.0.0"}, parts)
+    assert ": not vouched: made with" in str(check(row)[0]), "its commands must end an episode"
+
+
+def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(row: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    played = motions._played
+
+    def worse(*given: Any, **more: Any) -> Motion | None:
+        found = played(*given, **more)
+        return found and dataclasses.replace(found, total_reward=found.total_reward - 40.0)
+
+    card = json.loads((row / CARD).read_text()) | {"mujoco": "4.0.0"}
+    parts = json.loads((row / EPISODES).read_text())
+    for part in parts:
+        part["reproducible"] = False
+    seal(row, card, parts)
+    monkeypatch.setattr(motions, "_played", worse)
+    (found,) = check(row)
+    assert isinstance(found.row, MotionRow)
+    assert [each.total_reward for each in found.row.motions] == [each["total_reward"] - 40.0 for each in parts]
 
 
 def test_what_needs_no_replay_is_refused_whatever_mujoco_made_it(row: Path) -> None:

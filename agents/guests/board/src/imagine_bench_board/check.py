@@ -108,11 +108,12 @@ class _Court:
             start_seed = self._starts(folder, moved, moved.protocol.tests)
             of_round = start_seed is None or moved.protocol.seed == start_seed
             require(of_round, f"its seed is not that of the round {moved.round}.")
+            here = installed_mujoco()
+            is_other = moved.mujoco != here
             try:
-                read[0] = motions.check_motions(moved, self._motion_env(moved))
+                read[0] = motions.check_motions(moved, self._motion_env(moved), other_mujoco=is_other)
             except motions.ReplayError:
-                here = installed_mujoco()
-                if moved.mujoco == here:
+                if not is_other:
                     raise
                 made = f"made with MuJoCo {moved.mujoco}, checked with {here}"
                 remedy = f"check it with {moved.mujoco} (pip install mujoco=={moved.mujoco})."

@@ -45,9 +45,13 @@ RATE_HZ = 25.0
 SLACK_PERIODS = 3
 """Control periods by which an event may come earlier or later on another kind of processor."""
 DISTURBED = 16
-"""Replays of a test, with disturbances, that say whether its end depends on how a processor rounds."""
-DISTURBANCE = 1e-12
-"""Standard deviation of a disturbance of each joint, in rad or m: 10,000 times the rounding of numbers around 1."""
+"""Replays of a test, with disturbances, that say whether its end depends on the processor or the version of MuJoCo."""
+DISTURBANCE = 1e-6
+"""Standard deviation of a disturbance of each joint, in rad or m: 1 micrometre.
+
+Between processors, positions differ by their last bits, 1e-16. Between MuJoCo 3.17.0 and 4.0.0 too, until a part of the
+arm that is no fingertip touches something: then they differ by 1e-6 at once, in the median of 34 tests by chance.
+"""
 DISTURBED_EVERY = 25
 """Control periods between disturbances: 1 s. One at the start alone would die away while the servos hold the arm."""
 FAILED_RETURN = -5.0
@@ -112,7 +116,7 @@ class Motion:
     solved: bool
     fault: bool  #: whether a fault ended it
     fingerprint: int  #: CRC-32 of the start and of each event: macrostates and rewards
-    reproducible: bool = True  #: whether its end is the same however a processor rounds; if not, it counts as failed
+    reproducible: bool = True  #: whether its end is the same with tiny disturbances; if not, it counts as failed
 
     @property
     def periods(self) -> int:
@@ -321,8 +325,7 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
     def write(self, out: Path | str, name: str, *, agent: str, **claims: Any) -> Path:
         """Write the row ``name`` below a folder, and return its path.
 
-        Each test is played several times more, with disturbances as small as rounding, to see whether it is
-        reproducible.
+        Each test is played several times more, with tiny disturbances, to see whether it is reproducible.
 
         Args:
             out: The folder of rows, such as ``docs/board/rows``.
@@ -407,11 +410,12 @@ def read_motions(folder: Path) -> MotionRow:
     )
 
 
-def check_motions(row: MotionRow, env: gymnasium.Env[Any, Any]) -> MotionRow:
+def check_motions(row: MotionRow, env: gymnasium.Env[Any, Any], *, other_mujoco: bool = False) -> MotionRow:
     """Play every test of a row again, in an environment of its protocol.
 
     Returns the row, in which the tests that are not reproducible here are marked, and its figures follow from that. A
-    test that the row itself marks stays marked.
+    test that the row itself marks stays marked; it may then end in another way where ``other_mujoco`` says that the
+    installed MuJoCo is not the row's. The return of a test that ends in another way is the lower of both.
 
     Raises:
         ReplayError: A test does not play again.
@@ -429,9 +433,14 @@ def check_motions(row: MotionRow, env: gymnasium.Env[Any, Any]) -> MotionRow:
         start = row.protocol.start(test)
         played = _played(unwrapped, start, kept.commands)
         complaint = _difference(kept, played)
-        if complaint and _same_whatever_rounding(unwrapped, start, kept.commands, played):
+        if not complaint:
+            motions.append(kept)
+            continue
+        is_excused = other_mujoco and not kept.reproducible and played is not None
+        if not is_excused and _same_when_disturbed(unwrapped, start, kept.commands, played):
             raise ReplayError(f"test {test}: {complaint}")
-        motions.append(dataclasses.replace(kept, reproducible=False) if complaint else kept)
+        lowest = kept.total_reward if played is None else min(kept.total_reward, played.total_reward)
+        motions.append(dataclasses.replace(kept, reproducible=False, total_reward=lowest))
     return dataclasses.replace(row, motions=tuple(motions), vouched=MotionFigures.of(motions))
 
 
@@ -451,7 +460,7 @@ def _is_reproducible(env: MotionEnv, seed: int, kept: Motion) -> bool:
     return all(not _difference(kept, _played(env, seed, kept.commands, disturbance=k)) for k in range(DISTURBED))
 
 
-def _same_whatever_rounding(env: MotionEnv, seed: int, commands: Floats32, played: Motion | None) -> bool:
+def _same_when_disturbed(env: MotionEnv, seed: int, commands: Floats32, played: Motion | None) -> bool:
     """Whether all disturbed replays of some commands have the results of an undisturbed one."""
     wanted = None if played is None else played.facts
     for number in range(DISTURBED):
