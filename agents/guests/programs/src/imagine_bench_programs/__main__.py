@@ -18,9 +18,11 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.registry import task
 from imagine_bench.registry.machine import describe_environment
 
-from .experience import itself, macro_actions_of, play, write_experience
+from .experience import See, itself, macro_actions_of, play, write_experience
 from .program import Program
-from .scores import Codes, Scores, efficiency, score
+from .scores import Codes, ReadRules, Scores, efficiency, score
+from .sight import SeeingWriter
+from .symbol_rules import SymbolRules
 from .writing.writer import Writer
 
 _TIMES = 2.0
@@ -98,6 +100,11 @@ def _add_write(parser: argparse.ArgumentParser) -> None:
         default="",
         help="the writer reads codes of images of this appearance, such as clean; without it, it is shown macrostates",
     )
+    parser.add_argument(
+        "--own",
+        action="store_true",
+        help="with --codes: not an encoder's codes, but those of a perception that is learned from the writer's images",
+    )
     parser.add_argument("--times", type=float, default=_TIMES, help="macro-actions, times the cautious learner's")
     parser.add_argument(
         "--out", type=Path, help="a JSON file of all figures; the same command goes on where it stopped"
@@ -108,6 +115,9 @@ def _add_write(parser: argparse.ArgumentParser) -> None:
 def _write(given: argparse.Namespace) -> None:
     rows = json.loads(given.out.read_text())["rows"] if given.out is not None and given.out.exists() else []
     done = {(row["task"], row["codes"], row["seed"], row["macro_actions"]) for row in rows}
+    if given.own and not given.codes:
+        raise InvalidValueError("--own reads images; name their appearance with --codes, such as --codes clean.")
+    kind = f"own {given.codes}" if given.own else given.codes
     for name in given.tasks:
         spec = task(name)
         learner = _learner(spec)
@@ -116,36 +126,52 @@ def _write(given: argparse.Namespace) -> None:
                 f"The cautious learner does not end in {name}, so there is no budget; leave it out."
             )
         budget = int(given.times * learner)
-        for seed in [seed for seed in given.seeds if (name, given.codes, seed, budget) not in done]:
-            found = written(spec, budget, seed, given.codes)
-            rows.append({"task": name, "codes": given.codes, "learner": learner, **found})
+        for seed in [seed for seed in given.seeds if (name, kind, seed, budget) not in done]:
+            found = written(spec, budget, seed, given.codes, own=given.own)
+            rows.append({"task": name, "codes": kind, "learner": learner, **found})
             print(*(f"{value:.4g}" if isinstance(value, float) else value for value in rows[-1].values()), flush=True)
             if given.out is not None:
                 given.out.write_text(json.dumps({"rows": rows, "environment": describe_environment()}, indent=1))
 
 
-def written(spec: TaskSpec, macro_actions: int, seed: int, appearance: str = "") -> dict[str, Any]:
+def written(
+    spec: TaskSpec, macro_actions: int, seed: int, appearance: str = "", *, own: bool = False
+) -> dict[str, Any]:
     """The scores of a writer that explored a task for so many macro-actions, and the laws that it found.
 
-    Where an appearance is given, the writer reads the codes of images of it; else it is shown the macrostates.
+    Where an appearance is given, the writer reads the codes of images of it; else it is shown the macrostates. The
+    codes are those of the task's encoder, or, with ``own``, those of a perception that the writer learns.
     """
     begun_s = time.process_time()
     starts, choices, images = (np.random.default_rng([seed, each]) for each in range(3))
-    codes = Codes(spec, appearance, images) if appearance else None
-    sizes = [len(values) for values in spec.macrostate_values] if codes is None else codes.symbols.sizes
-    writer = Writer(sizes, spec.n_actions, choices)
-    see = itself if codes is None else codes.of
-    for row, last in play(spec, lambda symbols: writer.choose(symbols, explore=True), starts, see):
+    if own:
+        seeing = SeeingWriter(spec, appearance, images, choices)
+        _explore(seeing, spec, macro_actions, starts, seeing.see)
+        writer = seeing.writer
+    else:
+        codes = Codes(spec, appearance, images) if appearance else None
+        sizes = [len(values) for values in spec.macrostate_values] if codes is None else codes.symbols.sizes
+        writer = Writer(sizes, spec.n_actions, choices)
+        _explore(writer, spec, macro_actions, starts, itself if codes is None else codes.of)
+    cpu_s = time.process_time() - begun_s
+    rules: SymbolRules = writer.laws
+    if own or codes is not None:
+        rules = ReadRules(rules, seeing.codes() if own else codes)
+    found = asdict(score(rules, spec))
+    return {"seed": seed, "macro_actions": macro_actions, **found, "laws": writer.laws.count, "cpu_s": round(cpu_s, 2)}
+
+
+def _explore(
+    writer: Writer | SeeingWriter, spec: TaskSpec, macro_actions: int, rng: np.random.Generator, see: See
+) -> None:
+    """Let a writer take so many macro-actions from new starts, and write."""
+    for count, (row, last) in enumerate(play(spec, writer.explore, rng, see), start=1):
         writer.learn(row)
         if last:
             writer.begin_episode()
-        if len(writer.rows) == macro_actions:
+        if count == macro_actions:
             break
     writer.write()
-    laws = writer.laws
-    cpu_s = time.process_time() - begun_s
-    found = asdict(score(laws if codes is None else codes.read(laws), spec))
-    return {"seed": seed, "macro_actions": macro_actions, **found, "laws": laws.count, "cpu_s": round(cpu_s, 2)}
 
 
 if __name__ == "__main__":

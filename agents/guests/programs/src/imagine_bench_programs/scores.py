@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from imagine_bench.judge.truth import added_up, total_variation
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 
+from .sight import SeenCodes
 from .symbol_rules import SymbolRules
 from .symbols import Symbols
 
@@ -65,15 +66,15 @@ class Codes:
         shown = np.array([macrostate], dtype=np.int64)
         return self.symbols.read(self._spec.render_macrostates(shown, self._appearance, self._rng))[0]
 
-    def read(self, rules: SymbolRules) -> ReadRules:
-        """Rules between codes as rules between macrostates."""
-        return ReadRules(rules, self)
+    def macrostates(self, codes: Sequence[State]) -> NDArray[np.int64]:
+        """The macrostates that the encoder's probe reads in N codes. Shape (N, M)."""
+        return self.symbols.macrostates(codes)
 
 
 class ReadRules(SymbolRules):
-    """Rules between codes as rules between macrostates: of a code that is expected a probe reads the macrostate."""
+    """Rules between codes as rules between macrostates, by the codes of macrostates and the macrostates of codes."""
 
-    def __init__(self, rules: SymbolRules, codes: Codes) -> None:
+    def __init__(self, rules: SymbolRules, codes: Codes | SeenCodes) -> None:
         super().__init__(rules.n_actions)
         self._rules = rules
         self._codes = codes
@@ -87,7 +88,7 @@ class ReadRules(SymbolRules):
         key = (macrostate, action)
         if key not in self._known:
             expected = self._rules.outcomes(self._shown[macrostate], action)
-            read = self._codes.symbols.macrostates([each.macrostate for each in expected])
+            read = self._codes.macrostates([each.macrostate for each in expected])
             states = map(tuple, read.tolist())
             self._known[key] = tuple(
                 replace(each, macrostate=state) for each, state in zip(expected, states, strict=True)

@@ -258,8 +258,8 @@ class _Dynamics:
             moved = [(turned, row) for turned, row in pairs if turned != row.now]
             came = sum(turned == self._steady(row.then, row.then) for turned, row in moved)
             counts.append((came, sum(self._steady(row.now, row.then) == row.then for _, row in moved)))
-        each = [simplest(*pair) for pair in counts]
-        together = simplest(*(sum(column) for column in zip(*counts, strict=True)))
+        each = [_named(*pair) for pair in counts]
+        together = _named(*(sum(column) for column in zip(*counts, strict=True)))
         if together[1] <= sum(nats for _, nats in each):
             return [together[0]] * self.n_actions
         return [chance for chance, _ in each]
@@ -311,6 +311,12 @@ def simplest(came: int, failed: int) -> tuple[float, float]:
             if nats < found[1]:
                 found = (chance, nats)
     return found
+
+
+def _named(came: int, failed: int) -> tuple[float, float]:
+    """The same, where 0 and 1 also take the nats of the name of one probability in ten."""
+    chance, nats = simplest(came, failed)
+    return chance, nats + math.log(10) * ((came > 0) != (failed > 0))
 
 
 def ends_of(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> list[End]:

@@ -78,14 +78,18 @@ class Writer:
 
     def write(self) -> None:
         """Find the laws of all transitions so far."""
-        before = self.laws.delay
         self.laws = Laws(self.sizes, self.n_actions, self.rows)
         self._learned = len(self.rows)
         self._met = {claim for row in self.laws.present(self.rows) for claim in self._claims(row)}
-        if self.laws.delay != before:
-            self._tried.clear()
-            for row in complete(changes(self.rows, self.laws.delay)):
-                self._count_try(row)
+        self._tried.clear()
+        for row in complete(changes(self.rows, self.laws.delay)):
+            self._count_try(row)
+
+    def take_up(self, sizes: Sequence[int], rows: Sequence[Row]) -> None:
+        """Begin again with transitions whose symbols have so many values each."""
+        self.sizes = tuple(sizes)
+        self.rows = list(rows)
+        self.write()
 
     def _claims(self, row: Row) -> list[tuple[tuple[int, int], ...]]:
         """The values whose meeting decides a transition's reward and end, as far as the laws say; else all pairs."""
@@ -100,6 +104,10 @@ class Writer:
         row = Row(now, action, expected.macrostate, expected.reward, expected.terminated)
         tried = all(self._tried[action, factor, value] >= _TRIES for factor, value in enumerate(now))
         return not tried or not self._met.issuperset(self._claims(row))
+
+    def explore(self, state: State) -> int:
+        """The macro-action with which it explores."""
+        return self.choose(state, explore=True)
 
     def choose(self, state: State, *, explore: bool) -> int:
         """The first macro-action of the best plan from the newest symbols, along the likeliest outcomes."""

@@ -1,0 +1,192 @@
+"""Codes that the perception of the agent ``factored`` learns from the writer's own images, with no encoder.
+
+The perception looks for factors in the images that were seen, again and again while the writer explores. Whenever it
+finds others, all transitions so far get their new codes, and the writer begins again with these.
+
+A value of a factor may say that the image hides the factor, as where the human points only once. It is found by its
+contradictions: the same codes and macro-action have different outcomes, and hardly any do once the value last seen
+stands in its place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from imagine_bench_factored.perception import LearnedPerception
+from imagine_bench_factored.settings import LearnedPerceptionSettings
+from numpy.typing import NDArray
+
+from imagine_bench.interfaces import Frame, State, TaskSpec
+from imagine_bench.rules import states_of
+
+from .writing.delay import Row, complete
+from .writing.writer import Writer
+
+_GROWTH = 2.0
+"""Factors are looked for again after so many times the images of the last time."""
+_IMAGES = 3
+"""New images of each macrostate that say which code it has."""
+_CLEARER = 0.2
+"""A hidden value leaves less than this share of the contradictions."""
+
+
+class SeeingWriter:
+    """A writer that sees images, through a perception that it learns.
+
+    Args:
+        spec: The task.
+        appearance: How images vary, such as ``clean``.
+        rng: Draws how each image looks.
+        choices: Chooses among macro-actions that are equally good.
+    """
+
+    def __init__(self, spec: TaskSpec, appearance: str, rng: np.random.Generator, choices: np.random.Generator) -> None:
+        self._spec = spec
+        self._appearance = appearance
+        self._rng = rng
+        settings = LearnedPerceptionSettings(growth=_GROWTH, growth_if_known=_GROWTH)
+        self.perception = LearnedPerception(settings, factored=True)
+        self.writer = Writer(self.perception.sizes, spec.n_actions, choices)
+        self._hidden: Hidden | None = None
+        self._images: list[Frame] = []
+        self._codes: dict[int, State] = {}
+        """The present codes of images, by their number."""
+        self._rows: list[Row] = []
+        """Transitions between numbers of images."""
+
+    def see(self, macrostate: State) -> State:
+        """The number of a new image of a macrostate, whose hidden coordinates are -1."""
+        self._images.append(self._drawn([macrostate])[0])
+        return (len(self._images) - 1,)
+
+    def explore(self, number: State) -> int:
+        """The macro-action with which it explores from an image."""
+        code = self._code(number[0])
+        if self._hidden is not None:
+            begins = not self.writer.rows or self._rows[-1].then != number
+            code = self._hidden.fill(code, None if begins else self.writer.rows[-1].then)
+        return self.writer.explore(code)
+
+    def learn(self, row: Row) -> None:
+        """Take in a transition between images."""
+        before, after = (self._images[number] for (number,) in (row.now, row.then))
+        self._rows.append(row)
+        if not self.perception.full:
+            self.perception.remember(before, row.action, after, begins=row.step == 0)
+            if self.perception.renew():
+                self._begin_again()
+                return
+        self.writer.learn(self._coded(self._rows[-1 - row.step :])[-1])
+
+    def begin_episode(self) -> None:
+        """Forget the macro-actions so far."""
+        self.writer.begin_episode()
+
+    def write(self) -> None:
+        """Look for factors a last time, and find the laws of all transitions."""
+        if not self.perception.full:
+            self.perception.look(len(self.perception.frames))
+        self._begin_again()
+
+    def codes(self) -> SeenCodes:
+        """The codes that macrostates have by the present perception, each in new images."""
+        found = {}
+        for state in states_of(self._spec.rules):
+            codes, _ = self.perception.codes(self._drawn([state] * _IMAGES))
+            found[state] = Counter(codes)
+        return SeenCodes(found)
+
+    def _drawn(self, macrostates: Sequence[State]) -> Frame:
+        """An image of each of N macrostates. Shape (N, 64, 64, 3)."""
+        return self._spec.render_macrostates(np.array(macrostates, dtype=np.int64), self._appearance, self._rng)
+
+    def _begin_again(self) -> None:
+        """Give all transitions their present codes, and write anew."""
+        codes, _ = self.perception.codes(np.stack(self._images))
+        self._codes = dict(enumerate(codes))
+        self._hidden = None
+        rows = self._coded(self._rows)
+        self._hidden = hidden_value(rows, self.perception.sizes)
+        self.writer.take_up(self.perception.sizes, self._coded(self._rows))
+
+    def _code(self, number: int) -> State:
+        """The present code of an image."""
+        if number not in self._codes:
+            (self._codes[number],), _ = self.perception.codes(self._images[number][None])
+        return self._codes[number]
+
+    def _coded(self, rows: Sequence[Row]) -> list[Row]:
+        """Transitions between images as transitions between codes; the first one begins an episode."""
+        coded = [row._replace(now=self._code(row.now[0]), then=self._code(row.then[0])) for row in rows]
+        return coded if self._hidden is None else self._hidden.filled(coded)
+
+
+class Hidden(NamedTuple):
+    """A value of a factor with which an image says nothing about the factor."""
+
+    factor: int
+    value: int
+
+    def fill(self, code: State, before: State | None) -> State:
+        """A code with the value that the factor had in the code before; -1 if there was none."""
+        if code[self.factor] != self.value:
+            return code
+        last = -1 if before is None else before[self.factor]
+        return (*code[: self.factor], last, *code[self.factor + 1 :])
+
+    def filled(self, rows: Sequence[Row]) -> list[Row]:
+        """Transitions with values filled in; the first one begins an episode."""
+        found: list[Row] = []
+        for row in rows:
+            now = self.fill(row.now, found[-1].then if row.step else None)
+            found.append(row._replace(now=now, then=self.fill(row.then, now)))
+        return found
+
+
+def hidden_value(rows: Sequence[Row], sizes: Sequence[int]) -> Hidden | None:
+    """The value that leaves the fewest contradictions where the value last seen stands in its place, if there is one.
+
+    The first transition begins an episode.
+    """
+    without = _contradicting(rows)
+    values = [Hidden(factor, value) for factor, size in enumerate(sizes) if size > 1 for value in range(size)]
+    shares = {each: _contradicting(each.filled(rows)) for each in values} if without else {}
+    best = min(values, key=shares.__getitem__, default=None) if shares else None
+    return best if best is not None and shares[best] < _CLEARER * without else None
+
+
+def _contradicting(rows: Sequence[Row]) -> float:
+    """Share of the complete transitions that had another result than the first of the same code and macro-action."""
+    known = complete(rows)
+    first = {(row.now, row.action): row for row in reversed(known)}
+    other = sum(first[row.now, row.action][2:5] != row[2:5] for row in known)
+    return other / len(known) if known else math.inf
+
+
+class SeenCodes:
+    """Codes of macrostates, from how many images of each macrostate have which code.
+
+    A macrostate has the code of most of its images. A code is read as the macrostate of which most images have it.
+    """
+
+    def __init__(self, found: Mapping[State, Counter[State]]) -> None:
+        self._code = {state: codes.most_common(1)[0][0] for state, codes in found.items()}
+        times: defaultdict[State, Counter[State]] = defaultdict(Counter)
+        for state, codes in found.items():
+            for code, count in codes.items():
+                times[code][state] += count
+        self._state = {code: states.most_common(1)[0][0] for code, states in times.items()}
+        self._none = (-1,) * len(next(iter(found)))
+        """The reading of a code that no image has."""
+
+    def of(self, macrostate: State) -> State:
+        """The code of a macrostate."""
+        return self._code[macrostate]
+
+    def macrostates(self, codes: Sequence[State]) -> NDArray[np.int64]:
+        """The macrostates of N codes, -1 everywhere for a code that no image has. Shape (N, M)."""
+        return np.array([self._state.get(code, self._none) for code in codes], dtype=np.int64)
