@@ -76,9 +76,10 @@ QUESTIONS = {
     },
     "Which policies does it overrate?": {
         "policy_r": "policies, r", "policy_tau": "policies, τ", "policy_error": "policies, error", "lift": "lift",
-        "exploit": "exploit", "exploit_bound": "exploit, at most",
+        "lift_trained": "lift of training", "exploit": "exploit", "exploit_bound": "exploit, at most",
         "fidelity": "fidelity", "policy_r_ruled": "r, rules' rewards", "policy_tau_ruled": "τ, rules' rewards",
         "policy_error_ruled": "error, rules' rewards", "lift_ruled": "lift, rules' rewards",
+        "lift_trained_ruled": "lift of training, rules' rewards",
         "exploit_ruled": "exploit, rules' rewards", "exploit_bound_ruled": "at most, rules' rewards",
     },
     "What does it cost?": {
@@ -127,7 +128,8 @@ _WORDS = {
     "Pearson's and Kendall's correlations of the two, 1 is best; the error is the mean absolute difference. They are a "
     "dash where all policies are worth the same in the model. Lift: the true return of the plan that is optimal in the "
     "model, less that of the plan that is optimal in a table that counts the same transitions, and knows their "
-    "macrostates; above 0 the model is of use. Exploit: how far the model overrates the policy that it overrates most, "
+    "macrostates; above 0 the model is of use. Lift of training: the same of agents that learn by Q-learning in the "
+    "model alone, and from that table alone. Exploit: how far the model overrates the policy that it overrates most, "
     "found by a search from many starts, or, below 0, that it underrates all; no policy is overrated by more than “at "
     "most”, which is proved. Fidelity: the part of the optimal policy's gain over random macro-actions that "
     "is left if it sees the model's frames instead of real ones, after the first; chance in the world and in the model "

@@ -57,7 +57,7 @@ LEVELS = (
     ),
     EvidenceLevel(
         "L6",
-        ("value_loss", "lift"),
+        ("value_loss", "lift", "lift_trained"),
         "The policy that is optimal in it is good in the world, and better than without the model.",
         "Another optimizer, with another aim, does as well in it.",
     ),

@@ -12,8 +12,9 @@ from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.judge.policies.agreement import dense, kendall, pearson, values_of
 from imagine_bench.judge.policies.exploit import Exploit, largest_exploit, upper_bound
 from imagine_bench.judge.policies.policy_set import PolicyWorld
+from imagine_bench.judge.policies.training import trained
 
-SCORES = ("policy_r", "policy_tau", "policy_error", "lift", "exploit", "exploit_bound")
+SCORES = ("policy_r", "policy_tau", "policy_error", "lift", "lift_trained", "exploit", "exploit_bound")
 
 
 def level_scores(
@@ -23,14 +24,19 @@ def level_scores(
 
     ``policy_r`` and ``policy_tau`` compare the returns of the world's policies in model and truth, and ``policy_error``
     is their mean absolute difference. ``lift`` is the return, in the truth, of the plan that is optimal in the model,
-    less that of the plan that is optimal in ``table``, the counts of the model's data; NaN without a table. ``exploit``
-    and ``exploit_bound`` enclose the largest difference that any policy has between model and truth.
+    less that of the plan that is optimal in ``table``, the counts of the model's data; NaN without a table.
+    ``lift_trained`` is the same of agents that train there, the mean of :data:`.training.AGENTS`. ``exploit`` and
+    ``exploit_bound`` enclose the largest difference that any policy has between model and truth.
     """
     model = dense(held)
     imagined = values_of(model, world.policies.tables, world.horizon) @ world.starts
     found = largest_exploit(model, world.dense_truth, world.starts, world.policies.tables, world.horizon, rng)
-    lift = math.nan
+    lift = lift_trained = math.nan
     if table is not None:
+        (draws,) = rng.spawn(1)
+        agents = (trained(held, draws, (world.starts, world.horizon)), trained(table, draws))
+        returns = [(values_of(world.dense_truth, each, world.horizon) @ world.starts).mean() for each in agents]
+        lift_trained = float(returns[0] - returns[1])
         in_model, in_table = (values_of_planning(world.truth, each, world.horizon) for each in (held, table))
         lift = float((in_model - in_table) @ world.starts)
     scores = (
@@ -38,6 +44,7 @@ def level_scores(
         kendall(imagined, world.real),
         float(np.abs(imagined - world.real).mean()),
         lift,
+        lift_trained,
         float((found.believed - found.real) @ world.starts),
         float(upper_bound(model, world.dense_truth, world.horizon) @ world.starts),
     )

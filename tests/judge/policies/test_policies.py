@@ -22,8 +22,9 @@ from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge.policies.agreement import DenseModel, kendall, pearson, values_of
 from imagine_bench.judge.policies.exploit import largest_exploit, upper_bound
 from imagine_bench.judge.policies.film import Expected, Film, course
-from imagine_bench.judge.policies.levels import SCORES, counted_table
+from imagine_bench.judge.policies.levels import SCORES, counted_table, level_scores
 from imagine_bench.judge.policies.policy_set import PolicyWorld, policy_world
+from imagine_bench.judge.policies.training import AGENTS, trained
 from imagine_bench.judge.scores import policy_scores
 from imagine_bench.report.judge import COLUMNS
 from imagine_bench.report.levels import LEVELS
@@ -249,3 +250,34 @@ def test_a_table_of_every_transition_plans_as_the_truth_and_one_of_none_never_tr
     half = counted_table(episodes, macrostates, 2, world)
     assert (half.reward == NEVER).sum() == len(every) - 2
     assert half.reward[0, :2] == pytest.approx(world.truth.reward[0, :2])
+
+
+@pytest.mark.parametrize("task", [ARROWS, SLIPS, "pick_place"])
+def test_agents_that_train_in_the_truth_are_as_good_as_its_best_plan(task: str) -> None:
+    world = world_of(task)
+    best = world.real[world.policies.names.index("optimal")]
+    for episodes in ((world.starts, world.horizon), None):
+        policies = trained(world.truth, np.random.default_rng(0), episodes)
+        returns = values_of(world.dense_truth, policies, world.horizon) @ world.starts
+        assert len(returns) == AGENTS and returns.mean() == pytest.approx(best, abs=0.1)
+
+
+def test_an_agent_that_trains_on_data_tries_nothing_that_the_data_has_not() -> None:
+    world = world_of(ARROWS)
+    tried = np.random.default_rng(0).random(world.truth.reward.shape) < 0.4
+    assert not tried.any(axis=1).all(), "somewhere nothing was tried"
+    table = world.truth._replace(reward=np.where(tried, world.truth.reward, NEVER))
+    chosen = trained(table, np.random.default_rng(0)) > 0
+    assert not (chosen & ~tried)[:, tried.any(axis=1)].any()
+    with_all = trained(world.truth, np.random.default_rng(0)) > 0
+    assert (with_all & ~tried)[:, tried.any(axis=1)].any(), "where all was tried it chooses such macro-actions"
+
+
+def test_training_in_a_wrong_model_pays_less_than_training_on_the_data() -> None:
+    world = world_of(ARROWS)
+    wrong = world.truth._replace(reward=-world.truth.reward)
+    scores = {
+        name: level_scores(world, held, world.truth, np.random.default_rng(0))[0]["lift_trained"]
+        for name, held in (("wrong", wrong), ("true", world.truth))
+    }
+    assert scores["wrong"] < -20.0 and scores["true"] == pytest.approx(0.0, abs=0.1)
