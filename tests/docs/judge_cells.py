@@ -18,15 +18,19 @@ _EXACT = 0.005
 
 
 def _worlds(experiment: str, seen: str) -> set[tuple[str, str]]:
-    """The worlds of an experiment, by task and, where the writer reads ``codes`` of images, by their appearance."""
+    """The worlds of an experiment, by task and by the codes that the writer reads; see :func:`written`."""
     (levels,) = (each.levels for each in LADDER.experiments if each.name == experiment)
-    return {(each.task, each.protocol.get("appearance", "clean") if seen == "codes" else "") for each in levels}
+    prefix = {"codes": "", "own": "own "}
+    return {
+        (each.task, f"{prefix[seen]}{each.protocol.get('appearance', 'clean')}" if seen in prefix else "")
+        for each in levels
+    }
 
 
 def written(experiment: str, seen: str, column: str) -> str:
     """A figure of the writer of laws in the worlds of an experiment of the benchmark suite; a dash where none is.
 
-    The writer was shown ``macrostates``, or read ``codes``.
+    The writer was shown ``macrostates``, or read ``codes`` of an encoder, or of its ``own`` perception.
     """
     worlds = _worlds(experiment, seen)
     kept: list[dict[str, Any]] = json.loads((_RESULTS / "programs" / "written.json").read_text())["rows"]
