@@ -70,9 +70,11 @@ MOVED = {
     "imagine_bench.suite.experiments": "imagine_bench.sweep.grid",
     "imagine_bench.suite.run": "imagine_bench.sweep.run",
     "imagine_bench.suite.score": "imagine_bench.sweep.score",
+    "imagine_bench.tasks.continuous.demonstrator": "imagine_bench_motion.control.demonstrator",
     "imagine_bench.tasks.continuous.goals": "imagine_bench_motion.control.goals",
     "imagine_bench.tasks.robot_ik": "imagine_bench_regression.robot_ik",
     "imagine_bench.tasks.toy_regression": "imagine_bench_regression.toy_regression",
+    "imagine_bench.tools.demonstrations": "imagine_bench_motion.control.datasets",
     "imagine_bench.world_models": "imagine_bench.interfaces.model",
 }
 """Where each module lies now, by the path that it had."""

@@ -19,6 +19,7 @@ from imagine_bench.cli.options import (
     TaskWord,
     Word,
     Words,
+    demonstrations,
     one_of,
     require_with,
 )
@@ -158,12 +159,11 @@ class Verify(OfBench):
             raise error
 
     def _verify_demonstrations(self, folder: Path) -> None:
-        from imagine_bench.tools import demonstrations  # noqa: PLC0415 - likewise
-
         require_with("a bench", self, "train", "causes", "encoder")
+        module = demonstrations()
         kept = read_demonstrations(folder)
         try:
-            print(demonstrations.verify(kept))
+            print(module.verify(kept))
         except ArtefactError as error:
             print(f"Does not hold. {error}")
             raise CheckFailedError("Something in it is wrong; see above.") from error

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, is_dataclass
 from itertools import chain
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, TypeVar
 
 import tyro
@@ -51,6 +52,17 @@ ExecutionWord = Annotated[str | None, shown(f"{{{','.join(EXECUTIONS)}}}")]
 DeviceWord = Annotated[str, one_of(*DEVICES)]
 EncoderWord = Annotated[str | None, shown("NAME|FILE")]
 """Options that may be left out."""
+
+
+def demonstrations() -> ModuleType:
+    """The plug-in's module that collects, describes, verifies and records demonstrations of continuous control.
+
+    Raises:
+        SetupError: The plug-in is not installed; the message says how to install it.
+    """
+    registry.require_guest(registry.MOTION, "A dataset of continuous control")
+    module: ModuleType = registry.load("imagine_bench_motion.control.datasets")
+    return module
 
 
 @dataclass(frozen=True, kw_only=True)

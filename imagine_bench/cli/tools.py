@@ -21,6 +21,7 @@ from imagine_bench.cli.options import (
     OfBench,
     TaskWord,
     Word,
+    demonstrations,
     one_of,
     require_with,
     shown,
@@ -36,7 +37,6 @@ from imagine_bench.running.collect import describe as describe_episodes
 from imagine_bench.running.player import protocol_of_player
 from imagine_bench.store.bench_folder import newest_recording
 from imagine_bench.store.files import require_writable
-from imagine_bench.tools import demonstrations
 from imagine_bench.tools.describe import describe, names
 from imagine_bench.tools.doctor import examine
 from imagine_bench.tools.standard_data import standard_sets
@@ -86,7 +86,7 @@ class DatasetCommand:
             raise InvalidValueError("Give exactly one of a task to collect episodes of, --describe and --standard.")
         if self.describe is not None:
             if "control" in (read_card(self.describe) or {}):
-                print(demonstrations.describe(read_demonstrations(self.describe)))
+                print(demonstrations().describe(read_demonstrations(self.describe)))
             else:
                 print(describe_episodes(read_dataset(self.describe)))
             return
@@ -121,7 +121,8 @@ class DatasetCommand:
         folder = self.out or Path("datasets") / f"{file_name(str(self.task))}-{self.policy}"
         require_new(folder)
         require_writable(folder.parent)
-        made = demonstrations.collect(
+        module = demonstrations()
+        made = module.collect(
             task,
             policy=self.policy,
             episodes=self.episodes,
@@ -132,7 +133,7 @@ class DatasetCommand:
             folder=folder,
             workers=self.workers,
         )
-        print(f"{folder}\n{demonstrations.describe(made)}")
+        print(f"{folder}\n{module.describe(made)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,7 +188,7 @@ class ViewCommand(OfBench):
         if path is not None and (path / CARD).exists():
             index = self.episode or 0
             file = path.with_name(f"{path.name}-episode_{index}.rrd")
-            demonstrations.record(read_demonstrations(path), index, file)
+            demonstrations().record(read_demonstrations(path), index, file)
             path = file
         else:
             require_with("a folder of demonstrations", self, "episode")

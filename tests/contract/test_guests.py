@@ -24,6 +24,7 @@ from imagine_bench.errors import InvalidValueError, SetupError
 from imagine_bench.protocols.control import PRESETS, protocol, usual_agents
 from imagine_bench.registry.builtin import guests as own_guests
 from imagine_bench.running.control import plan_control
+from imagine_bench.store.files import sealed, write_json
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = sorted(file.parent for file in (ROOT / "agents" / "guests").glob("*/pyproject.toml"))
@@ -95,7 +96,7 @@ def without_guests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.mark.usefixtures("without_guests")
 def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_line(
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["describe"]) == 0
     marked = capsys.readouterr().out.partition("\nNot installed\n")[2].partition("\n\n")[0].splitlines()
@@ -115,7 +116,16 @@ def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_l
     where = f"Install it with: pip install -e {ROOT / 'agents' / 'guests' / 'peers'}"
     assert f"The agent dreamer_v3 is in the package imagine-bench-peers, which is not installed. {where}" in said
     install = f"which is not installed. Install it with: pip install -e {ROOT / 'agents' / 'guests' / 'motion'}"
-    for words in (["judge", "ArrowPuzzleMotion"], ["play", "ArrowPuzzleMotion"]):
+    write_json(tmp_path / "card.json", sealed({"control": "twist"}))  # of demonstrations
+    of_motions = (
+        ["judge", "ArrowPuzzleMotion"],
+        ["play", "ArrowPuzzleMotion"],
+        ["dataset", "ArrowPuzzleMotion", "--policy", "expert"],
+        ["dataset", "--describe", str(tmp_path)],
+        ["verify", str(tmp_path)],
+        ["view", str(tmp_path)],
+    )
+    for words in of_motions:
         assert main(words) == 2
         assert f"needs the package imagine-bench-motion, {install}" in capsys.readouterr().err
     for words in ("daily", "board check docs/board", "submit runs", "serve arrow_puzzle"):

@@ -12,6 +12,8 @@ venv=.venv-lerobot
 if [ ! -f "$venv/.installed" ]; then
     "${PYTHON:-python3.12}" -m venv --clear "$venv"
     "$venv/bin/python" -m pip install -q "lerobot[dataset]==0.6.1" -e ".[data]"
+    # the plug-in that collects demonstrations; its agents' libraries are left out
+    "$venv/bin/python" -m pip install -q --no-deps -e agents/guests/motion
     touch "$venv/.installed"
 fi
 folder=${1:-datasets/ArrowPuzzleMotion-lerobot}

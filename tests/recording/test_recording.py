@@ -16,6 +16,7 @@ import pytest
 import rerun as rr
 import rerun.blueprint as rrb
 from fake_agents import FakeAgent, FakeImaginer
+from imagine_bench_motion.control.datasets import replay
 from imagine_bench_motion.control.recording import motion_recording
 from numpy.typing import NDArray
 from recordings import contents, rerun, times, view_names
@@ -33,7 +34,6 @@ from imagine_bench.recording.stream import entity_name, log_motion, log_shapes, 
 from imagine_bench.rules import ending
 from imagine_bench.running.bench import bench
 from imagine_bench.seeding import episode_seed
-from imagine_bench.tools.demonstrations import replay
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}

@@ -22,6 +22,7 @@ from fake_reader import NO_ERRORS
 from imagine_bench.agents.encoders.cli import retrain
 from imagine_bench.agents.encoders.encoder import Encoder
 from imagine_bench.agents.encoders.recipes import Recipe
+from imagine_bench_motion.control import datasets
 from small_runs import FORMATS, Inline, collected, exact, small, written
 from storms import as_word, damages, hostile, interrupted, one_sentence
 
@@ -38,7 +39,6 @@ from imagine_bench.store.files import make_folder, write_json
 from imagine_bench.store.loading import archive_files, load_so_far
 from imagine_bench.sweep.grid import Study, Variant, read_grid
 from imagine_bench.sweep.run import run_study
-from imagine_bench.tools import demonstrations
 
 pytestmark = pytest.mark.slow
 _FEW: dict[str, Any] = {"budgets": (2, 4), "evaluation_episodes": 2}
@@ -69,12 +69,12 @@ def a_dataset(folder: Path, format: str) -> object:
 def demonstrations_of(folder: Path, format: str) -> object:
     """Demonstrations there, collected unless they are there, and their content, which replays."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demonstrations, "work_through", in_this_process)
+        patch.setattr(datasets, "work_through", in_this_process)
         if not (folder / "set").exists():
             what: dict[str, Any] = {"policy": "mixed", "episodes": 2, "seed": 0, "appearance": "clean", "size": 32}
-            demonstrations.collect("arrow_puzzle_easy", **what, format=format, folder=folder / "set", workers=1)
+            datasets.collect("arrow_puzzle_easy", **what, format=format, folder=folder / "set", workers=1)
     found = read_demonstrations(folder / "set")
-    return demonstrations.verify(found), found.card["content"], [content_hash(dict(each)) for each in found]
+    return datasets.verify(found), found.card["content"], [content_hash(dict(each)) for each in found]
 
 
 def in_this_process(function: Any, items: Any, *, on_end: Any, **_: object) -> None:
@@ -236,12 +236,13 @@ def test_every_region_of_every_file_may_be_damaged(
 _BEGINS = 77
 """The exit code of a command that would begin its work: its options have been accepted."""
 _WORK = (
-    "cli.tools.collect",
-    "tools.demonstrations.collect",
-    "testing.physics._segments",
-    "cli.judging.judge",
-    "cli.benches.run_study",
-    "cli.benches.run_suite",
+    "imagine_bench.cli.tools.collect",
+    "imagine_bench_motion.control.datasets.collect",
+    "imagine_bench.testing.physics._segments",
+    "imagine_bench.cli.judging.judge",
+    "imagine_bench.cli.benches.run_study",
+    "imagine_bench.cli.benches.run_suite",
+    "imagine_bench.agents.encoders.cli.train_encoder",
 )
 _FLAGS = {
     "dataset": ["policy", "format", "seed", "execution", "appearance", "motion-hz", "episodes", "describe"],
@@ -314,8 +315,8 @@ def test_hostile_inputs_of_the_other_doors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, share: str
 ) -> None:
     collected()
-    for work in (*_WORK, "agents.encoders.cli.train_encoder"):
-        monkeypatch.setattr(f"imagine_bench.{work}", _begin)
+    for work in _WORK:
+        monkeypatch.setattr(work, _begin)
     lanes = gymnasium.make_vec("imagine_bench/ArrowPuzzle-vector-v0", 3, execution="kinematic")
     storms: dict[str, Callable[[np.random.Generator], str | None]] = {
         "lanes": lambda rng: a_lane(rng, lanes),

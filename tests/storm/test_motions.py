@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from imagine_bench_motion.control import datasets
 from imagine_bench_motion.judge.judgement import MotionJudgement, data_of, judge, judged, stage
 from storms import interrupted
-
-from imagine_bench.tools import demonstrations
 
 pytestmark = pytest.mark.slow
 _ENDS = ("death", "full disk", "kill")
@@ -39,10 +38,10 @@ def digests(folder: Path) -> dict[str, str]:
 def test_a_set_of_motions_is_whole_or_not_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], how: str
 ) -> None:
-    monkeypatch.setattr(demonstrations, "work_through", in_this_process)
+    monkeypatch.setattr(datasets, "work_through", in_this_process)
 
     def write(folder: Path) -> None:
-        demonstrations.collect("arrow_puzzle", format="npz", folder=folder / "set", workers=1, **_PLAYED)
+        datasets.collect("arrow_puzzle", format="npz", folder=folder / "set", workers=1, **_PLAYED)
 
     write(tmp_path / "whole")
     whole = digests(tmp_path / "whole" / "set")

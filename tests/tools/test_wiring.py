@@ -15,7 +15,6 @@ import pytest
 
 import imagine_bench.testing.contract
 import imagine_bench.testing.physics
-import imagine_bench.tools.demonstrations
 import imagine_bench.tools.new
 import imagine_bench.tools.play
 import imagine_bench.tools.quiz  # noqa: F401 - all are loaded in no test's time
@@ -140,7 +139,7 @@ CALLS = [
     call("dataset --describe here", f"{_TOOLS}.read_dataset", HERE),
     call(
         "dataset ArrowPuzzleMotion --policy expert",
-        "imagine_bench.tools.demonstrations.collect",
+        "imagine_bench_motion.control.datasets.collect",
         "arrow_puzzle",
         folder=Path("datasets/ArrowPuzzleMotion-expert"),
         workers=None,
@@ -149,7 +148,7 @@ CALLS = [
     call(
         "dataset ArrowPuzzleMotion --policy noisy --episodes 3 --seed 4 --appearance mild --size 96 "
         "--out here --workers 2",
-        "imagine_bench.tools.demonstrations.collect",
+        "imagine_bench_motion.control.datasets.collect",
         "arrow_puzzle",
         policy="noisy",
         episodes=3,

@@ -1,1 +1,1 @@
-"""Continuous control in other forms: with goals, by keys, and recorded."""
+"""Continuous control in other forms: with goals, by keys, recorded, and as demonstrations."""

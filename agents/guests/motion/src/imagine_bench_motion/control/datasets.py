@@ -10,10 +10,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
+from imagine_bench.tasks.continuous.env import MotionEnv
+from imagine_bench.tasks.world import World
 from tqdm import tqdm
 
 from imagine_bench import registry, statistics
@@ -29,9 +31,7 @@ from imagine_bench.seeding import SEEDS, SeedTree, episode_seed
 from imagine_bench.store.files import read_arrays, write_arrays
 from imagine_bench.values import Json
 
-if TYPE_CHECKING:
-    from imagine_bench.tasks.continuous.env import MotionEnv
-    from imagine_bench.tasks.world import World
+from .demonstrator import Demonstrator
 
 POLICIES = {
     "expert": "optimal macro-actions, as planned",
@@ -47,7 +47,9 @@ _SAME_M = 2e-3
 class Actor(Protocol):
     """Plays an episode."""
 
-    macro_action: int
+    @property
+    def macro_action(self) -> int:
+        """The macro-action under way, -1 where there is none."""
 
     def act(self) -> Array | None:
         """The next command, or None, which leaves the episode."""
@@ -178,12 +180,11 @@ def _made(task: str, **options: Any) -> MotionEnv:
 
 def demonstration(settings: DemonstrationSettings, index: int) -> Arrays:
     """An episode of a set: the arrays of :mod:`imagine_bench.data.motion`, ``macrostates`` (N + 1, M) and ``seed``."""
-    make = registry.load("imagine_bench.tasks.continuous.demonstrator:Demonstrator")
     env, planner = stage(settings.task, settings.appearance, settings.size)
     seed = episode_seed("dataset", settings.seed, index)
     policy = _IN_TURN[index % len(_IN_TURN)] if settings.policy == "mixed" else settings.policy
     rng = SeedTree(settings.seed).child("demonstrations", index).generator()
-    return {**lived(env, seed, lambda: make(env, planner, policy, rng)), "seed": np.array(seed)}
+    return {**lived(env, seed, lambda: Demonstrator(env, planner, policy, rng)), "seed": np.array(seed)}
 
 
 def lived(env: MotionEnv, seed: int, actor_of: Callable[[], Actor], watch: Watch | None = None) -> Arrays:
@@ -305,13 +306,12 @@ def record(kept: Demonstrations, index: int, path: Path) -> None:
 
     Raises:
         InvalidValueError: There is no such episode.
-        SetupError: Rerun or the plug-in is not installed, or the file cannot be written.
+        SetupError: Rerun is not installed, or the file cannot be written.
     """
     seeds = read_files(kept.folder, kept.card)["privileged"]["seeds"]
     if not 0 <= index < len(seeds):
         raise InvalidValueError(f"Episode {index} is not in {kept.folder}; give 0 to {len(seeds) - 1}.")
     (episode,) = itertools.islice(kept, index, index + 1)
-    registry.require_guest(registry.MOTION, "Recording a demonstration")
     recording = registry.load("imagine_bench_motion.control.recording:motion_recording")
     with closing(replay_env(kept.card, "hand,front,proprio")) as env, recording(path, env) as watch:
         replay(env, int(seeds[index]), episode["actions"], watch)

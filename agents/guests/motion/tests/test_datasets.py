@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from imagine_bench_motion.control import datasets, demonstrator
+from imagine_bench_motion.control.datasets import DemonstrationSettings, demonstration, verify
 
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays, content_hash
@@ -19,8 +21,6 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.data.folder import FORMATS, new_folder, read_card, read_dataset, write_card
 from imagine_bench.data.motion import CAMERAS, Demonstrations, Digest, read_demonstrations
 from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.tools import demonstrations
-from imagine_bench.tools.demonstrations import DemonstrationSettings, demonstration, verify
 
 EASY = "arrow_puzzle_easy"  # one cube, at most two macro-actions
 
@@ -67,15 +67,14 @@ def test_the_expert_solves_its_episodes_and_says_which_macro_action_is_under_way
 
 def test_a_noisy_expert_fails_plans_again_and_still_succeeds(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first try of each macro-action lets go too early: it takes twice as long, and no event is a fault."""
-    module = registry.load("imagine_bench.tasks.continuous.demonstrator")
     begun = []
-    begin = module.Expert.begin
+    begin = demonstrator.Expert.begin
 
     def noted(self: Any, macro_action: int, *, fails: bool = False) -> None:
         begun.append(fails := len(begun) % 2 == 0)
         begin(self, macro_action, fails=fails)
 
-    monkeypatch.setattr(module.Expert, "begin", noted)
+    monkeypatch.setattr(demonstrator.Expert, "begin", noted)
     told = episode("noisy", 1)
     assert told["success"][-1] and begun == [True, False] * (len(begun) // 2)
     assert set(told["actions"][:, -1]) <= set(episode()["actions"][:, -1]), "its grip has no noise"
@@ -210,6 +209,6 @@ def test_a_collection_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pyt
     def fails(function: object, items: list[Any], *, on_end: Callable[[Any, str], None], **_: object) -> None:
         on_end(items[0], "the power went out.")
 
-    monkeypatch.setattr(demonstrations, "work_through", fails)
+    monkeypatch.setattr(datasets, "work_through", fails)
     assert main(["dataset", "ArrowPuzzleMotion", "--policy", "expert", "--out", str(tmp_path / "set")]) == 1
     assert not list(tmp_path.iterdir())

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-
-from ..world import World
-from .controls import Motion
-from .env import MotionEnv
-from .expert import Expert
+from imagine_bench.tasks.continuous.controls import Motion
+from imagine_bench.tasks.continuous.env import MotionEnv
+from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench.tasks.world import World
 
 ASIDE_M = 0.004
 TURNED_RAD = math.radians(5.0)
