@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from imagine_bench_motion import flat
 from imagine_bench_motion.__main__ import main
 from imagine_bench_motion.cloned_env import BUNDLED
-from imagine_bench_motion.flat import flat_env
+from imagine_bench_motion.flat import SETTINGS, Counts, Point, flat_env
 from imagine_bench_motion.levels import Level, environment, expects_nothing, learn, make_agent, oracle_success
 
 from imagine_bench.errors import UnknownNameError
@@ -86,6 +87,20 @@ def test_the_flat_environment_is_one_vector_of_all_that_there_is_to_see() -> Non
     env = flat_env()
     seen, _ = env.reset(seed=0)
     assert seen.shape == (16 + 7 + 4 + 1,) and env.action_space.shape == (7,)
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_sac_is_tested_on_whole_episodes_and_its_training_faults_are_counted(settings: str) -> None:
+    told: list[Point] = []
+    short = {"reward": "dense", "time_limit_s": 0.4}
+    curve = flat.learn(50, seed=3, settings=settings, every=25, tests=1, told=told.append, **short)
+    assert told == curve and [point.steps for point in curve] == [25, 50]
+    assert [point.robot_s for point in curve] == pytest.approx([1.0, 2.0])
+    assert curve[-1].train_faults == curve[-1].train_successes == 0, "no hand reaches a cube in 0.4 s"
+    counts = Counts()
+    ends = [(True, False), (False, True), (False, True), (False, False)]
+    counts.add([{"fault": fault, "is_success": success} for fault, success in ends])
+    assert (counts.faults, counts.successes) == (1, 2)
 
 
 def test_kept_numbers_of_the_page_are_those_of_the_kept_files() -> None:

@@ -185,6 +185,7 @@ def _add_flat(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=50_000, help="commands of training")
     parser.add_argument("--every", type=int, default=2_500, help="commands of training before each test")
     parser.add_argument("--reward", choices=["sparse", "dense"], default="sparse")
+    parser.add_argument("--settings", choices=["library", "tuned"], default="library", help="of SAC")
     parser.add_argument("--seed", type=int, default=0)
     parser.set_defaults(run=_flat)
 
@@ -200,7 +201,8 @@ def _flat(given: argparse.Namespace) -> None:
 
     commit = describe_environment()["commit"]
     curve: list[dict[str, float]] = []
-    learn(given.steps, seed=given.seed, every=given.every, told=told, reward=given.reward)
+    chosen = {"settings": given.settings, "reward": given.reward}
+    learn(given.steps, seed=given.seed, every=given.every, told=told, **chosen)
 
 
 def _add_level(parser: argparse.ArgumentParser) -> None:
