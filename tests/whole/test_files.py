@@ -14,13 +14,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from fake_agents import FakeImaginer
+from imagine_bench_motion.control.datasets import replay
 from imagine_bench_motion.control.recording import motion_recording
 from recordings import as_text
 from small_runs import FORMATS, collected, written
 from whole_outputs import Expected, rounded, short
 
 from imagine_bench.recording.episodes import record_run
-from imagine_bench.tools.demonstrations import replay
 
 CHANGING = ("versions", "command", "commit", "minari_version", "observation_space", "observation.image")
 """Facts of a card that are not of its episodes, and large ones of frames."""
