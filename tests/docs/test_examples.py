@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 import pytest
 from doc_cells import ROOT
+from imagine_bench.agents.encoders.encoder import Encoder
 from small_runs import Inline
 
 from imagine_bench import registry
@@ -64,6 +65,37 @@ def test_the_agent_keeps_the_contract(example: ModuleType) -> None:
 def test_the_agent_learns(example: ModuleType, tmp_path: Path) -> None:
     few, many = success(tmp_path, "pick_place", "own_agent", 5, 500)
     assert many > 0.6 > 2 * few
+
+
+@pytest.mark.parametrize("example", ["patched_vae"], indirect=True)
+def test_the_vae_of_patched_images_goes_on_to_the_same_bits(
+    example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = {"FRAMES": 40, "HELD_OUT_FRAMES": 20, "PROBE_STEPS": 5, "FIRST": (2, 4, 5e-4), "BATCH": 6}
+    for name, value in small.items():
+        monkeypatch.setattr(example, name, value)
+    monkeypatch.setattr(example.training, "SAVE_EVERY_S", -1.0)
+    begin = ["--start", str(ROOT / example.START), "--steps", "3"]
+    example.main([str(tmp_path / "whole.safetensors"), *begin])
+    calls: list[int] = []
+    loss_of = example.loss_of
+
+    def killed(*arguments: object) -> object:
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return loss_of(*arguments)
+
+    monkeypatch.setattr(example, "loss_of", killed)
+    with pytest.raises(KeyboardInterrupt):
+        example.main([str(tmp_path / "parts.safetensors"), *begin])
+    example.main([str(tmp_path / "parts.safetensors"), *begin])
+    whole, parts = (Encoder.load(tmp_path / f"{name}.safetensors") for name in ("whole", "parts"))
+    weights = parts.network.state_dict()
+    assert all(value.equal(weights[name]) for name, value in whole.network.state_dict().items())
+    assert len(calls) == 6, "the first three steps are not made again"
+    start = Encoder.load(ROOT / example.START).network.state_dict()
+    assert not start["encoder.0.weight"].equal(weights["encoder.0.weight"]), "nothing was learned"
 
 
 @pytest.mark.parametrize("example", ["own_task"], indirect=True)
