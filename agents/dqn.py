@@ -60,7 +60,9 @@ class Controller(TrainedModule):
         self.network = self.target = network or mlp((latent_size, *settings.hidden, n_actions), generator)
         if settings.target_rate < 1.0:
             self.target = copy.deepcopy(self.network).requires_grad_(False)
-        self.optimiser = Adam([(self.network.parameters(), 0.0)], settings.learning_rate)
+        self._fast = list(self.network.parameters())
+        self._slow = list(self.target.parameters())
+        self.optimiser = Adam([(self._fast, 0.0)], settings.learning_rate)
 
     @torch.no_grad()
     def values(self, z: Tensor) -> Tensor:
@@ -96,9 +98,13 @@ class Controller(TrainedModule):
         loss.backward()
         self.optimiser.step()
         if self.target is not self.network:
-            for slow, fast in zip(self.target.parameters(), self.network.parameters(), strict=True):
-                slow.lerp_(fast.detach(), self.settings.target_rate)
+            self._follow()
         return value
+
+    @torch.no_grad()
+    def _follow(self) -> None:
+        """Move the target network toward the network."""
+        torch._foreach_lerp_(self._slow, self._fast, self.settings.target_rate)
 
 
 class DQN:

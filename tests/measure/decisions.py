@@ -2,9 +2,10 @@
 
 The benches are kept ones of the agents of the headlines, by default those of this repository; their seeds are put
 together. A group with as many seeds of each agent as the default bench has is a repetition of it. First come groups
-that share no seed, then groups drawn with replacement, which differ as groups of new seeds would. Printed before is how
-often one look, and several with more seeds each time, claim a headline though all agents have one law. Printed last are
-the CPU seconds of these runs.
+that share no seed, then groups drawn with replacement, which differ as groups of new seeds would. Where the kept runs
+have other numbers of tests than the default bench, the drawn scores are given its noise (:func:`with_noise_of`). Printed
+before is how often one look, and several with more seeds each time, claim a headline though all agents have one law.
+Printed last are the CPU seconds of these runs.
 """
 
 from __future__ import annotations
@@ -45,14 +46,30 @@ def repetitions(benches: Sequence[Path], draws: int, rng: np.random.Generator) -
     trials = min(result.protocol.evaluation_episodes for result in results)
     scores = {agent: rng.permutation(scores_of(agent, results)) for agent in COUNTS}
     apart = min(len(scores[agent]) // count for agent, count in COUNTS.items())
+    tests = _DEFAULT.evaluation_episodes
+    noisy = {agent: with_noise_of(tests, each, trials, rng, draws) for agent, each in scores.items()}
     groups = {
         "disjoint": [
             {agent: scores[agent][place * count : (place + 1) * count] for agent, count in COUNTS.items()}
             for place in range(apart)
         ],
-        "drawn": [{agent: rng.choice(scores[agent], count) for agent, count in COUNTS.items()} for _ in range(draws)],
+        "drawn": [{agent: rng.choice(noisy[agent], count) for agent, count in COUNTS.items()} for _ in range(draws)],
     }
-    return {name: [decided(group, trials) for group in each] for name, each in groups.items()}
+    trials_of = {"disjoint": trials, "drawn": tests}
+    return {name: [decided(group, trials_of[name]) for group in each] for name, each in groups.items()}
+
+
+def with_noise_of(tests: int, scores: Floats, trials: int, rng: np.random.Generator, draws: int) -> Floats:
+    """Scores (draws,) as runs with ``tests`` tests would have, from scores (seeds,) of runs with ``trials`` tests.
+
+    The variance of scores is that between trained agents plus the binomial one of the tests. Scores are drawn, moved
+    toward their mean until the former is left, and given binomial noise anew. ``tests`` equal to ``trials`` changes
+    nothing but for chance.
+    """
+    variance = scores.var(ddof=1)
+    between = max(variance - np.mean(scores * (1.0 - scores)) / trials, 0.0)
+    drawn = scores.mean() + (rng.choice(scores, draws) - scores.mean()) * np.sqrt(between / variance)
+    return rng.binomial(tests, np.clip(drawn, 0.0, 1.0)) / tests
 
 
 def scores_of(agent: str, results: Sequence[BenchResult]) -> Floats:
