@@ -3,7 +3,7 @@
 The benches are kept ones of the agents of the headlines, by default those of this repository; their seeds are put
 together. A group with as many seeds of each agent as the default bench has is a repetition of it. First come groups
 that share no seed, then groups drawn with replacement, which differ as groups of new seeds would. Where the kept runs
-have other numbers of tests than the default bench, the drawn scores are given its noise (:func:`with_noise_of`). Printed
+have another number of tests than the default bench, the drawn scores get its noise (:func:`with_noise_of`). Printed
 before is how often one look, and several with more seeds each time, claim a headline though all agents have one law.
 Printed last are the CPU seconds of these runs.
 """

@@ -174,10 +174,10 @@ def test_every_ratio_is_measured_and_kept(tmp_path: Path, monkeypatch: pytest.Mo
 def test_scores_get_the_noise_of_another_number_of_tests() -> None:
     """The law: variance between agents plus p (1 - p) / tests. Agents between 50 and 70 %, measured with 20 tests."""
     rng = np.random.default_rng(0)
-    truth = rng.uniform(0.5, 0.7, 4000)
+    truth = rng.uniform(0.5, 0.7, 100_000)
     scores = rng.binomial(20, truth) / 20
     for tests in (20, 400):
-        changed = decisions.with_noise_of(tests, scores, 20, rng, 40_000)
+        changed = decisions.with_noise_of(tests, scores, 20, rng, 100_000)
         expected = truth.var() + np.mean(truth * (1.0 - truth)) / tests
         assert changed.mean() == pytest.approx(truth.mean(), abs=0.005)
         assert changed.var() == pytest.approx(expected, rel=0.1), tests
