@@ -77,13 +77,14 @@ def draw(axes: plt.Axes, cubes: int) -> None:
 
 
 def draw_flat(axes: plt.Axes) -> None:
-    """The flat baseline, for each reward that was measured."""
+    """The flat baseline, for each reward and settings that were measured."""
     for file, line in zip(sorted(RESULTS.glob("flat_*.json")), ("-", "--"), strict=False):
         kept = json.loads(file.read_text())
         minutes = [point["robot_s"] / 60 for point in kept["curve"]]
         shares = [100 * point["successes"] / point["tests"] for point in kept["curve"]]
         color, marker = FLAT
-        label = f"SAC, flat at 25 Hz, {kept['reward']} reward"
+        settings = kept.get("settings", "library")  # older files are of the library's
+        label = f"SAC, flat at 25 Hz, {kept['reward']} reward, {settings} settings"
         axes.plot(minutes, shares, line, color=color, marker=marker, markersize=4, label=label)
 
 
