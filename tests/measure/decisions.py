@@ -67,7 +67,7 @@ def with_noise_of(tests: int, scores: Floats, trials: int, rng: np.random.Genera
     nothing but for chance.
     """
     variance = scores.var(ddof=1)
-    between = max(variance - np.mean(scores * (1.0 - scores)) / trials, 0.0)
+    between = max(variance - np.mean(scores * (1.0 - scores)) / (trials - 1), 0.0)
     drawn = scores.mean() + (rng.choice(scores, draws) - scores.mean()) * np.sqrt(between / variance)
     return rng.binomial(tests, np.clip(drawn, 0.0, 1.0)) / tests
 
