@@ -336,7 +336,7 @@ def test_a_forger_gains_nothing_by_naming_another_mujoco(
 def test_a_marked_test_may_end_otherwise_with_another_mujoco_and_has_failed(
     row: Path, total_reward: float, least: float
 ) -> None:
-    """With the MuJoCo of the card the same row is refused."""
+    """With the MuJoCo of the card the same row is refused. Nobody gains: a policy that does nothing has 0, not -5."""
     card = json.loads((row / CARD).read_text())
     parts = json.loads((row / EPISODES).read_text())
     honest = read_motions(row).vouched
@@ -351,7 +351,12 @@ def test_a_marked_test_may_end_otherwise_with_another_mujoco_and_has_failed(
     assert found.row.vouched.mean_return == honest.mean_return + least / TESTS, "test 1 had a return of 0"
     cut(card, parts)
     seal(row, card | {"mujoco": "4.0.0"}, parts)
-    assert ": not vouched: made with" in str(check(row)[0]), "its commands must end an episode"
+    (found,) = check(row)
+    assert isinstance(found.row, MotionRow) and "1 not reproducible and counted as failed" in str(found)
+    assert found.row.vouched.mean_return == honest.mean_return + least / TESTS
+    parts[1]["reproducible"] = True
+    seal(row, card | {"mujoco": "4.0.0"}, parts)
+    assert ": not vouched: made with" in str(check(row)[0]), "a test that is not marked must end with its commands"
 
 
 def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(row: Path, monkeypatch: pytest.MonkeyPatch) -> None:
