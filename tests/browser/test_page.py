@@ -209,20 +209,15 @@ def test_rows_are_checked_against_the_rules() -> None:
         assert sentence in found["refused"], question
 
 
-PICK_ROW: dict[str, Any] = {
-    "title": "somebody",
-    "world": "pick_place",
-    "episodes": [
-        {"start": [0, 0, 0, 1], "actions": [1, 3], "states": [[0, 1, 0, 3], [0, 2, 0, 3]], "success": True},
-        {"start": [0, 0, 0, 1], "actions": [0], "states": [[1, 0, 0, 4]], "success": False},
-    ],
-}
+HANDED_OVER = {"start": [0, 0, 0, 1], "actions": [1, 3], "states": [[0, 1, 0, 3], [0, 2, 0, 3]], "success": True}
+WRONG = {"start": [0, 0, 0, 1], "actions": [0], "states": [[1, 0, 0, 4]], "success": False}
+PICK_ROW = {"title": "somebody", "world": "pick_place", "episodes": [HANDED_OVER, WRONG]}
 
 
 @needs_node
 def test_rows_of_pick_and_place_are_checked_against_the_rules() -> None:
     assert ask([{"kind": "row", "row": PICK_ROW}]) == [2]
-    forgeries: tuple[tuple[dict[str, Any], str], ...] = (
+    forgeries: tuple[tuple[dict[str, object], str], ...] = (
         ({"start": [1, 1, 0, 3]}, "starts in no macrostate"),
         ({"start": [0, 0, 0]}, "starts in no macrostate"),
         ({"start": ["0", 0, 0, 1]}, "starts in no macrostate"),
@@ -233,7 +228,7 @@ def test_rows_of_pick_and_place_are_checked_against_the_rules() -> None:
         ({"actions": [1, 3, 3], "states": [[0, 1, 0, 3], [0, 2, 0, 3], [0, 2, 0, 3]]}, "goes on after its end"),
         ({"success": False}, "claims another end"),
     )
-    rows = [{**PICK_ROW, "episodes": [{**PICK_ROW["episodes"][0], **change}]} for change, _ in forgeries]
+    rows = [{**PICK_ROW, "episodes": [{**HANDED_OVER, **change}]} for change, _ in forgeries]
     for (change, sentence), found in zip(forgeries, ask([{"kind": "row", "row": row} for row in rows]), strict=True):
         assert sentence in found["refused"], change
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_board import motions
 from imagine_bench_board.check import NOT_VOUCHED, check
@@ -22,6 +23,7 @@ from imagine_bench_board.motions import SLACK_PERIODS, Motion, MotionRow, Motion
 from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import CARD, EPISODES, LONGEST
 
+from imagine_bench.arrays import Floats32
 from imagine_bench.errors import CheckFailedError, InvalidValueError, UnknownNameError
 
 WORLD = "arrows:cubes=1"
@@ -362,8 +364,8 @@ def test_a_marked_test_may_end_otherwise_with_another_mujoco_and_has_failed(
 def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(row: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     played = motions._played
 
-    def worse(*given: Any, **more: Any) -> Motion | None:
-        found = played(*given, **more)
+    def worse(env: MotionEnv, seed: int, commands: Floats32) -> Motion | None:
+        found = played(env, seed, commands)
         return found and dataclasses.replace(found, total_reward=found.total_reward - 40.0)
 
     card = json.loads((row / CARD).read_text()) | {"mujoco": "4.0.0"}
