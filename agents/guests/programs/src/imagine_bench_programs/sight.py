@@ -26,8 +26,10 @@ from imagine_bench.rules import states_of
 from .writing.delay import Row, complete
 from .writing.writer import Writer
 
-_GROWTH = 2.0
-"""Factors are looked for again after so many times the images of the last time."""
+_GROWTH = 1.1
+_GROWTH_IF_KNOWN = 2.0
+"""Factors are looked for again after so many times the images of the last time: if an image showed something that has
+no known value, and if none did."""
 _IMAGES = 3
 """New images of each macrostate that say which code it has."""
 _CLEARER = 0.2
@@ -48,7 +50,7 @@ class SeeingWriter:
         self._spec = spec
         self._appearance = appearance
         self._rng = rng
-        settings = LearnedPerceptionSettings(growth=_GROWTH, growth_if_known=_GROWTH)
+        settings = LearnedPerceptionSettings(growth=_GROWTH, growth_if_known=_GROWTH_IF_KNOWN)
         self.perception = LearnedPerception(settings, factored=True)
         self.writer = Writer(self.perception.sizes, spec.n_actions, choices)
         self._hidden: Hidden | None = None
