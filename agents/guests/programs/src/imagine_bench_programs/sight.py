@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from imagine_bench_factored.perception import LearnedPerception
+from imagine_bench_factored.perception import LearnedPerception, Sight
 from imagine_bench_factored.settings import LearnedPerceptionSettings
 from numpy.typing import NDArray
 
@@ -33,7 +33,7 @@ no known value, and if none did."""
 _IMAGES = 3
 """New images of each macrostate that say which code it has."""
 _CLEARER = 0.2
-"""A hidden value leaves less than this share of the contradictions."""
+"""A hidden value leaves less than this share of the contradictions; so do former factors that are kept."""
 
 
 class SeeingWriter:
@@ -77,12 +77,14 @@ class SeeingWriter:
         """Take in a transition between images."""
         before, after = (self._images[number] for (number,) in (row.now, row.then))
         self._rows.append(row)
+        coded = self._coded(self._rows[-1 - row.step :])[-1]
+        sight = self._sight()
         if not self.perception.full:
             self.perception.remember(before, row.action, after, begins=row.step == 0)
             if self.perception.renew():
-                self._begin_again()
+                self._begin_again(sight)
                 return
-        self.writer.learn(self._coded(self._rows[-1 - row.step :])[-1])
+        self.writer.learn(coded)
 
     def begin_episode(self) -> None:
         """Forget the macro-actions so far."""
@@ -90,9 +92,10 @@ class SeeingWriter:
 
     def write(self) -> None:
         """Look for factors a last time, and find the laws of all transitions."""
+        sight = self._sight()
         if not self.perception.full:
             self.perception.look(len(self.perception.frames))
-        self._begin_again()
+        self._begin_again(sight)
 
     def codes(self) -> SeenCodes:
         """The codes that macrostates have by the present perception, each in new images."""
@@ -106,14 +109,34 @@ class SeeingWriter:
         """An image of each of N macrostates. Shape (N, 64, 64, 3)."""
         return self._spec.render_macrostates(np.array(macrostates, dtype=np.int64), self._appearance, self._rng)
 
-    def _begin_again(self) -> None:
-        """Give all transitions their present codes, and write anew."""
+    def _sight(self) -> tuple[Sight, int, Sequence[int]]:
+        """The present factors, in how many images they were found, and their numbers of values."""
+        return self.perception.sight, self.perception.found_in, self.perception.sizes
+
+    def _begin_again(self, before: tuple[Sight, int, Sequence[int]]) -> None:
+        """Give all transitions their present codes, and write anew.
+
+        The factors of before are kept if by them far fewer transitions contradict one another.
+        """
+        *earlier, sizes = before
+        kept = self._codes
+        known = self._explained(sizes)
         codes, _ = self.perception.codes(np.stack(self._images))
         self._codes = dict(enumerate(codes))
+        found = self._explained(self.perception.sizes)
+        if earlier[0].factors and _contradicting(known[1]) < _CLEARER * _contradicting(found[1]):
+            self.perception.take(*earlier)
+            self._codes = kept
+            found = known
+        self._hidden, rows = found
+        self.writer.take_up(self.perception.sizes, rows)
+
+    def _explained(self, sizes: Sequence[int]) -> tuple[Hidden | None, list[Row]]:
+        """The value of all codes that hides a factor, and the transitions in which the value last seen stands there."""
         self._hidden = None
         rows = self._coded(self._rows)
-        self._hidden = hidden_value(rows, self.perception.sizes)
-        self.writer.take_up(self.perception.sizes, self._coded(self._rows))
+        hidden = hidden_value(rows, sizes)
+        return hidden, rows if hidden is None else hidden.filled(rows)
 
     def _code(self, number: int) -> State:
         """The present code of an image."""
