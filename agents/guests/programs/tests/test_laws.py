@@ -12,11 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imagine_bench_factored.perception import LearnedPerception, Sight
+from imagine_bench_factored.seeing.appearance import SeenFactor
+from imagine_bench_factored.seeing.standard import Standard
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import written
 from imagine_bench_programs.agent import LawsAgent
 from imagine_bench_programs.scores import Codes, ReadRules, score
-from imagine_bench_programs.sight import Hidden, SeenCodes, hidden_value
+from imagine_bench_programs.sight import Hidden, SeeingWriter, SeenCodes, hidden_value
 from imagine_bench_programs.symbol_rules import SymbolRules
 from imagine_bench_programs.symbols import Symbols
 from imagine_bench_programs.writing.delay import Row, changes, too_early
@@ -225,6 +228,50 @@ def test_codes_are_read_by_most_images() -> None:
     codes = SeenCodes({(0,): Counter({(5,): 2, (6,): 1}), (1,): Counter({(6,): 3})})
     assert (codes.of((0,)), codes.of((1,))) == ((5,), (6,))
     np.testing.assert_array_equal(codes.macrostates([(6,), (5,), (7,)]), [[1], [0], [-1]])
+
+
+class BytePerception(LearnedPerception):
+    """Sees the first byte of a frame, or, once it has renewed its factors, only the half of it."""
+
+    full = False
+    found_in = 1
+    sizes = (4,)
+
+    def __init__(self, renews_at: int) -> None:
+        self.sight = Sight([SeenFactor((), np.zeros((1, 0), dtype=np.int64))], Standard())
+        self.fine = self.sight
+        self.left = renews_at
+
+    def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_]]:
+        values = frames[:, 0, 0, 0] // (1 if self.sight is self.fine else 2)
+        return [(int(value),) for value in values], np.ones((len(frames), 1), dtype=bool)
+
+    def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
+        self.left -= 1
+
+    def renew(self) -> bool:
+        if self.left == 0:
+            self.sight = self.sight._replace(standard=Standard())
+        return self.left == 0
+
+    def take(self, sight: Sight, found_in: int) -> None:
+        self.sight = sight
+
+
+@pytest.mark.parametrize(("step", "keeps"), [(1, True), (2, False)])
+def test_former_factors_are_kept_where_the_new_ones_contradict(step: int, keeps: bool) -> None:
+    rng = np.random.default_rng(0)
+    writer = SeeingWriter(registry.task("arrows:cubes=2"), "clean", rng, rng)
+    perception = BytePerception(renews_at=12)
+    writer.perception = perception
+    writer.writer.take_up(perception.sizes, [])
+    for number in range(12):  # a dial of four values that turns by one or two
+        for value in (number, number + step):
+            writer._images.append(np.full((64, 64, 3), value % 4, dtype=np.uint8))
+        writer.learn(Row((2 * number,), 0, (2 * number + 1,), 0.0, False))
+    assert (perception.sight is perception.fine) == keeps
+    values = (3, 0) if keeps else (1, 0)
+    assert writer.writer.laws.turned(values[:1], 0) == values[1:]
 
 
 @pytest.mark.slow  # half a minute: a perception learns to see

@@ -179,9 +179,13 @@ def hidden_value(rows: Sequence[Row], sizes: Sequence[int]) -> Hidden | None:
     """
     without = _contradicting(rows)
     values = [Hidden(factor, value) for factor, size in enumerate(sizes) if size > 1 for value in range(size)]
-    shares = {each: _contradicting(each.filled(rows)) for each in values} if without else {}
-    best = min(values, key=shares.__getitem__, default=None) if shares else None
-    return best if best is not None and shares[best] < _CLEARER * without else None
+    left = {}
+    for each in values if without else ():
+        filled = each.filled(rows)
+        if 2 * len(complete(filled)) > len(rows):  # else too much is left out to tell
+            left[each] = _contradicting(filled)
+    best = min(left, key=left.__getitem__, default=None)
+    return best if best is not None and left[best] < _CLEARER * without else None
 
 
 def _contradicting(rows: Sequence[Row]) -> float:
