@@ -60,9 +60,9 @@ class Controller(TrainedModule):
         self.network = self.target = network or mlp((latent_size, *settings.hidden, n_actions), generator)
         if settings.target_rate < 1.0:
             self.target = copy.deepcopy(self.network).requires_grad_(False)
-        self._fast = list(self.network.parameters())
-        self._slow = list(self.target.parameters())
-        self.optimiser = Adam([(self._fast, 0.0)], settings.learning_rate)
+        self._fast: list[Tensor] = [*self.network.parameters()]
+        self._slow: list[Tensor] = [*self.target.parameters()]
+        self.optimiser = Adam([(self.network.parameters(), 0.0)], settings.learning_rate)
 
     @torch.no_grad()
     def values(self, z: Tensor) -> Tensor:
