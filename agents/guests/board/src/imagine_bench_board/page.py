@@ -122,8 +122,8 @@ def _motion_section(world: str, rows: Sequence[MotionRow]) -> Section:
     """The table of a world of continuous control."""
     best_first = sorted(rows, key=lambda row: -row.vouched.mean_return)
     words = (
-        "Each command, 25 a second, was carried out again. A test is not reproducible if its end depends on how a "
-        "processor rounds; it counts as failed. The columns that are marked so are claimed."
+        "Each command, 25 a second, was carried out again. A test is not reproducible if tiny disturbances change its "
+        "end; it counts as failed. The columns that are marked so are claimed."
     )
     table = Table.of(f"table-{file_name(world)}", [_motion_cells(row) for row in best_first], "", "not said")
     return Section(world, [words], tables=[table])
