@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from agent_states import same
+from numpy.typing import NDArray
 from small_runs import final_state, measured, run_observed, small
+from whole_outputs import Expected, rounded
 
 from imagine_bench import registry
+from imagine_bench.interfaces import AgentState
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import run_state
 from imagine_bench.store import encoders
@@ -38,6 +41,25 @@ def do(folder: Path, agent: str, every_s: float) -> RunResult:
     encoder = encoders.own(registry.task("arrow_puzzle"), "clean", kind=registry.agents()[agent].encoder_kind)
     spec = RunSpec(protocol=protocol, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
     return run_observed(spec, folder, lambda progress: None)
+
+
+def mean(array: NDArray[Any]) -> float:
+    """Mean magnitude; of texts their number."""
+    return float(np.abs(array.astype(np.float64)).mean()) if array.dtype.kind in "fiub" else array.size
+
+
+def as_text(run: RunResult, state: AgentState) -> str:
+    """The actions of a run, and its numbers with so few digits that processors agree."""
+    assert run.training is not None
+    lines = [f"settings {rounded(dict(run.settings))}", f"training {rounded(run.training.actions)}"]
+    for row in run.checkpoints:
+        assert row.kept is not None and row.kept.lengths.sum() == len(row.kept.actions)
+        said = {name: float(f"{value:.3g}") for name, value in row.diagnostics.items() if not name.startswith("time/")}
+        lines += [f"after {row.episodes}: {rounded(row.kept.actions)} {row.successes} solved", f"  {rounded(said)}"]
+    for name, array in sorted(state.arrays.items()):
+        is_frame = array.dtype == np.uint8  # or the state of a generator
+        lines.append(f"  {name} {array.shape}" + ("" if is_frame or not array.size else f": {mean(array):.3g}"))
+    return "\n".join(lines)
 
 
 _DO_LESS = (
@@ -66,8 +88,12 @@ def test_copies_and_pickles_of_a_learner_learn_on_by_themselves(agent: str) -> N
 
 
 @pytest.mark.parametrize("agent", EACH)
-def test_a_killed_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str) -> None:
+def test_a_killed_learner_ends_in_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str, expected: Expected
+) -> None:
+    """And the uninterrupted one in the actions, diagnostics and magnitudes that are kept."""
     whole = do(tmp_path / "whole", agent, 1e9)
+    expected("learners", as_text(whole, final_state(tmp_path / "whole")), section=agent, exactly=False)
     real, saves = run_state.save_snapshot, []
 
     def killing(folder: Path, snapshot: Any) -> Path:

@@ -48,20 +48,36 @@ class Expected:
         self._write = write
         self._folder = folder
 
-    def __call__(self, name: str, text: str, *, exactly: bool = True) -> None:
-        """Fail with the difference; ``exactly=False`` lets the last digit of decimal numbers be one off."""
+    def __call__(self, name: str, text: str, *, section: str = "", exactly: bool = True) -> None:
+        """Fail with the difference; ``exactly=False`` lets the last digit of decimal numbers be one off.
+
+        Args:
+            name: Of the file.
+            text: The whole output.
+            section: The part of the file that this test compares; without it, all.
+            exactly: Whether every digit counts.
+        """
         file = self._folder / f"{name}.txt"
-        text = "\n".join(line.rstrip() for line in text.splitlines()) + "\n"
-        if self._write:
-            if not file.exists() or difference(text, file.read_text(encoding="utf-8"), exactly=exactly):
-                file.write_text(text, encoding="utf-8")
-            return
-        if not file.exists():
-            pytest.fail(f"{file} is missing; write it with --write-expected", pytrace=False)
-        if found := difference(text, file.read_text(encoding="utf-8"), exactly=exactly):
-            pytest.fail(
-                f"another output than {file.name} has; if it is right: --write-expected\n{found}", pytrace=False
-            )
+        text = "\n".join(line.rstrip() for line in text.strip("\n").splitlines()) + "\n"
+        sections = _sections(file)
+        kept = sections.get(section)
+        found = "missing" if kept is None else difference(text, kept, exactly=exactly)
+        if found and self._write:
+            sections[section] = text
+            parts = (f"==== {part}\n{sections[part]}" if part else sections[part] for part in sorted(sections))
+            file.write_text("".join(parts), encoding="utf-8")
+        elif found:
+            where = f"{file.name} {section}".strip()
+            pytest.fail(f"not the output of {where}; if it is right: --write-expected\n{found}", pytrace=False)
+
+
+def _sections(file: Path) -> dict[str, str]:
+    """The text of each section of a file; that before any has an empty name."""
+    if not file.exists():
+        return {}
+    first, *others = re.split(r"^==== (.*)\n", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    found = {"": first} if first else {}
+    return found | dict(zip(others[::2], others[1::2], strict=True))
 
 
 def short(text: str) -> str:
