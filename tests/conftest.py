@@ -185,9 +185,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.fixture
 def expected(request: pytest.FixtureRequest) -> Expected:
     """Compares a whole output with the kept one."""
-    from whole_outputs import Expected
+    from whole_outputs import expected_of
 
-    return Expected(write=bool(request.config.getoption("--write-expected")))
+    return expected_of(request.config)
 
 
 @pytest.fixture

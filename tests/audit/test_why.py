@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_runs import Inline, small
+from whole_outputs import Expected, masked
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
@@ -34,13 +35,16 @@ def write_texts(folder: Path, page: Page) -> None:
         write_bytes(make_folder(folder) / name, text.encode())
 
 
-def test_the_shares_of_a_bench_sum_to_all_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_shares_of_a_bench_sum_to_all_failures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, expected: Expected
+) -> None:
     monkeypatch.setattr(audits, "write_page", write_texts)
     wanted = small(agents=("table", "random"), seeds=(0, 1), evaluation_episodes=12)
     folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
     said = why_report(folder, root=tmp_path, task=None, encoder=None)
     with (folder / "why" / "causes.csv").open() as file:
         rows = list(csv.DictReader(file))
+    expected("why", masked(f"{said}\n{(folder / 'why' / 'causes.csv').read_text()}", tmp_path))
     result = load_bench(folder)
     for run in result.of("table"):  # type: ignore[union-attr]
         for row in run.checkpoints:

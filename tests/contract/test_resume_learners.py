@@ -44,8 +44,8 @@ def do(folder: Path, agent: str, every_s: float) -> RunResult:
 
 
 def mean(array: NDArray[Any]) -> float:
-    """Mean magnitude; of texts their number."""
-    return float(np.abs(array.astype(np.float64)).mean()) if array.dtype.kind in "fiub" else array.size
+    """Mean magnitude, of texts their number; gradients below 0.01 may be roundings alone, and all are shown so."""
+    return max(0.01, float(np.abs(array.astype(np.float64)).mean())) if array.dtype.kind in "fiub" else array.size
 
 
 def as_text(run: RunResult, state: AgentState) -> str:
@@ -58,7 +58,7 @@ def as_text(run: RunResult, state: AgentState) -> str:
         lines += [f"after {row.episodes}: {rounded(row.kept.actions)} {row.successes} solved", f"  {rounded(said)}"]
     for name, array in sorted(state.arrays.items()):
         is_frame = array.dtype == np.uint8  # or the state of a generator
-        lines.append(f"  {name} {array.shape}" + ("" if is_frame or not array.size else f": {mean(array):.3g}"))
+        lines.append(f"  {name} {array.shape}" + ("" if is_frame or not array.size else f": {mean(array):.2g}"))
     return "\n".join(lines)
 
 

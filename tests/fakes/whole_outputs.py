@@ -71,6 +71,11 @@ class Expected:
             pytest.fail(f"not the output of {where}; if it is right: --write-expected\n{found}", pytrace=False)
 
 
+def expected_of(config: pytest.Config) -> Expected:
+    """The comparison of a session, also of plug-ins' tests, which do not know the fixture."""
+    return Expected(write=bool(config.getoption("--write-expected", default=False)))
+
+
 def _sections(file: Path) -> dict[str, str]:
     """The text of each section of a file; that before any has an empty name."""
     if not file.exists():
@@ -78,6 +83,12 @@ def _sections(file: Path) -> dict[str, str]:
     first, *others = re.split(r"^==== (.*)\n", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
     found = {"": first} if first else {}
     return found | dict(zip(others[::2], others[1::2], strict=True))
+
+
+def masked(text: str, folder: Path | None = None) -> str:
+    """A text without digests, and with HERE for a folder."""
+    text = text if folder is None else text.replace(str(folder), "HERE")
+    return re.sub(r"\b(?<!\.)(?=[0-9a-f]*[a-f])[0-9a-f]{12,64}\b", "DIGEST", text)
 
 
 def short(text: str) -> str:

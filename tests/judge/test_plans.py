@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from recordings import contents
 from rerun.chunk import RrdReader
 from small_runs import Inline, small
+from whole_outputs import Expected, rounded
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
@@ -185,9 +186,14 @@ def test_faults_and_macro_actions_are_counted_one_by_one(right: list[PlanResult]
     assert (found["faults"], found["steps"], found["attempted"]) == (6, sum(plan.done for plan in plans), 4)
 
 
-def test_what_is_written_holds_every_plan(wrong: list[PlanResult], right: list[PlanResult], tmp_path: Path) -> None:
+def test_what_is_written_holds_every_plan(
+    wrong: list[PlanResult], right: list[PlanResult], tmp_path: Path, expected: Expected
+) -> None:
     write_plans(tmp_path, wrong, TASK, {"commit": "abc"})
     summary = summarise(wrong)
+    outcomes = [plan.outcome for plan in (*wrong, *right)]
+    written = [(tmp_path / name).read_text() for name in ("plans.csv", "summary.json")]
+    expected("plans", "\n".join([*written, *outcomes, rounded(summarise(right))]))
     rows = (tmp_path / "plans.csv").read_text().splitlines()
     assert len(rows) == 13 and rows[0].startswith("plan,start,shortest,planned,done,solved,optimal,refused")
     kept = json.loads((tmp_path / "summary.json").read_text())

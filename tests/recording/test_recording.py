@@ -5,10 +5,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 from contextlib import closing
-from datetime import timedelta
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -16,8 +13,6 @@ import pytest
 import rerun as rr
 import rerun.blueprint as rrb
 from fake_agents import FakeAgent, FakeImaginer
-from imagine_bench_motion.control.datasets import replay
-from imagine_bench_motion.control.recording import motion_recording
 from numpy.typing import NDArray
 from recordings import contents, rerun, times, view_names
 from rerun.chunk import RrdReader
@@ -36,14 +31,7 @@ from imagine_bench.running.bench import bench
 from imagine_bench.seeding import episode_seed
 
 REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
-IMAGINED = {"/imagined/filmstrip", *(f"/imagined/uncertainty/{kind}" for kind in ("epistemic", "aleatoric", "modal"))}
-BY_DEPTH = {
-    f"/imagined/episode_{episode}/{leaf}"
-    for episode in (1, 2)
-    for leaf in ("frame", "real_frame", "prediction/reward", "prediction/p_terminated", "uncertainty/epistemic")
-}
 NOTHING = lambda _: rrb.Vertical()  # noqa: E731
-VALUES = {"/real/q_table", "/real/q_values/turn_the_left_cube_clockwise"}
 
 
 def record(
@@ -65,23 +53,6 @@ def test_verifies(imagined: Path) -> None:
     assert checked.returncode == 0, checked.stderr
 
 
-def test_entities_and_timelines(imagined: Path) -> None:
-    found = contents(imagined)
-    assert set(found) >= REAL | IMAGINED | BY_DEPTH | VALUES
-    for path in REAL - {"/scene/cube_1/cube_1_arrow"}:
-        assert found[path] >= {"sim_time", "env_step", "episode"}
-    assert found["/scene/cube_1/cube_1_arrow"] == set()  # for all times
-    assert all("imagined_depth" in found[path] for path in BY_DEPTH)
-    assert times(imagined, "/real/frame", "imagined_depth") == {0}, "the first start alone is real there"
-    assert times(imagined, "/imagined/episode_1/frame", "imagined_depth") == set(range(1 + episodes.IMAGINED_DEPTH))
-
-
-def test_the_scene_stands_as_every_frame_shows_it(imagined: Path) -> None:
-    frames = {name: times(imagined, "/real/frame", name) for name in ("env_step", "sim_time")}
-    assert len(frames["env_step"]) >= 4
-    assert {name: times(imagined, "/scene/cube_0", name) for name in frames} == frames
-
-
 def by_step(path: Path, entity: str, column: str) -> list[tuple[int, object]]:
     """The values that were logged for an entity, each with its real step, in their order."""
     batches = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity]
@@ -92,12 +63,6 @@ def by_step(path: Path, entity: str, column: str) -> list[tuple[int, object]]:
         for pair in zip(batch.column("env_step").to_pylist(), batch.column(column).to_pylist(), strict=True)
     ]
     return sorted(found, key=lambda pair: pair[0])
-
-
-def test_at_an_episode_s_end_nothing_more_is_expected(imagined: Path) -> None:
-    for entity in ("/real/q_table", "/imagined"):  # and all that lies below it
-        (_, _), (last, _) = by_step(imagined, entity, "Clear:is_recursive")
-        assert last == max(times(imagined, "/real/frame", "env_step"))
 
 
 class _HandsOver(FakeImaginer):
@@ -264,12 +229,6 @@ def test_a_module_in_the_current_folder_is_no_viewer(tmp_path: Path, monkeypatch
     assert (tmp_path / "ran").read_text() == "path"
 
 
-def test_each_episode_has_a_start_of_its_own(imagined: Path) -> None:
-    texts = [str(text) for _, (text,) in by_step(imagined, "/real/text", "TextDocument:text")]
-    starts = [text.partition("a new start")[2].partition("**")[0] for text in texts if "a new start" in text]
-    assert len(set(starts)) == len(starts) == 2
-
-
 def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
     _, left, right, *_ = q_table(("left", "right turn"), np.array([-1.0, 2.5], dtype=np.float32), 1).splitlines()
     assert left.startswith("  left") and right.startswith("> right turn   +2.50 ")
@@ -279,13 +238,6 @@ def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
     rows = q_table(("a", "b"), np.array([-1.0, -4.0], dtype=np.float32), 0).splitlines()[1:3]
     assert all(row[row.index("│") - 1] == "█" for row in rows), "a short bar begins at zero, too"
     assert "nan" not in q_table(("a", "b"), np.zeros(2, dtype=np.float32), 0)
-
-
-def test_every_series_has_its_name(imagined: Path) -> None:
-    names = registry.task("arrow_puzzle").action_names
-    found = logged(imagined)
-    for name in names:
-        assert str([name]) in found["/real/q_values/" + entity_name(name), "SeriesLines:names"]
 
 
 @pytest.mark.parametrize(
@@ -407,21 +359,3 @@ def test_of_so_many_seeds_alone_runs_are_recorded(tmp_path: Path) -> None:
     result = bench(wanted, {}, root=tmp_path, launcher=Inline())
     assert [run.recording is not None for run in result.runs] == [True, False]
     assert bench(wanted, {}, root=tmp_path, launcher=Inline(patience=0)).missing == (), "no run lacks anything"
-
-
-def test_a_recording_of_continuous_control_shows_each_period(tmp_path: Path) -> None:
-    made: Any = gymnasium.make("imagine_bench/ArrowPuzzleEasyMotion-v0", disable_env_checker=True, size=32)
-    env = made.unwrapped
-    path = tmp_path / "motion.rrd"
-    commands = np.zeros((5, 7), np.float32)
-    with motion_recording(path, env) as watch:
-        replay(env, 0, commands, watch)
-    found = contents(path)
-    shown = {"hand", "front", "text", "fingers/left_finger_n", "joints/joint_6_n_m", "command/grip", "reward"}
-    assert set(found) >= {f"/motion/{name}" for name in shown} | {"/scene/hand_target", "/scene/finger_left"}
-    assert times(path, "/motion/front", "env_step") == set(range(6)), "the start, and five periods"
-    assert times(path, "/motion/command/grip", "env_step") == set(range(1, 6)), "no command before the start"
-    moments = sorted(times(path, "/scene/hand_target", "sim_time"))
-    since_s = [(late - early) / timedelta(seconds=1) for early, late in pairwise(moments)]
-    assert since_s == pytest.approx([0.04] * 5)
-    env.close()

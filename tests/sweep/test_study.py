@@ -17,7 +17,9 @@ import pytest
 from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
 from imagine_bench.agents.settings import flatten
 from numpy.typing import NDArray
+from report_pages import page_in_words
 from small_runs import Inline
+from whole_outputs import Expected
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
@@ -49,7 +51,9 @@ STUDY = Study(
 )
 
 
-def test_every_variant_is_run_once_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_variant_is_run_once_and_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: Expected
+) -> None:
     launcher = Inline()
     lines = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
     assert [(line.variant.name, line.success.shape) for line in lines] == [
@@ -59,8 +63,8 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path, capsys: pytest.C
     assert lines[0].difference is None
     for line, base in ((lines[1], lines[0]), (lines[2], lines[1])):
         assert line.difference is not None
-        expected = line.success.mean(axis=0) - base.success.mean(axis=0)
-        assert [one.value for one in line.difference] == pytest.approx(expected.tolist())
+        gains = line.success.mean(axis=0) - base.success.mean(axis=0)
+        assert [one.value for one in line.difference] == pytest.approx(gains.tolist())
     again = run_study(STUDY, "arrow_puzzle", root=tmp_path, launcher=launcher)
     assert len(launcher.jobs) == 6, "finished runs are not run again"
     assert all(np.array_equal(one.success, other.success) for one, other in zip(lines, again, strict=True))
@@ -75,6 +79,7 @@ def test_every_variant_is_run_once_and_compared(tmp_path: Path, capsys: pytest.C
     right = dataclasses.replace(right, difference=(Estimate(0.1, *[math.nan] * 2), Estimate(-0.2, *[math.nan] * 2)))
     first = dataclasses.replace(lines[0], success=np.array([[0.1, 0.2], [0.3, 0.4]]))
     page = study_page(STUDY, [first, right])
+    expected("study", page_in_words(page).partition("How it was made")[0])
     assert [row[-4] for row in page.sections[0].tables[0].rows][:2] == ["20.0", "30.0"], "means of seeds"
     assert [row[-2] for row in page.sections[0].tables[0].rows] == ["–", "–", "20.0", "30.0"], "means of seeds"
     assert [row[-3] for row in page.sections[0].tables[0].rows] == ["–", "–", "+10.0", "−20.0"], "of each budget"

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from report_pages import page_in_words
 from small_runs import Inline
+from whole_outputs import masked
 
 from imagine_bench import registry
 from imagine_bench.exact.splits import split_of
@@ -98,8 +100,10 @@ def test_a_failing_agent_costs_the_others_nothing(tmp_path):
     assert found.score(suite.experiments[0], "oracle").value == 1.0
 
 
-def test_the_page_shows_every_score_and_the_hash(result):
+def test_the_page_shows_every_score_and_the_hash(result, expected):
     page = suite_page(result)
+    text = page_in_words(page).partition("How it was made")[0]
+    expected("suite", masked(text.partition("training of all levels")[0]))
     (section,) = page.sections
     cells = [row[1:] for row in section.tables[0].rows[:-1]]
     scores = list(csv.DictReader(io.StringIO(page.files["scores.csv"])))

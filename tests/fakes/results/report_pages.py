@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from html import unescape
 
+from imagine_bench.report.page import Page, texts
+
 PAGE_PX = 1200 - 2 * 24  # the page's own margin
 CHARACTER_PX, PADDING_PX = 8.0, 19.2
 
@@ -47,3 +49,24 @@ def check_dashes(page: str) -> None:
     for section in page.split("<h2>"):
         if re.search(r"<td[^>]*>–</td>", section):
             assert "–: " in section, section[:80]
+
+
+def in_words(html: str) -> str:
+    """A page as its reader sees it, a row of a table or a paragraph a line."""
+    text = re.sub(r"<(style|svg|script|title)\b.*?</\1>", "", html, flags=re.DOTALL)
+    text = re.sub(r"</t[dh]>\s*<t[dh][^>]*>", " | ", text)
+    text = re.sub(r"</(tr|p|h\d|li|summary|caption|figcaption|table|dt|dd|pre)>", "\n", text)
+    lines = [" ".join(unescape(re.sub(r"<[^>]+>", "", line)).split()) for line in text.splitlines()]
+    return "\n".join(line for line in lines if line and "imagine_bench" not in line)
+
+
+def page_in_words(page: Page) -> str:
+    """A checked page, and of each of its files the first and last lines."""
+    written = texts(page, images=False)
+    index = written.pop("index.html")
+    check_page(index)
+    shown = [in_words(index)]
+    for name, file in sorted(written.items()):
+        rows = file.splitlines()
+        shown += [f"== {name}: {len(rows)} lines", *rows[:3], *rows[-2:]]
+    return "\n".join(shown)

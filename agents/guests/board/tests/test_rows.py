@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,9 @@ from imagine_bench_board.check import NEVER_SHOWN, NOT_VOUCHED, check
 from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import CARD, EPISODES, LARGEST, LONGEST, read_row, world_words
 from imagine_bench_board.submit import submit
+from report_pages import in_words
 from small_runs import Inline, small
+from whole_outputs import expected_of
 
 from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
@@ -231,12 +234,15 @@ def test_hostile_claims_are_text_on_the_pages(row: Path, tmp_path: Path) -> None
         assert "<img src=x" not in page.read_text() and "<script>alert" not in page.read_text()
 
 
-def test_every_number_of_the_page_leads_to_its_episodes(row: Path, tmp_path: Path) -> None:
+def test_every_number_of_the_page_leads_to_its_episodes(row: Path, tmp_path: Path, pytestconfig: pytest.Config) -> None:
     page = write_board(check(row.parents[1]), tmp_path / "page")
     text = page.read_text()
     address = f"{row.name}.html#seed-0-after-9"
     assert text.count(f'href="{address}"') == 2
     linked = (page.parent / f"{row.name}.html").read_text()
+    words = "\n\n".join(in_words(each).partition("How it was made")[0] for each in (text, linked))
+    words = re.sub(r"\S+ \| nothing$", "CPU s | nothing", words.replace(row.name, "ROW"), flags=re.MULTILINE)
+    expected_of(pytestconfig)("board", words)
     assert 'id="seed-0-after-9"' in linked
     read = read_row(row)
     for test in range(6):
