@@ -357,17 +357,22 @@ def separating() -> None:
     Failed tests stand above the solved ones, by cause, where causes are kept; those of all seeds that have them.
     """
     folders = [RESULTS / f"separating-{name}" for name in ("world-453", *(f"{name}-450" for name in CHALLENGES))]
+    also = {"separating-world-453": ("separating-world-lewm-453", "separating-world-lewm-454")}
     benches = [json.loads((folder / "bench.json").read_text()) for folder in folders]
-    widths = [len(kept["protocol"]["agents"]) for kept in benches]
+    widths = [
+        len(kept["protocol"]["agents"]) + (folder.name in also) for folder, kept in zip(folders, benches, strict=True)
+    ]
     figure, every = plt.subplots(
         1, len(folders), figsize=(13.6, 3.4), width_ratios=widths, sharey=True, layout="constrained"
     )
     for axes, folder, kept in zip(every, folders, benches, strict=True):
         protocol = kept["protocol"]
         last = protocol["budgets"][-1]
-        agents = sorted(agent_label(agent, protocol) for agent in protocol["agents"])
+        shown = {agent_label(agent, protocol): [folder.name] for agent in protocol["agents"]}
+        shown |= {"lewm": list(also[folder.name])} if folder.name in also else {}
+        agents = sorted(shown)
         for place, agent in enumerate(agents):
-            values = 100 * rates(folder.name, agent)[last]
+            values = 100 * np.concatenate([rates(name, agent)[last] for name in shown[agent]])
             bottom = values.mean()
             axes.bar(place, bottom, width=0.6, color="#d9d9d9", label="solved" if agent == agents[0] else None)
             counts = failures(folder).get(agent, {}).get(str(last), Counter())
