@@ -216,7 +216,7 @@ def shown(values: Sequence[int | None], hidden: int, episodes: int = 20) -> list
 
 def test_a_value_that_hides_a_factor_is_found_by_its_contradictions() -> None:
     hidden = hidden_value(shown((1, None, 1, None), hidden=3), (4, 1))
-    assert hidden == (0, 3)
+    assert hidden is not None and hidden == (0, 3)
     filled = hidden.filled(shown((1, None, None), hidden=3))
     assert all(each.now == each.then and min(each.now) >= 0 for each in filled)
     assert hidden_value(shown((1, 1, 1), hidden=3), (4, 1)) is None, "nothing is hidden, and nothing contradicts"

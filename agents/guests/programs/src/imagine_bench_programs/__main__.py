@@ -21,8 +21,7 @@ from imagine_bench.registry.machine import describe_environment
 from .experience import See, itself, macro_actions_of, play, write_experience
 from .program import Program
 from .scores import Codes, ReadRules, Scores, efficiency, score
-from .sight import SeeingWriter
-from .symbol_rules import SymbolRules
+from .sight import SeeingWriter, SeenCodes
 from .writing.writer import Writer
 
 _TIMES = 2.0
@@ -154,10 +153,8 @@ def written(
         writer = Writer(sizes, spec.n_actions, choices)
         _explore(writer, spec, macro_actions, starts, itself if codes is None else codes.of)
     cpu_s = time.process_time() - begun_s
-    rules: SymbolRules = writer.laws
-    if own or codes is not None:
-        rules = ReadRules(rules, seeing.codes() if own else codes)
-    found = asdict(score(rules, spec))
+    read: SeenCodes | Codes | None = seeing.codes() if own else codes
+    found = asdict(score(writer.laws if read is None else ReadRules(writer.laws, read), spec))
     return {"seed": seed, "macro_actions": macro_actions, **found, "laws": writer.laws.count, "cpu_s": round(cpu_s, 2)}
 
 

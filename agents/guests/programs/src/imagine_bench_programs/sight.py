@@ -118,14 +118,14 @@ class SeeingWriter:
 
         The factors of before are kept if by them far fewer transitions contradict one another.
         """
-        *earlier, sizes = before
+        sight, found_in, sizes = before
         kept = self._codes
         known = self._explained(sizes)
         codes, _ = self.perception.codes(np.stack(self._images))
         self._codes = dict(enumerate(codes))
         found = self._explained(self.perception.sizes)
-        if earlier[0].factors and _contradicting(known[1]) < _CLEARER * _contradicting(found[1]):
-            self.perception.take(*earlier)
+        if sight.factors and _contradicting(known[1]) < _CLEARER * _contradicting(found[1]):
+            self.perception.take(sight, found_in)
             self._codes = kept
             found = known
         self._hidden, rows = found
@@ -179,7 +179,7 @@ def hidden_value(rows: Sequence[Row], sizes: Sequence[int]) -> Hidden | None:
     """
     without = _contradicting(rows)
     values = [Hidden(factor, value) for factor, size in enumerate(sizes) if size > 1 for value in range(size)]
-    left = {}
+    left: dict[Hidden, float] = {}
     for each in values if without else ():
         filled = each.filled(rows)
         if 2 * len(complete(filled)) > len(rows):  # else too much is left out to tell
