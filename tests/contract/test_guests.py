@@ -120,7 +120,7 @@ def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_l
     of_motions = (
         ["judge", "ArrowPuzzleMotion"],
         ["play", "ArrowPuzzleMotion"],
-        ["dataset", "ArrowPuzzleMotion", "--policy", "expert"],
+        ["dataset", "ArrowPuzzleMotion", "--policy", "expert", "--episodes", "0"],
         ["dataset", "--describe", str(tmp_path)],
         ["verify", str(tmp_path)],
         ["view", str(tmp_path)],
