@@ -81,14 +81,18 @@ def test_pages_name_commands() -> None:
 
 @pytest.mark.parametrize("page", [page for page in WRITTEN if commands_of(page)], ids=name)
 def test_commands_could_be_carried_out(page: Path) -> None:
-    """Options, tasks, agents and settings that a page names exist, and every bench could be begun."""
+    """Options, tasks, agents and settings that a page names exist, and every bench could be begun.
+
+    A page may also name a task that a command of the page makes.
+    """
+    made = re.findall(r"imagine-bench new task (\w+)", page.read_text())
     for said in commands_of(page):
         try:
             command = parsed(shlex.split(said))
         except SystemExit:
             pytest.fail(f"{page.name} names a command that is not understood: imagine-bench {said}")
         task = getattr(command, "task", None)
-        is_known = task in (None, "TASK", "my_task", *regressions(), *AGENTS) or has_task(task)
+        is_known = task in (None, "TASK", "my_task", *made, *regressions(), *AGENTS) or has_task(task)
         assert is_known or task_of_motion(task), f"{page.name}: {said}"
         if isinstance(command, Bench) and not (
             command.learner.dataset or str(command.learner.encoder).endswith(".safetensors")
