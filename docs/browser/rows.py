@@ -69,9 +69,13 @@ def converted(card: dict[str, Any], logs: list[dict[str, Any]]) -> dict[str, obj
 def _events(env: MotionEnv, row: motions.MotionRow, test: int) -> dict[str, object]:
     """A test of continuous control, carried out again: the macro-action and the macrostate of each event.
 
-    A fault is no macro-action, so the events end before it. An event may come some periods later than in the file.
+    A fault is no macro-action, so the events end before it. They also end at the horizon of the macro-actions, since
+    time alone ends continuous control. A test that is not reproducible counts as failed, wherever its events lead. An
+    event may come some periods later than in the file.
     """
-    commands = row.motions[test].commands
+    motion = row.motions[test]
+    commands = motion.commands
+    horizon = registry.task(row.protocol.task).horizon
     env.restart(seed=row.protocol.start(test))
     start = [int(value) for value in env.episode.macrostate]
     actions: list[int] = []
@@ -84,9 +88,15 @@ def _events(env: MotionEnv, row: motions.MotionRow, test: int) -> dict[str, obje
         if event is not None and event.fault is None:
             actions.append(int(event.action))
             states.append([int(value) for value in event.outcome.macrostate])
-        if period.terminated or period.truncated:
+        if period.terminated or period.truncated or len(actions) == horizon:
             break
-    return {"start": start, "actions": actions, "states": states, "success": success}
+    return {
+        "start": start,
+        "actions": actions,
+        "states": states,
+        "success": success and motion.reproducible,
+        "reproducible": motion.reproducible,
+    }
 
 
 def moved(folder: Path) -> dict[str, object] | None:

@@ -5,6 +5,7 @@ They run in Node.js, which needs no network. The arm and the page itself are in 
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -323,11 +324,49 @@ def test_actions_of_continuous_control_are_the_events_of_the_replay(
             assert terminated or truncated
             ended_by_fault += bool(info["fault"])
             assert (episode["states"], episode["actions"]) == (states, actions)
-            assert episode["success"] == info["is_success"]
+            assert episode["success"] == (info["is_success"] and motion.reproducible)
             assert not motion.reproducible or episode["success"] == motion.solved
     assert sum(len(each["actions"]) for each in found["episodes"]) == events
     assert ended_by_fault >= faults
     assert ask([{"kind": "row", "row": found}]) == [20], "the page takes it"
+
+
+def _moved(monkeypatch: pytest.MonkeyPatch, task: str, *, reproducible: bool) -> dict[str, Any]:
+    """The first test of the expert's row as one of another world; its row for the page."""
+    import rows
+
+    kept = read_motions(rows.BOARD / "expert-motion-arrow_puzzle")
+    row = dataclasses.replace(
+        kept,
+        protocol=dataclasses.replace(kept.protocol, task=task, tests=1),
+        motions=(dataclasses.replace(kept.motions[0], reproducible=reproducible),),
+    )
+    monkeypatch.setattr(rows.motions, "read_motions", lambda _: row)
+    monkeypatch.setattr(rows.motions, "check_motions", lambda *_: row)
+    found: dict[str, Any] = rows.moved(rows.BOARD)
+    return found
+
+
+@needs_node
+@pytest.mark.usefixtures("made")
+def test_a_test_with_more_events_than_macro_actions_ends_at_the_horizon(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = _moved(monkeypatch, "arrow_puzzle", reproducible=True)
+    cut = _moved(monkeypatch, "arrows:horizon=1", reproducible=True)
+    (long,), (short,) = whole["episodes"], cut["episodes"]
+    assert len(long["actions"]) > 1 and long["success"]
+    assert (short["actions"], short["states"], short["success"]) == (long["actions"][:1], long["states"][:1], False)
+    assert ask([{"kind": "row", "row": cut}]) == [1], "the page takes it"
+
+
+@needs_node
+@pytest.mark.usefixtures("made")
+def test_a_test_that_is_not_reproducible_is_not_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = _moved(monkeypatch, "arrow_puzzle", reproducible=False)
+    (episode,) = row["episodes"]
+    assert (episode["success"], episode["reproducible"]) == (False, False)
+    forged = {**row, "episodes": [{**episode, "success": True}]}
+    taken, refused = ask([{"kind": "row", "row": each} for each in (row, forged)])
+    assert taken == 1 and "claims another end" in refused["refused"]
 
 
 @pytest.mark.usefixtures("made")

@@ -160,14 +160,15 @@ class Page {
   }
 
   #anew() {
-    this.queue = [];
-    this.moving = null;
-    this.waiting = null;
     this.game.reset();
     this.#begin();
   }
 
+  /** Show the start of an episode; nothing that was asked for before is carried out in it. */
   #begin() {
+    this.queue = [];
+    this.moving = null;
+    this.waiting = null;
     this.scene.place(this.game.state);
     this.view.hidesHand = !this.game.shown;
     this.dream?.look(this.rules.rowOf(this.game.state));
@@ -294,7 +295,9 @@ class Page {
     find('episode').replaceChildren(...this.row.episodes.map((episode, index) => {
       const option = document.createElement('option');
       option.value = String(index);
-      option.textContent = `${index + 1} · ${episode.success ? 'solved' : 'not solved'} in ${episode.actions.length}`;
+      const end = episode.success ? 'solved' : 'not solved';
+      const why = episode.reproducible === false ? ', as it is not reproducible' : '';
+      option.textContent = `${index + 1} · ${end} in ${episode.actions.length}${why}`;
       return option;
     }));
     const known = Number.isInteger(first) && first >= 1 && first <= this.row.episodes.length;
@@ -305,7 +308,6 @@ class Page {
 
   #watch() {
     const episode = this.row.episodes[Number(find('episode').value)];
-    this.moving = null;
     this.game.reset([...episode.start]);
     this.#begin();
     this.queue = episode.actions.map((action, at) => ({ action, reached: episode.states[at] }));

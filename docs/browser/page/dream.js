@@ -52,7 +52,7 @@ export class Dream {
    * Imagine a macro-action, and say the expected outcome.
    * @param {import('./rules.js').Turn[]} turns
    * @param {number} row of the macrostate that was reached
-   * @param {import('./rules.js').Outcome} outcome
+   * @param {import('./outcomes.js').Outcome} outcome
    */
   follow(turns, row, outcome) {
     let found = null;

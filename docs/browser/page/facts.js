@@ -3,7 +3,7 @@
 
 /**
  * Outcomes of every macro-action in every macrostate in which an episode goes on.
- * @param {import('./rules.js').Rules} rules
+ * @param {import('./families.js').Rules} rules
  */
 function tabulate(rules) {
   const alive = [];
@@ -33,7 +33,7 @@ function tabulate(rules) {
 /**
 
 /**
- * @param {import('./rules.js').Rules} rules
+ * @param {import('./families.js').Rules} rules
  * @returns {{chance: number, optimum: number}}
  */
 export function factsOf(rules) {

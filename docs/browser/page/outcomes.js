@@ -13,7 +13,8 @@
  */
 
 /**
- * The outcomes of a macro-action in a world that slips, and in which the goal changes; equal ones are one.
+ * The outcomes of a macro-action in a world that slips, and in which the goal changes; those of one
+ * macrostate, which have the same reward and end, are one.
  * @param {{slip: number, goal_change: number}} world
  * @param {Outcome[]} outcomes without both
  * @param {Outcome} slipped that of a macro-action that leaves all as it is
@@ -31,7 +32,7 @@ export function varied(world, outcomes, slipped, askedOtherwise) {
   /** @type {Map<string, Outcome>} */
   const merged = new Map();
   const add = (outcome, probability) => {
-    const key = JSON.stringify({ ...outcome, probability: 1 });
+    const key = outcome.macrostate.join();
     const before = merged.get(key)?.probability ?? 0;
     merged.set(key, { ...outcome, probability: before + probability });
   };
