@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from imagine_bench.tasks.continuous.env import MotionEnv
-from imagine_bench_board import motions
+from imagine_bench_board import motion_rows, motions
 
 from imagine_bench import registry
 from imagine_bench.interfaces import Rules, TaskSpec
@@ -66,7 +66,7 @@ def converted(card: dict[str, Any], logs: list[dict[str, Any]]) -> dict[str, obj
     return {"title": title, "world": spec.id, "episodes": episodes}
 
 
-def _events(env: MotionEnv, row: motions.MotionRow, test: int) -> dict[str, object]:
+def _events(env: MotionEnv, row: motion_rows.MotionRow, test: int) -> dict[str, object]:
     """A test of continuous control, carried out again: the macro-action and the macrostate of each event.
 
     A fault is no macro-action, so the events end before it. They also end at the horizon of the macro-actions, since
@@ -105,7 +105,7 @@ def moved(folder: Path) -> dict[str, object] | None:
     Raises:
         ArtefactError: The row is damaged, or does not play again.
     """
-    row = motions.read_motions(folder)
+    row = motion_rows.read_motions(folder)
     spec: TaskSpec = registry.task(row.protocol.task)
     if not has_scene(spec):
         return None
@@ -125,7 +125,7 @@ def write(folder: Path, board: Path = BOARD) -> None:
     index = []
     for path in sorted(board.glob("*/card.json")):
         card = json.loads(path.read_text())
-        if card.get("format") == motions.FORMAT:
+        if card.get("format") == motion_rows.FORMAT:
             row = moved(path.parent)
         else:
             row = converted(card, json.loads(path.with_name("episodes.json").read_text()))

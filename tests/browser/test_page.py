@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from imagine_bench_board.motions import SLACK_PERIODS, read_motions
+from imagine_bench_board.motion_rows import read_motions
+from imagine_bench_board.motions import SLACK_PERIODS
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, ImagineBenchError

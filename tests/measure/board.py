@@ -21,7 +21,7 @@ from unittest import mock
 
 import mujoco
 from imagine_bench_board.check import Checked, check, row_folders
-from imagine_bench_board.motions import FORMAT
+from imagine_bench_board.motion_rows import FORMAT
 from imagine_bench_board.rows import CARD, ROWS
 
 from imagine_bench.store.files import read_json

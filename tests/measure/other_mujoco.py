@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench_board import motions
-from imagine_bench_board.motions import FORMAT, Motion, MotionProtocol, MotionRow, read_motions
+from imagine_bench_board.motion_rows import FORMAT, Motion, MotionProtocol, MotionRow, read_motions
 from imagine_bench_board.rows import read_card
 from numpy.typing import NDArray
 

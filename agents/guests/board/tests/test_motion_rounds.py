@@ -12,7 +12,8 @@ import pytest
 from board_forging import AFTER, BEFORE, CLOSES, ROUND, on
 from imagine_bench_board import rounds
 from imagine_bench_board.check import check
-from imagine_bench_board.motions import MotionTests, read_motions
+from imagine_bench_board.motion_rows import read_motions
+from imagine_bench_board.motions import MotionTests
 from imagine_bench_board.rows import CARD, ROWS
 from imagine_bench_board.submit import file_agents
 from test_motions import WORLD, played

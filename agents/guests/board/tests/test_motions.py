@@ -19,7 +19,8 @@ from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_board import motions
 from imagine_bench_board.check import NOT_VOUCHED, check
 from imagine_bench_board.commands import board
-from imagine_bench_board.motions import SLACK_PERIODS, Motion, MotionRow, MotionTests, read_motions
+from imagine_bench_board.motion_rows import Motion, MotionRow, read_motions
+from imagine_bench_board.motions import SLACK_PERIODS, MotionTests
 from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import CARD, EPISODES, LONGEST
 

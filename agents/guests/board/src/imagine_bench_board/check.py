@@ -20,8 +20,8 @@ from imagine_bench.running.retraining import Verdict, judged, part_digest
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import Purpose, evaluation_split
 
-from . import motions, rounds
-from .motions import MotionRow
+from . import motion_rows, motions, rounds
+from .motion_rows import MotionRow
 from .rows import CARD, ROWS, Row, read_card, read_row, require_whole
 
 NOT_VOUCHED = ("the player", "which seeds and how many tests", "the price", "the data seen beforehand")
@@ -102,8 +102,8 @@ class _Court:
         return Checked(verdict=verdict, row=None if verdict.complaint else read[0])
 
     def _check(self, folder: Path, read: list[Row | MotionRow]) -> Verdict:
-        if read_card(folder).get("format") == motions.FORMAT:
-            moved = motions.read_motions(folder)
+        if read_card(folder).get("format") == motion_rows.FORMAT:
+            moved = motion_rows.read_motions(folder)
             read.append(moved)
             start_seed = self._starts(folder, moved, moved.protocol.tests)
             of_round = start_seed is None or moved.protocol.seed == start_seed

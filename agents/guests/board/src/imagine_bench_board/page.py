@@ -32,7 +32,7 @@ from imagine_bench.report.page import (
 from imagine_bench.store.files import make_folder, table_text, write_bytes
 
 from .check import NEVER_SHOWN, Checked
-from .motions import RATE_HZ, MotionRow
+from .motion_rows import RATE_HZ, MotionRow
 from .rows import Claims, Row
 
 _PERSON = "person"
