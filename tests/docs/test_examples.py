@@ -19,6 +19,7 @@ from imagine_bench.agents.encoders.encoder import Encoder
 from small_runs import Inline
 
 from imagine_bench import registry
+from imagine_bench.errors import ArtefactError
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.judge.models import source_of
 from imagine_bench.judge.questions import one_step
@@ -89,7 +90,10 @@ def test_the_vae_of_patched_images_goes_on_to_the_same_bits(
     monkeypatch.setattr(example, "loss_of", killed)
     with pytest.raises(KeyboardInterrupt):
         example.main([str(tmp_path / "parts.safetensors"), *begin])
+    with pytest.raises(ArtefactError, match="another training"):
+        example.main([str(tmp_path / "parts.safetensors"), *begin[:2], "--steps", "2"])
     example.main([str(tmp_path / "parts.safetensors"), *begin])
+    assert not list(tmp_path.glob("*.unfinished"))
     whole, parts = (Encoder.load(tmp_path / f"{name}.safetensors") for name in ("whole", "parts"))
     weights = parts.network.state_dict()
     assert all(value.equal(weights[name]) for name, value in whole.network.state_dict().items())

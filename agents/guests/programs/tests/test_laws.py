@@ -246,6 +246,9 @@ class BytePerception(LearnedPerception):
         values = frames[:, 0, 0, 0] // (1 if self.sight is self.fine else 2)
         return [(int(value),) for value in values], np.ones((len(frames), 1), dtype=bool)
 
+    def code(self, frame: Frame) -> State:
+        return self.codes(frame[None])[0][0]
+
     def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
         self.left -= 1
 

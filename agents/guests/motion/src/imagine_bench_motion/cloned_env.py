@@ -6,6 +6,7 @@ now and then.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ import gymnasium
 import numpy as np
 from imagine_bench.tasks.rendering.cameras import agent_camera_view
 
+from imagine_bench.arrays import Observed
 from imagine_bench.errors import InvalidValueError, brief
 from imagine_bench.interfaces import Frame
 
@@ -31,6 +33,51 @@ _HOME_PERIODS = 25
 """The most control periods of the way home."""
 _AT_HOME_RAD = 2e-3
 """An arm nearer to its observation pose, at each joint, is there."""
+
+
+class Period(NamedTuple):
+    """What a control period ends with."""
+
+    seen: Observed
+    event: bool  #: whether the macrostate changed, or a fault happened
+    over: bool  #: whether no further period is to follow
+
+
+def carry_out(clone: Clone, instruction: str, seen: Observed, period: Callable[[Command], Period]) -> Period:
+    """Let a clone follow an instruction, then lift the hand, and bring the arm home along its joints.
+
+    Args:
+        clone: The skill.
+        instruction: The macro-action in words.
+        seen: The newest observation.
+        period: Makes one control period with a command. After one that says that it is over, none follows.
+
+    Returns:
+        The last period.
+    """
+    latest = Period(seen, event=False, over=False)
+    clone.begin(instruction)
+    for _ in range(MOST_PERIODS):
+        latest = period(clone.act(latest.seen))
+        if latest.over:
+            return latest
+        if latest.event:
+            break
+    clone.begin(GO_BACK)
+    for _ in range(_BACK_PERIODS):
+        latest = period(clone.act(latest.seen))
+        if latest.over:
+            return latest
+    for _ in range(_HOME_PERIODS):
+        latest = period(HOME_COMMAND)
+        if latest.over or _is_home(latest.seen):
+            break
+    return latest
+
+
+def _is_home(seen: Any) -> bool:
+    joints_rad = seen["proprio"][: len(HOME_COMMAND) - 1]
+    return bool(np.abs(joints_rad - HOME_COMMAND[:-1]).max() < _AT_HOME_RAD)
 
 
 class _Event(NamedTuple):
@@ -115,7 +162,7 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
         before = self.motion.episode.macrostate
         self._periods = 0
         self._events = []
-        blew_up = self._carry_out(self.action_names[chosen])
+        blew_up = carry_out(self.clone, self.action_names[chosen], self._seen, self._period).over
         if not self._events:  # the fingers turned nothing, as where a turn slips
             outcome = rules.judge(before, chosen, before)
             self._events = [_Event(outcome.reward, outcome.terminated, outcome.success, -1, "")]
@@ -135,27 +182,8 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
 
     # --- details -------------------------------------------------------------------------------------------------
 
-    def _carry_out(self, instruction: str) -> bool:
-        """Let the clone follow an instruction, then go back and home. Returns whether the simulation blew up."""
-        self.clone.begin(instruction)
-        for _ in range(MOST_PERIODS):
-            if self._period(self.clone.act(self._seen)):
-                return True
-            if self._events:
-                break
-        self.clone.begin(GO_BACK)
-        for _ in range(_BACK_PERIODS):
-            if self._period(self.clone.act(self._seen)):
-                return True
-        for _ in range(_HOME_PERIODS):
-            if self._period(HOME_COMMAND):
-                return True
-            if np.abs(self._seen["proprio"][: len(HOME_COMMAND) - 1] - HOME_COMMAND[:-1]).max() < _AT_HOME_RAD:
-                break
-        return False
-
-    def _period(self, command: Command) -> bool:
-        """One control period; keeps its event unless the episode is over. Returns whether the simulation blew up."""
+    def _period(self, command: Command) -> Period:
+        """One control period; keeps its event unless the episode is over. It is the last if the simulation blew up."""
         self._seen, reward, terminated, blew_up, info = self.motion.step(command)
         self._periods += 1
         self._latest = info
@@ -165,7 +193,7 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
                 float(reward), terminated, bool(info["is_success"]), int(info["macro_action"]), info["fault_reason"]
             )
             self._events.append(event)
-        return blew_up
+        return Period(self._seen, bool(info["event"]), blew_up)
 
     def _frame(self) -> Frame:
         return self.motion.world.composite(self._camera.frame(self.motion.data))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,11 @@ from imagine_bench.judge.truth import added_up, total_variation
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 
-from .sight import SeenCodes
 from .symbol_rules import SymbolRules
 from .symbols import Symbols
+
+if TYPE_CHECKING:
+    from .sight import SeenCodes
 
 DISTRACTORS = 5
 """Macrostates among which a real next one is ranked."""

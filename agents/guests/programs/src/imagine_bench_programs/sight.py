@@ -141,7 +141,7 @@ class SeeingWriter:
     def _code(self, number: int) -> State:
         """The present code of an image."""
         if number not in self._codes:
-            (self._codes[number],), _ = self.perception.codes(self._images[number][None])
+            self._codes[number] = self.perception.code(self._images[number])  # which keeps it for `remember`
         return self._codes[number]
 
     def _coded(self, rows: Sequence[Row]) -> list[Row]:
