@@ -342,7 +342,7 @@ def _moved(monkeypatch: pytest.MonkeyPatch, task: str, *, reproducible: bool) ->
         protocol=dataclasses.replace(kept.protocol, task=task, tests=1),
         motions=(dataclasses.replace(kept.motions[0], reproducible=reproducible),),
     )
-    monkeypatch.setattr(rows.motions, "read_motions", lambda _: row)
+    monkeypatch.setattr(rows.motion_rows, "read_motions", lambda _: row)
     monkeypatch.setattr(rows.motions, "check_motions", lambda *_: row)
     found: dict[str, Any] = rows.moved(rows.BOARD)
     return found
