@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-KEPT = Path(__file__).parents[1] / "whole" / "expected"
+KEPT = Path(__file__).parent / "expected"
 DECIMAL = re.compile(r"-?\d+\.\d+")
 
 
