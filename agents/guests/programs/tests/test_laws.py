@@ -16,14 +16,14 @@ from imagine_bench_factored.perception import LearnedPerception, Sight
 from imagine_bench_factored.seeing.appearance import SeenFactor
 from imagine_bench_factored.seeing.standard import Standard
 from imagine_bench_programs import __main__ as commands
-from imagine_bench_programs.__main__ import written
+from imagine_bench_programs.__main__ import _explore, written
 from imagine_bench_programs.agent import LawsAgent
 from imagine_bench_programs.scores import Codes, ReadRules, score
 from imagine_bench_programs.sight import Hidden, SeeingWriter, SeenCodes, hidden_value
 from imagine_bench_programs.symbol_rules import SymbolRules
 from imagine_bench_programs.symbols import Symbols
 from imagine_bench_programs.writing.delay import Row, changes, too_early
-from imagine_bench_programs.writing.laws import Laws, ends_of, simplest
+from imagine_bench_programs.writing.laws import Laws, _cover, ends_of, simplest
 from imagine_bench_programs.writing.writer import Writer
 from numpy.typing import NDArray
 
@@ -94,6 +94,11 @@ def test_ends_say_two_equal_values_in_one_condition() -> None:
     alike, usual = ends_of(rows, (4, 4), 1)
     assert (len(alike.tests), alike.tests[0].alike, alike.reward, alike.ended) == (1, True, -1.0, True)
     assert usual.tests == () and not usual.ended
+
+
+def test_a_law_that_later_ones_make_superfluous_is_left_out() -> None:
+    holds = np.array([[1, 1, 1, 1, 0, 0], [1, 1, 0, 0, 1, 0], [0, 0, 1, 1, 0, 1]], dtype=bool)
+    assert _cover(holds, np.ones(6, dtype=bool)) == [(1,), (2,)]
 
 
 def test_unseen_values_teach_nothing() -> None:
@@ -318,6 +323,31 @@ def test_rules_between_codes_are_scored_as_a_probe_reads_them() -> None:
     codes = ReversedCodes(spec)
     found = score(ReadRules(ReversedTruth(spec, codes), codes), spec)
     assert (found.total_variation, found.ranking) == (0.0, 1.0) and found.found == found.facts > 0
+
+
+class ShuffledCodes(Codes):
+    """The codes of macrostates are here the macrostates with other names for the values of each coordinate."""
+
+    def __init__(self, spec: TaskSpec, rng: np.random.Generator) -> None:
+        self.sizes = [len(values) for values in spec.macrostate_values]
+        self._names = [rng.permutation(size) for size in self.sizes]
+
+    def of(self, macrostate: State) -> State:
+        return tuple(int(names[value]) for names, value in zip(self._names, macrostate, strict=True))
+
+    def macrostates(self, codes: Sequence[State]) -> NDArray[np.int64]:
+        return np.array([[int(np.argsort(n)[v]) for n, v in zip(self._names, code, strict=True)] for code in codes])
+
+
+@pytest.mark.parametrize("seed", [1003, 1005])
+def test_a_program_of_codes_has_every_fact(seed: int) -> None:
+    spec = registry.task("arrow_puzzle")
+    starts, choices, names = (np.random.default_rng([seed, each]) for each in range(3))
+    codes = ShuffledCodes(spec, names)
+    writer = Writer(codes.sizes, spec.n_actions, choices)
+    _explore(writer, spec, 224, starts, codes.of)
+    found = score(ReadRules(writer.laws, codes), spec)
+    assert (found.total_variation, found.found) == (0.0, found.facts)
 
 
 class ByteSymbols(Symbols):

@@ -7,6 +7,8 @@ A program of laws has three parts, each the shortest that explains the data. Sym
   macro-action come about together, with one probability; otherwise it changes nothing.
 - *Drifts*: whatever is done, a factor turns into another of its values with one probability, while the episode goes on.
 - *Ends*: a list of "if at most two conditions hold, this reward, and whether the episode ends", read from the top.
+  Laws of a class have one of four forms, and a form with fewer possible conditions makes each law shorter. The first
+  form has conditions on the symbols after alone. So a law does not say by coincidence that two codes are alike.
 
 Lengths are in nats. A law costs the logarithm of the number of laws of its form, data its negative log-likelihood. A
 probability is counted and then rounded: to one decimal, unless two decimals pay for themselves. The idea is that of
@@ -326,12 +328,13 @@ def ends_of(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> list[E
     values = np.array([(*row.then, row.action, *row.now) for row in rows])
     kinds = sorted({(row.reward, row.ended) for row in rows})
     label = np.array([kinds.index((row.reward, row.ended)) for row in rows])
-    tests = _tests(sizes, n_actions)
+    forms = _forms(sizes, n_actions)
+    tests = forms[-1]
     holds = np.array([values[:, t.place] == (values[:, t.value] if t.alike else t.value) for t in tests])
     laws: list[End] = []
     while len(left := np.unique(label)) > 1:
-        claims = [(_cover(holds, label == kind), int(kind)) for kind in left]
-        conditions, kind = min(claims, key=lambda claim: sum(map(len, claim[0])) or math.inf)
+        claims = [(_shortest_cover(holds, label == kind, list(map(len, forms))), int(kind)) for kind in left]
+        (_, conditions), kind = min(claims, key=lambda claim: claim[0][0])
         if not conditions:
             break
         laws += [End(tuple(tests[place] for place in chosen), *kinds[kind]) for chosen in conditions]
@@ -340,11 +343,40 @@ def ends_of(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> list[E
     return [*laws, End((), *kinds[usual])]
 
 
-def _tests(sizes: Sequence[int], n_actions: int) -> list[Test]:
-    """Conditions on the symbols after, on the action and on the symbols before."""
-    tests = [Test(place, value) for place, size in enumerate((*sizes, n_actions, *sizes)) for value in range(size)]
-    pairs = itertools.combinations(range(len(sizes)), 2)
-    return tests + [Test(one, other, alike=True) for one, other in pairs if sizes[one] == sizes[other]]
+def _shortest_cover(holds: Bools, wanted: Bools, forms: Sequence[int]) -> tuple[float, list[tuple[int, ...]]]:
+    """The cover of the fewest nats, and these nats; empty if there is none.
+
+    Args:
+        holds: Which condition holds in which of N transitions. Shape (conditions, N).
+        wanted: Shape (N,).
+        forms: How many of the conditions, from the first on, laws of each form may have.
+    """
+    found: tuple[float, list[tuple[int, ...]]] = (math.inf, [])
+    for count in forms:
+        cover = _cover(holds[:count], wanted)
+        possible = sum(math.comb(count, size) for size in range(1, _TESTS + 1))
+        nats = len(cover) * math.log(possible)
+        if cover and nats < found[0]:
+            found = (nats, cover)
+    return found
+
+
+def _forms(sizes: Sequence[int], n_actions: int) -> list[list[Test]]:
+    """Conditions of four forms of laws, each with those of the form before.
+
+    They are on the symbols after; on two of these that are alike; on the action; and on the symbols before.
+    """
+    count = len(sizes)
+    places = (*sizes, n_actions, *sizes)
+    each = [[Test(place, value) for value in range(size)] for place, size in enumerate(places)]
+    pairs = [pair for pair in itertools.combinations(range(count), 2) if sizes[pair[0]] == sizes[pair[1]]]
+    added = [
+        list(itertools.chain(*each[:count])),
+        [Test(*pair, alike=True) for pair in pairs],
+        each[count],
+        list(itertools.chain(*each[count + 1 :])),
+    ]
+    return list(itertools.accumulate(added, list.__add__))
 
 
 def _cover(holds: Bools, wanted: Bools) -> list[tuple[int, ...]]:
@@ -368,6 +400,10 @@ def _cover(holds: Bools, wanted: Bools) -> list[tuple[int, ...]]:
         if not gains.any():
             return []
         best = int(gains.argmax())
-        found.append(sets[pure[best]])
+        found.append(best)
         missing = missing & ~each[best]
-    return found
+    for best in list(found):  # the first ones may be superfluous by now
+        others = [other for other in found if other != best]
+        if not (wanted & ~each[others].any(axis=0)).any():
+            found = others
+    return [sets[pure[best]] for best in found]
