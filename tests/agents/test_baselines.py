@@ -36,24 +36,11 @@ def test_random_is_uniform_seeded_and_resumable() -> None:
     assert actions(other, 20) == onward
 
 
-def test_oracle_asks_the_policy_about_what_frames_show() -> None:
-    oracle = make_oracle(context(optimal_policy=lambda: lambda shown, step: sum(shown) + 10 * step))
-    truth = np.array([1, 0, 3, 1])
-    assert oracle.act(Observation(frame=FRAME, macrostate=truth), explore=True) == 5
-    hidden = Observation(frame=FRAME, macrostate=truth, shown=np.array([1, 0, 3, -1]))
-    assert [oracle.act(hidden, explore=False) for _ in range(2)] == [13, 23]
-    oracle.begin_episode()
-    assert oracle.act(hidden, explore=False) == 3
-
-
-def test_oracle_without_rules_or_macrostate_says_so() -> None:
+def test_what_an_agent_cannot_do_is_said() -> None:
     with pytest.raises(InvalidValueError, match="needs the rules' optimal policy"):
         make_oracle(context())
     with pytest.raises(InvalidValueError, match="was shown no macrostate"):
-        make_oracle(context(optimal_policy=lambda: lambda *_: 0)).act(Observation(frame=FRAME), explore=False)
-
-
-def test_a_foreign_snapshot_is_named() -> None:
+        actions(make_oracle(context(optimal_policy=lambda: lambda *_: 0)), 1)
     foreign = AgentState(arrays={"controller/value": np.zeros(3)}, values={})
     with pytest.raises(ArtefactError, match="'controller/value'; it is of another agent"):
         make_random(context()).restore(foreign)

@@ -7,18 +7,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from imagine_bench.agents.dqn import Controller, epsilon, td_target
+from imagine_bench.agents.dqn import Controller, epsilon
 from imagine_bench.agents.dqn_settings import ControllerSettings
 from imagine_bench.agents.replay import Batch
 from imagine_bench.agents.snapshot import load_training, training_arrays
 
 from imagine_bench.errors import DivergedError
-
-
-def test_termination_stops_bootstrapping_truncation_does_not() -> None:
-    reward, q_next = torch.tensor([50.0, -1.0]), torch.tensor([[3.0, 7.0], [3.0, 7.0]])
-    ended_and_cut_off = torch.tensor([1.0, 0.0])  # a truncated transition is stored with terminated = 0
-    assert td_target(reward, ended_and_cut_off, q_next, 0.9).tolist() == pytest.approx([50.0, -1.0 + 0.9 * 7.0])
 
 
 def test_epsilon_falls_from_maximum_to_minimum() -> None:
@@ -28,14 +22,14 @@ def test_epsilon_falls_from_maximum_to_minimum() -> None:
     assert epsilon(10**6, settings) == pytest.approx(0.001)
 
 
-def make(discount: float = 0.9) -> Controller:
-    settings = ControllerSettings(hidden=(8,), discount=discount)
-    return Controller(3, 2, settings, torch.Generator().manual_seed(0))
+def make(seed: int = 0, target_rate: float = 1.0) -> Controller:
+    settings = ControllerSettings(hidden=(8,), discount=0.9, target_rate=target_rate)
+    return Controller(3, 2, settings, torch.Generator().manual_seed(seed))
 
 
 def batch(reward: float = 1.0) -> Batch:
-    generator = torch.Generator().manual_seed(1)
-    z, next_z = torch.randn(2, 5, 3, generator=generator)
+    """Of two rows that ended; a truncated transition is stored with terminated = 0."""
+    z, next_z = torch.randn(2, 5, 3, generator=torch.Generator().manual_seed(1))
     terminated = torch.tensor([1.0, 0.0, 0.0, 1.0, 0.0])
     return Batch(z, torch.tensor([0, 1, 1, 0, 1]), torch.full((5,), reward), next_z, terminated)
 
@@ -45,26 +39,19 @@ def weights(module: torch.nn.Module) -> torch.Tensor:
 
 
 def test_loss_is_the_mean_squared_bellman_error_row_by_row() -> None:
+    """And no gradient flows through the targets."""
     controller, rows = make(), batch()
-    values, following = controller.values(rows.z), controller.values(rows.next_z)
-    errors = []
-    for i in range(5):
-        bootstrap = 0.0 if rows.terminated[i] else 0.9 * following[i].max()
-        errors.append((1.0 + bootstrap - values[i, rows.action[i]]) ** 2)
-    torch.testing.assert_close(controller.loss(rows).detach(), torch.stack(errors).mean())
-    torch.testing.assert_close(controller.errors(rows).square(), torch.stack(errors))
+    following = controller.values(rows.next_z)
+    bootstrap = [0.0 if ended else 0.9 * q.max() for ended, q in zip(rows.terminated, following, strict=True)]
+    target = 1.0 + torch.tensor(bootstrap)
+    q = controller.network(rows.z)[torch.arange(5), rows.action]
+    errors = (target - q).square()
+    torch.testing.assert_close(controller.loss(rows), errors.mean())
+    torch.testing.assert_close(controller.errors(rows).square(), errors.detach())
     weight = torch.tensor([1.0, 0.5, 0.0, 0.25, 1.0])
-    weighted = controller.loss(replace(rows, weight=weight)).detach()
-    torch.testing.assert_close(weighted, (weight * torch.stack(errors)).mean())
-
-
-def test_no_gradient_flows_through_the_target() -> None:
-    controller, rows = make(), batch()
-    target = td_target(rows.reward, rows.terminated, controller.values(rows.next_z), 0.9)
-    q = controller.network(rows.z).gather(1, rows.action.unsqueeze(1)).squeeze(1)
-    weight = next(controller.network.parameters())
-    (expected,) = torch.autograd.grad((target - q).square().mean(), weight)
-    (given,) = torch.autograd.grad(controller.loss(rows), weight)
+    torch.testing.assert_close(controller.loss(replace(rows, weight=weight)), (weight * errors).mean())
+    first = next(controller.network.parameters())
+    given, expected = (torch.autograd.grad(loss, first)[0] for loss in (controller.loss(rows), errors.mean()))
     torch.testing.assert_close(given, expected)
     assert expected.abs().max() > 0.0
 
@@ -78,15 +65,13 @@ def test_a_loss_that_is_no_number_leaves_the_weights() -> None:
 
 
 def test_a_target_network_follows_at_its_rate() -> None:
-    settings = ControllerSettings(hidden=(8,), discount=0.9, target_rate=0.25)
-    controller, again = (Controller(3, 2, settings, torch.Generator().manual_seed(seed)) for seed in (0, 5))
+    controller, again, plain = make(0, 0.25), make(5, 0.25), make()
     before = weights(controller.network)
     assert torch.equal(weights(controller.target), before)
     controller.update(batch())
     after = weights(controller.network)
     torch.testing.assert_close(weights(controller.target), before + 0.25 * (after - before))
     assert (after != before).any()
-    plain = make()
     plain.network.load_state_dict(controller.network.state_dict())
     assert controller.loss(batch()) != plain.loss(batch()), "the loss must use the target network's values"
     load_training(again, again.optimiser, training_arrays(controller, controller.optimiser))

@@ -16,18 +16,17 @@ def draws(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def filled(capacity: int, count: int, sigma: float = 0.0, prioritised: bool = False) -> RealMemory:
-    memory = RealMemory(capacity, 2, CPU, prioritised=prioritised)
-    fill(memory, count, sigma)
-    return memory
+def filled(capacity: int, count: int, **how: bool) -> RealMemory:
+    return fill(RealMemory(capacity, 2, CPU, **how), count)
 
 
-def fill(memory: RealMemory, count: int, sigma: float = 0.0) -> None:
+def fill(memory: RealMemory, count: int, sigma: float = 0.0) -> RealMemory:
     """Row i leads from latent i to latent i + 0.5, so every pair is recognisable."""
     spread = torch.full((2,), sigma)
     for i in range(count):
         now = torch.full((2,), float(i))
         memory.add((now, spread), i % 3, float(i), (now + 0.5, spread), terminated=i % 2 == 0)
+    return memory
 
 
 def test_no_batch_pairs_states_of_different_transitions() -> None:
@@ -52,54 +51,6 @@ def test_latents_are_drawn_anew_from_their_posteriors_as_widely_as_asked(spread:
     assert (both - torch.eye(4)).abs().max() < 0.03, "noise must be independent"
 
 
-@pytest.mark.parametrize(("at_once", "times", "kept"), [(4, 3, range(7, 12)), (12, 1, range(7, 12)), (4, 1, range(4))])
-def test_the_imagined_memory_keeps_the_last_rows_in_pairs(at_once: int, times: int, kept: range) -> None:
-    memory = ImaginedMemory(5, 2, CPU)
-    rows = torch.arange(at_once * times, dtype=torch.float32)[:, None].expand(-1, 2)
-    for z in rows.split(at_once):
-        memory.add(Batch(z, torch.zeros(len(z), dtype=torch.int64), z[:, 0], z + 0.5, torch.zeros(len(z))))
-    assert (len(memory), memory.added) == (len(kept), len(rows))
-    batch = memory.sample(300, draws())
-    assert set(batch.reward.tolist()) == set(kept)
-    assert torch.equal(batch.next_z, batch.z + 0.5)
-    assert torch.equal(batch.reward, batch.z[:, 0])
-
-
-@pytest.mark.parametrize("count", [3, 20])
-def test_a_memory_is_restored_exactly_and_independently(count: int) -> None:
-    memory, other = filled(8, count, sigma=0.1), RealMemory(8, 2, CPU)
-    arrays = memory.arrays()
-    assert len(arrays["mu"]) == min(count, 8), "only filled rows are stored"
-    other.load(arrays, memory.added)
-    for each in (memory, other):
-        fill(each, 1)
-    first, second = (each.sample(50, draws(1)) for each in (memory, other))
-    assert torch.equal(first.z, second.z)
-    assert torch.equal(first.reward, second.reward)
-    fill(memory, 8, sigma=0.5)
-    assert (arrays["sigma"] < 0.2).all(), "stored rows do not follow later writes"
-
-
-def test_sampling_an_empty_memory_is_an_error() -> None:
-    with pytest.raises(InvalidValueError, match="The memory is empty; store a transition before"):
-        RealMemory(4, 2, CPU).sample(1, draws())
-
-
-@pytest.mark.parametrize("balance", [0.0, 0.5, 1.0])
-def test_rare_outcomes_are_drawn_as_often_as_the_balance_says(balance: float) -> None:
-    """An outcome that n transitions had, in proportion to n ** (1 - balance); another reward or end is another one."""
-    counts = {(-1.0, False): 16, (-1.0, True): 4, (2.0, False): 4}
-    memory = RealMemory(32, 2, CPU)
-    for (reward, terminated), count in counts.items():
-        for _ in range(count):
-            memory.add(NOTHING, 0, reward, NOTHING, terminated)
-    drawn = memory.sample(20_000, draws(), balance=balance)
-    total = sum(count ** (1.0 - balance) for count in counts.values())
-    for (reward, terminated), count in counts.items():
-        share = ((drawn.reward == reward) & (drawn.terminated == float(terminated))).float().mean()
-        assert float(share) == pytest.approx(count ** (1.0 - balance) / total, abs=0.015)
-
-
 def test_prioritised_draws_are_in_proportion_to_errors() -> None:
     memory = filled(4, 4, prioritised=True)
     memory.prioritise(torch.arange(4), torch.tensor([1.0, -4.0, 9.0, 0.0]))
@@ -120,3 +71,45 @@ def test_a_new_transition_is_drawn_first_and_priorities_come_back() -> None:
     for each in (memory, other):
         rows = each.sample_prioritised(2_000, draws(), exponent=1.0, correction=0.0).rows
         assert set(rows.tolist()) == {1, 3}
+
+
+@pytest.mark.parametrize("at_once", [4, 12])
+def test_the_imagined_memory_keeps_the_last_rows_in_pairs(at_once: int) -> None:
+    memory = ImaginedMemory(5, 2, CPU)
+    for z in torch.arange(12.0)[:, None].expand(-1, 2).split(at_once):
+        memory.add(Batch(z, torch.zeros(len(z), dtype=torch.int64), z[:, 0], z + 0.5, torch.zeros(len(z))))
+        batch = memory.sample(300, draws())
+        assert set(batch.reward.tolist()) == {*range(memory.added)[-5:]}
+        assert torch.equal(batch.next_z, batch.z + 0.5)
+        assert torch.equal(batch.reward, batch.z[:, 0])
+    assert (len(memory), memory.added) == (5, 12)
+
+
+@pytest.mark.parametrize("count", [3, 20])
+def test_a_memory_is_restored_exactly_and_independently(count: int) -> None:
+    memory, other = filled(8, count), RealMemory(8, 2, CPU)
+    with pytest.raises(InvalidValueError, match="The memory is empty; store a transition before"):
+        other.sample(1, draws())
+    arrays = memory.arrays()
+    assert len(arrays["mu"]) == min(count, 8), "only filled rows are stored"
+    other.load(arrays, memory.added)
+    first, second = (fill(each, 1).sample(50, draws(1)) for each in (memory, other))
+    assert torch.equal(first.z, second.z)
+    assert torch.equal(first.reward, second.reward)
+    fill(memory, 8, sigma=0.5)
+    assert not arrays["sigma"].any(), "stored rows do not follow later writes"
+
+
+@pytest.mark.parametrize("balance", [0.5, 1.0])
+def test_rare_outcomes_are_drawn_as_often_as_the_balance_says(balance: float) -> None:
+    """An outcome that n transitions had, in proportion to n ** (1 - balance); another reward or end is another one."""
+    memory = RealMemory(32, 2, CPU)
+    counts = {(-1.0, False): 16, (-1.0, True): 4, (2.0, False): 4}
+    for (reward, terminated), count in counts.items():
+        for _ in range(count):
+            memory.add(NOTHING, 0, reward, NOTHING, terminated)
+    drawn = memory.sample(20_000, draws(), balance=balance)
+    total = sum(count ** (1.0 - balance) for count in counts.values())
+    for (reward, terminated), count in counts.items():
+        share = ((drawn.reward == reward) & (drawn.terminated == float(terminated))).double().mean().item()
+        assert share == pytest.approx(count ** (1.0 - balance) / total, abs=0.015)

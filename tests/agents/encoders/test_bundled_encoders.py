@@ -21,9 +21,9 @@ from imagine_bench.seeding import SeedTree
 
 TARGETS = [
     (name, appearance, required)
-    for name, spec in ((name, registry.task(name)) for name in registry.TASKS)
-    if spec.targets is not None
-    for appearance, required in spec.targets.encoders.items()
+    for name in registry.TASKS
+    if (targets := registry.task(name).targets)
+    for appearance, required in targets.encoders.items()
 ]
 """Share of fresh frames whose whole macrostate must be read right."""
 FRESH = 500

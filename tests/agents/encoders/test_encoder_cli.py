@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from encoder_frames import CHAPTER_5, QUICK, arrow_spec
-from imagine_bench.agents.encoders import cli, training
+from imagine_bench.agents.encoders import training
 from imagine_bench.agents.encoders.cli import retrain
 from imagine_bench.agents.encoders.encoder import Encoder
 from PIL import Image
@@ -41,41 +41,17 @@ def test_retrain_leaves_three_files_and_never_overwrites(tmp_path: Path, monkeyp
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == written
 
 
-def test_without_a_terminal_a_line_is_said_now_and_then(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def trained(spec: Any, *, progress: Any, **how: Any) -> None:
-        for second in range(100):
-            now[0] = float(second)
-            progress("training", second / 100)
-        raise KeyboardInterrupt
-
-    now = [0.0]
-    monkeypatch.setattr(cli.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(cli, "train_encoder", trained)
-    with pytest.raises(KeyboardInterrupt):
-        made(tmp_path)
-    said = [line for line in capsys.readouterr().err.splitlines() if ": training" in line]
-    assert said == [f"drawn_arrows-mild: training {share}%" for share in (16, 32, 48, 64, 80, 96)]
-
-
 @pytest.mark.parametrize(
-    ("how", "error", "message"),
+    ("how", "message"),
     [
-        ({"recipe": "defualt"}, UnknownNameError, r"No encoder recipe 'defualt'. Did you mean 'default'"),
-        ({"appearance": "x"}, UnknownNameError, "Known: clean, mild, strong"),
-        ({"latents": 0}, InvalidValueError, "needs latents, frames"),
-        (
-            {"recipe": "codes", "steps": 1, "latents": 11},
-            InvalidValueError,
-            r"without gradient steps; leave out --steps 1 --latents 11\.",
-        ),
-        ({"recipe": "codes", "device": "cuda"}, InvalidValueError, "leave out --device cuda"),
+        ({"recipe": "defualt"}, r"No encoder recipe 'defualt'. Did you mean 'default'"),
+        ({"appearance": "x"}, "Known: clean, mild, strong"),
+        ({"latents": 0}, "needs latents, frames"),
+        ({"recipe": "codes", "steps": 1, "latents": 11}, r"gradient steps; leave out --steps 1 --latents 11\."),
+        ({"recipe": "codes", "device": "cuda"}, "leave out --device cuda"),
     ],
 )
-def test_wrong_choices_are_named_before_anything_is_made(
-    tmp_path: Path, how: dict[str, Any], error: type[Exception], message: str
-) -> None:
-    with pytest.raises(error, match=message):
+def test_wrong_choices_are_named_before_anything_is_made(tmp_path: Path, how: dict[str, Any], message: str) -> None:
+    with pytest.raises((InvalidValueError, UnknownNameError), match=message):
         made(tmp_path / "new", **how)
     assert not (tmp_path / "new").exists()

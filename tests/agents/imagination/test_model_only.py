@@ -8,25 +8,19 @@ from unittest import mock
 
 import numpy as np
 import pytest
-import torch
 from agent_states import same
 from counting_model import CountingModel, practising
 from fake_latents import CODES, built, frame, live, make_dqn, transition
-from imagine_bench.agents.dqn import Controller, epsilon
+from imagine_bench.agents.dqn import epsilon
 from imagine_bench.agents.imagination import agent as imagination_agents
 from imagine_bench.agents.imagination import model_only
 from imagine_bench.agents.imagination.model_only import ModelOnlyAgent
 
 from imagine_bench.interfaces import Observation
-from imagine_bench.interfaces.capabilities import ModelOnlyTrainer
 
 
 def made(**changes: Any) -> ModelOnlyAgent:
     return built(model_only.make, {"imagination.model_only_episodes": 8, **changes})
-
-
-def weights(controller: Controller) -> torch.Tensor:
-    return torch.nn.utils.parameters_to_vector(controller.parameters()).detach().clone()
 
 
 def train_in_model(agent: ModelOnlyAgent) -> int:
@@ -56,56 +50,47 @@ def test_a_controller_trained_in_the_model_alone_beats_chance() -> None:
     assert solved(agent) >= 5 / 6 > untrained  # chance 1 / 3; five of six by luck: 1 in 56
 
 
+def training(agent: ModelOnlyAgent, part: str = "") -> dict[str, bytes]:
+    arrays = agent.state().arrays
+    return {name: array.tobytes() for name, array in arrays.items() if name.startswith(f"model_only/{part}")}
+
+
 def test_the_explorer_is_the_dqn_and_the_tested_controller_sees_no_real_transition() -> None:
-    plain = built(make_dqn)
-    agent = made()
+    """Only new experience asks for new training."""
+    plain, agent = built(make_dqn), made()
+    assert not agent.train_in_model(), "nothing was learned yet"
     for start in (0, 3):
-        before = weights(agent.tested)
+        before = training(agent, "controller")
         first, second = (live(each, range(start, start + 3), np.random.default_rng(start)) for each in (plain, agent))
         assert first == second
-        assert torch.equal(weights(agent.tested), before)
+        assert training(agent, "controller") == before
         assert train_in_model(agent) == 8
-        assert not torch.equal(weights(agent.tested), before)
-    assert torch.equal(weights(plain.controller), weights(agent.controller))
-
-
-def test_only_new_experience_asks_for_new_training() -> None:
-    agent = made()
-    assert isinstance(agent, ModelOnlyTrainer)
-    assert not isinstance(built(imagination_agents.make), ModelOnlyTrainer)
-    assert not agent.train_in_model(), "nothing was learned yet"
-    for episodes in (range(3), range(3, 4)):
-        live(agent, episodes, np.random.default_rng(0))
-        assert train_in_model(agent) == 8
-        before = agent.state().arrays["model_only/generator"]
-        assert not agent.train_in_model()
-        assert np.array_equal(before, agent.state().arrays["model_only/generator"])
+        after = training(agent)
+        assert training(agent, "controller") != before and not agent.train_in_model()
+        assert training(agent) == after
+    weights = (each.state().arrays["controller/network.0.weight/weight"] for each in (plain, agent))
+    assert np.array_equal(*weights)
 
 
 def test_training_twice_from_equal_experience_gives_equal_bits() -> None:
-    """Earlier training, at another budget, leaves no trace in later training."""
+    """Earlier training, at another budget, leaves no trace in later training; interrupted training goes on."""
 
-    def trained(often: bool) -> dict[str, np.ndarray]:
-        agent = made()
+    def trained(often: bool) -> ModelOnlyAgent:
+        agent = made(**{"controller.target_rate": 0.1})
         rng = np.random.default_rng(0)
         live(agent, range(3), rng)
         if often:
             train_in_model(agent)
         live(agent, range(3, 5), rng)
-        train_in_model(agent)
-        return {name: array for name, array in agent.state().arrays.items() if name.startswith("model_only/")}
+        return agent
 
-    once = trained(often=False)
-    assert all(np.array_equal(array, once[name]) for name, array in trained(often=True).items())
-
-
-def test_interrupted_training_goes_on_to_the_same_bits() -> None:
-    agent, resumed = (made(**{"controller.target_rate": 0.1}) for _ in range(2))
-    live(agent, range(3), np.random.default_rng(0))
-    assert all(agent.train_in_model() for _ in range(3))
-    resumed.restore(copy.deepcopy(agent.state()))
-    assert [train_in_model(each) for each in (agent, resumed)] == [5, 5]
-    assert same(agent.state(), resumed.state())
+    once, twice = trained(often=False), trained(often=True)
+    assert all(once.train_in_model() for _ in range(3))
+    resumed = made(**{"controller.target_rate": 0.1})
+    resumed.restore(copy.deepcopy(once.state()))
+    assert [train_in_model(each) for each in (once, resumed, twice)] == [5, 5, 8]
+    assert same(once.state(), resumed.state())
+    assert training(once) == training(twice)
 
 
 def test_imagined_episodes_begin_where_real_ones_did() -> None:
@@ -117,25 +102,6 @@ def test_imagined_episodes_begin_where_real_ones_did() -> None:
     begun = agent.state().arrays["model_only/memory/z"]
     distance = np.linalg.norm(begun[:, None] - CODES[:3].numpy()[None], axis=-1).min(axis=1)
     assert distance.shape == (8,) and distance.max() < 0.5, "drawn from the posteriors of starts, whose sigma is 0.05"
-
-
-@pytest.mark.parametrize(
-    ("model", "filtered", "settings", "steps", "predicted"),
-    [
-        ({"end_at": 2}, False, {}, 2, 2),
-        ({"uncertain_at": 4}, True, {"threshold_quantile": 1.0, "threshold": 99.0}, 3, 4),
-    ],
-)
-def test_an_imagined_episode_goes_on_until_its_end_or_what_is_uncertain(
-    model: dict[str, int], filtered: bool, settings: dict[str, Any], steps: int, predicted: int
-) -> None:
-    agent = practising(CountingModel(**model), filtered=filtered, **settings)
-    for episode in (1, 2):
-        agent.train_in_model()
-        assert agent.imagined_steps == agent.imagined.added == steps * episode
-    ends = [0.0] * (steps - 1) + [float("end_at" in model)]
-    assert agent.imagined.arrays()["terminated"].tolist() == ends * 2
-    assert agent.diagnostics()["imagination/acceptance_rate"] == pytest.approx(steps / predicted)
 
 
 def test_exploration_falls_to_that_of_the_settings() -> None:
@@ -165,3 +131,19 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make) -> None:  #
     first, second = (live(each, range(5), np.random.default_rng(1)) for each in (learner, resumed))
     assert first == second and same(learner.state(), resumed.state())
     assert not any(np.array_equal(before[name], learner.state().arrays[name]) for name in kept), "it goes on learning"
+
+
+@pytest.mark.parametrize(
+    ("model", "settings", "steps", "predicted"),
+    [({"end_at": 2}, {}, 2, 2), ({"uncertain_at": 4}, {"threshold_quantile": 1.0, "threshold": 99.0}, 3, 4)],
+)
+def test_an_imagined_episode_goes_on_until_its_end_or_what_is_uncertain(
+    model: dict[str, int], settings: dict[str, Any], steps: int, predicted: int
+) -> None:
+    agent = practising(CountingModel(**model), filtered=True, **settings)
+    for episode in (1, 2):
+        agent.train_in_model()
+        assert agent.imagined_steps == agent.imagined.added == steps * episode
+    ends = [0.0] * (steps - 1) + [float("end_at" in model)]
+    assert agent.imagined.arrays()["terminated"].tolist() == ends * 2
+    assert agent.diagnostics()["imagination/acceptance_rate"] == pytest.approx(steps / predicted)
