@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from imagine_bench_board.motion_rows import read_motions
+from imagine_bench_board.motion_rows import MotionRow, read_motions
 from imagine_bench_board.motions import SLACK_PERIODS
 
 from imagine_bench import registry
@@ -177,86 +177,54 @@ def test_hostile_worlds_are_refused_in_one_sentence() -> None:
             registry.task(line)
 
 
-ROW: dict[str, Any] = {
-    "title": "somebody",
-    "world": "arrow_puzzle",
-    "episodes": [{"start": [3, 1, 2, 0], "actions": [0], "states": [[0, 1, 2, 0]], "success": True}],
-}
+EPISODE = {"start": [3, 1, 2, 0], "actions": [0], "states": [[0, 1, 2, 0]], "success": True}
+ROW: dict[str, Any] = {"title": "somebody", "world": "arrow_puzzle", "episodes": [EPISODE]}
+HANDED_OVER = {"start": [0, 0, 0, 1], "actions": [1, 3], "states": [[0, 1, 0, 3], [0, 2, 0, 3]], "success": True}
+WRONG = {"start": [0, 0, 0, 1], "actions": [0], "states": [[1, 0, 0, 4]], "success": False}
+PICK_ROW = {"title": "somebody", "world": "pick_place", "episodes": [HANDED_OVER, WRONG]}
+FORGERIES: tuple[tuple[dict[str, Any], dict[str, object], str], ...] = (
+    (ROW, {"start": [3, 1, 2, 3]}, "starts in no macrostate"),
+    (ROW, {"start": [3, 1, 2]}, "starts in no macrostate"),
+    (ROW, {"start": "3120"}, "starts in no macrostate"),
+    (ROW, {"actions": [6]}, "has macro-actions of no such world"),
+    (ROW, {"actions": [0] * 11}, "has macro-actions of no such world"),
+    (ROW, {"actions": [0, 0], "states": [[0, 1, 2, 0], [1, 1, 2, 0]]}, "goes on after its end"),
+    (ROW, {"states": []}, "does not say where each macro-action led"),
+    (ROW, {"states": [[0, 1, 2, "<b>"]]}, "reaches no macrostate"),
+    (ROW, {"states": [[2, 1, 3, 0]], "success": False}, "the rules do not allow"),
+    (ROW, {"success": False}, "claims another end"),
+    (PICK_ROW, {"start": [1, 1, 0, 3]}, "starts in no macrostate"),
+    (PICK_ROW, {"start": ["0", 0, 0, 1]}, "starts in no macrostate"),
+    (PICK_ROW, {"actions": [1, 4]}, "has macro-actions of no such world"),
+    (PICK_ROW, {"states": [[0, 1, 0, 1], [0, 2, 0, 3]]}, "reaches no macrostate"),
+    (PICK_ROW, {"states": [[0, 1, 0, 2], [0, 2, 0, 3]]}, "the rules do not allow"),
+    (PICK_ROW, {"actions": [1, 3, 3], "states": [[0, 1, 0, 3], [0, 2, 0, 3], [0, 2, 0, 3]]}, "goes on after its end"),
+    (PICK_ROW, {"success": False}, "claims another end"),
+)
+"""Rows with a change of their first episode, and a part of the sentence that refuses each."""
 
 
 @needs_node
 def test_rows_are_checked_against_the_rules() -> None:
-    assert ask([{"kind": "row", "row": ROW}]) == [1]
-    asked: list[dict[str, object]] = []
-    sentences = []
-    for change, sentence in (
-        ({"start": [3, 1, 2, 3]}, "starts in no macrostate"),
-        ({"start": [3, 1, 2]}, "starts in no macrostate"),
-        ({"start": "3120"}, "starts in no macrostate"),
-        ({"actions": [6]}, "has macro-actions of no such world"),
-        ({"actions": [0] * 11}, "has macro-actions of no such world"),
-        ({"actions": [0, 0], "states": [[0, 1, 2, 0], [1, 1, 2, 0]]}, "goes on after its end"),
-        ({"states": []}, "does not say where each macro-action led"),
-        ({"states": [[0, 1, 2, "<b>"]]}, "reaches no macrostate"),
-        ({"states": [[2, 1, 3, 0]], "success": False}, "the rules do not allow"),
-        ({"success": False}, "claims another end"),
-    ):
-        forged = {**ROW, "episodes": [{**ROW["episodes"][0], **change}]}
-        asked.append({"kind": "row", "row": forged})
-        sentences.append(sentence)
-    for forged in (None, [], {}, {**ROW, "world": "nowhere"}, {**ROW, "title": 3}, {**ROW, "episodes": []}):
-        asked.append({"kind": "row", "row": forged})
-        sentences.append("")
-    for question, sentence, found in zip(asked, sentences, ask(asked), strict=True):
-        assert sentence in found["refused"], question
-
-
-HANDED_OVER = {"start": [0, 0, 0, 1], "actions": [1, 3], "states": [[0, 1, 0, 3], [0, 2, 0, 3]], "success": True}
-WRONG = {"start": [0, 0, 0, 1], "actions": [0], "states": [[1, 0, 0, 4]], "success": False}
-PICK_ROW = {"title": "somebody", "world": "pick_place", "episodes": [HANDED_OVER, WRONG]}
-
-
-@needs_node
-def test_rows_of_pick_and_place_are_checked_against_the_rules() -> None:
-    assert ask([{"kind": "row", "row": PICK_ROW}]) == [2]
-    forgeries: tuple[tuple[dict[str, object], str], ...] = (
-        ({"start": [1, 1, 0, 3]}, "starts in no macrostate"),
-        ({"start": [0, 0, 0]}, "starts in no macrostate"),
-        ({"start": ["0", 0, 0, 1]}, "starts in no macrostate"),
-        ({"actions": [1, 4]}, "has macro-actions of no such world"),
-        ({"states": [[0, 1, 0, 3], [0, 2, 0, "<b>"]]}, "reaches no macrostate"),
-        ({"states": [[0, 1, 0, 1], [0, 2, 0, 3]]}, "reaches no macrostate"),
-        ({"states": [[0, 1, 0, 2], [0, 2, 0, 3]]}, "the rules do not allow"),
-        ({"actions": [1, 3, 3], "states": [[0, 1, 0, 3], [0, 2, 0, 3], [0, 2, 0, 3]]}, "goes on after its end"),
-        ({"success": False}, "claims another end"),
-    )
-    rows = [{**PICK_ROW, "episodes": [{**HANDED_OVER, **change}]} for change, _ in forgeries]
-    for (change, sentence), found in zip(forgeries, ask([{"kind": "row", "row": row} for row in rows]), strict=True):
-        assert sentence in found["refused"], change
+    rows = [{**row, "episodes": [{**row["episodes"][0], **change}]} for row, change, _ in FORGERIES]
+    nothing = [None, [], {}, {**ROW, "world": "nowhere"}, {**ROW, "title": 3}, {**ROW, "episodes": []}]
+    taken, taken_too, *refused = ask([{"kind": "row", "row": row} for row in (ROW, PICK_ROW, *rows, *nothing)])
+    assert (taken, taken_too) == (1, 2)
+    sentences = [sentence for *_, sentence in FORGERIES] + [""] * len(nothing)
+    for row, sentence, found in zip((*rows, *nothing), sentences, refused, strict=True):
+        assert sentence in found["refused"], row
 
 
 @needs_node
 def test_names_of_rows_lead_out_of_no_folder() -> None:
-    names = (
-        "../secret",
-        "..",
-        "a/../b",
-        "/etc/passwd",
-        "https://example.org/x",
-        "a\nb",
-        "A",
-        "",
-        "x" * 81,
-        "a%2f",
-        "a..b",
-    )
+    names = ("../secret", "..", "a/../b", "/etc/passwd", "https://example.org/x", "a\nb", "A", "", "x" * 81, "a%2f")
     for name, found in zip(names, ask([{"kind": "rowFile", "name": name} for name in names]), strict=True):
         assert "There is no row" in found["refused"], name
     assert ask([{"kind": "rowFile", "name": "dqn-f2c3"}]) == ["data/rows/dqn-f2c3.json"]
 
 
 @pytest.mark.usefixtures("made")
-def test_rows_of_the_board_are_converted(tmp_path: Path) -> None:
+def test_the_row_of_most_episodes_of_the_first_seed_is_converted() -> None:
     import rows
 
     log = {"starts": [[3, 1, 2, 0], [3, 1, 2, 0]], "actions": [[0], [1, 1]], "solved": "10"}
@@ -264,123 +232,106 @@ def test_rows_of_the_board_are_converted(tmp_path: Path) -> None:
         "protocol": {"task": "arrow_puzzle"},
         "claimed": {"agent": "dqn"},
         "vouched": [
-            {"seed": 400, "episodes": 100, "successes": 0, "test_episodes": 2},
-            {"seed": 400, "episodes": 250, "successes": 1, "test_episodes": 2},
-            {"seed": 401, "episodes": 500, "successes": 2, "test_episodes": 2},
+            {"seed": seed, "episodes": episodes, "successes": 1, "test_episodes": 2}
+            for seed, episodes in ((400, 100), (400, 250), (401, 500))
         ],
     }
-    (tmp_path / "board" / "dqn-1").mkdir(parents=True)
-    (tmp_path / "board" / "dqn-1" / "card.json").write_text(json.dumps(card))
-    (tmp_path / "board" / "dqn-1" / "episodes.json").write_text(json.dumps([{}, log, {}]))
-    rows.write(tmp_path / "out", tmp_path / "board")
-    found = json.loads((tmp_path / "out" / "dqn-1.json").read_text())
-    assert found["title"] == "dqn, 250 episodes: 1 of 2 solved"
-    assert found["episodes"][0] == {"start": [3, 1, 2, 0], "actions": [0], "states": [[0, 1, 2, 0]], "success": True}
-    assert found["episodes"][1]["states"] == [[2, 1, 2, 0], [1, 1, 2, 0]]
-    assert json.loads((tmp_path / "out" / "index.json").read_text()) == [["dqn-1", found["title"]]]
+    states = [[2, 1, 2, 0], [1, 1, 2, 0]]
+    lost = {"start": log["starts"][1], "actions": [1, 1], "states": [tuple(each) for each in states], "success": False}
+    won = {**EPISODE, "states": [(0, 1, 2, 0)]}
+    title = "dqn, 250 episodes: 1 of 2 solved"
+    row = rows.converted(card, [{}, log, {}])
+    assert row == {"title": title, "world": "arrow_puzzle", "episodes": [won, lost]}
     card["protocol"] = {"task": "arrow_puzzle:slip=0.1"}
     assert rows.converted(card, [{}, log, {}]) is None
 
 
+def _moved(
+    monkeypatch: pytest.MonkeyPatch, tests: int, name: str = "expert-motion-arrow_puzzle", **change: Any
+) -> tuple[MotionRow, dict[str, Any]]:
+    """A row of the board with its first tests alone and a change of its protocol or motions; and it for the page."""
+    import rows
+
+    kept = read_motions(rows.BOARD / name)
+    task = change.pop("task", kept.protocol.task)
+    row = dataclasses.replace(
+        kept,
+        protocol=dataclasses.replace(kept.protocol, task=task, tests=tests),
+        motions=tuple(dataclasses.replace(each, **change) for each in kept.motions[:tests]),
+    )
+    monkeypatch.setattr(rows.motion_rows, "read_motions", lambda _: row)
+    monkeypatch.setattr(rows.motions, "check_motions", lambda *_: row)
+    return row, json.loads(json.dumps(rows.moved(rows.BOARD)))
+
+
 @needs_node
 @pytest.mark.parametrize(
-    ("name", "solved", "events", "replayed", "faults"),
+    ("name", "solved", "faults"),
     [
-        ("expert-motion-arrow_puzzle", 20, 56, 20, 0),
-        ("random-motion-arrow_puzzle", 0, 0, 8, 6),
-        ("expert-motion-pick_place", 20, 106, 12, 0),
-        ("random-motion-pick_place", 0, 0, 8, 7),
+        ("expert-motion-arrow_puzzle", 4, 0),
+        ("random-motion-arrow_puzzle", 0, 2),
+        ("expert-motion-pick_place", 4, 0),
+        ("random-motion-pick_place", 0, 2),
     ],
 )
 @pytest.mark.usefixtures("made")
 def test_actions_of_continuous_control_are_the_events_of_the_replay(
-    name: str, solved: int, events: int, replayed: int, faults: int
+    monkeypatch: pytest.MonkeyPatch, name: str, solved: int, faults: int
 ) -> None:
-    """Each command is one step of the environment here, and infos are read; the page's script reads events.
-
-    The first tests of a row are played here: all of the shortest, fewer of the others.
-    """
-    import rows
-
-    found = json.loads(json.dumps(rows.moved(rows.BOARD / name)))
+    """Each command is one step of the environment here, and infos are read; the page's script reads events."""
+    row, found = _moved(monkeypatch, 4, name)
     agent, _, task = name.split("-")
-    title = f"{agent}, continuous control in {task}, each event as a planned movement: {solved} of 20 solved"
-    assert found["title"] == title and found["world"] == task
-    kept = read_motions(rows.BOARD / name)
+    assert found["title"].startswith(f"{agent}, continuous control in {task}, each event as a planned movement: ")
+    assert found["world"] == task
     ended_by_fault = 0
-    with closing(kept.protocol.make(observation="state")) as env:
-        played = list(zip(kept.motions, found["episodes"], strict=True))[:replayed]
-        for test, (motion, episode) in enumerate(played):
-            _, info = env.reset(seed=kept.protocol.start(test))
+    with closing(row.protocol.make(observation="state")) as env:
+        for test, (motion, episode) in enumerate(zip(row.motions, found["episodes"], strict=True)):
+            _, info = env.reset(seed=row.protocol.start(test))
             assert episode["start"] == info["macrostate"].tolist()
-            states = []
-            actions = []
+            events = []
             for command in np.concatenate([motion.commands, np.repeat(motion.commands[-1:], SLACK_PERIODS, axis=0)]):
                 _, _, terminated, truncated, info = env.step(command)
                 if info["event"] and not info["fault"]:
-                    states.append(info["macrostate"].tolist())
-                    actions.append(int(info["macro_action"]))
+                    events.append((int(info["macro_action"]), info["macrostate"].tolist()))
                 if terminated or truncated:
                     break
             assert terminated or truncated
             ended_by_fault += bool(info["fault"])
-            assert (episode["states"], episode["actions"]) == (states, actions)
+            assert list(zip(episode["actions"], episode["states"], strict=True)) == events
             assert episode["success"] == (info["is_success"] and motion.reproducible)
             assert not motion.reproducible or episode["success"] == motion.solved
-    assert sum(len(each["actions"]) for each in found["episodes"]) == events
+    assert sum(each["success"] for each in found["episodes"]) == solved
     assert ended_by_fault >= faults
-    assert ask([{"kind": "row", "row": found}]) == [20], "the page takes it"
-
-
-def _moved(monkeypatch: pytest.MonkeyPatch, task: str, *, reproducible: bool) -> dict[str, Any]:
-    """The first test of the expert's row as one of another world; its row for the page."""
-    import rows
-
-    kept = read_motions(rows.BOARD / "expert-motion-arrow_puzzle")
-    row = dataclasses.replace(
-        kept,
-        protocol=dataclasses.replace(kept.protocol, task=task, tests=1),
-        motions=(dataclasses.replace(kept.motions[0], reproducible=reproducible),),
-    )
-    monkeypatch.setattr(rows.motion_rows, "read_motions", lambda _: row)
-    monkeypatch.setattr(rows.motions, "check_motions", lambda *_: row)
-    found: dict[str, Any] = rows.moved(rows.BOARD)
-    return found
+    assert ask([{"kind": "row", "row": found}]) == [4], "the page takes it"
 
 
 @needs_node
 @pytest.mark.usefixtures("made")
-def test_a_test_with_more_events_than_macro_actions_ends_at_the_horizon(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = _moved(monkeypatch, "arrow_puzzle", reproducible=True)
-    cut = _moved(monkeypatch, "arrows:horizon=1", reproducible=True)
-    (long,), (short,) = whole["episodes"], cut["episodes"]
+def test_a_test_ends_at_the_horizon_and_is_solved_only_if_it_is_reproducible(monkeypatch: pytest.MonkeyPatch) -> None:
+    (_, whole), (_, cut) = _moved(monkeypatch, 1), _moved(monkeypatch, 1, task="arrows:horizon=1")
+    _, row = _moved(monkeypatch, 1, reproducible=False)
+    ((long,), (short,), (episode,)) = (each["episodes"] for each in (whole, cut, row))
     assert len(long["actions"]) > 1 and long["success"]
     assert (short["actions"], short["states"], short["success"]) == (long["actions"][:1], long["states"][:1], False)
-    assert ask([{"kind": "row", "row": cut}]) == [1], "the page takes it"
-
-
-@needs_node
-@pytest.mark.usefixtures("made")
-def test_a_test_that_is_not_reproducible_is_not_solved(monkeypatch: pytest.MonkeyPatch) -> None:
-    row = _moved(monkeypatch, "arrow_puzzle", reproducible=False)
-    (episode,) = row["episodes"]
     assert (episode["success"], episode["reproducible"]) == (False, False)
     forged = {**row, "episodes": [{**episode, "success": True}]}
-    taken, refused = ask([{"kind": "row", "row": each} for each in (row, forged)])
-    assert taken == 1 and "claims another end" in refused["refused"]
+    *taken, refused = ask([{"kind": "row", "row": each} for each in (cut, row, forged)])
+    assert taken == [1, 1] and "claims another end" in refused["refused"]
 
 
 @pytest.mark.usefixtures("made")
-def test_rows_of_continuous_control_are_on_the_page(tmp_path: Path) -> None:
+def test_rows_of_the_board_are_on_the_page(tmp_path: Path) -> None:
     import rows
 
     board = tmp_path / "board"
-    name = "expert-motion-arrow_puzzle"
-    shutil.copytree(rows.BOARD / name, board / name)
+    names = ("expert-motion-arrow_puzzle", "random-f2c325a69092")
+    for name in names:
+        shutil.copytree(rows.BOARD / name, board / name)
     rows.write(tmp_path / "out", board)
-    ((written, title),) = json.loads((tmp_path / "out" / "index.json").read_text())
-    assert written == name and title.endswith("20 of 20 solved")
-    episodes = board / name / "episodes.json"
+    written = dict(json.loads((tmp_path / "out" / "index.json").read_text()))
+    assert written == {name: json.loads((tmp_path / "out" / f"{name}.json").read_text())["title"] for name in names}
+    assert written[names[0]].endswith("20 of 20 solved")
+    episodes = board / names[0] / "episodes.json"
     episodes.write_text(episodes.read_text().replace('"solved":true', '"solved":false', 1))
     with pytest.raises(ArtefactError):
         rows.write(tmp_path / "again", board)

@@ -105,12 +105,6 @@ def test_the_command_measures_and_keeps_a_certificate(name: str, tmp_path: Any, 
     assert "not of arrow_puzzle_hard" in said
 
 
-@pytest.mark.parametrize("name", ["ArrowPuzzleMotion", "arrow_puzzle", "ArrowsMotion:cubes=1"])
-def test_describe_knows_continuous_control(name: str, capsys: Any) -> None:
-    assert main(["describe", name]) == 0
-    assert "by hand" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("name", "nearest"), [("ArowPuzzleMotion", "ArrowPuzzleMotion"), ("PickMotion", "PickPlaceMotion")]
 )

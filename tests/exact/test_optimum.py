@@ -19,7 +19,7 @@ from imagine_bench.rules import states_of
 WORLDS = {
     "seen": (Wheels(n=2, slip=0.2), Glimpse(), 4),
     "first": (Wheels(n=2, fickle=0.3), Glimpse(finger="first"), 3),
-    "half": (Wheels(n=2, slip=0.1), Glimpse(finger=0.5), 3),
+    "half": (Wheels(n=2, slip=0.1), Glimpse(finger=0.5), 2),
     "lag 2": (Wheels(n=2, slip=0.3), Glimpse(lag=2), 4),
     "lag 1, half": (Wheels(n=2, fickle=0.2), Glimpse(finger=0.5, lag=1), 3),
 }
@@ -64,59 +64,41 @@ def test_the_optimum_with_memory_is_that_of_all_histories(rules, sight, horizon)
     assert found.optimum <= found.seen_optimum + 1e-9
 
 
+OUT, TRAP = -1, -2
+
+
 @dataclass(frozen=True)
-class _Corridor:
-    """Five rooms in a row; the way out is behind the left one, a trap behind the right one, and one starts between."""
+class _Rooms:
+    """Rooms with two doors each, each to another room, out or into a trap; one starts in any of ``starts``."""
 
-    slip: float = 0.0  #: one goes the other way
+    doors: tuple[tuple[int, int], ...]
+    starts: tuple[int, ...]
+    slip: float = 0.0  #: one goes through the other door
+    parts: int = 1  #: so many outcomes, alike and equally probable, of each
 
-    n_actions, states, start_states = 2, None, ((1,), (2,), (3,))
+    n_actions, states = 2, None
+
+    @property
+    def start_states(self):
+        return tuple((room,) for room in self.starts)
 
     def outcomes(self, state, action):
         found = []
-        for share, way in ((1 - self.slip, action), (self.slip, 1 - action)):
-            to = state[0] + (1 if way else -1)
-            done, lost = to < 0, to > 4
-            if share:
-                found.append(Outcome(share, (max(0, min(to, 4)),), float(done), terminated=done or lost, success=done))
+        for share, door in ((1 - self.slip, action), (self.slip, 1 - action)):
+            to = self.doors[state[0]][door]
+            done = to == OUT
+            room = to if to >= 0 else state[0]
+            outcome = Outcome(share / self.parts, (room,), float(done), terminated=to < 0, success=done)
+            found += [outcome] * (self.parts if share else 0)
         return tuple(found)
 
     def is_terminal(self, state):
         return False
 
 
-@dataclass(frozen=True)
-class _Maze:
-    """Four rooms, and the way out, 4: where each of two doors of a room leads."""
-
-    doors: tuple[tuple[int, int], ...]
-
-    n_actions, states, start_states = 2, None, ((0,), (1,), (2,))
-
-    def outcomes(self, state, action):
-        to = self.doors[state[0]][action]
-        return (Outcome(1.0, (min(to, 3),), 0.0, terminated=to == 4, success=to == 4),)
-
-    def is_terminal(self, state):
-        return False
-
-
-class _Halves:
-    """The same rules, each outcome as two of half its probability."""
-
-    states = None
-
-    def __init__(self, rules):
-        self.rules = rules
-        self.n_actions = rules.n_actions
-        self.start_states = rules.start_states
-
-    def outcomes(self, state, action):
-        halves = (dataclasses.replace(o, probability=o.probability / 2) for o in self.rules.outcomes(state, action))
-        return tuple(each for half in halves for each in (half, half))
-
-    def is_terminal(self, state):
-        return False
+CORRIDOR = _Rooms(((OUT, 1), (0, 2), (1, 3), (2, 4), (3, TRAP)), (1, 2, 3))
+EARLY = _Rooms(((2, 2), (OUT, 2), (3, 0), (2, 1)), (0, 1, 2))
+LATE = _Rooms(((OUT, 3), (2, 1), (1, 0), (0, 0)), (0, 1, 2))
 
 
 class _Wall:
@@ -138,13 +120,13 @@ class _Lit:
 
 
 TINY = {
-    "walls": (_Corridor(), _Wall(), 5),
-    "late": (_Corridor(), _Lit(), 4),
-    "slipping": (_Corridor(slip=0.2), _Wall(), 6),
-    "solved if no later": (_Maze(((2, 2), (4, 2), (3, 0), (2, 1))), _Lit(), 5),
-    "solved if later": (_Maze(((4, 3), (2, 1), (1, 0), (0, 0))), _Lit(), 5),
-    "in halves": (_Halves(_Corridor(slip=0.2)), _Wall(), 6),
-    "late, in halves": (_Halves(_Maze(((4, 3), (2, 1), (1, 0), (0, 0)))), _Lit(), 5),
+    "walls": (CORRIDOR, _Wall(), 5),
+    "late": (CORRIDOR, _Lit(), 4),
+    "slipping": (dataclasses.replace(CORRIDOR, slip=0.2), _Wall(), 6),
+    "solved if no later": (EARLY, _Lit(), 5),
+    "solved if later": (LATE, _Lit(), 5),
+    "in halves": (dataclasses.replace(CORRIDOR, slip=0.2, parts=2), _Wall(), 6),
+    "late, in halves": (dataclasses.replace(LATE, parts=2), _Lit(), 5),
     "wheel": (Wheels(n=1, slip=0.3), Glimpse(finger=0.5, lag=1), 3),
 }
 

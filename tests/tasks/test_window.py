@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.errors import SetupError
 
 pygame = pytest.importorskip("pygame")  # of the extra play
 
@@ -79,14 +78,6 @@ def test_who_must_be_seen_needs_a_desktop():
     done = subprocess.run([sys.executable, "-c", code], env=quiet, capture_output=True, text=True, check=False)
     assert done.stdout == "dummy\n"
     assert "SetupError: There is no desktop to open a window on" in done.stderr
-
-
-def test_without_pygame_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    env = make(render_mode="human", execution="kinematic")
-    with pytest.raises(SetupError, match=r"pip install 'imagine-bench\[play\]'"):
-        env.reset(seed=0)
-    env.close()
 
 
 _PRESS_ESCAPE = """

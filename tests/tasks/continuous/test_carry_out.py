@@ -7,32 +7,32 @@ from typing import Any
 
 import numpy as np
 import pytest
+from by_hand import FAMILIES
 from imagine_bench.tasks.continuous import env as module
 from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
 from imagine_bench.tasks.continuous.env import MotionEnv, Period
 from imagine_bench.tasks.continuous.expert import Expert
-from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
+from imagine_bench.tasks.continuous.segments import random_episode
+from imagine_bench.tasks.continuous.spec import make_arrows
 
 from imagine_bench.arrays import Floats32
 from imagine_bench.errors import InvalidValueError
-
-FAMILIES = {"arrows": make_arrows, "pick_place": make_pick_place}
 
 
 def experts(env: MotionEnv, seed: int, count: int) -> Floats32:
     """Actions of the expert in an episode; every eleventh goes astray, so that objects are pushed."""
     rng = np.random.default_rng(seed)
     env.restart(seed=seed)
-    expert = Expert(env, env.another_world())
+    expert = Expert(env)
     actions = []
-    while len(actions) < count:
+    over = False
+    while len(actions) < count and not over:
         if expert.is_done:
             expert.begin(env.task.rules.optimal_action(env.episode.macrostate))
         drawn = rng.uniform(env.action_space.low, env.action_space.high)
         actions.append(np.asarray(drawn if len(actions) % 11 == 10 else expert.act(), dtype=np.float32))
         _, terminated, truncated, _ = env.act(actions[-1])
-        if terminated or truncated:
-            break
+        over = terminated or truncated
     return np.stack(actions)
 
 
@@ -40,10 +40,9 @@ def one_by_one(env: MotionEnv, actions: Floats32) -> list[Period]:
     """The periods of actions, by :meth:`MotionEnv.act`."""
     periods = []
     for action in actions:
-        reward, terminated, truncated, info = env.act(action)
+        *ends, info = env.act(action)
         reached = tuple(info["macrostate"].tolist()) if info["event"] else None
-        fault = info["fault_reason"] or None
-        periods.append(Period(reward, terminated, truncated, bool(info["success"]), reached, fault))
+        periods.append(Period(*ends, bool(info["success"]), reached, info["fault_reason"] or None))
     return periods
 
 
@@ -54,14 +53,25 @@ def test_actions_at_once_do_as_one_by_one_to_the_bit(family: str, control: str, 
     env = FAMILIES[family](control=control, observation="proprio", slip=0.3, **options)
     actions = experts(env, 540, 120)
     assert env.episode.events > 0
-    env.restart(seed=540)
-    expected = one_by_one(env, actions)
-    after = pickle.dumps(env.get_state())
-    positions = env.data.xpos.tobytes()
-    env.restart(seed=540)
-    assert env.carry_out(actions) == expected
-    assert pickle.dumps(env.get_state()) == after
-    assert env.data.xpos.tobytes() == positions
+    found = []
+    for carry_out in (one_by_one, MotionEnv.carry_out):
+        env.restart(seed=540)
+        found.append((carry_out(env, actions), pickle.dumps(env.get_state()), env.data.xpos.tobytes()))
+    assert found[0] == found[1]
+
+
+def test_a_random_episode_is_of_actions_one_by_one() -> None:
+    env = make_arrows(observation="proprio")
+    solved = random_episode(env, 1)
+    at_once = (env.episode.periods, env.data.qpos.tobytes())
+    rng = np.random.default_rng([1, 1])
+    env.restart(seed=1)
+    over = False
+    while not over:
+        _, terminated, truncated, info = env.act(rng.uniform(env.action_space.low, env.action_space.high))
+        over = terminated or truncated
+    assert ((env.episode.periods, env.data.qpos.tobytes()), info["is_success"]) == (at_once, solved)
+    assert env.episode.periods > 25
 
 
 def test_nothing_is_carried_out_after_the_end_and_only_that_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,26 +87,26 @@ def test_nothing_is_carried_out_after_the_end_and_only_that_is_computed(monkeypa
     assert env.carry_out(np.tile(still, (3, 1))) == []
 
 
+TO_A_POSE = [0.6, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0, 1.0]
+
+
 @pytest.mark.parametrize(
-    ("control", "wrong"),
-    [("joint", [np.nan] * 8), ("joint", [0.0] * 7), ("pose", [0.6, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 1.0])],
+    ("control", "actions"),
+    [
+        ("joint", [[0.5] * 8, [np.nan] * 8]),
+        ("joint", [[0.5] * 7, [0.5] * 7]),
+        ("pose", [TO_A_POSE, [*TO_A_POSE[:3], 0.0, 0.0, 0.0, 0.0, 1.0]]),
+    ],
 )
-def test_a_wrong_action_among_several_is_refused_before_anything_moves(control: str, wrong: list[float]) -> None:
+def test_a_wrong_action_among_several_is_refused_before_anything_moves(
+    control: str, actions: list[list[float]]
+) -> None:
     env = make_arrows(control=control, observation="proprio")
-    good = experts(env, 541, 3)
     env.reset(seed=541)
     before = pickle.dumps(env.get_state())
-    actions = np.array([*good, wrong]) if len(wrong) == good.shape[1] else np.array([wrong] * 3)
     with pytest.raises(InvalidValueError, match=r"has another shape or a value that is not finite|quaternion"):
-        env.carry_out(actions.astype(np.float32))
+        env.carry_out(np.array(actions))
     assert pickle.dumps(env.get_state()) == before
-
-
-def test_one_action_is_no_row_of_actions() -> None:
-    env = make_arrows(control="joint", observation="proprio")
-    env.reset(seed=541)
-    with pytest.raises(InvalidValueError, match="has another shape"):
-        env.step(np.zeros((1, 8), dtype=np.float32))
 
 
 def test_a_simulation_that_blows_up_after_an_event_has_no_second_event(monkeypatch: pytest.MonkeyPatch) -> None:

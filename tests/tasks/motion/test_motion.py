@@ -7,86 +7,56 @@ import tempfile
 import mujoco
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.scene import compile_arrow_scene, layout
+from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.motion.arm_model import ArmModel
 from imagine_bench.tasks.motion.executor import MAX_SAVED
-from imagine_bench.tasks.motion.orientation import Sensing
-from imagine_bench.tasks.motion.turn import TurnExecutor
+from imagine_bench.tasks.scenes.appearance import Appearance
 from imagine_bench.tasks.scenes.arm import arm_columns
-from imagine_bench.tasks.scenes.constants import (
-    CUBE_EDGE_M,
-    OBSERVATION_QPOS_RAD,
-    TABLE_HEIGHT_M,
-    TIMESTEP_S,
-)
+from imagine_bench.tasks.scenes.constants import OBSERVATION_QPOS_RAD, TIMESTEP_S
 
 from imagine_bench.errors import DivergedError
 
-SLOTS_XY_M = layout(3).slots_xy_m
-QUARTER_RAD = math.pi / 2
-CUBE_Z_M = TABLE_HEIGHT_M + CUBE_EDGE_M / 2
+FIXED = Appearance(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0)
 
 
 @pytest.fixture(scope="module")
-def arm():
-    return ArmModel()
+def world():
+    return ArrowWorld(FIXED)
 
 
-@pytest.fixture(scope="module")
-def turner():
-    model = compile_arrow_scene()
-    return TurnExecutor(model, mujoco.MjData(model), SLOTS_XY_M, Sensing())
+def place(world, *yaws_rad):
+    """Stand the cubes on their slots, the first ones turned."""
+    world.place((0, 0, 0, 0), np.random.default_rng(0))
+    for row, yaw_rad in zip(world.object_qpos, yaws_rad, strict=False):
+        world.data.qpos[row[3:]] = math.cos(yaw_rad / 2), 0, 0, math.sin(yaw_rad / 2)
 
 
-def cube_slice(model, cube):
-    start = int(model.joint(f"cube_{cube}_joint").qposadr[0])
-    return slice(start, start + 7)
+def yaw_deg(world, cube):
+    w, _, _, z = world.object_poses()[cube, 3:]
+    return math.degrees(math.remainder(2 * math.atan2(z, w), 2 * math.pi))
 
 
-def place(model, data, yaws_rad, offsets_m=((0, 0), (0, 0), (0, 0))):
-    """Stand the cubes on their slots, turned and shifted."""
-    mujoco.mj_resetData(model, data)
-    for cube, (yaw, (dx, dy)) in enumerate(zip(yaws_rad, offsets_m, strict=True)):
-        x, y = SLOTS_XY_M[cube]
-        data.qpos[cube_slice(model, cube)] = [x + dx, y + dy, CUBE_Z_M, math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]
-
-
-def poses(model, data):
-    """Position and yaw of each cube, read from the rotation matrix. Shape (3, 4)."""
-    rows = []
-    for cube in range(3):
-        position, quat = np.split(data.qpos[cube_slice(model, cube)], [3])
-        matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, quat)
-        rows.append([*position, math.atan2(matrix[3], matrix[0])])
-    return np.array(rows)
-
-
-def wrap(angle_rad):
-    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
-
-
-def test_a_turn_keeps_the_limits_of_speed_and_force_and_returns(arm, turner):
+def test_a_turn_keeps_the_limits_of_speed_and_force_and_returns(world):
     """Replay one turn step by step and read the forces: within the limits, at rest far below, the grip firm.
 
     Gravity is compensated beside the servos, so that a motor would give the sum: the shoulder's goes beyond its limit.
     """
-    model, data = turner.model, turner.data
-    place(model, data, (0, 0, 0))
+    model, data = world.model, world.data
+    place(world)
     peak, motor_peak_nm = np.zeros(model.nu), np.zeros(7)
     arm_dofs = [int(model.joint(f"right_j{index}").dofadr[0]) for index in range(7)]
-    turner.capture_motion_hz = 1 / TIMESTEP_S
-    result = turner.turn(cube=0, clockwise=True)
+    world.executor.capture_motion_hz = 1 / TIMESTEP_S
+    result = world.executor.turn(cube=0, clockwise=True)
     motion = result.motion
-    turner.capture_motion_hz = 0.0
+    world.executor.capture_motion_hz = 0.0
     np.testing.assert_allclose(motion.time_s[[0, 1, -1]], [0, TIMESTEP_S, result.sim_time_s])
     arm_qpos = motion.qpos[:, arm_columns(model).qpos[:7]]
-    speed_share = np.abs(np.diff(arm_qpos, axis=0)).max(axis=0) / TIMESTEP_S / arm.speed_limit_rad_s
+    speed_share = np.abs(np.diff(arm_qpos, axis=0)).max(axis=0) / TIMESTEP_S / ArmModel().speed_limit_rad_s
     assert 0.9 < speed_share.max() <= 1.0
     np.testing.assert_allclose(arm_qpos[[0, -1]], [OBSERVATION_QPOS_RAD] * 2, atol=1e-3)
     reached = data.qpos.copy()
-    place(model, data, (0, 0, 0))
-    turner.rest()
+    place(world)
+    world.executor.rest()
     for command in motion.ctrl[:-1]:
         data.ctrl[:] = command
         mujoco.mj_step(model, data)
@@ -100,49 +70,32 @@ def test_a_turn_keeps_the_limits_of_speed_and_force_and_returns(arm, turner):
     np.testing.assert_array_equal(data.qpos, reached)  # rollout and stepping agree, bit for bit
 
 
-def test_a_turn_depends_on_positions_alone(turner):
+def test_a_turn_depends_on_positions_alone(world):
     """Not on earlier speeds, nor on the solver's warm start or the servos' targets."""
     ends = []
     for left_over in (0.0, 0.3):
-        place(turner.model, turner.data, (0, 0.1, 0))
-        for array in (turner.data.qvel, turner.data.qacc_warmstart, turner.data.ctrl):
+        place(world, 0, 0.1)
+        for array in (world.data.qvel, world.data.qacc_warmstart, world.data.ctrl):
             array[:] = left_over
-        assert turner.turn(cube=1, clockwise=True).fault is None
-        ends.append(np.concatenate([turner.data.qpos, turner.data.qvel]))
+        assert world.executor.turn(cube=1, clockwise=True).fault is None
+        ends.append(np.concatenate([world.data.qpos, world.data.qvel]))
     np.testing.assert_array_equal(*ends)
 
 
 @pytest.mark.parametrize("clockwise", [True, False])
-def test_very_skew_cubes_are_squared(turner, clockwise):
+@pytest.mark.parametrize("skew_deg", [-25, 25])
+def test_very_skew_cubes_are_squared(world, skew_deg, clockwise):
     """Even 25 degrees off, where the wrist would leave its range if it took the usual faces."""
-    model, data = turner.model, turner.data
-    for skew_rad in (-math.radians(25), math.radians(25)):
-        place(model, data, (skew_rad, 0, 0))
-        assert turner.turn(cube=0, clockwise=clockwise).fault is None
-        target = -QUARTER_RAD if clockwise else QUARTER_RAD
-        assert abs(math.degrees(wrap(poses(model, data)[0, 3] - target))) < 1
+    place(world, math.radians(skew_deg))
+    assert world.executor.turn(cube=0, clockwise=clockwise).fault is None
+    assert yaw_deg(world, 0) == pytest.approx(-90 if clockwise else 90, abs=1)
 
 
-def tips(model):
-    return [index for index in range(model.ngeom) if "_tip_" in model.geom(index).name]
-
-
-def turned_deg(turner, model, change=None):
-    """How far cube 1 turns in a clockwise macro-action on a changed scene, and the fault."""
-    if change:
-        change(model)
-    data = mujoco.MjData(model)
-    executor = TurnExecutor(model, data, SLOTS_XY_M, Sensing())
-    place(model, data, (0, 0, 0))
-    result = executor.turn(cube=1, clockwise=True)
-    return -math.degrees(poses(model, data)[1, 3]), result.fault
-
-
-def test_two_motions_of_one_macro_action_have_one_clock(turner):
-    place(turner.model, turner.data, (0, 0, 0))
-    turner.capture_motion_hz = 10.0
-    first, second = (turner.turn(cube=cube, clockwise=True) for cube in (0, 1))
-    turner.capture_motion_hz = 0.0
+def test_two_motions_of_one_macro_action_have_one_clock(world):
+    place(world)
+    world.executor.capture_motion_hz = 10.0
+    first, second = (world.executor.turn(cube=cube, clockwise=True) for cube in (0, 1))
+    world.executor.capture_motion_hz = 0.0
     both = first.then(second)
     assert both.sim_time_s == first.sim_time_s + second.sim_time_s
     assert both.motion.time_s[0] == 0.0 and both.motion.time_s[-1] == pytest.approx(both.sim_time_s)
@@ -150,70 +103,71 @@ def test_two_motions_of_one_macro_action_have_one_clock(turner):
     assert len(both.motion.time_s) == len(both.motion.qpos) == len(first.motion.qpos) + len(second.motion.qpos)
 
 
-def test_only_contact_turns_the_cube(turner):
+def turned(change):
+    """How far (deg) cube 1 turns in a clockwise macro-action in a changed scene, and the fault."""
+    world = ArrowWorld(FIXED)
+    change(world.model)
+    place(world)
+    fault = world.executor.turn(cube=1, clockwise=True).fault
+    return -yaw_deg(world, 1), fault
+
+
+def test_only_contact_turns_the_cube():
     """No weld, no teleport: fingertips that pass through the cube leave it alone, and the robot feels it holds none."""
 
     def ghost_tips(model):
-        model.geom_contype[tips(model)] = 0
-        model.geom_conaffinity[tips(model)] = 0
-        model.geom_contype[model.geom_contype == 2] = 0  # the fingers' backs
+        fingers = ["_tip_" in model.geom(index).name or model.geom_contype[index] == 2 for index in range(model.ngeom)]
+        model.geom_contype[fingers] = model.geom_conaffinity[fingers] = 0
 
-    assert turned_deg(turner, compile_arrow_scene())[0] == pytest.approx(90, abs=1)
-    angle, fault = turned_deg(turner, compile_arrow_scene(), ghost_tips)
-    assert angle == pytest.approx(0, abs=0.1)
+    assert turned(lambda model: None)[0] == pytest.approx(90, abs=1)
+    angle_deg, fault = turned(ghost_tips)
+    assert angle_deg == pytest.approx(0, abs=0.1)
     assert fault == "the fingers closed past cube 1"
 
 
-def test_an_arm_of_which_one_joint_does_not_come_back_is_a_fault(turner):
+def test_an_arm_of_which_one_joint_does_not_come_back_is_a_fault():
     """The wrist's 9 Nm hold a spring of 10 Nm/rad, whose rest is a radian away, 0.1 rad off."""
 
     def pulled_wrist(model):
         joint = model.joint("right_j6")
         model.jnt_stiffness[joint.id], model.qpos_spring[joint.qposadr[0]] = 10.0, OBSERVATION_QPOS_RAD[6] + 1.0
 
-    fault = turned_deg(turner, compile_arrow_scene(), pulled_wrist)[1]
-    assert fault == "the arm ended 0.100 rad off its observation pose"
+    assert turned(pulled_wrist)[1] == "the arm ended 0.100 rad off its observation pose"
 
 
 @pytest.mark.parametrize(
-    ("quat", "position", "message"),
+    ("columns", "values", "message"),
     [
-        ((math.cos(0.1), 0, math.sin(0.1), 0), (*SLOTS_XY_M[1], CUBE_Z_M), "cube 1 is tipped by 11 degrees"),
-        ((1, 0, 0, 0), (1.4, 0, CUBE_Z_M), "cube 1 is out of reach: The gripper cannot reach"),
+        (slice(3, 7), (math.cos(0.1), 0, math.sin(0.1), 0), "cube 1 is tipped by 11 degrees"),
+        (slice(0, 1), 1.4, "cube 1 is out of reach: The gripper cannot reach"),
     ],
     ids=["leaning", "far"],
 )
-def test_what_the_robot_cannot_do_is_a_fault(turner, quat, position, message):
-    model, data = turner.model, turner.data
-    place(model, data, (0, 0, 0))
-    data.qpos[cube_slice(model, 1)] = [*position, *quat]
-    before = poses(model, data)
-    result = turner.turn(cube=1, clockwise=True)
+def test_what_the_robot_cannot_do_is_a_fault(world, columns, values, message):
+    place(world)
+    world.data.qpos[world.object_qpos[1, columns]] = values
+    before = world.object_poses()
+    result = world.executor.turn(cube=1, clockwise=True)
     assert message in result.fault
-    assert result.sim_time_s == 0.0
-    assert result.motion.qpos.shape == (0, model.nq)
-    np.testing.assert_array_equal(poses(model, data), before)
+    assert (result.sim_time_s, len(result.motion.qpos)) == (0.0, 0)
+    np.testing.assert_array_equal(world.object_poses(), before)
 
 
-def test_exploded_physics_is_reported_with_its_start(turner, tmp_path, monkeypatch):
+def test_exploded_physics_is_reported_with_its_start(world, tmp_path, monkeypatch):
     """In one file of a bounded number, or without one where none can be written."""
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)  # MuJoCo's own log
     for index in range(MAX_SAVED + 3):
         old = tmp_path / f"imagine_bench_diverged_{index}.npz"
         old.touch()
         os.utime(old, (index, index))
-    model, data = turner.model, turner.data
-    place(model, data, (0, 0, 0))
-    data.qpos[cube_slice(model, 2)] = [1e11, 0, 0, 1, 0, 0, 0]
-    with pytest.raises(DivergedError, match="its start state and controls were saved in"):
-        turner.turn(cube=0, clockwise=True)
+    place(world)
+    for folder, said in ((tmp_path, "were saved in"), (tmp_path / "gone", "could not be saved")):
+        monkeypatch.setattr(tempfile, "tempdir", str(folder))
+        world.data.qpos[world.object_qpos[2]] = [1e11, 0, 0, 1, 0, 0, 0]
+        with pytest.raises(DivergedError, match=f"its start state and controls {said}"):
+            world.executor.turn(cube=0, clockwise=True)
     saved = sorted(tmp_path.glob("imagine_bench_diverged_*.npz"), key=os.path.getmtime)
     assert len(saved) == MAX_SAVED and saved[0].stem.endswith("_4")
     with np.load(saved[-1]) as contents:
         assert contents["start_state"].max() == 1e11
-        assert contents["control"].shape[1] == model.nu
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
-    data.qpos[cube_slice(model, 2)] = [1e11, 0, 0, 1, 0, 0, 0]
-    with pytest.raises(DivergedError, match="its start state and controls could not be saved"):
-        turner.turn(cube=0, clockwise=True)
+        assert contents["control"].shape[1] == world.model.nu

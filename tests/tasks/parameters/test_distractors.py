@@ -108,12 +108,3 @@ def test_balls_are_anywhere_on_the_screen_equally_often():
     assert cells == pytest.approx(1 / 9, abs=0.02)
     rim = np.minimum(share, 1.0 - share) < 0.002 / (high_m - low_m)
     assert rim.mean(axis=0) == pytest.approx(0.004 / (high_m - low_m), rel=0.25)
-
-
-def test_each_ball_has_a_color_of_its_own():
-    model = make(ARROWS, cubes=3, distractors=4).model
-    names = [
-        name for name in map(lambda i: model.material(i).name, range(model.nmat)) if name.startswith("distractor_")
-    ]
-    assert len(names) == 3
-    assert len({tuple(model.material(name).rgba.round(3)) for name in names}) == len(names)
