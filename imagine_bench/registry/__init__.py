@@ -224,7 +224,8 @@ def _named_entry(one: AgentConfiguration, own: Mapping[str, Any], group: str) ->
         return dataclasses.replace(entry, title=f"{entry.title or prefix} {re.sub('@[0-9a-f]{12}$', '', argument)}")
     if is_prefix:
         raise InvalidValueError(f"{prefix} alone is no name; give {prefix}:ARGUMENT. {known[prefix].description}")
-    if colon and prefix in known and not argument.isidentifier():
+    has_variants = any(name.startswith(f"{prefix}:") for name in known)  # such as factored:given
+    if colon and prefix in known and not (has_variants and argument.isidentifier()):
         example = "controller.discount=0.9"
         raise InvalidValueError(f"In {one.agent!r}, {argument!r} is not of the form name=value, such as {example}.")
     is_absent = prefix not in known and guest_with(group, prefix) is not None

@@ -35,7 +35,7 @@ def test_a_configuration_has_one_name(text: str, name: str, words: str) -> None:
     assert (str(one), one.words) == (name, words) and parse_configuration(name) == one
 
 
-@pytest.mark.parametrize("text", ["dqn:", "dqn:controller.discount", "dqn:a=1,a=2"])
+@pytest.mark.parametrize("text", ["dqn:", "dqn:discount", "dqn:controller.discount", "dqn:a=1,a=2"])
 def test_settings_that_are_none_are_refused(text: str) -> None:
     with pytest.raises(InvalidValueError, match=r"is not of the form name=value|twice"):
         protocol("arrow_puzzle", agents=(text,))
