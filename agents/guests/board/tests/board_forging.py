@@ -93,12 +93,18 @@ class OpenRow:
             figures["mean_length"] = sum(map(len, part["actions"])) / tests
             figures["faults"] = sum(part["faults"])
 
-    def write(self, *, sealed: bool = True) -> None:
+    def sealed(self) -> OpenRow:
+        """Written, with all figures brought up to date."""
+        self.follow()
+        return self.write()
+
+    def write(self, *, sealed: bool = True) -> OpenRow:
         content = json.dumps(self.parts).encode()
         (self.folder / EPISODES).write_bytes(content)
         if sealed:
             self.card["episodes_sha256"] = hashlib.sha256(content).hexdigest()
         (self.folder / CARD).write_text(json.dumps(self.card))
+        return self
 
 
 class BoardForger:
@@ -117,6 +123,10 @@ class BoardForger:
         rows = sorted((self.board / "rows").iterdir())
         rows = [each for each in rows if each.name.startswith(("dqn", "count_table"))]
         return OpenRow(self.pick(*[each for each in rows if each.name.endswith(ROUND) == dated]))
+
+    def any_learner(self) -> OpenRow:
+        """One with open starts, or one of the round."""
+        return self.learner(dated=self.pick(True, False))
 
     def other(self, row: OpenRow) -> OpenRow:
         """The other learner's row of the same kind."""

@@ -10,6 +10,7 @@ import json
 import shutil
 from collections.abc import Mapping
 
+import numpy as np
 from board_forging import ROUND, BoardForger, Forgery, OpenRow
 from forging import WORLD
 from imagine_bench_board.rounds import promise
@@ -27,17 +28,16 @@ BEFOREHAND = "the data seen beforehand"
 
 def edited_card(f: BoardForger) -> OpenRow:
     """A figure of the card alone."""
-    row = f.learner(dated=f.pick(True, False))
+    row = f.any_learner()
     figures = f.pick(*row.card["vouched"])
     name = f.pick("successes", "mean_return", "mean_length", "faults")
     figures[name] += f.pick(1, 2)
-    row.write()
-    return row
+    return row.write()
 
 
 def edited_everywhere(f: BoardForger) -> OpenRow:
     """Failed tests called solved, in the flags, the returns and every figure."""
-    row = f.learner(dated=f.pick(True, False))
+    row = f.any_learner()
     part = f.pick(*row.parts)
     failed = [test for test, each in enumerate(part["solved"]) if each == "0"]
     for test in failed[: f.pick(1, 3, len(failed))]:
@@ -45,19 +45,16 @@ def edited_everywhere(f: BoardForger) -> OpenRow:
         part["returns"][test] = f.pick(50.0, 49.0)
     if not failed:
         part["returns"][0] += 1.0
-    row.follow()
-    row.write()
-    return row
+    return row.sealed()
 
 
 def unsealed(f: BoardForger) -> OpenRow:
     """Episodes changed after they were sealed."""
-    row = f.learner(dated=f.pick(True, False))
+    row = f.any_learner()
     part = f.pick(*row.parts)
     part["returns"][f.pick(0, 1, 2)] += 1.0
     row.follow()
-    row.write(sealed=False)
-    return row
+    return row.write(sealed=False)
 
 
 def better_actions(f: BoardForger) -> OpenRow:
@@ -67,44 +64,37 @@ def better_actions(f: BoardForger) -> OpenRow:
     test = f.pick(*range(len(part["actions"])))
     actions = part["actions"][test]
     actions[-1] = (actions[-1] + f.pick(1, 2, 3)) % 6
-    row.follow()
-    row.write()
-    return row
+    return row.sealed()
 
 
 def fingerprints(f: BoardForger) -> OpenRow:
     """A fingerprint or a start changed."""
-    row = f.learner(dated=f.pick(True, False))
+    row = f.any_learner()
     part = f.pick(*row.parts)
     test = f.pick(0, 1, 2)
     if f.pick(True, False):
         part["fingerprints"][test] ^= f.pick(1, 256)
     else:
         part["starts"][test][0] = (part["starts"][test][0] + 1) % 4
-    row.write()
-    return row
+    return row.write()
 
 
 def swapped_agents(f: BoardForger) -> OpenRow:
     """Two learners' rows under each other's names."""
-    row = f.learner(dated=f.pick(True, False))
+    row = f.any_learner()
     other = f.other(row)
     row.parts, other.parts = other.parts, row.parts
     row.card["vouched"], other.card["vouched"] = other.card["vouched"], row.card["vouched"]
     other.write()
-    row.write()
-    return row
+    return row.write()
 
 
 def another_seeds_episodes(f: BoardForger) -> OpenRow:
     """The tests of the best seed in place of another's."""
     row = f.learner()
-    best = max(range(len(row.parts)), key=lambda place: row.card["vouched"][place]["mean_return"])
-    worst = min(range(len(row.parts)), key=lambda place: row.card["vouched"][place]["mean_return"])
-    row.parts[worst] = row.parts[best]
-    row.follow()
-    row.write()
-    return row
+    returns = [figures["mean_return"] for figures in row.card["vouched"]]
+    row.parts[int(np.argmin(returns))] = row.parts[int(np.argmax(returns))]
+    return row.sealed()
 
 
 def copied_row(f: BoardForger) -> OpenRow:
@@ -114,8 +104,7 @@ def copied_row(f: BoardForger) -> OpenRow:
     row.folder.mkdir()
     row.card["claimed"] |= {"agent": "imagination", "author": "somebody else"}
     row.protocol["agents"] = ["imagination"]
-    row.write()
-    return row
+    return row.write()
 
 
 def dropped_failures(f: BoardForger) -> OpenRow:
@@ -128,21 +117,18 @@ def dropped_failures(f: BoardForger) -> OpenRow:
     for place in range(len(row.parts)):
         row.drop_tests(place, left_out)
     row.protocol["evaluation_episodes"] = tests - len(left_out)
-    row.follow()
-    row.write()
-    return row
+    return row.sealed()
 
 
 def dropped_seed(f: BoardForger) -> OpenRow:
     """The worst seed left out in every copy."""
-    row = f.learner(dated=f.pick(True, False))
+    row = f.any_learner()
     seeds = row.protocol["seeds"]
     worst = min(row.card["vouched"], key=lambda figures: figures["mean_return"])["seed"]
     kept = [place for place, figures in enumerate(row.card["vouched"]) if figures["seed"] != worst]
     row.protocol["seeds"] = [seed for seed in seeds if seed != worst]
     row.keep_places(kept)
-    row.write()
-    return row
+    return row.write()
 
 
 def renamed_seeds(f: BoardForger) -> OpenRow:
@@ -152,8 +138,7 @@ def renamed_seeds(f: BoardForger) -> OpenRow:
     for figures in row.card["vouched"]:
         figures["seed"] = names[figures["seed"]]
     row.protocol["seeds"] = [*names.values()]
-    row.write()
-    return row
+    return row.write()
 
 
 def by_oracle(f: BoardForger) -> OpenRow:
@@ -161,9 +146,7 @@ def by_oracle(f: BoardForger) -> OpenRow:
     row = f.learner()
     for place in range(len(row.parts)):
         row.set_tests(place, f.played(row.protocol["evaluation_episodes"]))
-    row.follow()
-    row.write()
-    return row
+    return row.sealed()
 
 
 def longer(f: BoardForger) -> OpenRow:
@@ -174,9 +157,7 @@ def longer(f: BoardForger) -> OpenRow:
         part["actions"][f.pick(0, 1)] += [f.pick(0, 1)] * f.pick(1, 5)
     else:
         row.protocol["task"] = f"arrows:horizon={f.pick(20, 50)}"
-    row.follow()
-    row.write()
-    return row
+    return row.sealed()
 
 
 def easier_starts(f: BoardForger) -> OpenRow:
@@ -194,9 +175,7 @@ def easier_starts(f: BoardForger) -> OpenRow:
             log.add(env.episode)
     for place in range(len(row.parts)):
         row.set_tests(place, log)
-    row.follow()
-    row.write()
-    return row
+    return row.sealed()
 
 
 def other_world(f: BoardForger) -> OpenRow:
@@ -209,12 +188,10 @@ def other_world(f: BoardForger) -> OpenRow:
         env = make_env(other, other.task)
         log = EvaluationCounts()
         for test in range(row.protocol["evaluation_episodes"]):
-            episode, _ = replay(env, episode_seed("evaluation", 0, test), [0, 0, 2, 2, 4, 4, 1, 1, 3, 3])
-            log.add(episode)
+            log.add(replay(env, episode_seed("evaluation", 0, test), [0, 0, 2, 2, 4, 4, 1, 1, 3, 3])[0])
         row.set_tests(0, log)
         row.follow()
-    row.write()
-    return row
+    return row.write()
 
 
 def called_physics(f: BoardForger) -> OpenRow:
@@ -224,8 +201,7 @@ def called_physics(f: BoardForger) -> OpenRow:
     if f.pick(True, False):
         for part in row.parts:
             part["sim_times_s"] = [float(f.rng.uniform(4, 12)) * len(each) for each in part["actions"]]
-    row.write()
-    return row
+    return row.write()
 
 
 def prices(f: BoardForger) -> OpenRow:
@@ -236,8 +212,7 @@ def prices(f: BoardForger) -> OpenRow:
             price["train_cpu_s"] *= float(f.pick(0.01, 0.5))
         else:
             price["env_steps"] = int(price["env_steps"] * f.pick(0.1, 0.8))
-    row.write()
-    return row
+    return row.write()
 
 
 def later_called_earlier(f: BoardForger) -> OpenRow:
@@ -250,16 +225,19 @@ def later_called_earlier(f: BoardForger) -> OpenRow:
     for figures, price in zip(row.card["vouched"], row.card["claimed"]["prices"], strict=True):
         figures["episodes"] = row.protocol["budgets"][0]
         price["env_steps"] = figures["episodes"] * 2
-    row.write()
-    return row
+    return row.write()
 
 
 def unseen(f: BoardForger) -> OpenRow:
     """Encoders, datasets and demonstrations concealed."""
-    row = f.learner(dated=f.pick(True, False))
+    row = f.any_learner()
     row.card["claimed"] |= {"seen_beforehand": "nothing", "frames_beforehand": f.pick(0, 10)}
-    row.write()
-    return row
+    return row.write()
+
+
+def file_as(f: BoardForger, row: OpenRow, agents: dict[str, str]) -> None:
+    """File digests under a row's name, as if before the round began."""
+    (f.board / "rounds" / ROUND / "filed" / f"{row.folder.name}.json").write_text(json.dumps(agents))
 
 
 def called_dated(f: BoardForger) -> OpenRow:
@@ -268,10 +246,8 @@ def called_dated(f: BoardForger) -> OpenRow:
     row.card["round"] = ROUND
     if f.pick(True, False):
         row.folder = row.folder.rename(row.folder.with_name(f"zz-{ROUND}"))
-        filed = {str(figures["seed"]): "" for figures in row.card["vouched"]}
-        (f.board / "rounds" / ROUND / "filed" / f"{row.folder.name}.json").write_text(json.dumps(filed))
-    row.write()
-    return row
+        file_as(f, row, {str(figures["seed"]): "" for figures in row.card["vouched"]})
+    return row.write()
 
 
 def other_agents(f: BoardForger) -> OpenRow:
@@ -279,13 +255,9 @@ def other_agents(f: BoardForger) -> OpenRow:
     row = f.learner(dated=True)
     row.card["claimed"]["prices"][0]["agent_sha256"] = f.pick("0" * 64, "")
     if f.pick(True, False):
-        agents = {
-            str(figures["seed"]): price["agent_sha256"]
-            for figures, price in zip(row.card["vouched"], row.card["claimed"]["prices"], strict=True)
-        }
-        (f.board / "rounds" / ROUND / "filed" / f"{row.folder.name}.json").write_text(json.dumps(agents))
-    row.write()
-    return row
+        both = zip(row.card["vouched"], row.card["claimed"]["prices"], strict=True)
+        file_as(f, row, {str(figures["seed"]): price["agent_sha256"] for figures, price in both})
+    return row.write()
 
 
 def other_seed(f: BoardForger) -> OpenRow:
@@ -309,8 +281,7 @@ def round_left_out(f: BoardForger) -> OpenRow:
         row.card["round"] = ""
     else:
         shutil.rmtree(f.board / "rounds" / ROUND)
-    row.write()
-    return row
+    return row.write()
 
 
 KINDS: Mapping[str, tuple[Forgery, str]] = {

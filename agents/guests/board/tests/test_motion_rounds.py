@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
@@ -14,9 +13,9 @@ from imagine_bench_board import rounds
 from imagine_bench_board.check import check
 from imagine_bench_board.motion_rows import read_motions
 from imagine_bench_board.motions import MotionTests
-from imagine_bench_board.rows import CARD, ROWS
+from imagine_bench_board.rows import ROWS
 from imagine_bench_board.submit import file_agents
-from test_motions import WORLD, played
+from test_motions import WORLD, OpenMotions, played
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.seeding import episode_seed
@@ -55,11 +54,14 @@ def test_a_filed_policy_plays_the_starts_of_the_round(root: Path) -> None:
     (found,) = check(root / "board")
     assert found.verdict.complaint == "" and found.verdict.episodes == TESTS
     assert f"; round {ROUND}; " in str(found)
-    row = read_motions(root / "board" / ROWS / NAME)
-    assert row.protocol.seed == json.loads((root / "secret.json").read_text())["seed"] == SEED
-    assert [row.protocol.start(test) for test in range(TESTS)] == [
-        episode_seed("board", SEED, test) for test in range(TESTS)
-    ]
+    row = root / "board" / ROWS / NAME
+    protocol = read_motions(row).protocol
+    assert protocol.seed == json.loads((root / "secret.json").read_text())["seed"] == SEED
+    wanted = [episode_seed("board", SEED, test) for test in range(TESTS)]
+    assert [protocol.start(test) for test in range(TESTS)] == wanted
+    row.rename(row.with_name("not-filed"))
+    (found,) = check(root / "board")
+    assert found.row is None and "it was not filed in the round winter" in found.verdict.complaint
 
 
 def test_only_the_filed_file_plays(root: Path) -> None:
@@ -78,66 +80,41 @@ def test_only_the_filed_file_plays(root: Path) -> None:
         env.write(root / "other", "another", agent="me")
 
 
-def edit(path: Path, change: Callable[[dict[str, dict[str, object]]], object]) -> None:
-    values = json.loads(path.read_text())
-    change(values)
-    path.write_text(json.dumps(values))
-
-
-def other_policy(board: Path) -> None:
-    edit(board / ROWS / NAME / CARD, lambda card: card.update(policy_sha256="0" * 64))
-
-
-def other_policy_filed_late(board: Path) -> None:
-    other_policy(board)
-    path = board / rounds.ROUNDS / ROUND / "filed" / f"{NAME}.json"
-    edit(path, lambda filed: filed.update(policy="0" * 64))
-
-
-def not_filed(board: Path) -> None:
-    (board / ROWS / NAME).rename(board / ROWS / "not-filed")
-
-
-def other_seed(board: Path) -> None:
-    """A seed of one's own, whose starts the row cannot claim to be the round's."""
-    edit(board / ROWS / NAME / CARD, lambda card: card["protocol"].update(seed=5))
-
-
-def fewer_tests(board: Path) -> None:
-    edit(board / rounds.ROUNDS / ROUND / "round.json", lambda values: values.update(tests=TESTS + 1))
-
-
-def round_left_out(board: Path) -> None:
-    edit(board / ROWS / NAME / CARD, lambda card: card["protocol"].update(round=""))
-
-
-def round_elsewhere(board: Path) -> None:
-    edit(board / ROWS / NAME / CARD, lambda card: card["protocol"].update(round="../winter"))
+OTHERS = "0" * 64
 
 
 @pytest.mark.parametrize(
-    ("forgery", "complaint"),
+    ("changes", "complaint"),
     [
-        (other_policy, "its agents are not those that were filed in the round winter"),
-        (other_policy_filed_late, "was changed after the seed of the round was published"),
-        (not_filed, "it was not filed in the round winter"),
-        (other_seed, "its seed is not that of the round winter"),
-        (fewer_tests, "it has 2 tests, and the round winter has 3"),
-        (round_left_out, "test 0: "),
-        (round_elsewhere, "its round is '../winter'"),
+        ({"card": {"policy_sha256": OTHERS}}, "its agents are not those that were filed in the round winter"),
+        (
+            {"card": {"policy_sha256": OTHERS}, "filed": {"policy": OTHERS}},
+            "was changed after the seed of the round was published",
+        ),
+        ({"protocol": {"seed": 5}}, "its seed is not that of the round winter"),
+        ({"round": {"tests": TESTS + 1}}, "it has 2 tests, and the round winter has 3"),
+        ({"protocol": {"round": ""}}, "test 0: "),
+        ({"protocol": {"round": "../winter"}}, "its round is '../winter'"),
     ],
 )
-def test_forged_rows_of_a_round_are_refused(root: Path, forgery: Callable[[Path], None], complaint: str) -> None:
-    forgery(root / "board")
-    (found,) = check(root / "board")
+def test_forged_rows_of_a_round_are_refused(root: Path, changes: dict[str, dict[str, object]], complaint: str) -> None:
+    folder = root / "board" / rounds.ROUNDS / ROUND
+    row = OpenMotions(root / "board" / ROWS / NAME)
+    row.card |= changes.get("card", {})
+    row.card["protocol"] |= changes.get("protocol", {})
+    files = {"filed": folder / "filed" / f"{NAME}.json", "round": folder / "round.json"}
+    for name in files.keys() & changes.keys():
+        files[name].write_text(json.dumps(json.loads(files[name].read_text()) | changes[name]))
+    found = row.check()
     assert found.row is None and complaint in found.verdict.complaint
 
 
 def test_open_tests_are_not_called_those_of_a_round(root: Path) -> None:
-    shutil.rmtree(root / "board" / ROWS)
-    folder = played(root / "board" / ROWS, NAME, control="joint", tests=TESTS, seed=31)
-    policy = json.loads((root / "board" / rounds.ROUNDS / ROUND / "filed" / f"{NAME}.json").read_text())["policy"]
-    edit(folder / CARD, lambda card: card.update(policy_sha256=policy))
-    edit(folder / CARD, lambda card: card["protocol"].update(seed=SEED, round=ROUND))
-    (found,) = check(root / "board")
+    rows = root / "board" / ROWS
+    shutil.rmtree(rows)
+    row = OpenMotions(played(rows, NAME, control="joint", tests=TESTS, seed=31))
+    filed = json.loads((root / "board" / rounds.ROUNDS / ROUND / "filed" / f"{NAME}.json").read_text())
+    row.card["policy_sha256"] = filed["policy"]
+    row.card["protocol"] |= {"seed": SEED, "round": ROUND}
+    found = row.check()
     assert found.row is None and "test 0: " in found.verdict.complaint

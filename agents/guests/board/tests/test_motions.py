@@ -17,7 +17,7 @@ import pytest
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_board import motions
-from imagine_bench_board.check import NOT_VOUCHED, check
+from imagine_bench_board.check import NOT_VOUCHED, Checked, check
 from imagine_bench_board.commands import board
 from imagine_bench_board.motion_rows import Motion, MotionRow, read_motions
 from imagine_bench_board.motions import SLACK_PERIODS, MotionTests
@@ -25,10 +25,12 @@ from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import CARD, EPISODES, LONGEST
 
 from imagine_bench.arrays import Floats32
-from imagine_bench.errors import CheckFailedError, InvalidValueError, UnknownNameError
+from imagine_bench.errors import CheckFailedError, ImagineBenchError, InvalidValueError
 
 WORLD = "arrows:cubes=1"
 TESTS = 4
+OTHER = "4.0.0"
+"""Another version of MuJoCo."""
 
 
 def played(root: Path, name: str = "expert-and-nobody", **options: Any) -> Path:
@@ -48,31 +50,72 @@ def played(root: Path, name: str = "expert-and-nobody", **options: Any) -> Path:
     return env.write(root, name, agent="expert", author="a founder")
 
 
+class OpenMotions:
+    """A row's card and tests, open for changes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.card: dict[str, Any] = json.loads((folder / CARD).read_text())
+        self.parts: list[dict[str, Any]] = json.loads((folder / EPISODES).read_text())
+
+    def commands(self, test: int) -> Any:
+        return np.frombuffer(base64.b64decode(self.parts[test]["commands"]), "<f4").reshape(-1, 8).copy()
+
+    def put(self, test: int, commands: Any) -> None:
+        self.parts[test]["commands"] = base64.b64encode(commands.astype("<f4").tobytes()).decode()
+
+    def check(self) -> Checked:
+        """The finding about the card as it is now."""
+        (self.folder / CARD).write_text(json.dumps(self.card))
+        (found,) = check(self.folder)
+        return found
+
+    def sealed(self, mujoco: str = "") -> Checked:
+        """The finding once digest and figures were brought up to date, by which version of MuJoCo is said."""
+        content = json.dumps(self.parts).encode()
+        (self.folder / EPISODES).write_bytes(content)
+        self.card["mujoco"] = mujoco or self.card["mujoco"]
+        self.card["episodes_sha256"] = hashlib.sha256(content).hexdigest()
+        sure = [part for part in self.parts if part["reproducible"]]
+        failed = [min(part["total_reward"], -5.0) for part in self.parts if not part["reproducible"]]
+        self.card["vouched"] = {
+            "successes": sum(part["solved"] is True for part in sure),
+            "faults": sum(part["fault"] for part in sure),
+            "mean_return": float(np.mean([part["total_reward"] for part in sure] + failed)),
+            "mean_periods": float(np.mean([len(part["commands"]) * 3 // 4 // 32 for part in self.parts])),
+            "not_reproducible": len(failed),
+        }
+        return self.check()
+
+
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return played(tmp_path_factory.mktemp("board") / "rows", control="joint")
 
 
 @pytest.fixture
-def row(honest: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(honest, tmp_path / "rows" / honest.name)
+def row(honest: Path, tmp_path: Path) -> OpenMotions:
+    return OpenMotions(shutil.copytree(honest, tmp_path / "rows" / honest.name))
 
 
-def test_an_honest_row_holds_and_says_what_happened(row: Path, tmp_path: Path) -> None:
-    read = read_motions(row)
+def test_an_honest_row_holds_and_says_what_happened(row: OpenMotions, tmp_path: Path) -> None:
+    read = read_motions(row.folder)
     assert [each.solved for each in read.motions] == [True, False, True, False]
     assert read.vouched.successes == 2 and read.vouched.faults == 0
     assert all(each.reproducible for each in read.motions)
     assert [each.periods for each in read.motions][1::2] == [750, 750]  # 3 s for each of ten macro-actions
-    (found,) = check(row.parents[1] / "rows" / row.name)
+    assert len(row.parts[1]["commands"]) < 750 * 43, "as long as a row allows for"
+    found = row.sealed()
     assert str(found) == (
-        f"{row.name}: holds in {WORLD}, continuous control at 25 Hz, clean; open starts; 4 episodes played again; "
+        f"{read.name}: holds in {WORLD}, continuous control at 25 Hz, clean; open starts; 4 episodes played again; "
         f"not vouched: {', '.join(NOT_VOUCHED)}"
     )
     page = write_board([found], tmp_path / "page").read_text()
     assert "continuous control at 25 Hz" in page
-    assert page.count(f'href="{row.name}.html#tests"') == 5, "each number that is vouched for leads to its episodes"
-    assert "2 of 4 tests solved" in (tmp_path / "page" / f"{row.name}.html").read_text()
+    assert page.count(f'href="{read.name}.html#tests"') == 5, "each number that is vouched for leads to its episodes"
+    assert "2 of 4 tests solved" in (tmp_path / "page" / f"{read.name}.html").read_text()
+    row.card["protocol"] |= {"task": f"{WORLD},slip=0", "appearance": "light=0"}
+    assert "holds" in str(row.check()) and read_motions(row.folder).world == read.world, "the same world in other words"
 
 
 @pytest.mark.parametrize("control", ["twist", "joint_delta", "pose"])
@@ -110,147 +153,61 @@ def test_every_test_is_played_whole_and_no_more_than_asked(tmp_path: Path, monke
         with pytest.raises(InvalidValueError, match="A row cannot be called"):
             env.write(tmp_path / "rows", name, agent="nobody")
     assert not list(tmp_path.iterdir())
-    written = env.write(tmp_path, "whole", agent="nobody")
-    assert len(read_motions(written).claimed.command) == LONGEST, "a long command is cut"
-    assert [each.periods for each in read_motions(written).motions] == [750]
+    written = read_motions(env.write(tmp_path, "whole", agent="nobody"))
+    assert len(written.claimed.command) == LONGEST, "a long command is cut"
+    assert [each.periods for each in written.motions] == [750]
     with pytest.raises(InvalidValueError, match="exists; remove it, or give another name"):
         env.write(tmp_path, "whole", agent="nobody")
 
 
-def test_a_library_s_own_loop_plays_the_tests(tmp_path: Path) -> None:
-    evaluation = pytest.importorskip("stable_baselines3.common.evaluation")
-
-    class Still:
-        def predict(self, observation: Any, state: Any = None, **more: Any) -> tuple[Any, None]:
-            return np.zeros((len(observation), 7), np.float32), None
-
-    env = MotionTests(WORLD, observation="proprio", tests=2, seed=3)
-    with pytest.warns(UserWarning, match="not wrapped with a ``Monitor``"):
-        mean, _ = evaluation.evaluate_policy(Still(), env, n_eval_episodes=2)
-    assert mean == 0.0
-    (found,) = check(env.write(tmp_path, "still", agent="still"))
-    assert found.verdict.episodes == 2 and not found.verdict.complaint
+def dropped(row: OpenMotions) -> None:
+    row.parts.pop(1)
+    row.card["protocol"]["tests"] -= 1
 
 
-def commands_of(part: dict[str, Any]) -> Any:
-    return np.frombuffer(base64.b64decode(part["commands"]), "<f4").reshape(-1, 8).copy()
+def longer(row: OpenMotions) -> None:
+    commands = row.commands(0)
+    row.put(0, np.concatenate([commands, np.repeat(commands[-1:], SLACK_PERIODS + 1, axis=0)]))
 
 
-def put(part: dict[str, Any], commands: Any) -> None:
-    part["commands"] = base64.b64encode(commands.astype("<f4").tobytes()).decode()
-
-
-def solved_everywhere(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    parts[1] |= {"solved": True, "total_reward": 50.0}
-
-
-def dearer(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    parts[0]["total_reward"] += 1.0
-
-
-def other_fingerprint(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    parts[1]["fingerprint"] ^= 1
-
-
-def swapped(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    parts[0], parts[1] = parts[1], parts[0]
-
-
-def copied(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    parts[1] = dict(parts[0])
-
-
-def dropped(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    del parts[1]
-    card["protocol"]["tests"] -= 1
-
-
-def cut(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    put(parts[1], commands_of(parts[1])[:300])
-
-
-def longer(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    commands = commands_of(parts[0])
-    put(parts[0], np.concatenate([commands, np.repeat(commands[-1:], SLACK_PERIODS + 1, axis=0)]))
-
-
-def another_seed(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    card["protocol"]["seed"] += 1
-
-
-def another_world(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    card["protocol"]["task"] = "arrows:cubes=2"
-
-
-def no_numbers(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    commands = commands_of(parts[1])
+def no_numbers(row: OpenMotions) -> None:
+    commands = row.commands(1)
     commands[5, 3] = np.nan
-    put(parts[1], commands)
+    row.put(1, commands)
 
 
-def no_commands(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    parts[1]["commands"] = "not base64!"
+def other_fingerprint(row: OpenMotions, test: int = 1) -> None:
+    row.parts[test]["fingerprint"] ^= 1
 
 
-def a_file_s_world(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    card["protocol"]["task"] = "arrows:@/etc/passwd"
+FORGERIES: dict[str, Callable[[OpenMotions], object]] = {
+    "a failure called solved": lambda row: row.parts[1].update(solved=True, total_reward=50.0),
+    "a higher return": lambda row: row.parts[0].update(total_reward=row.parts[0]["total_reward"] + 1.0),
+    "another fingerprint": other_fingerprint,
+    "swapped tests": lambda row: row.parts.insert(0, row.parts.pop(1)),
+    "a copied test": lambda row: row.parts[1].update(row.parts[0]),
+    "a dropped test": dropped,
+    "cut commands": lambda row: row.put(1, row.commands(1)[:300]),
+    "longer commands": longer,
+    "another seed": lambda row: row.card["protocol"].update(seed=31),
+    "another world": lambda row: row.card["protocol"].update(task="arrows:cubes=2"),
+    "commands that are no numbers": no_numbers,
+    "no commands": lambda row: row.parts[1].update(commands="not base64!"),
+    "a world in a file": lambda row: row.card["protocol"].update(task="arrows:@/etc/passwd"),
+    "a text for a flag": lambda row: row.parts[0].update(solved="yes"),
+    "too many tests": lambda row: row.card["protocol"].update(tests=10**9),
+}
 
 
-def no_flag(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    parts[0]["solved"] = "yes"
-
-
-def too_many(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    card["protocol"]["tests"] = 10**9
-
-
-def hidden(card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    """A failure said to be a success that depends on rounding."""
-    solved_everywhere(card, parts)
-    parts[1]["reproducible"] = False
-
-
-FORGERIES = [
-    solved_everywhere, dearer, other_fingerprint, swapped, copied, dropped, cut, longer, another_seed, another_world,
-    no_numbers, no_commands, a_file_s_world, no_flag, too_many, hidden,
-]  # fmt: skip
-
-
-def seal(row: Path, card: dict[str, Any], parts: list[dict[str, Any]]) -> None:
-    """Write a row with digest and figures brought up to date."""
-    content = json.dumps(parts).encode()
-    card["episodes_sha256"] = hashlib.sha256(content).hexdigest()
-    sure = [part for part in parts if part["reproducible"]]
-    failed = [min(part["total_reward"], -5.0) for part in parts if not part["reproducible"]]
-    card["vouched"] = {
-        "successes": sum(part["solved"] is True for part in sure),
-        "faults": sum(part["fault"] for part in sure),
-        "mean_return": float(np.mean([part["total_reward"] for part in sure] + failed)),
-        "mean_periods": float(np.mean([len(part["commands"]) * 3 // 4 // 32 for part in parts])),
-        "not_reproducible": len(failed),
-    }
-    (row / EPISODES).write_bytes(content)
-    (row / CARD).write_text(json.dumps(card))
-
-
+@pytest.mark.parametrize("mujoco", ["", "999.0.0"])
 @pytest.mark.parametrize("forgery", FORGERIES)
-def test_forged_rows_are_refused_in_one_line(
-    row: Path, forgery: Callable[[dict[str, Any], list[dict[str, Any]]], None]
-) -> None:
+def test_forged_rows_never_hold_whatever_mujoco_they_name(row: OpenMotions, forgery: str, mujoco: str) -> None:
     """The forger brings digest and figures up to date."""
-    card = json.loads((row / CARD).read_text())
-    parts = json.loads((row / EPISODES).read_text())
-    forgery(card, parts)
-    seal(row, card, parts)
-    (found,) = check(row)
-    assert found.row is None and found.verdict.complaint
+    FORGERIES[forgery](row)
+    found = row.sealed(mujoco)
+    assert found.row is None and found.verdict.complaint and "holds" not in str(found)
+    assert found.is_refused or mujoco
     assert "\n" not in str(found) and "Traceback" not in str(found)
-
-
-def test_a_row_sealed_again_without_a_change_holds(row: Path) -> None:
-    """So the refusals above are for the forged parts."""
-    seal(row, json.loads((row / CARD).read_text()), json.loads((row / EPISODES).read_text()))
-    assert "holds" in str(check(row)[0])
 
 
 CHAOS_RAD = 0.05
@@ -277,159 +234,116 @@ def test_a_test_that_depends_on_rounding_is_marked_by_its_author(
     assert page.count("no, so it counts as failed") == TESTS
 
 
-def test_a_test_that_ends_in_another_way_is_excused_only_if_disturbed_replays_do_so_too(
-    row: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    card = json.loads((row / CARD).read_text())
-    parts = json.loads((row / EPISODES).read_text())
-    other_fingerprint(card, parts[1:])  # test 2, which the expert solves
-    seal(row, card, parts)
-    (found,) = check(row)
-    assert "refused: test 2: its fingerprint is" in str(found)
-    monkeypatch.setattr(motions, "DISTURBANCE", CHAOS_RAD)
-    (found,) = check(row)
-    assert "4 episodes played again, 1 not reproducible and counted as failed;" in str(found)
+def marked(found: Checked) -> MotionRow:
+    """A row that holds with one test that is not reproducible."""
     assert isinstance(found.row, MotionRow)
-    assert [each.reproducible for each in found.row.motions] == [True, True, False, True]
-    assert found.row.vouched.successes == card["vouched"]["successes"] - 1 == 1
+    assert "4 episodes played again, 1 not reproducible and counted as failed;" in str(found)
+    return found.row
 
 
-@pytest.mark.parametrize("version", ["4.0.0", "3.16.0", "3.17.1", "999.0.0"])
+def test_a_test_that_ends_in_another_way_is_excused_only_if_disturbed_replays_do_so_too(
+    row: OpenMotions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other_fingerprint(row, 2)  # of a test that the expert solves
+    assert "refused: test 2: its fingerprint is" in str(row.sealed())
+    monkeypatch.setattr(motions, "DISTURBANCE", CHAOS_RAD)
+    found = marked(row.check())
+    assert [each.reproducible for each in found.motions] == [True, True, False, True]
+    assert found.vouched.successes == row.card["vouched"]["successes"] - 1 == 1
+
+
 def test_a_row_of_another_mujoco_is_not_vouched_for_and_never_holds(
-    row: Path, version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    row: OpenMotions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Whether the card tells the truth, lies, or names a version that does not exist."""
-    card = json.loads((row / CARD).read_text())
-    parts = json.loads((row / EPISODES).read_text())
-    here = card["mujoco"]
-    seal(row, {**card, "mujoco": version}, parts)
-    assert "holds" in str(check(row)[0]), "another version alone is no reason"
-    other_fingerprint(card, parts)
-    seal(row, {**card, "mujoco": version}, parts)
-    (found,) = check(row)
+    here = row.card["mujoco"]
+    assert "holds" in str(row.sealed(OTHER)), "another version alone is no reason"
+    other_fingerprint(row)
+    found = row.sealed()
     assert found.row is None
     assert str(found) == (
-        f"{row.name}: not vouched: made with MuJoCo {version}, checked with {here}, where it does not play again; "
-        f"check it with {version} (pip install mujoco=={version})."
+        f"{row.folder.name}: not vouched: made with MuJoCo {OTHER}, checked with {here}, where it does not play again; "
+        f"check it with {OTHER} (pip install mujoco=={OTHER})."
     )
     page = write_board([found], tmp_path / "page")
-    assert "0 of 1 rows hold" in page.read_text() and not page.with_name(f"{row.name}.html").exists()
+    assert "0 of 1 rows hold" in page.read_text() and not page.with_name(f"{row.folder.name}.html").exists()
     with pytest.raises(CheckFailedError, match="0 of 1 rows are refused, and 1 cannot be vouched for with this MuJoCo"):
-        board(action="check", path=row, out=tmp_path, closes=None, tests=1, secret=tmp_path, round=None)
+        board(action="check", path=row.folder, out=tmp_path, closes=None, tests=1, secret=tmp_path, round=None)
     assert "not vouched: made with" in capsys.readouterr().out
-    monkeypatch.setattr("imagine_bench_board.check.installed_mujoco", lambda: version)
-    (found,) = check(row)
+    monkeypatch.setattr("imagine_bench_board.check.installed_mujoco", lambda: OTHER)
+    found = row.check()
     assert found.is_refused and ": refused: test 1: its fingerprint is" in str(found), "as before, with its version"
-
-
-@pytest.mark.parametrize("version", ["4.0.0", "999.0.0"])
-@pytest.mark.parametrize("forgery", [each for each in FORGERIES if each is not hidden])
-def test_a_forger_gains_nothing_by_naming_another_mujoco(
-    row: Path, forgery: Callable[[dict[str, Any], list[dict[str, Any]]], None], version: str
-) -> None:
-    card = json.loads((row / CARD).read_text()) | {"mujoco": version}
-    parts = json.loads((row / EPISODES).read_text())
-    forgery(card, parts)
-    seal(row, card, parts)
-    (found,) = check(row)
-    assert found.row is None and "holds" not in str(found)
 
 
 @pytest.mark.parametrize(("total_reward", "least"), [(50.0, -5.0), (-40.0, -40.0)])
 def test_a_marked_test_may_end_otherwise_with_another_mujoco_and_has_failed(
-    row: Path, total_reward: float, least: float
+    row: OpenMotions, total_reward: float, least: float
 ) -> None:
     """With the MuJoCo of the card the same row is refused. Nobody gains: a policy that does nothing has 0, not -5."""
-    card = json.loads((row / CARD).read_text())
-    parts = json.loads((row / EPISODES).read_text())
-    honest = read_motions(row).vouched
-    hidden(card, parts)
-    parts[1]["total_reward"] = total_reward
-    seal(row, card, parts)
-    assert ": refused: test 1: its total reward is" in str(check(row)[0])
-    seal(row, card | {"mujoco": "4.0.0"}, parts)
-    (found,) = check(row)
-    assert isinstance(found.row, MotionRow) and "1 not reproducible and counted as failed" in str(found)
-    assert found.row.vouched.successes == honest.successes
-    assert found.row.vouched.mean_return == honest.mean_return + least / TESTS, "test 1 had a return of 0"
-    cut(card, parts)
-    seal(row, card | {"mujoco": "4.0.0"}, parts)
-    (found,) = check(row)
-    assert isinstance(found.row, MotionRow) and "1 not reproducible and counted as failed" in str(found)
-    assert found.row.vouched.mean_return == honest.mean_return + least / TESTS
-    parts[1]["reproducible"] = True
-    seal(row, card | {"mujoco": "4.0.0"}, parts)
-    assert ": not vouched: made with" in str(check(row)[0]), "a test that is not marked must end with its commands"
+    honest = read_motions(row.folder).vouched
+    row.parts[1] |= {"solved": True, "total_reward": total_reward, "reproducible": False}
+    assert ": refused: test 1: its total reward is" in str(row.sealed())
+    found = marked(row.sealed(OTHER))
+    assert found.vouched.successes == honest.successes
+    assert found.vouched.mean_return == honest.mean_return + least / TESTS, "test 1 had a return of 0"
+    FORGERIES["cut commands"](row)
+    assert marked(row.sealed()).vouched.mean_return == honest.mean_return + least / TESTS
+    row.parts[1]["reproducible"] = True
+    assert ": not vouched: made with" in str(row.sealed()), "a test that is not marked must end with its commands"
 
 
-def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(row: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    played = motions._played
+def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(
+    row: OpenMotions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replayed = motions._played
 
     def worse(env: MotionEnv, seed: int, commands: Floats32) -> Motion | None:
-        found = played(env, seed, commands)
+        found = replayed(env, seed, commands)
         return found and dataclasses.replace(found, total_reward=found.total_reward - 40.0)
 
-    card = json.loads((row / CARD).read_text()) | {"mujoco": "4.0.0"}
-    parts = json.loads((row / EPISODES).read_text())
-    for part in parts:
+    for part in row.parts:
         part["reproducible"] = False
-    seal(row, card, parts)
     monkeypatch.setattr(motions, "_played", worse)
-    (found,) = check(row)
-    assert isinstance(found.row, MotionRow)
-    assert [each.total_reward for each in found.row.motions] == [each["total_reward"] - 40.0 for each in parts]
+    found = row.sealed(OTHER).row
+    assert isinstance(found, MotionRow)
+    assert [each.total_reward for each in found.motions] == [part["total_reward"] - 40.0 for part in row.parts]
 
 
-def test_what_needs_no_replay_is_refused_whatever_mujoco_made_it(row: Path) -> None:
-    card = json.loads((row / CARD).read_text()) | {"mujoco": "4.0.0"}
-    card["vouched"]["successes"] += 1
-    (row / CARD).write_text(json.dumps(card))
-    assert ": refused: successes is 2, and 3 was kept." in str(check(row)[0])
+NO_VERSION = "and no version such as 3.17.0."
 
 
 @pytest.mark.parametrize(
-    "version", ["", "4", "4.0", "3.017.0", "3.17.0.0", "4.0.0; rm -r .", "4.0.0\n", "v4.0.0", None]
+    ("mujoco", "figures", "sentence"),
+    [
+        *((version, {}, NO_VERSION) for version in ("4.0", "3.017.0", "4.0.0; rm -r .", "4.0.0\n", "v4.0.0", None)),
+        (OTHER, {"successes": 3}, ": refused: successes is 2, and 3 was kept."),
+        (OTHER, {"faults": False}, "faults was given False; it takes a whole number."),
+    ],
 )
-def test_a_version_is_written_as_pip_writes_it(row: Path, version: str | None) -> None:
-    card = json.loads((row / CARD).read_text()) | {"mujoco": version}
-    (row / CARD).write_text(json.dumps(card))
-    (found,) = check(row)
-    assert found.is_refused and "and no version such as 3.17.0." in str(found)
+def test_what_needs_no_replay_is_refused_whatever_mujoco_made_it(
+    row: OpenMotions, mujoco: str | None, figures: dict[str, object], sentence: str
+) -> None:
+    row.card["mujoco"] = mujoco
+    row.card["vouched"] |= figures
+    found = row.check()
+    assert found.is_refused and sentence in str(found)
 
 
-def test_a_copied_row_is_said_to_be_one(row: Path) -> None:
-    shutil.copytree(row, row.with_name("z-copy"))
-    first, second = check(row.parents[1])
+def test_a_copied_row_is_said_to_be_one(row: OpenMotions) -> None:
+    shutil.copytree(row.folder, row.folder.with_name("z-copy"))
+    first, second = check(row.folder.parents[1])
     assert "another player" not in str(first)
-    assert str(second).endswith(f", whether it is another player than that of {row.name}")
+    assert str(second).endswith(f", whether it is another player than that of {row.folder.name}")
 
 
-@pytest.mark.parametrize("value", ["0", False])
-def test_a_figure_of_another_type_is_named(row: Path, value: object) -> None:
-    card = json.loads((row / CARD).read_text())
-    card["vouched"]["faults"] = value
-    (row / CARD).write_text(json.dumps(card))
-    (found,) = check(row)
-    assert f"faults was given {value!r}; it takes a whole number." in found.verdict.complaint
-
-
-def test_one_world_in_other_words_stands_in_the_same_table(row: Path) -> None:
-    card = json.loads((row / CARD).read_text())
-    card["protocol"] |= {"task": f"{WORLD},slip=0", "appearance": "light=0"}
-    (row / CARD).write_text(json.dumps(card))
-    assert read_motions(row).world == f"{WORLD}, continuous control at 25 Hz, clean"
-
-
-def test_no_row_is_begun_that_its_file_could_not_hold(row: Path) -> None:
-    commands = json.loads((row / EPISODES).read_text())[1]["commands"]
-    assert len(commands) < 750 * 43
-    assert MotionTests("pick_place", observation="proprio").protocol.tests == 100
-    with pytest.raises(InvalidValueError, match="tests is 104; a row holds 103 tests of pick_place, however long"):
-        MotionTests("pick_place", observation="proprio", tests=104)
-
-
-def test_wrong_values_are_one_error() -> None:
-    with pytest.raises(InvalidValueError, match="give 1 to 1,000 tests and a seed"):
-        MotionTests(WORLD, tests=0)
-    with pytest.raises(UnknownNameError, match="twits"):
-        MotionTests(WORLD, control="twits")
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"task": "pick_place", "tests": 104}, "tests is 104; a row holds 103 tests of pick_place, however long"),
+        ({"tests": 0}, "give 1 to 1,000 tests and a seed"),
+        ({"control": "twits"}, "twits"),
+    ],
+)
+def test_wrong_values_are_one_error(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ImagineBenchError, match=sentence):
+        MotionTests(**{"task": WORLD, "observation": "proprio", **options})

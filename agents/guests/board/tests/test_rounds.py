@@ -26,11 +26,11 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline()).folder
 
 
-def opened(tmp_path: Path, closes: str = CLOSES) -> tuple[Path, Path]:
+def opened(tmp_path: Path) -> tuple[Path, Path]:
     folder = tmp_path / "board" / "rounds" / ROUND
     secret = tmp_path / "secret.json"
     with on(BEFORE):
-        rounds.open_round(folder, closes=closes, tests=TESTS, secret=secret)
+        rounds.open_round(folder, closes=CLOSES, tests=TESTS, secret=secret)
     return folder, secret
 
 
@@ -71,20 +71,17 @@ def test_days_decide_what_may_be_done(finished: Path, tmp_path: Path) -> None:
         submit(finished, tmp_path / "rows", author="", round_folder=folder, encoder=None)
 
 
-def test_agents_that_were_not_filed_play_no_round(finished: Path, tmp_path: Path) -> None:
+def test_only_what_was_filed_and_promised_is_published(finished: Path, tmp_path: Path) -> None:
     folder, secret = opened(tmp_path)
+    values = json.loads(secret.read_text())
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps({**values, "seed": (values["seed"] + 1) % 2**24}))
     with on(AFTER):
+        with pytest.raises(ArtefactError, match=r"other.json is not of winter"):
+            rounds.reveal(folder, other)
         rounds.reveal(folder, secret)
     with pytest.raises(ArtefactError, match="was not filed in the round winter before its seed was published"):
         submit(finished, tmp_path / "rows", author="", round_folder=folder, encoder=None)
-
-
-def test_a_secret_of_another_round_is_refused(tmp_path: Path) -> None:
-    folder, secret = opened(tmp_path)
-    values = json.loads(secret.read_text())
-    secret.write_text(json.dumps({**values, "seed": (values["seed"] + 1) % 2**24}))
-    with on(AFTER), pytest.raises(ArtefactError, match=r"secret.json is not of winter"):
-        rounds.reveal(folder, secret)
 
 
 @pytest.mark.parametrize(
