@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_latents import CODES, built, frame, live, transition, with_own_settings
+from fake_latents import built, live, transition, with_own_settings
 from imagine_bench.agents.dqn import td_target
 from imagine_bench_controls.efficient import EfficientDQN, EpisodicMemory, make
 
@@ -35,11 +35,10 @@ def returns(memory: EpisodicMemory, steps: int) -> dict[float, tuple[float, floa
     """Of each start: the summed reward, the state bootstrapped from, and the share that is bootstrapped."""
     batch = memory.sample_returns(500, torch.Generator().manual_seed(0), steps=steps, discount=GAMMA)
     target = td_target(torch.zeros(500), batch.terminated, torch.ones(500, 1), GAMMA)
-    rows = zip(*(part.ravel().tolist() for part in (batch.z, batch.reward, batch.next_z, target)), strict=True)
+    columns = (part.ravel().tolist() for part in (batch.z, batch.reward, batch.next_z, target))
+    rows = set(zip(*columns, strict=True))
     found = {z: (reward, then, share) for z, reward, then, share in rows}
-    assert len({(z, reward) for z, reward in zip(batch.z.ravel().tolist(), batch.reward.tolist(), strict=True)}) == len(
-        found
-    ), "of one start there is one return"
+    assert len(rows) == len(found), "of one start there is one return"
     return found
 
 
@@ -78,7 +77,7 @@ def test_a_reset_keeps_a_share_of_the_hidden_layers_and_nothing_of_the_last() ->
     assert all(torch.equal(one, other) for one, other in zip(slow, after, strict=True))
 
 
-@pytest.mark.parametrize(("every", "resets"), [(0, 0), (5, 4), (4, 5), (100, 0)])
+@pytest.mark.parametrize(("every", "resets"), [(0, 0), (4, 5), (100, 0)])
 def test_resets_come_as_often_as_settings_say(every: int, resets: int) -> None:
     learner = agent(reuse__reset_every=every, controller__updates_per_step=2)
     made = []
@@ -93,4 +92,3 @@ def test_where_an_episode_ends_is_remembered() -> None:
     for how in ({}, {"truncated": True}, {"terminated": True}, {}):
         learner.observe(transition(0, 0, 0.0, 1, **how), episode=0)
     assert learner.real.arrays()["last"].tolist() == [False, True, True, False]
-    assert torch.equal(learner.perceive(frame(3)), CODES[3])

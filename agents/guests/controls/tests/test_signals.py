@@ -14,29 +14,29 @@ def bits(variance: float) -> float:
     return 0.5 * math.log2(2.0 * math.pi * math.e * variance)
 
 
+def lost(means: list[float], variances: list[float]) -> float:
+    """Of members that predict one number each."""
+    given = (torch.tensor(values, dtype=torch.float64)[:, None] for values in (means, variances))
+    return lost_information(*given).item()
+
+
 def test_lost_information_of_two_gaussians_is_that_by_hand() -> None:
     """Variances 1 and 1/3: precisions 1 and 3, fused 1/2; means 0 and 1: fused 1/2 * (0 + 3) / 2 = 3/4."""
-    means = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
-    variances = torch.tensor([[1.0], [1.0 / 3.0]], dtype=torch.float64)
     epistemic = ((3 / 4) ** 2 + (1 / 4) ** 2) / 2
     left = 0.5 * epistemic / (0.5 + epistemic)
-    assert lost_information(means, variances).item() == pytest.approx(bits(left), abs=1e-6)
+    assert lost([0.0, 1.0], [1.0, 1.0 / 3.0]) == pytest.approx(bits(left), abs=1e-6)
 
 
 def test_members_that_agree_lose_nothing_and_those_that_never_do_lose_all() -> None:
-    variances = torch.full((3, 1), 0.25, dtype=torch.float64)
-    agree = lost_information(torch.ones((3, 1), dtype=torch.float64), variances).item()
-    apart = lost_information(torch.tensor([[-1e6], [0.0], [1e6]], dtype=torch.float64), variances).item()
-    assert agree < -15.0
+    assert lost([1.0] * 3, [0.25] * 3) < -15.0
+    apart = lost([-1e6, 0.0, 1e6], [0.25] * 3)
     assert apart == pytest.approx(bits(0.25), abs=1e-6), "no more is lost than the prediction itself leaves open"
 
 
 def test_noise_is_no_loss_and_disagreement_is() -> None:
-    means = torch.tensor([[0.0], [0.1]], dtype=torch.float64)
-    some = [lost_information(means, torch.full((2, 1), v, dtype=torch.float64)).item() for v in (0.1, 1.0, 10.0)]
-    assert some[2] - some[1] < 0.01, "much noise hides the little disagreement, and little is lost"
-    more = lost_information(3.0 * means, torch.ones((2, 1), dtype=torch.float64)).item()
-    assert more > some[1] + 1.0
+    some, much = (lost([0.0, 0.1], [variance] * 2) for variance in (1.0, 10.0))
+    assert much - some < 0.01, "much noise hides the little disagreement, and little is lost"
+    assert lost([0.0, 0.3], [1.0] * 2) > some + 1.0
 
 
 def test_mixtures_count_with_their_mean_and_whole_variance() -> None:

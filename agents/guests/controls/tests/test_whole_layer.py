@@ -13,24 +13,14 @@ from imagine_bench_controls.whole_layer import WholeLayerModel, limit_layer_norm
 LIMIT = 0.5
 
 
-def test_a_layer_within_the_limit_stays_as_it_is_and_a_larger_one_keeps_its_direction():
-    small = torch.tensor([[[0.3, 0.0], [0.0, 0.3]]])
-    large = 10 * small
-    limit_layer_norm(small, LIMIT)
-    limit_layer_norm(large, LIMIT)
-    assert torch.equal(small, torch.tensor([[[0.3, 0.0], [0.0, 0.3]]]))
-    expected = LIMIT / 2**0.5  # two equal weights
-    assert torch.allclose(large, expected * torch.eye(2).unsqueeze(0))
+def test_a_member_within_the_limit_stays_as_it_is_and_a_larger_one_keeps_its_direction() -> None:
+    weights = torch.stack([0.3 * torch.eye(2), 3.0 * torch.eye(2)])
+    limit_layer_norm(weights, LIMIT)
+    assert torch.equal(weights[0], 0.3 * torch.eye(2))
+    torch.testing.assert_close(weights[1], LIMIT / 2**0.5 * torch.eye(2))  # two equal weights
 
 
-def test_members_are_limited_apart():
-    weights = torch.stack([torch.eye(2), 100 * torch.eye(2)])
-    limit_layer_norm(weights, 2.0)
-    assert torch.equal(weights[0], torch.eye(2))
-    assert torch.allclose(weights[1].norm(), torch.tensor(2.0))
-
-
-def test_after_an_update_every_layer_is_within_the_limit_where_units_alone_are_not():
+def test_after_an_update_every_layer_is_within_the_limit_where_units_alone_are_not() -> None:
     settings = HYPERPARAMETERS.resolve("published", {"model.max_norm": LIMIT}, "chapter_5").model
     settings = replace(settings, dynamics_hidden=(32, 32), reward_hidden=(32,), termination_hidden=(32,))
     draws = torch.Generator().manual_seed(0)
