@@ -11,28 +11,10 @@ import pytest
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_motion.__main__ import main
 from imagine_bench_motion.cloned_env import BUNDLED
-from imagine_bench_motion.cloning import Clone
 from imagine_bench_motion.control.beside_expert import Compared, Played, record_beside_expert
-from imagine_bench_motion.skills import skill_env
 from imagine_bench_motion.trials import MOST_PERIODS
 from recordings import contents, times
-
-
-class Repeats(Clone):
-    """Gives the commands that it was given, and then its last one."""
-
-    def __init__(self, commands: list[Any]) -> None:
-        self.about = {"observation": "proprio,objects"}
-        self.commands = commands
-        self.seen: list[Any] = []
-
-    def begin(self, instruction: str) -> None:
-        self.instruction = instruction
-        self.due = list(self.commands)
-
-    def act(self, observation: Any) -> Any:
-        self.seen.append(observation["objects"].copy())
-        return self.due.pop(0) if len(self.due) > 1 else self.due[0]
+from scripted_clone import ScriptedClone
 
 
 def test_a_clone_that_does_as_the_expert_has_its_hand_where_the_experts_is(
@@ -47,19 +29,19 @@ def test_a_clone_that_does_as_the_expert_has_its_hand_where_the_experts_is(
         return commands[-1]
 
     monkeypatch.setattr(Expert, "act", kept)
-    still = Repeats([np.append(skill_env("proprio").servo_targets()[:7], 1.0).astype(np.float32)])
+    still = ScriptedClone()
     found = record_beside_expert(tmp_path / "still.rrd", still, 3, seed=570, placement=0.03)
     assert found.expert.done and not found.clone.done
     assert found.clone.periods == MOST_PERIODS > found.expert.periods
     assert found.apart_m.max() > 0.1
     assert times(tmp_path / "still.rrd", "/motion/command/grip", "env_step") == set(range(MOST_PERIODS))
 
-    alike = Repeats(commands)
+    alike = ScriptedClone(commands)
     again = record_beside_expert(tmp_path / "alike.rrd", alike, 3, seed=570, placement=0.03)
     assert again.clone.done
     assert again.clone.periods == again.expert.periods == found.expert.periods
     assert again.apart_m.max() < 1e-6
-    np.testing.assert_array_equal(alike.seen[0], still.seen[0])
+    np.testing.assert_array_equal(alike.seen[0]["objects"], still.seen[0]["objects"])
     assert alike.instruction == "turn the middle cube counter-clockwise"
     shown = {"/scene/hand_target", "/scene/expert_hand_target", "/motion/distance/distance_from_the_expert_s_hand_mm"}
     assert set(contents(tmp_path / "alike.rrd")) >= shown

@@ -56,12 +56,11 @@ def test_the_expert_solves_its_episodes_and_says_which_macro_action_is_under_way
     assert told["success"][-1] and told["terminated"][-1] and not told["success"][:-1].any()
     assert told["actions"].dtype == np.float32 and told["actions"].shape == (n_steps, 7)
     assert told["hand"].shape == told["front"].shape == (n_steps + 1, 32, 32, 3)
-    changes = np.flatnonzero((np.diff(told["macrostates"], axis=0) != 0).any(axis=1))
-    rules = registry.task("arrow_puzzle_easy").rules
-    for row in changes:
-        before = tuple(told["macrostates"][row].tolist())
-        after = rules.outcomes(before, int(told["macro_action"][row]))[0].macrostate
-        assert after == tuple(told["macrostates"][row + 1].tolist())
+    states = list(map(tuple, told["macrostates"].tolist()))
+    rules = registry.task(EASY).rules
+    for before, after, macro_action in zip(states, states[1:], told["macro_action"].tolist(), strict=False):
+        assert after in (before, rules.outcomes(before, macro_action)[0].macrostate)
+    assert len(set(states)) > 1
     assert told["instruction"][0].startswith("Turn the")
 
 
@@ -102,10 +101,9 @@ def test_lerobot_is_told_of_both_cameras_the_state_and_the_task_of_each_row(tmp_
     table = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
     assert set(table.schema.names) == set(info["features"])
     assert info["fps"] == 25 and info["total_tasks"] == 2
-    assert {name: info["features"][f"observation.images.{name}"]["shape"] for name in CAMERAS} == {
-        name: [32, 32, 3] for name in CAMERAS
-    }
-    assert info["features"]["action"]["shape"] == [7] and info["features"]["observation.state"]["shape"] == [16]
+    images = {f"observation.images.{name}": [32, 32, 3] for name in CAMERAS}
+    shapes = {**images, "action": [7], "observation.state": [16]}
+    assert {name: info["features"][name]["shape"] for name in shapes} == shapes
     assert table["task_index"].to_pylist() == [0] * 40 + [1] * (len(table) - 40)
     np.testing.assert_allclose(table["timestamp"].to_numpy(), np.arange(len(table)) / 25, atol=1e-5)
     (row,) = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
@@ -116,18 +114,20 @@ def test_lerobot_is_told_of_both_cameras_the_state_and_the_task_of_each_row(tmp_
     np.testing.assert_allclose(np.ravel(stats["observation.images.hand"]["mean"]), hand.mean(axis=0), rtol=1e-9)
 
 
-def changed(name: str, change: Callable[[np.ndarray[Any, Any]], None]) -> dict[str, np.ndarray[Any, Any]]:
+def changed(name: str, place: object, value: object) -> dict[str, np.ndarray[Any, Any]]:
+    """A part of the episode that is otherwise in one place."""
     array = episode()[name].copy()
-    change(array)
+    assert np.any(array[place] != value)
+    array[place] = value
     return {name: array}
 
 
 FORGERIES: dict[str, Callable[[], dict[str, np.ndarray[Any, Any]]]] = {
-    "a command": lambda: changed("actions", lambda array: array[20].__setitem__(0, 0.9)),
-    "a reward": lambda: changed("rewards", lambda array: array.__setitem__(3, 1.0)),
-    "a macrostate": lambda: changed("macrostates", lambda array: array[5].__setitem__(0, (array[5, 0] + 1) % 4)),
-    "an instruction": lambda: changed("instruction", lambda array: array.__setitem__(7, "Stop.")),
-    "the arm's sense": lambda: changed("proprio", lambda array: array[9].__setitem__(2, array[9, 2] + 0.01)),
+    "a command": lambda: changed("actions", (20, 0), 0.9),
+    "a reward": lambda: changed("rewards", 3, 1.0),
+    "a macrostate": lambda: changed("macrostates", (5, 0), 3),
+    "an instruction": lambda: changed("instruction", 7, "Stop."),
+    "the arm's sense": lambda: changed("proprio", (9, 2), episode()["proprio"][9, 2] + 0.01),
     "another start": lambda: {"seed": episode()["seed"] + 1},
     "the end is missing": lambda: {name: array[: len(array) - 30] for name, array in episode().items() if array.ndim},
 }
@@ -150,21 +150,21 @@ def test_worlds_with_options_and_chance_replay(tmp_path: Path, task: str) -> Non
 
 def test_an_image_that_was_changed_is_not_that_of_the_card(tmp_path: Path) -> None:
     written(tmp_path / "honest")
-    images = changed("hand", lambda array: array.__setitem__((3, 0, 0), 7))
-    written(tmp_path / "other", **images)
+    written(tmp_path / "other", **changed("hand", (3, 0, 0), 7))
     shutil.copy(tmp_path / "other/episodes/000000.npz", tmp_path / "honest/episodes/000000.npz")
     with pytest.raises(ArtefactError, match="its episodes are not those of its card"):
         verify(read_demonstrations(tmp_path / "honest"))
 
 
 def test_the_command_says_whether_a_folder_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    written(tmp_path / "honest")
-    written(tmp_path / "forged", **FORGERIES["a reward"]())
-    assert main(["verify", str(tmp_path / "honest")]) == 0
-    said = capsys.readouterr().out
-    assert said == "Holds. 1 of 1 episodes replay from seed and commands to equal rewards and macrostates.\n"
-    assert main(["verify", str(tmp_path / "forged")]) == 1
-    assert "rewards[3] is 0.0, and the file says 1.0" in capsys.readouterr().out
+    answers = {}
+    for name, changes in (("honest", {}), ("forged", FORGERIES["a reward"]())):
+        written(tmp_path / name, **changes)
+        answers[name] = (main(["verify", str(tmp_path / name)]), capsys.readouterr().out)
+    holds = "Holds. 1 of 1 episodes replay from seed and commands to equal rewards and macrostates.\n"
+    assert answers["honest"] == (0, holds)
+    code, complaint = answers["forged"]
+    assert code == 1 and "rewards[3] is 0.0, and the file says 1.0" in complaint
 
 
 @pytest.mark.parametrize(
@@ -185,10 +185,10 @@ def test_a_wrong_command_is_one_sentence(
     assert sentence in said and said.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["ArrowPuzzleMotion", "imagine_bench/ArrowPuzzleMotion-v0"])
-def test_names_of_continuous_control_are_those_of_its_environments(name: str) -> None:
-    assert registry.task_of_motion(name) == "arrow_puzzle"
-    assert registry.task_of_motion(f"{name}:cubes=2") == "arrow_puzzle:cubes=2"
+def test_names_of_continuous_control_are_those_of_its_environments() -> None:
+    for name in ("ArrowPuzzleMotion", "imagine_bench/ArrowPuzzleMotion-v0"):
+        assert registry.task_of_motion(f"{name}:cubes=2") == "arrow_puzzle:cubes=2"
+    assert registry.task_of_motion("ArrowPuzzleMotion") == "arrow_puzzle"
     assert registry.task_of_motion("arrow_puzzle") is None
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_motion.control.goals import make
-from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env
 
 from imagine_bench import registry
@@ -57,9 +56,5 @@ def test_goals_of_images_are_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_checker_and_hindsight_replay_of_a_library_take_it() -> None:
-    env = gymnasium.make("imagine_bench_motion/ArrowPuzzleEasyGoals-v0")
-    check_env(env, skip_render_check=True)
-    learner = SAC("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, learning_starts=800, seed=0)
-    learner.learn(900)
-    assert learner.num_timesteps == 900
+def test_a_library_s_checker_takes_it() -> None:
+    check_env(gymnasium.make("imagine_bench_motion/ArrowPuzzleEasyGoals-v0"), skip_render_check=True)

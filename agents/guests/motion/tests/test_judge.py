@@ -7,40 +7,42 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 import torch
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
-from imagine_bench_motion.judge.interface import Motions
 from imagine_bench_motion.judge.judgement import SIMULATOR, MotionJudgement, judge, judged
 from imagine_bench_motion.judge.labelled import Labelled
 from imagine_bench_motion.judge.no_change import NoChange
-from imagine_bench_motion.judge.questions import MotionQuestions, MotionSource, moved, moving_actions
+from imagine_bench_motion.judge.questions import AnsweredMotions, MotionQuestions, MotionSource, moved, moving_actions
 from imagine_bench_motion.judge.recurrent import MotionNetwork
 from imagine_bench_motion.judge.report import motion_tables
 from imagine_bench_motion.judge.scores import Simulator, score
 
-from imagine_bench.arrays import Array, Floats32, Frame, Ints
+from imagine_bench.arrays import Array, Ints
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
+
+FEW = MotionJudgement(task="arrow_puzzle", models=("no_change",), sizes=(3,), seeds=(0,), pairs=2, chains=1)
+FAMILIES = {"arrows": make_arrows, "pick_place": make_pick_place}
+
+
+def every(asked: MotionQuestions) -> tuple[AnsweredMotions, ...]:
+    return (asked.planned, asked.raised, *asked.chains)
 
 
 class KnownFrames:
     """Reads the frames of some motions, and nothing else."""
 
     def __init__(self, asked: MotionQuestions) -> None:
-        self._shows = {}
-        for motions in (asked.planned, asked.raised, *asked.chains):
+        self._shows: dict[bytes, Ints] = {}
+        for motions in every(asked):
             for frames, states in ((motions.before, motions.states), (motions.after, motions.reached)):
                 self._shows |= {frame.tobytes(): state for frame, state in zip(frames, states, strict=True)}
 
     def read(self, pictures: Array) -> Ints:
-        """The macrostates (N, M) of frames."""
         return np.array([self._shows[picture.tobytes()] for picture in pictures])
-
-
-FEW = MotionJudgement(task="arrow_puzzle", models=("no_change",), sizes=(3,), seeds=(0,), pairs=2, chains=1)
-FAMILIES = {"arrows": make_arrows, "pick_place": make_pick_place}
 
 
 @functools.cache
@@ -52,26 +54,23 @@ def questions(family: str) -> MotionQuestions:
     return MotionQuestions(planned=planned, raised=raised, chains=source.chains(8, 2, rng))
 
 
+def moves(before: Ints, after: Ints) -> list[bool]:
+    """In which rows an object moved."""
+    return [moved(*ends) for ends in zip(before, after, strict=True)]
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_pair_begins_alike_and_only_its_height_decides_the_end(family: str) -> None:
-    asked = questions(family)
-    planned = asked.planned
-    raised = asked.raised
-    np.testing.assert_array_equal(planned.before, raised.before)
-    np.testing.assert_array_equal(planned.labels, raised.labels)
-    np.testing.assert_array_equal(planned.states, raised.states)
-    assert all(moved(*ends) for ends in zip(planned.reached, raised.reached, strict=True))
-    assert planned.proper.all()
-    assert raised.proper.all()
-
-
-def test_a_planned_motion_turns_its_cube_and_a_raised_one_nothing() -> None:
-    asked = questions("arrows")
-    planned = asked.planned
-    turned = (planned.reached - planned.states) % 4
-    cubes = np.arange(3) == planned.labels[:, None] // 2
-    np.testing.assert_array_equal(turned[:, :3], np.where(cubes, np.where(planned.labels % 2, 3, 1)[:, None], 0))
-    np.testing.assert_array_equal(asked.raised.states, asked.raised.reached)
+    planned, raised, *_ = every(questions(family))
+    for part in ("before", "labels", "states"):
+        np.testing.assert_array_equal(getattr(planned, part), getattr(raised, part))
+    assert all(moves(planned.reached, raised.reached))
+    assert planned.proper.all() and raised.proper.all()
+    if family == "arrows":
+        cubes = np.arange(3) == planned.labels[:, None] // 2
+        turns = np.where(cubes, np.where(planned.labels % 2, 3, 1)[:, None], 0)
+        np.testing.assert_array_equal((planned.reached - planned.states)[:, :3] % 4, turns)
+        np.testing.assert_array_equal(raised.states, raised.reached)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -79,9 +78,9 @@ def test_each_motion_of_a_chain_moves_an_object_from_where_the_one_before_ended(
     first, second = questions(family).chains
     np.testing.assert_array_equal(first.reached, second.states)
     np.testing.assert_array_equal(first.after, second.before)
+    rules = FAMILIES[family](observation="proprio").task.rules
     for motions in (first, second):
-        assert all(moved(*ends) for ends in zip(motions.states, motions.reached, strict=True))
-        rules = FAMILIES[family](observation="proprio").task.rules
+        assert all(moves(motions.states, motions.reached))
         assert all(moving_actions(rules, tuple(state)) for state in motions.reached.tolist()), "another can follow"
 
 
@@ -94,17 +93,10 @@ def test_questions_are_the_same_after_they_were_in_a_file() -> None:
 
 def test_a_model_is_given_each_part_of_a_motion_in_its_place() -> None:
     asked = questions("arrows")
-    given: list[tuple[object, ...]] = []
-
-    class Noting(Simulator):
-        def imagine_motion(self, frames: Frame, actions: Floats32, lengths: Ints, labels: Ints) -> Frame:
-            given.append((actions, lengths, labels))
-            return super().imagine_motion(frames, actions, lengths, labels)
-
-    score("noting", Noting(asked), asked, KnownFrames(asked))
-    motions = (asked.planned, asked.raised, *asked.chains)
-    wanted = [(each.actions, each.lengths, each.labels) for each in motions]
-    assert [tuple(map(id, each)) for each in given] == [tuple(map(id, each)) for each in wanted]
+    with mock.patch.object(Simulator, "imagine_motion", side_effect=[each.after for each in every(asked)]) as given:
+        score("noting", Simulator(asked), asked, KnownFrames(asked))
+    wanted = [(each.actions, each.lengths, each.labels) for each in every(asked)]
+    assert [tuple(map(id, call.args[1:])) for call in given.call_args_list] == [tuple(map(id, each)) for each in wanted]
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -114,11 +106,9 @@ def test_the_simulator_is_right_in_all_and_a_copy_where_nothing_changes(family: 
     exact = score("simulator", Simulator(asked), asked, reader)
     assert (exact.right, exact.raised_right, exact.painted, exact.pairs, exact.by_depth) == (1, 1, 0, 1, (1, 1))
     copied = score("no_change", NoChange(), asked, reader)
-    unchanged = float(
-        np.mean([not moved(*ends) for ends in zip(asked.raised.states, asked.raised.reached, strict=True)])
-    )
-    assert (copied.right, copied.raised_right, copied.painted, copied.pairs) == (0, unchanged, 0, 0)
-    assert copied.by_depth == (0, 0)
+    unchanged = 1.0 - np.mean(moves(asked.raised.states, asked.raised.reached))
+    found = (copied.right, copied.raised_right, copied.painted, copied.pairs, copied.by_depth)
+    assert found == (0, unchanged, 0, 0, (0, 0))
 
 
 @pytest.mark.parametrize(
@@ -159,52 +149,35 @@ def test_a_judgement_goes_on_where_it_was_stopped_and_refuses_what_is_damaged(tm
 
 
 def test_what_is_no_frame_is_refused() -> None:
-    class Half(NoChange):
-        def imagine_motion(self, frames: Array, actions: Array, lengths: Ints, labels: Ints) -> Array:
-            return super().imagine_motion(frames, actions, lengths, labels)[::2]
-
     asked = questions("arrows")
+    half = mock.Mock(imagine_motion=lambda frames, *_: frames[::2])
     with pytest.raises(InvalidValueError, match=r"half: imagine_motion\(\) gave uint8 \(2, 64, 64, 3\)"):
-        score("half", Half(), asked, KnownFrames(asked))
+        score("half", half, asked, KnownFrames(asked))
 
 
-def test_commands_after_a_motions_end_change_nothing_that_a_network_imagines() -> None:
-    motions: Motions = questions("arrows").planned
-    generator = torch.Generator().manual_seed(0)
-    network = MotionNetwork(motions.actions.shape[2])
-    network.draw_weights(generator)
-    frames = torch.rand(len(motions), 16, 16, 48, generator=generator)
-    actions = torch.from_numpy(motions.actions)
-    lengths = torch.from_numpy(motions.lengths)
-    longer = torch.cat([actions, torch.zeros(len(actions), 7, actions.shape[2])], dim=1)
-    with torch.no_grad():
-        torch.testing.assert_close(network(frames, actions, lengths), network(frames, longer, lengths))
-
-
-def test_weights_follow_from_the_passed_generator_alone() -> None:
-    weights = []
+def test_a_network_follows_its_generator_and_no_command_after_a_motions_end() -> None:
+    motions = questions("arrows").planned
+    networks = []
     for global_seed in (1, 2):
         with torch.random.fork_rng():
             torch.random.default_generator.manual_seed(global_seed)
-            network = MotionNetwork(7)
-            network.draw_weights(torch.Generator().manual_seed(3))
-        weights.append(torch.nn.utils.parameters_to_vector(network.parameters()))
-    assert torch.equal(*weights)
+            networks.append(MotionNetwork(motions.actions.shape[2]))
+            networks[-1].draw_weights(torch.Generator().manual_seed(3))
+    network, again = networks
+    frames = torch.rand(len(motions), 16, 16, 48, generator=torch.Generator().manual_seed(0))
+    actions = torch.from_numpy(motions.actions)
+    longer = torch.cat([actions, torch.zeros(len(actions), 7, actions.shape[2])], dim=1)
+    lengths = torch.from_numpy(motions.lengths)
+    with torch.no_grad():
+        imagined = network(frames, actions, lengths)
+        assert torch.equal(imagined, again(frames, actions, lengths)), "the global generator draws nothing"
+        torch.testing.assert_close(imagined, network(frames, longer, lengths))
 
 
 def test_a_labelled_model_with_a_smaller_image_gives_the_scenes_size() -> None:
     """Each pixel of the small image fills a square of the large one."""
     small = np.arange(2 * 4 * 4, dtype=np.uint8).reshape(2, 1, 1, 4, 4)
-
-    class Small:
-        """Imagines gray images of 4 by 4 pixels."""
-
-        def imagine(self, *_: object) -> SimpleNamespace:
-            """The same images every time."""
-            return SimpleNamespace(pictures=small)
-
-    smaller: Any = Small()
-    model = Labelled(smaller, n_actions=2)
+    model = Labelled(mock.Mock(imagine=lambda *_: SimpleNamespace(pictures=small)), n_actions=2)
     frames = np.zeros((2, 8, 8, 3), dtype=np.uint8)
     drawn = model.imagine_motion(frames, np.zeros((2, 1, 7), np.float32), np.ones(2, np.int64), np.zeros(2, np.int64))
     assert drawn.shape == frames.shape and drawn.dtype == np.uint8

@@ -6,6 +6,7 @@ import hashlib
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,33 +14,27 @@ import pytest
 from imagine_bench_motion import flat
 from imagine_bench_motion.__main__ import main
 from imagine_bench_motion.cloned_env import BUNDLED
-from imagine_bench_motion.flat import SETTINGS, Counts, Point, flat_env
+from imagine_bench_motion.flat import SETTINGS, Counts, Point
 from imagine_bench_motion.levels import Level, environment, expects_nothing, learn, make_agent, oracle_success
 
-from imagine_bench.errors import UnknownNameError
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 
 KEPT = Path(__file__).parents[4] / "docs" / "results" / "motion"
 
 
-class Sticky:
-    """A model that expects nothing of three macro-actions in four, and success of the others."""
+def test_what_a_model_expects_not_to_change_is_weighted_by_its_probability() -> None:
+    """Nothing in three macro-actions of four, and success in the others."""
 
-    def read_frames(self, frames: Any) -> Any:
-        return np.zeros((len(frames), 4), dtype=np.int64)
-
-    def predict_outcomes(self, frames: Any, rng: Any) -> Any:
-        del rng
+    def predict(frames: Any, rng: Any) -> ExpectedOutcomes:
         macrostates = np.zeros((len(frames), 4, 2, 4), dtype=np.int64)
         macrostates[:, :, 1] = 1
         p_continues = np.tile([0.75, 0.25], (len(frames), 4, 1))
         return ExpectedOutcomes(macrostates=macrostates, p_continues=p_continues, reward=np.zeros((len(frames), 4)))
 
-
-def test_what_a_model_expects_not_to_change_is_weighted_by_its_probability() -> None:
-    stage = environment("planner", cubes=3, slip=0.0)
-    assert expects_nothing(stage.env, Sticky(), 2) == pytest.approx(0.75)
-    assert expects_nothing(stage.env, object(), 2) is None
+    sticky = SimpleNamespace(read_frames=lambda frames: np.zeros((len(frames), 4), np.int64), predict_outcomes=predict)
+    env = environment("planner", cubes=3, slip=0.0).env
+    assert expects_nothing(env, sticky, 2) == pytest.approx(0.75)
+    assert expects_nothing(env, object(), 2) is None
 
 
 def test_the_planner_solves_what_the_rules_say_and_robot_time_adds_up() -> None:
@@ -60,8 +55,6 @@ def test_an_agents_own_settings_reach_it() -> None:
     usual: Any = make_agent("dqn", spec, 0)
     other: Any = make_agent("dqn:controller.discount=0.5", spec, 0)
     assert other.settings.controller.discount == 0.5 != usual.settings.controller.discount
-    with pytest.raises(UnknownNameError, match=r"controller\.discont"):
-        make_agent("dqn:controller.discont=0.5", spec, 0)
 
 
 def test_a_kept_file_names_its_clone_and_its_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,23 +63,10 @@ def test_a_kept_file_names_its_clone_and_its_world(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(sys, "argv", ["motion", "try", str(BUNDLED), *words, str(out)])
     main()
     kept = json.loads(out.read_text())
-    asked = {name: kept[name] for name in ("count", "seed", "appearances", "family", "placement", "swapped")}
-    assert asked == {
-        "count": 1,
-        "seed": 5,
-        "appearances": ["mild"],
-        "family": "arrows",
-        "placement": 0.0,
-        "swapped": False,
-    }
-    assert kept["clone"] == f"{BUNDLED.name}@{hashlib.sha256(BUNDLED.read_bytes()).hexdigest()[:12]}"
+    asked = {"count": 1, "seed": 5, "appearances": ["mild"], "family": "arrows", "placement": 0.0, "swapped": False}
+    clone = f"{BUNDLED.name}@{hashlib.sha256(BUNDLED.read_bytes()).hexdigest()[:12]}"
+    assert kept == kept | asked | {"clone": clone}
     assert str(BUNDLED.parent) not in out.read_text()
-
-
-def test_the_flat_environment_is_one_vector_of_all_that_there_is_to_see() -> None:
-    env = flat_env()
-    seen, _ = env.reset(seed=0)
-    assert seen.shape == (16 + 7 + 4 + 1,) and env.action_space.shape == (7,)
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
@@ -105,9 +85,7 @@ def test_sac_is_tested_on_whole_episodes_and_its_training_faults_are_counted(set
 
 def test_kept_numbers_of_the_page_are_those_of_the_kept_files() -> None:
     page = (KEPT.parents[1] / "how_to" / "clone.md").read_text()
-    for file in sorted(KEPT.glob("tries_*.json")):
-        kept = json.loads(file.read_text())
-        assert f"{kept['done']} of {kept['count']}" in page, file.name
-    for file in sorted(KEPT.glob("level_*_oracle.json")):
-        kept = json.loads(file.read_text())
-        assert f"{kept['successes']} of {kept['tests']}" in page, file.name
+    for pattern, done, count in (("tries_*.json", "done", "count"), ("level_*_oracle.json", "successes", "tests")):
+        for file in sorted(KEPT.glob(pattern)):
+            kept = json.loads(file.read_text())
+            assert f"{kept[done]} of {kept[count]}" in page, file.name
