@@ -11,11 +11,10 @@ import fake_codes
 import numpy as np
 import pytest
 from agent_states import same
-from fake_codes import ACTIONS, FakeCodes, agent, frame, live, starts, success
+from fake_codes import ACTIONS, SIZES, agent, frame, live, starts, success
 from imagine_bench_factored.agent import ACCEPTED, FactoredAgent
 from imagine_bench_factored.factors import CodeTransition
 from imagine_bench_factored.model import FactoredModel, Moves, Results
-from imagine_bench_factored.perception import CodePerception
 from imagine_bench_factored.planner import TIE, Planner
 from imagine_bench_factored.settings import FactoredSettings
 from numpy.typing import NDArray
@@ -23,14 +22,29 @@ from numpy.typing import NDArray
 from imagine_bench.errors import ArtefactError
 from imagine_bench.interfaces import AgentState, Observation
 
+PLANNING = FactoredSettings().planning
+Code = tuple[int, ...]
 
-@pytest.mark.parametrize("sizes", [(3, 4, 4, 4), (7, 7), (3, 3, 2)])
-def test_what_an_untried_action_does_is_imagined_as_expected(sizes: tuple[int, ...]) -> None:
+
+def rows(codes: list[Code]) -> list[CodeTransition]:
+    """Every macro-action in these codes."""
+    pairs = itertools.product(codes, range(ACTIONS))
+    return [CodeTransition(code, action, *fake_codes.step(code, action)) for code, action in pairs]
+
+
+def fitted(seen: list[CodeTransition], sizes: Code = SIZES, n_actions: int = ACTIONS) -> FactoredModel:
+    model = FactoredModel(sizes, n_actions, FactoredSettings())
+    for row in seen:
+        model.add(row)
+    model.outcomes.fit()
+    return model
+
+
+@pytest.mark.parametrize("sizes", [(3, 4, 4, 4), (7, 7)])
+def test_what_an_untried_action_does_is_imagined_as_expected(sizes: Code) -> None:
     """Whether a tie between experience and the prior is rounded up or down must not decide it."""
-    model, rng = FactoredModel(sizes, 2, FactoredSettings()), np.random.default_rng(0)
-    code = (0,) * len(sizes)
-    for _ in range(3):
-        model.add(CodeTransition(code, 0, code, -1.0, False))
+    code, rng = (0,) * len(sizes), np.random.default_rng(0)
+    model = fitted([CodeTransition(code, 0, code, -1.0, False)] * 3, sizes, 2)
     expected = [part.expected[0, 1] for part in model.dynamics.predict(np.array([code]))]
     drawn = [model.sample(code, 1, rng) for _ in range(400)]
     assert [sure for _, sure in drawn] == pytest.approx([np.prod([chance.max() for chance in expected])] * 400)
@@ -39,32 +53,15 @@ def test_what_an_untried_action_does_is_imagined_as_expected(sizes: tuple[int, .
     assert all(not any(model.sample(code, 0, rng)[0]) for _ in range(20)), "seen to stay"
 
 
-def test_whole_codes_have_a_number_each() -> None:
-    perception = CodePerception(FakeCodes(), factored=False)  # type: ignore[arg-type]
-    every = np.stack([frame(code) for code in itertools.product(range(3), range(3), range(2))])
-    assert perception.sizes == (18,)
-    assert perception.codes(every) == [(number,) for number in range(18)]
-    assert np.array_equal(perception.latents(perception.codes(every)), FakeCodes().encode(every)[0])
-
-
-def rows(codes: list[tuple[int, ...]]) -> list[CodeTransition]:
-    made = []
-    for code in codes:
-        for action in range(ACTIONS):
-            following, reward, ended = fake_codes.step(code, action)
-            made.append(CodeTransition(code, action, following, reward, ended))
-    return made
+def _backed_up(code: Code, action: int, values: dict[Code, float]) -> float:
+    following, reward, ended = fake_codes.step(code, action)
+    return reward + (0.0 if ended else 0.95 * values[following])
 
 
 def test_plans_are_optimal_where_everything_is_known() -> None:
-    settings = FactoredSettings()
-    model = FactoredModel((3, 3, 2), ACTIONS, settings)
-    for row in rows(starts()) * 30:
-        model.add(row)
-    model.outcomes.fit()
-    planner = Planner(model, settings.planning)
+    planner = Planner(fitted(rows(starts()) * 30), PLANNING)
     values = dict.fromkeys(starts(), 0.0)
-    for _ in range(settings.planning.depth):
+    for _ in range(PLANNING.depth):
         values = {code: max(_backed_up(code, action, values) for action in range(ACTIONS)) for code in values}
     for code in starts():
         exact = [_backed_up(code, action, values) for action in range(ACTIONS)]
@@ -74,31 +71,39 @@ def test_plans_are_optimal_where_everything_is_known() -> None:
 
 
 class _Chain:
-    """Codes (0,) to (length - 1,): the only macro-action goes one further; the last is rewarded, unknown, and ends."""
+    """Codes (0,) to (4,): the only macro-action goes one further; the last is rewarded, unknown, and ends.
+
+    The effect of the others is unknown in part.
+    """
 
     n_actions = 1
+    sizes = (5,)
     outcomes = SimpleNamespace(rewards=np.array([10.0]))
 
-    def __init__(self, length: int, branches: int) -> None:
-        self.length, self.branches, self.sizes = length, branches, (length,)
+    def __init__(self, unknown: float = 0.0) -> None:
+        self.unknown = unknown
 
     def moves(self, codes: NDArray[np.int64]) -> Moves:
-        following = np.zeros((len(codes), 1, self.branches, 1), dtype=np.int64)
-        following[:, 0, 0] = np.minimum(codes + 1, self.length - 1)
-        chance = np.zeros((len(codes), 1, self.branches))
+        following = np.zeros((len(codes), 1, PLANNING.branches, 1), dtype=np.int64)
+        following[:, 0, 0] = np.minimum(codes + 1, 4)
+        chance = np.zeros((len(codes), 1, PLANNING.branches))
         chance[:, :, 0] = 1.0
         return Moves(following, chance, np.ones((len(codes), 1)))
 
     def results(self, codes: NDArray[np.int64], moves: Moves) -> Results:
-        ends = (codes[:, :1] == self.length - 1).astype(float)  # [N, A]
+        ends = (codes[:, :1] == 4).astype(float)  # [N, A]
         p_continues = moves.chance * (1.0 - ends[:, :, None])
-        return Results(p_continues=p_continues, reward=10.0 * ends, unknown=ends, p_terminated=ends)
+        unknown = np.full_like(ends, self.unknown) if self.unknown else ends
+        return Results(p_continues=p_continues, reward=10.0 * ends, unknown=unknown, p_terminated=ends)
+
+
+def chain_planner(unknown: float = 0.0, **planning: float) -> Planner:
+    return Planner(_Chain(unknown), dataclasses.replace(PLANNING, discount=0.9, **planning))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("depth", [1, 4, 5, 20])
 def test_values_are_discounted_by_the_step_and_end_at_the_depth(depth: int) -> None:
-    settings = dataclasses.replace(FactoredSettings().planning, depth=depth, discount=0.9, novelty_discount=0.8)
-    planner = Planner(_Chain(5, settings.branches), settings)  # type: ignore[arg-type]
+    planner = chain_planner(depth=depth, novelty_discount=0.8)
     for place in range(5):
         steps = 4 - place  # before the one that is rewarded
         within = steps < depth
@@ -109,15 +114,24 @@ def test_values_are_discounted_by_the_step_and_end_at_the_depth(depth: int) -> N
             assert planner.values((place,), left=left) == pytest.approx([worth], abs=1e-12)
 
 
-def _backed_up(code: tuple[int, ...], action: int, values: dict[tuple[int, ...], float]) -> float:
-    following, reward, ended = fake_codes.step(code, action)
-    return reward + (0.0 if ended else 0.95 * values[following])
+@pytest.mark.parametrize(("unknown", "hopes"), [(0.5, True), (0.21, True), (0.19, False)])
+def test_optimism_values_the_unknown_at_the_best_reward_and_r_max_where_it_is_enough(
+    unknown: float, hopes: bool
+) -> None:
+    planner = chain_planner(unknown, depth=9, r_max_threshold=0.2)
+    known = value = 10.0  # in part known, and in part hoped for
+    for place in (4, 3, 2, 1, 0):
+        assert planner.values((place,)) == pytest.approx([known])
+        assert planner.values((place,), "optimistic") == pytest.approx([value])
+        assert planner.values((place,), "r_max") == pytest.approx([10.0 if hopes else known])
+        known = 0.9 * known
+        value = (1.0 - unknown) * 0.9 * value + unknown * 10.0
 
 
-@pytest.mark.parametrize("states", [2, 8, 18])
+@pytest.mark.parametrize("states", [8, 18])
 def test_a_plan_depends_on_the_model_alone_not_on_what_was_asked_or_learned_before(states: int) -> None:
-    planning = dataclasses.replace(FactoredSettings().planning, states=states)
-    model, seen = FactoredModel((3, 3, 2), ACTIONS, FactoredSettings()), rows(starts())
+    planning = dataclasses.replace(PLANNING, states=states)
+    model, seen = fitted([]), rows(starts())
     used = Planner(model, planning)
     for first in range(0, len(seen), 12):
         for row in seen[first : first + 12]:
@@ -134,19 +148,15 @@ def test_a_plan_depends_on_the_model_alone_not_on_what_was_asked_or_learned_befo
 
 
 @pytest.mark.parametrize("discount", [0.95, 0.5])
-def test_a_search_that_ends_early_finds_the_same_best_actions(discount: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    planning = dataclasses.replace(FactoredSettings().planning, novelty_discount=discount)
+def test_a_search_that_ends_early_finds_the_same_best_actions(discount: float) -> None:
+    planning = dataclasses.replace(PLANNING, novelty_discount=discount)
     seen, rng, early = rows(starts()), np.random.default_rng(0), 0
     for few in (1, 3, 8, 20, 60):
-        model = FactoredModel((3, 3, 2), ACTIONS, FactoredSettings())
-        for index in rng.integers(len(seen), size=few).tolist():
-            model.add(seen[index])
-        model.outcomes.fit()
+        model = fitted([seen[index] for index in rng.integers(len(seen), size=few)])
         ending, whole = Planner(model, planning), Planner(model, planning)
         for code in starts():
             found = ending.values(code, "novelty")
-            with monkeypatch.context() as patch:
-                patch.setattr(Planner, "_discovery", lambda *_: None)
+            with mock.patch.object(whole, "_discovery", return_value=None):
                 wanted = whole.values(code, "novelty")
             assert found.max() == wanted.max() and (found <= wanted).all()
             assert np.array_equal(found >= found.max() - TIE, wanted >= wanted.max() - TIE)
@@ -201,13 +211,6 @@ def test_what_follows_from_what_is_unknown_is_not_accepted_either() -> None:
     assert known_again > 0, "after the first rejection something known is imagined"
 
 
-def test_what_surprised_it_is_known_at_once() -> None:
-    learner = agent()
-    for number, code in enumerate([(0, 1, 0), (1, 0, 0), (0, 1, 1)]):  # which bring -1, -5 and 10
-        learner.observe(fake_codes.transition(code, 1), episode=0)
-        assert learner.diagnostics()["model/outcomes"] == learner.learned == number + 1
-
-
 def test_what_draws_it_can_be_read_and_changes_nothing() -> None:
     learner = agent(planning__exploration="curiosity")
     seen, rng = Observation(frame=frame((0, 1, 0))), np.random.default_rng(0)
@@ -217,41 +220,6 @@ def test_what_draws_it_can_be_read_and_changes_nothing() -> None:
     assert same(before, learner.state())
     assert novelty is not None and novelty.shape == (ACTIONS,) and 0.5 < novelty.max() <= 1.0
     assert novelty[learner.act(seen, explore=True)] == novelty.max()
-
-
-@pytest.mark.parametrize("place", range(4))
-def test_optimism_values_the_unknown_at_the_best_reward(place: int) -> None:
-    class Untried(_Chain):
-        """Only the end brings a reward; the effect of the others is half unknown."""
-
-        def results(self, codes: NDArray[np.int64], moves: Moves) -> Results:
-            found = super().results(codes, moves)
-            return found._replace(unknown=np.full_like(found.unknown, 0.5))
-
-    settings = dataclasses.replace(FactoredSettings().planning, depth=9, discount=0.9)
-    planner = Planner(Untried(5, settings.branches), settings)  # type: ignore[arg-type]
-    value = 10.0  # 0.5 * 10 known and 0.5 * 10 hoped for
-    for _ in range(4 - place):
-        value = 0.5 * 0.9 * value + 0.5 * 10.0
-    assert planner.values((place,), "optimistic") == pytest.approx([value])
-    assert planner.values((place,)) == pytest.approx([10.0 * 0.9 ** (4 - place)])
-
-
-@pytest.mark.parametrize(("unknown", "hoped"), [(0.21, 10.0), (0.19, None)])
-def test_r_max_values_only_enough_of_the_unknown_at_the_best_reward(unknown: float, hoped: float | None) -> None:
-    class Untried(_Chain):
-        """Only the end brings a reward; the effect of the others is a little unknown."""
-
-        def results(self, codes: NDArray[np.int64], moves: Moves) -> Results:
-            found = super().results(codes, moves)
-            return found._replace(unknown=np.full_like(found.unknown, unknown))
-
-    settings = dataclasses.replace(FactoredSettings().planning, r_max_threshold=0.2, discount=0.9)
-    planner = Planner(Untried(5, settings.branches), settings)  # type: ignore[arg-type]
-    known = [10.0 * 0.9 ** (4 - place) for place in range(5)]
-    assert [planner.values((place,)).item() for place in range(5)] == pytest.approx(known)
-    found = [planner.values((place,), "r_max").item() for place in range(5)]
-    assert found == pytest.approx(known if hoped is None else [hoped] * 5)
 
 
 @pytest.mark.parametrize(
@@ -270,36 +238,31 @@ def test_it_is_curious_only_where_nothing_unknown_may_earn_more_and_the_goal_is_
 
 
 def test_a_likely_transition_is_still_a_surprise_while_unknown() -> None:
-    def surprises(threshold: float) -> float:
+    surprises = []
+    for threshold in (0.0, 0.5):
         learner = agent(planning__exploration_threshold=threshold)
-        for _ in range(50):
+        for _ in range(51):
+            learner.diagnostics()
             learner.observe(fake_codes.transition((0, 1, 0), 1), episode=0)
-        learner.diagnostics()
-        learner.observe(fake_codes.transition((0, 1, 0), 1), episode=0)
-        return learner.diagnostics()["model/unexpected"]
-
-    assert surprises(0.0) == 1.0, "nothing is ever wholly known"
-    assert surprises(0.5) == 0.0, "after fifty times it is expected"
+        surprises.append(learner.diagnostics()["model/unexpected"])
+    assert surprises == [1.0, 0.0], "nothing is ever wholly known, but after fifty times it is expected"
 
 
-def _visits(learner: FactoredAgent, start: tuple[int, ...]) -> list[tuple[int, ...]]:
+def _visits(learner: FactoredAgent, start: Code) -> list[Code]:
     """The codes that the greedy agent reaches in one episode of six macro-actions."""
     learner.begin_episode()
-    code = start
-    visited = []
+    visited = [start]
     for _ in range(6):
-        code, _, _ = fake_codes.step(code, learner.act(Observation(frame=frame(code)), explore=False))
-        visited.append(code)
+        action = learner.act(Observation(frame=frame(visited[-1])), explore=False)
+        visited.append(fake_codes.step(visited[-1], action)[0])
     return visited
 
 
 def test_a_test_does_not_hope_again_for_a_reward_that_did_not_come() -> None:
     learner = agent()
-    for code in starts():
-        for action in range(ACTIONS):
-            if code[2] == 1:  # nothing is seen under a dark lamp
-                learner.begin_episode()
-                learner.observe(fake_codes.transition(code, action), episode=0)
+    for row in rows([code for code in starts() if code[2] == 1]):  # nothing is seen under a dark lamp
+        learner.begin_episode()
+        learner.observe(fake_codes.transition(row.code, row.action), episode=0)
     start = (0, 1, 0)
     observation = Observation(frame=frame(start))
     learner.begin_episode()
@@ -313,22 +276,18 @@ def test_a_test_does_not_hope_again_for_a_reward_that_did_not_come() -> None:
 
 
 def test_only_an_unlikely_going_on_after_an_unseen_transition_is_news() -> None:
-    model = FactoredModel((3, 3, 2), ACTIONS, FactoredSettings())
-    for row in rows(starts()):
-        if row.following != (2, 1, 0) and (row.code, row.action) != ((1, 0, 0), 0):
-            model.add(row)
-    model.add(CodeTransition((0, 1, 0), 1, (2, 1, 0), 10.0, True))  # by chance
-    outcomes = model.outcomes
-    outcomes.fit()
+    by_chance = CodeTransition((0, 1, 0), 1, (2, 1, 0), 10.0, True)
+    seen = [row for row in rows(starts()) if row.following != (2, 1, 0) and row[:2] != ((1, 0, 0), 0)]
+    outcomes = fitted([*seen, by_chance]).outcomes
     assert not outcomes.goes_on((2, 0, 1), 2, (2, 1, 1)), "seen: chance decides"
     assert not outcomes.goes_on((1, 0, 0), 0, (2, 0, 0)), "it is expected to go on"
     assert outcomes.goes_on((2, 0, 0), 2, (2, 1, 0))
     codes, nexts = np.array([(2, 0, 0), (0, 1, 0)]), np.array([(2, 1, 0)] * 2)
     probability, _ = outcomes.predict(codes, np.array([2, 1]), nexts)
     assert probability.sum(axis=1) == pytest.approx(1.0)
-    unseen, seen = (probability @ outcomes.ends).tolist()
+    unseen, known = (probability @ outcomes.ends).tolist()
     assert unseen == 0.0
-    assert seen > 0.9, "an end that was seen may come again"
+    assert known > 0.9, "an end that was seen may come again"
     assert outcomes.forget_going_on()
     assert not outcomes.forget_going_on()
     probability, _ = outcomes.predict(codes, np.array([2, 1]), nexts)

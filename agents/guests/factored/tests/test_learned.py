@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,14 +38,14 @@ def live(learner: LearnedPerceptionAgent, episodes: range, seed: int) -> list[in
 EPISODES = 40
 
 
+Trained = tuple[LearnedPerceptionAgent, list[int]]
+
+
 @pytest.fixture(scope="module")
-def trained() -> tuple[LearnedPerceptionAgent, list[int]]:
+def trained() -> Trained:
     """An agent that began with nothing, after forty episodes, and its actions; tests leave it as it is."""
     learner = agent()
     return learner, live(learner, range(EPISODES), seed=0)
-
-
-Trained = tuple[LearnedPerceptionAgent, list[int]]
 
 
 def gray(count: int) -> Frame:
@@ -52,9 +53,24 @@ def gray(count: int) -> Frame:
     return np.full((count, 64, 64, 3), 120, dtype=np.uint8)
 
 
+def show(frames: Frame, where: Any, kind: int, top: int = 20) -> None:
+    """Let some frames show a mark."""
+    frames[where, top : top + 12, top : top + 12] += (100 * shape(kind))[..., None].astype(np.uint8)
+
+
 def pairs(values: NDArray[np.int64], truth: NDArray[np.int64]) -> int:
     """How many pairs of found and true values there are: as many as values if each names the other."""
     return len(set(zip(values.tolist(), truth.tolist(), strict=True)))
+
+
+def told_apart(
+    frames: Frame, begins: NDArray[np.bool_] | None = None, actions: NDArray[np.int64] | None = None
+) -> tuple[list[int], NDArray[np.int64]]:
+    """How many values each factor has that is found in frames, and the codes of these frames; all are known."""
+    found = appearance.find(frames, begins, actions)
+    codes, known = appearance.read(found, frames)
+    assert known.all()
+    return [len(factor.joint) for factor in found], codes
 
 
 def test_factors_and_values_are_found_in_few_frames_of_its_own() -> None:
@@ -82,8 +98,8 @@ def test_pieces_that_hardly_part_are_one_factor() -> None:
     shown = np.where(np.arange(60) % 2, np.random.default_rng(0).integers(1, 3, size=60), 0)
     frames = gray(60)
     frames[shown == 1, 20:27, 20:22] = frames[shown == 2, 20:22, 24:31] = 220
-    codes, _ = appearance.read(appearance.find(frames), frames)
-    assert codes.shape == (60, 1) and pairs(codes[:, 0], shown) == 3
+    sizes, codes = told_apart(frames)
+    assert len(sizes) == 1 and pairs(codes[:, 0], shown) == 3
 
 
 @pytest.mark.parametrize(("top", "found"), [(30, 1), (0, 0), (59, 0)])
@@ -109,9 +125,8 @@ def test_what_is_nearly_alike_is_parted_where_that_tells_what_follows(matters: b
     frames = gray(count)
     frames[shown < 2, 20:40, 27:33] = frames[shown == 1, 20:29, 33:41] = frames[shown == 2, 28:34, 20:40] = 220
     actions[-1] = -1
-    found = appearance.find(frames, None, actions if told else None)
-    codes, _ = appearance.read(found, frames)
-    parted = pairs(codes[:, 0], shown) == len(found[0].joint) == 3
+    sizes, codes = told_apart(frames, None, actions if told else None)
+    parted = pairs(codes[:, 0], shown) == sizes[0] == 3
     assert parted == (matters and told)
 
 
@@ -133,18 +148,17 @@ def test_what_changes_only_between_episodes_is_a_factor_too() -> None:
     frames = gray(600)
     for frame, place in zip(frames, places, strict=True):
         frame[20:32, 8 + 12 * place : 16 + 12 * place] = 220
-    begins = np.arange(600) % 25 == 0
     assert appearance.find(frames) == [], "no pixel changes in 3 % of all steps"
-    codes, _ = appearance.read(appearance.find(frames, begins), frames)
+    _, codes = told_apart(frames, np.arange(600) % 25 == 0)
     assert len(np.unique(codes, axis=0)) == len(np.unique(np.column_stack([codes, places]), axis=0)) == 4
 
 
 def test_what_is_seen_once_in_twenty_frames_is_a_value() -> None:
     """Where most crops of a region have no contour at all."""
     frames = gray(60)
-    frames[[5, 20, 40], 20:32, 20:32] += (100 * shape(0))[..., None].astype(np.uint8)
-    codes, known = appearance.read(appearance.find(frames), frames)
-    assert known.all() and np.argwhere(codes).tolist() == [[5, 0], [20, 0], [40, 0]]
+    show(frames, [5, 20, 40], 0)
+    _, codes = told_apart(frames)
+    assert np.argwhere(codes).tolist() == [[5, 0], [20, 0], [40, 0]]
 
 
 def test_the_widest_gap_parts_the_groups() -> None:
@@ -159,10 +173,10 @@ def test_the_widest_gap_parts_the_groups() -> None:
 def test_what_changed_often_enough_is_a_factor_however_long_nothing_changed() -> None:
     """In 2.5 % of the steps, the share of one of many things; a thing that changed half as often is none yet."""
     frames = gray(800)
-    frames[40::80, 20:32, 20:32] += (100 * shape(0))[..., None].astype(np.uint8)
-    frames[80::160, 40:52, 40:52] += (100 * shape(1))[..., None].astype(np.uint8)
-    found = appearance.find(frames)
-    assert [len(factor.joint) for factor in found] == [2] and found[0].parts[0].mask[20:32, 20:32].any()
+    show(frames, slice(40, None, 80), 0)
+    show(frames, slice(80, None, 160), 1, top=40)
+    (found,) = appearance.find(frames)
+    assert len(found.joint) == 2 and found.parts[0].mask[20:32, 20:32].any()
 
 
 def test_a_faint_edge_in_an_empty_place_is_no_value() -> None:
@@ -170,12 +184,10 @@ def test_a_faint_edge_in_an_empty_place_is_no_value() -> None:
     value = np.arange(90) % 3  # nothing, or one of two marks
     frames = gray(90)
     for kind in (0, 1):
-        frames[value == kind + 1, 20:32, 20:32] += (100 * shape(kind))[..., None].astype(np.uint8)
+        show(frames, value == kind + 1, kind)
     frames[(value == 0) & (np.arange(90) % 2 == 0), 20:32, 20:21] += 50
-    found = appearance.find(frames)
-    codes, known = appearance.read(found, frames)
-    assert [len(factor.joint) for factor in found] == [3] and known.all()
-    assert pairs(codes[:, 0], value) == 3
+    sizes, codes = told_apart(frames)
+    assert sizes == [3] and pairs(codes[:, 0], value) == 3
 
 
 def test_a_look_that_was_never_seen_is_unknown() -> None:
@@ -191,26 +203,22 @@ def test_a_look_that_was_never_seen_is_unknown() -> None:
 def test_a_resumed_perception_looks_again_as_soon_as_one_that_was_not_interrupted() -> None:
     """Sooner once something had no known value."""
     _, frames = walk(16, np.random.default_rng(0))
-    eyes = LearnedPerception(LearnedPerceptionSettings(), factored=True)
+    eyes, resumed = (LearnedPerception(LearnedPerceptionSettings(), factored=True) for _ in range(2))
     for begins, (before, after) in enumerate(pairwise(frames)):
         eyes.remember(before, 0, after, begins=not begins)
     eyes.look(len(eyes.frames))
     for unknown, frame in ((False, frames[0]), (True, gray(1)[0])):
         eyes.remember(eyes.frames[-1], 1, frame)
-        state = AgentState(
-            arrays={**eyes.arrays(), "replay/action": np.array(eyes.actions)}, values=dict(eyes.values())
-        )
-        resumed = LearnedPerception(LearnedPerceptionSettings(), factored=True)
-        resumed.load(state)
+        arrays = {**eyes.arrays(), "replay/action": np.array(eyes.actions)}
+        resumed.load(AgentState(arrays=arrays, values=dict(eyes.values())))
         assert resumed.values() == eyes.values() and eyes.unknown == unknown
 
 
-@pytest.mark.parametrize(("shift", "gain"), [((5, -5), 0.5), ((-3, 4), 2.0)])
-def test_shifted_and_dimmed_crops_are_alike_and_others_are_not(shift: tuple[int, int], gain: float) -> None:
+def test_shifted_and_dimmed_crops_are_alike_and_others_are_not() -> None:
     mask = np.zeros((64, 64), dtype=np.bool_)
     mask[16:48, 16:48] = True
 
-    def crop(kind: int, down: int, right: int, gain: float = 1.0) -> NDArray[np.float32]:
+    def crop(kind: int, down: int = 0, right: int = 0, gain: float = 1.0) -> NDArray[np.float32]:
         image = np.full((1, 64, 64, 3), 0.4, dtype=np.float32)
         image[0, 26 + down : 38 + down, 26 + right : 38 + right] += shape(kind)[..., None].astype(np.float32)
         return appearance.crops(appearance.contours(gain * image), mask)
@@ -218,11 +226,12 @@ def test_shifted_and_dimmed_crops_are_alike_and_others_are_not(shift: tuple[int,
     def distance(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
         return float(appearance.distances(one, other, mask, 1e-6)[0, 0])
 
-    one = crop(0, 0, 0)
-    assert distance(one, crop(0, *shift, gain)) == pytest.approx(0.0, abs=1e-4)
-    assert distance(one, crop(1, *shift, gain)) > 0.5
-    assert distance(one, crop(0, 9, 0)) > 0.2, "it is compared at shifts of up to five pixels"
-    assert distance(np.zeros_like(one), np.zeros_like(one)) == 0.0, "two empty crops are alike"
+    for moved in ((5, -5, 0.5), (-3, 4, 2.0)):
+        assert distance(crop(0), crop(0, *moved)) == pytest.approx(0.0, abs=1e-4)
+        assert distance(crop(0), crop(1, *moved)) > 0.5
+    assert distance(crop(0), crop(0, 9)) > 0.2, "it is compared at shifts of up to five pixels"
+    nothing = np.zeros_like(crop(0))
+    assert distance(nothing, nothing) == 0.0, "two empty crops are alike"
 
 
 def test_what_does_not_vary_freely_is_one_factor() -> None:

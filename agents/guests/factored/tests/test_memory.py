@@ -41,15 +41,8 @@ def test_the_last_value_that_told_something_is_remembered_for_an_episode() -> No
             rows.append(CodeTransition((7, before), 0, (7, after), 0.0, terminated=False))
             begins.append(index == 0)
     found = remembering(rows, begins, Memory(factor=1, hidden=2))
-    assert [(row.code[2], row.following[2]) for row in found] == [
-        (2, 0),
-        (0, 0),
-        (0, 1),
-        (1, 1),
-        (2, 2),
-        (2, 1),
-        (0, 0),
-    ]
+    remembered = [(2, 0), (0, 0), (0, 1), (1, 1), (2, 2), (2, 1), (0, 0)]
+    assert [(row.code[2], row.following[2]) for row in found] == remembered
     assert [row.code[:2] for row in found] == [row.code for row in rows], "a seen value stays as it is"
     assert remembering(rows, begins, None) == rows
 

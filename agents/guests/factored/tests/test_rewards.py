@@ -24,10 +24,9 @@ def rows(
 ) -> list[CodeTransition]:
     """Transitions whose code and action decide the outcome; rewards are noisy by a deviation, or by three steps."""
     rng = np.random.default_rng(0)
+    drawn = (rng.integers(most, size=count).tolist() for most in (codes, 6))
     found = []
-    for code, action in zip(
-        rng.integers(codes, size=count).tolist(), rng.integers(6, size=count).tolist(), strict=True
-    ):
+    for code, action in zip(*drawn, strict=True):
         reward, ends = outcomes[(7 * code + 5 * action) % len(outcomes)]
         noise = std * float(rng.standard_normal()) + step * int(rng.integers(-1, 2))
         found.append(CodeTransition((code,), action, ((code + action) % codes,), reward + noise, ends))
@@ -54,12 +53,12 @@ def test_noisy_rewards_have_the_classes_of_the_rules(std: float, step: float) ->
 
 
 def test_transitions_seen_often_are_told_apart_though_their_rewards_overlap() -> None:
-    found = reward_classes(rows(600, outcomes=PICKS, std=0.5))
+    noisy, exact = (rows(600, outcomes=PICKS, std=std) for std in (0.5, 0.0))
+    found = reward_classes(noisy)
     assert found.centers[False] == pytest.approx([0.0, 1.0], abs=0.15)
     assert found.centers[True] == pytest.approx([-5.0, 5.0], abs=0.15)
-    exact = {row[:3]: row.reward for row in rows(600, outcomes=PICKS)}
-    wrong = [row for row in rows(600, outcomes=PICKS, std=0.5) if abs(found.reward(row) - exact[row[:3]]) > 0.3]
-    assert len(wrong) < 0.02 * 600
+    ruled = {row[:3]: row.reward for row in exact}
+    assert sum(abs(found.reward(row) - ruled[row[:3]]) > 0.3 for row in noisy) < 0.02 * 600
 
 
 def test_a_few_rewards_make_no_class_of_their_own() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from fake_pictures import picture, shape
@@ -93,11 +95,9 @@ def test_a_shift_is_undone_to_the_pixel() -> None:
     standard = standard_of(shifted(frames, by_px))
     assert corrections(standard) == {"moved"}
     upright = standard.of(shifted(frames, by_px))
-    apart = [
-        np.abs(np.roll(upright, (down, right), axis=(1, 2))[:, 8:-8, 8:-8] - frames[:, 8:-8, 8:-8]).max()
-        for down in range(-6, 7)
-        for right in range(-6, 7)
-    ]
+    inner = np.s_[:, 8:-8, 8:-8]
+    moves = itertools.product(range(-6, 7), repeat=2)
+    apart = [np.abs(np.roll(upright, move, axis=(1, 2))[inner] - frames[inner]).max() for move in moves]
     assert min(apart) == 0.0, "all frames lie alike, by whatever all of them are off"
 
 
@@ -122,12 +122,10 @@ def share_right(values: NDArray[np.int64], truth: NDArray[np.int64]) -> float:
 def test_values_are_found_and_read_behind_a_nuisance(nuisance: str) -> None:
     rng = np.random.default_rng(2)
     codes, frames = drawn(2)
-    made = {
-        "moved": lambda: shifted(frames, rng.integers(-4, 5, size=(COUNT, 2))),
-        "light": lambda: shadowed(frames, rng),
-        "noise": lambda: noisy(frames, rng),
-    }
-    seen = made[nuisance]()
+    if nuisance == "moved":
+        seen = shifted(frames, rng.integers(-4, 5, size=(COUNT, 2)))
+    else:
+        seen = {"light": shadowed, "noise": noisy}[nuisance](frames, rng)
     standard = standard_of(seen)
     assert corrections(standard) == {nuisance}
     whole = standard.of(seen)

@@ -114,64 +114,65 @@ def test_resumed_on_a_second_task_equals_uninterrupted() -> None:
 
 # --- queries -----------------------------------------------------------------------------------------------------
 
+CODE = (0, 1, 1)
+SEEN = Observation(frame=frame(CODE))
 
-def ask(learner: FactoredAgent, queries: int, code: tuple[int, ...] = (0, 1, 1)) -> list[tuple[int, ...]]:
+
+def ask(learner: FactoredAgent, queries: int) -> list[list[int]]:
     """Let it query, and label truly; the macro-actions asked about."""
     asked = []
-    for _ in range(queries):
-        actions = learner.query(Observation(frame=frame(code)))
-        if actions is None:
-            break
-        asked.append(tuple(actions.tolist()))
-        here = code
-        for action in actions:
-            here, reward, ended = fake_codes.step(here, int(action))
-        learner.learn_label(Observation(frame=frame(code)), actions, Label(reward, ended))
+    while len(asked) < queries and (actions := learner.query(SEEN)) is not None:
+        asked.append(actions.tolist())
+        here = CODE
+        for action in asked[-1]:
+            here, *outcome = fake_codes.step(here, action)
+        learner.learn_label(SEEN, actions, Label(*outcome))
     return asked
 
 
-def test_it_queries_what_is_uncertain_and_learns_no_dynamics() -> None:
+@pytest.fixture
+def curious() -> FactoredAgent:
+    """After twelve episodes, the expected outcome of the last one included."""
     learner = agent()
-    assert isinstance(learner, QueryingAgent)
-    assert learner.query(Observation(frame=frame((0, 1, 0)))) is None, "nothing is known, so nothing can be imagined"
     live(learner, range(12), np.random.default_rng(0))
-    learner.learn()  # the expected outcome, too
+    learner.learn()
+    return learner
+
+
+def test_it_queries_what_is_uncertain_and_learns_no_dynamics(curious: FactoredAgent) -> None:
+    assert isinstance(curious, QueryingAgent)
+    assert agent().query(SEEN) is None, "nothing is known, so nothing can be imagined"
 
     def unknown() -> float:
-        given = {"actions": np.array([0]), "depth": 1, "rng": np.random.default_rng(0)}
-        return float(learner.imagine(frame((0, 1, 1)), **given).epistemic[0])
+        rollout = curious.imagine(SEEN.frame, actions=np.array([0]), depth=1, rng=np.random.default_rng(0))
+        return float(rollout.epistemic[0])
 
-    known, real, before = [evidence.copy() for evidence in dynamics_of(learner)], len(learner.replay), unknown()
-    asked = ask(learner, 200)
+    known, real, before = copy.deepcopy(dynamics_of(curious)), len(curious.replay), unknown()
+    asked = ask(curious, 200)
     assert 0 < len(asked) < 200
     assert max(map(len, asked)) > 1, "states that are not one action away can be asked about too"
-    assert all(np.array_equal(*pair) for pair in zip(known, dynamics_of(learner), strict=True))
-    counted = learner.diagnostics()
+    assert all(np.array_equal(*pair) for pair in zip(known, dynamics_of(curious), strict=True))
+    counted = curious.diagnostics()
     assert (counted["real_transitions"], counted["oracle/labels"]) == (real, len(asked))
     assert unknown() <= before
 
 
-def test_what_has_no_label_teaches_nothing_and_is_not_asked_again() -> None:
-    learner = agent()
-    live(learner, range(12), np.random.default_rng(0))
-    learner.learn()  # the expected outcome, too
-    seen, asked = Observation(frame=frame((0, 1, 1))), []
-    values = learner.q_values(seen)
+def test_what_has_no_label_teaches_nothing_and_is_not_asked_again(curious: FactoredAgent) -> None:
+    values = curious.q_values(SEEN)
     for _ in range(5):
-        actions = learner.query(seen)
+        actions = curious.query(SEEN)
         assert actions is not None
-        learner.learn_label(seen, actions, None)
-        asked.append(learner.replay[-1][:2])
-        assert not learner.replay[-1].has_reward
-    assert len(set(asked)) == 5
-    assert learner.diagnostics()["oracle/labels"] == 0
-    assert np.array_equal(learner.q_values(seen), values)
+        curious.learn_label(SEEN, actions, None)
+    unlabelled = curious.replay[-5:]
+    assert len({row[:2] for row in unlabelled}) == 5 and not any(row.has_reward for row in unlabelled)
+    assert curious.diagnostics()["oracle/labels"] == 0
+    assert np.array_equal(curious.q_values(SEEN), values)
 
 
 def test_queries_lead_where_the_dynamics_do(experienced: FactoredAgent) -> None:
     learner = copy.deepcopy(experienced)
     learner.learn()
-    learner.learn_label(Observation(frame=frame((0, 1, 1))), np.array([0, 2, 1]), Label(-1.0, False))
+    learner.learn_label(SEEN, np.array([0, 2, 1]), Label(-1.0, False))
     assert learner.replay[-1][:3] == ((1, 2, 1), 1, (0, 2, 1))
     reached, _ = learner.model.likeliest(np.array(starts()))
     truth = [[fake_codes.step(code, action)[0] for action in range(ACTIONS)] for code in starts()]

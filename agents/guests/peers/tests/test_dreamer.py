@@ -95,33 +95,29 @@ def test_it_sees_latents_where_there_is_an_encoder() -> None:
     assert np.array_equal(rows["replay/latents"][2], wanted) and agent.updates == 1
 
 
-def test_updates_follow_the_ratio_and_the_global_generator_is_left_alone() -> None:
-    agent = learner(learning_starts=2, replay_ratio=0.7)
-    before = torch.get_rng_state()
-    episode(agent, 0)
-    episode(agent, 1, length=1)
-    assert torch.equal(before, torch.get_rng_state()) and agent.updates == 2, "0.7 a step, from the second of four"
-
-
 @pytest.mark.parametrize("validated", [True, False])
-def test_distributions_of_others_are_validated_as_before(validated: bool) -> None:
-    agent = learner()
-    default = torch.distributions.Distribution._validate_args
-    torch.distributions.Distribution.set_default_validate_args(validated)
+def test_updates_follow_the_ratio_and_what_is_global_is_left_alone(validated: bool) -> None:
+    """The generator, and whether distributions of others are validated."""
+    agent = learner(learning_starts=2, replay_ratio=0.7)
+    distribution = torch.distributions.Distribution
+    default = distribution._validate_args
+    before = torch.get_rng_state()
+    distribution.set_default_validate_args(validated)
     try:
         episode(agent, 0)
-        assert torch.distributions.Distribution._validate_args is validated
+        episode(agent, 1, length=1)
+        assert distribution._validate_args is validated
     finally:
-        torch.distributions.Distribution.set_default_validate_args(default)
+        distribution.set_default_validate_args(default)
+    assert torch.equal(before, torch.get_rng_state()) and agent.updates == 2, "0.7 a step, from the second of four"
 
 
 def test_a_memory_of_the_episode_decides_its_beliefs() -> None:
     agent = learner()
-    agent.begin_episode()
-    agent.act(seen(0), explore=False)
-    fresh = agent._player.recurrent_state.clone()
-    agent.act(seen(0), explore=False)
-    assert not torch.equal(fresh, agent._player.recurrent_state)
-    agent.begin_episode()
-    agent.act(seen(0), explore=False)
-    assert torch.equal(fresh, agent._player.recurrent_state)
+    beliefs = []
+    for begins in (True, False, True):
+        if begins:
+            agent.begin_episode()
+        agent.act(seen(0), explore=False)
+        beliefs.append(agent._player.recurrent_state.clone())
+    assert torch.equal(beliefs[0], beliefs[2]) and not torch.equal(beliefs[0], beliefs[1])

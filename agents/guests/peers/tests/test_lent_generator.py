@@ -12,22 +12,15 @@ def drawn(lent: LentGenerator, count: int) -> list[float]:
         return torch.rand(count).tolist()
 
 
-def test_draws_go_on_where_they_stopped() -> None:
-    apart = LentGenerator(3, "cpu")
-    at_once = LentGenerator(3, "cpu")
+def test_draws_go_on_where_they_stopped_and_nobody_else_notices() -> None:
+    apart, at_once = (LentGenerator(3, "cpu") for _ in range(2))
     before = torch.get_rng_state()
     parts = drawn(apart, 2)
-    torch.rand(5)
-    parts += drawn(apart, 3)
-    torch.set_rng_state(before)
-    assert parts == drawn(at_once, 2) + drawn(at_once, 3) and len(set(parts)) == 5
-    assert torch.equal(before, torch.get_rng_state())
-    apart.reset(3)
-    assert drawn(apart, 2) == parts[:2] != drawn(LentGenerator(4, "cpu"), 2)
-
-
-def test_it_is_given_back_after_an_error() -> None:
-    before = torch.get_rng_state()
     with pytest.raises(ZeroDivisionError), LentGenerator(0, "cpu").lent():
         raise ZeroDivisionError
+    parts += drawn(apart, 3)
     assert torch.equal(before, torch.get_rng_state())
+    torch.rand(5)
+    assert parts == drawn(at_once, 2) + drawn(at_once, 3) and len(set(parts)) == 5
+    apart.reset(3)
+    assert drawn(apart, 2) == parts[:2] != drawn(LentGenerator(4, "cpu"), 2)

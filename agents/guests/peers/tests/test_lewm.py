@@ -36,20 +36,22 @@ def moved(place: int, action: int) -> int:
     return (place + action - 1) % PLACES
 
 
+def ended(place: int, action: int, reward: float, then: int) -> Transition:
+    """An episode of one transition."""
+    return Transition(
+        observation=seen(place), action=action, reward=reward, next_observation=seen(then), terminated=True,
+        truncated=False,
+    )  # fmt: skip
+
+
 def practise(agent: LeWMPlanner, steps: int) -> list[int]:
-    """Episodes of one transition from each place in turn, paid where they end at the goal."""
+    """Episodes from each place in turn, paid where they end at the goal."""
     actions = []
     for step in range(steps):
         place = step % PLACES
         actions.append(agent.act(seen(place), explore=True))
-        following = moved(place, actions[-1])
-        agent.observe(
-            Transition(
-                observation=seen(place), action=actions[-1], reward=float(following == GOAL),
-                next_observation=seen(following), terminated=True, truncated=False,
-            ),
-            episode=step,
-        )  # fmt: skip
+        then = moved(place, actions[-1])
+        agent.observe(ended(place, actions[-1], float(then == GOAL), then), episode=step)
     return actions
 
 
@@ -80,19 +82,20 @@ def test_a_full_memory_forgets_the_oldest() -> None:
 def test_goals_are_the_frames_that_earned_most() -> None:
     agent = learner(goals=2)
     for reward, place in ((-1.0, 0), (3.0, 1), (2.0, 0), (3.0, 2), (3.0, 3)):
-        agent.observe(
-            Transition(observation=seen(0), action=0, reward=reward, next_observation=seen(place),
-                       terminated=True, truncated=False),
-            episode=0,
-        )  # fmt: skip
+        agent.observe(ended(0, 0, reward, place), episode=0)
     goals = agent.state().arrays["replay/goals"]
     assert np.array_equal(goals, [seen(2).frame, seen(3).frame]), "the latest two of those that earned 3"
 
 
-def test_plans_lead_to_the_nearest_goal_at_whichever_step() -> None:
-    agent = learner(horizon=3, learning_starts=100)
-    agent._model = Exact()
+def planner(model: torch.nn.Module, horizon: int) -> LeWMPlanner:
+    agent = learner(horizon=horizon, learning_starts=100)
+    agent._model = model
     agent._goals = [seen(GOAL).frame]
+    return agent
+
+
+def test_plans_lead_to_the_nearest_goal_at_whichever_step() -> None:
+    agent = planner(Exact(), 3)
     assert agent.act(seen(GOAL - 1), explore=False) == 2
     assert agent.act(seen(GOAL + 1), explore=False) == 0
     two_away = agent.act(seen(0), explore=False)
@@ -117,10 +120,7 @@ class Detour(torch.nn.Module):
 
 def test_a_plan_costs_the_squared_distances_of_all_its_steps_at_rest_after_its_arrival() -> None:
     """To stay at 1 costs 1 + 1, the way over 1.5 costs 2.25."""
-    agent = learner(horizon=2, learning_starts=100)
-    agent._model = Detour()
-    agent._goals = [seen(GOAL).frame]
-    assert agent.act(seen(0), explore=False) == 0
+    assert planner(Detour(), 2).act(seen(0), explore=False) == 0
 
 
 def test_updates_follow_the_ratio_and_the_global_generator_is_left_alone() -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -61,10 +65,7 @@ def test_its_loop_is_counted_and_tested_and_leaves_no_temporary_files(
     left = [path.name for path in temporary.iterdir() if not path.name.startswith("torchinductor")]  # torch's import
     assert not left
     first, last = result.checkpoints
-    assert [row.env_steps for row in result.checkpoints] == [
-        result.training_length[:4].sum(),
-        result.training_length.sum(),
-    ]
+    assert [first.env_steps, last.env_steps] == [result.training_length[:4].sum(), result.training_length.sum()]
     assert result.training_length.shape == (8,) and result.training_length.max() <= 10
     assert (first.test_episodes, last.test_episodes) == (2, 2)
     if "ppo" not in agent:
@@ -79,11 +80,9 @@ def test_its_loop_is_counted_and_tested_and_leaves_no_temporary_files(
 def test_exploration_does_not_depend_on_the_last_budget(tmp_path: Path) -> None:
     """Fewer possible steps than exploration takes, and more: one run gives all budgets."""
     eighty = tuple(sorted({**registry.own_settings(LATENTS, FEW), "sb3.exploration_steps": 80}.items()))
-    short = do(tmp_path / "short", budgets=(4,), overrides=eighty)
-    longer = do(tmp_path / "longer", overrides=eighty)
-    first = short.checkpoints[0]
-    same = longer.checkpoints[0]
-    assert (first.env_steps, first.diagnostics["epsilon"]) == (same.env_steps, same.diagnostics["epsilon"])
+    runs = [do(tmp_path / str(budgets), budgets=budgets, overrides=eighty) for budgets in ((4,), (4, 8))]
+    short, same = (run.checkpoints[0] for run in runs)
+    assert (short.env_steps, short.diagnostics["epsilon"]) == (same.env_steps, same.diagnostics["epsilon"])
 
 
 @pytest.mark.parametrize("agent", [LATENTS, *(pytest.param(name, marks=pytest.mark.slow) for name in IMAGINING)])
@@ -92,77 +91,59 @@ def test_the_same_seed_learns_the_same_even_after_a_kill(
 ) -> None:
     whole = do(tmp_path / "whole", agent)
 
-    def killed(*arguments: Any, **names: Any) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(run_folder, "finish", killed)
-        do(tmp_path / "run", agent)
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(runner, "play_test_episode", killed)
-        do(tmp_path / "run", agent)
+    for where, name in ((run_folder, "finish"), (runner, "play_test_episode")):
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(where, name, mock.Mock(side_effect=KeyboardInterrupt))
+            do(tmp_path / "run", agent)
     assert not (tmp_path / "run/metrics.csv").exists(), "leftovers of the attempt before are not this one's"
     again = do(tmp_path / "run", agent)
     assert measured(whole) == measured(again)
-    assert whole.training_length.tolist() == again.training_length.tolist()
-    assert whole.training_success.tolist() == again.training_success.tolist()
+    for column in ("training_length", "training_success"):
+        np.testing.assert_array_equal(getattr(whole, column), getattr(again, column))
 
 
-def test_its_episodes_start_where_all_agents_of_a_seed_start() -> None:
-    entry = registry.task_entry("arrow_puzzle")
-    with_starts = training_starts(gymnasium.make(entry.env_id, execution="kinematic"), 3)
-    plain = gymnasium.make(entry.env_id, execution="kinematic")
+@pytest.fixture
+def world() -> Iterator[gymnasium.Env[Any, Any]]:
+    with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")) as env:
+        yield env
+
+
+def test_its_episodes_start_where_all_agents_of_a_seed_start(world: gymnasium.Env[Any, Any]) -> None:
+    with_starts = training_starts(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic"), 3)
     for episode in range(4):
         frame, _ = with_starts.reset(seed=99)  # a loop may ask for another
-        expected, _ = plain.reset(seed=episode_seed("training", 3, episode))
+        expected, _ = world.reset(seed=episode_seed("training", 3, episode))
         assert np.array_equal(frame, expected)
     with_starts.close()
-    plain.close()
 
 
-def test_latents_are_those_of_our_own_agents() -> None:
+def test_latents_are_those_of_our_own_agents(world: gymnasium.Env[Any, Any]) -> None:
     from imagine_bench.agents.encoders.encoder import Encoder
     from imagine_bench.agents.encoders.latent_observation import LatentObservation
 
-    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
-    wrapped = LatentObservation(env, "arrow_puzzle-clean")
+    frame, _ = world.reset(seed=5)
+    wrapped = LatentObservation(world, "arrow_puzzle-clean")
     latents, _ = wrapped.reset(seed=5)
-    frame, _ = env.reset(seed=5)
     path = encoders.own(registry.task("arrow_puzzle"), "clean")
     assert np.array_equal(latents, Encoder.load(path).encode(frame[None])[0][0].numpy())
-    assert latents.shape == wrapped.observation_space.shape and latents.dtype == np.float32
-    assert wrapped.observation_space.contains(wrapped.step(0)[0])
-    wrapped.close()
+    assert wrapped.observation_space.contains(latents) and wrapped.observation_space.contains(wrapped.step(0)[0])
 
 
-class Listener:
-    """An algorithm of the library's shape that learns nothing: it compares its rewards with those of the task."""
-
-    def __init__(self, policy: str, world: gymnasium.Env[Any, Any], **keywords: Any) -> None:
-        self.world = world
-
-    def set_logger(self, logger: Any) -> None:
-        """Log nothing."""
-
-    def learn(self, steps: int, **keywords: Any) -> None:
-        """Play three macro-actions in the library's world and in a plain one."""
-        plain = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
-        self.world.reset(seed=5)
-        plain.reset(seed=5)
-        for action in (0, 1, 2):
-            seen = self.world.step(action)[1]
-            paid = float(plain.step(action)[1])
-            assert seen == pytest.approx(paid * 0.04) and paid, "the library's rewards are the task's, divided by 25"
-        plain.close()
+LISTENER = mock.MagicMock()
+"""An algorithm of the library's shape that learns nothing."""
 
 
-def test_the_library_sees_rewards_of_about_one() -> None:
+def test_the_library_sees_rewards_of_about_one(world: gymnasium.Env[Any, Any]) -> None:
     from imagine_bench_peers.sb3 import LibraryAgent
 
-    agent = LibraryAgent(context_of(spec("sb3_dqn")), f"{__name__}:Listener")
-    env = gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")
-    agent.train(env, episodes=1, horizon=30, on_episode=lambda solved, length: False)
-    env.close()
+    agent = LibraryAgent(context_of(spec("sb3_dqn")), f"{__name__}:LISTENER")
+    agent.train(world, episodes=1, horizon=30, on_episode=lambda solved, length: False)
+    given = LISTENER.call_args.args[1]
+    seen, paid = [], []
+    for env, rewards in ((given, seen), (world, paid)):
+        env.reset(seed=5)
+        rewards.extend(float(env.step(action)[1]) for action in (0, 1, 2))
+    assert all(paid) and seen == pytest.approx([0.04 * reward for reward in paid]), "the task's, divided by 25"
 
 
 @pytest.mark.parametrize("agent", ["sb3_dqn", "sb3_qrdqn", LATENTS, "sb3_ppo_latents", *IMAGINING])
@@ -182,15 +163,8 @@ def test_it_is_never_taken_up_again_half_way() -> None:
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     from imagine_bench_peers import sb3
 
-    present = sb3.importlib.import_module
-
-    def missing(name: str) -> Any:
-        if name == "sb3_contrib":
-            raise ImportError(f"No module named {name!r}")
-        return present(name)
-
     context = context_of(spec("sb3_qrdqn"))
-    monkeypatch.setattr(sb3.importlib, "import_module", missing)
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
     sentence = r"needs the library sb3_contrib.*pip install 'imagine-bench\[peers\]'"
     with pytest.raises(SetupError, match=sentence):
         sb3.make_qrdqn(context)
