@@ -184,6 +184,16 @@ def test_a_misspelt_name_is_answered_by_the_nearest(group: str) -> None:
         assert f"The five nearest: {name}, " in said if len(known) > 8 else f"Known: {', '.join(known)}." in said
 
 
+@pytest.mark.parametrize("given", [[], ["list", "more"]])
+def test_words_of_a_caller_are_read_instead_of_those_of_the_process(
+    given: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["imagine-bench", "list"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main(given)
+    assert ended.value.code == 2
+
+
 @pytest.mark.parametrize("command", ["bench", "sweep"])
 def test_whoever_launches_names_every_launcher(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):

@@ -84,8 +84,9 @@ def test_2000_training_episodes_take_less_than_150_kb_and_are_read_back_to_the_b
 
 def test_numpy_scalars_are_kept_as_numbers_and_what_an_older_file_lacks_takes_its_default() -> None:
     row = variants(Checkpoint)[-1]
-    values, arrays = pack(dataclasses.replace(row, diagnostics={"x": np.float32(0.1)}))
-    assert values["diagnostics"] == {"x": float(np.float32(0.1))}
+    numbers = {"x": np.float32(0.1), "count": np.int64(5), "flag": np.True_, "text": np.str_("a")}
+    values, arrays = pack(dataclasses.replace(row, diagnostics=numbers))
+    assert json.dumps(values["diagnostics"]) == '{"x": 0.10000000149011612, "count": 5, "flag": true, "text": "a"}'
     del values["solved"]
     assert unpack(Checkpoint, values, arrays).solved is None
     del values["faults"]
