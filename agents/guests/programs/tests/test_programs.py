@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import subprocess
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from imagine_bench_programs import __main__ as commands
-from imagine_bench_programs.experience import write_experience
+from imagine_bench_programs.experience import play, write_experience
 from imagine_bench_programs.model import make_program
 from imagine_bench_programs.program import Program, spelled
 from imagine_bench_programs.scores import efficiency, score
@@ -205,3 +206,10 @@ def test_a_program_is_judged_exact_and_benched_without_training(tmp_path: Path) 
     options = {"execution": "kinematic", "evaluation_episodes": 20, "launcher": "this_process"}
     found = bench("arrow_puzzle", name, preset="smoke", out=tmp_path, **options)
     assert {float(share) for share in found.frame()["success_rate"]} == {1.0}
+
+
+def test_experience_begins_from_every_start() -> None:
+    spec = registry.task("arrows:cubes=2")
+    rng = np.random.default_rng(0)
+    rows = itertools.islice(play(spec, lambda _: int(rng.integers(spec.n_actions)), rng), 2000)
+    assert {row.now for row, _ in rows if row.step == 0} == set(spec.rules.start_states)
