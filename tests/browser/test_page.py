@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 from imagine_bench_board.motion_rows import MotionRow, read_motions
 from imagine_bench_board.motions import SLACK_PERIODS
+from whole_outputs import KEPT, Expected
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, ImagineBenchError
@@ -54,6 +56,7 @@ PICK_WORLDS = (
     "pick_place:gesture=first,slip=0.5",
 )
 ASKED = 2_000
+LONG = ("world", "arrows:" + "slip=0.1," * 5_000)
 
 
 def ask(questions: list[dict[str, object]]) -> list[Any]:
@@ -134,47 +137,21 @@ def test_a_share_below_1_is_never_shown_as_100_percent() -> None:
     assert ask([{"kind": "percent", "share": share} for share in shares]) == list(shares.values())
 
 
-HOSTILE = (
-    ("", "There is no world"),
-    ("<img src=x onerror=alert(1)>", "There is no world"),
-    ("__proto__", "There is no world"),
-    ("constructor:cubes=3", "There is no world"),
-    ("pick_place_2", "There is no world"),
-    ("pick_place:cubes=3", "sets no parameter"),
-    ("pick_place:slip=1", "give a number from 0 to 0.99."),
-    ("pick_place:gesture=never", "gesture is"),
-    ("pick_place:lag=1.5", "give an integer from 0 to 10."),
-    ("arrows:", "sets no parameter"),
-    ("arrows:toString=1", "sets no parameter"),
-    ("arrows:cubes=7", 'cubes is "7"; give an integer from 1 to 6.'),
-    ("arrows:cubes=1e0", "give an integer from 1 to 6."),
-    ("arrows:cubes=3.0", "give an integer from 1 to 6."),
-    ("arrows:slip=NaN", "give a number from 0 to 0.99."),
-    ("arrows:slip=Infinity", "give a number from 0 to 0.99."),
-    ("arrows:slip=1", "give a number from 0 to 0.99."),
-    ("arrows:horizon=1001", "give an integer from 1 to 1000."),
-    ("arrows:cubes=2,cubes=3", "cubes is given twice"),
-    ("arrows:goal_change=0.1,fickle=0.1", "goal_change is given twice"),
-    ("arrows:goal=__proto__", "goal is"),
-    ("arrows:goal=01", "or 3 digits from 0 to 3."),
-    ("arrows:goal=000", "cannot be reached from anywhere"),
-    ("arrows:forbid=none+equal", "contradicts itself"),
-    ("arrows:cubes=4,forbid=equal", "give at most 3 cubes."),
-    ("arrows:cubes=1,coupling=neighbour", "give at least 2 cubes."),
-    ("arrows:gesture=never", "gesture is"),
-    ("arrows:" + "slip=0.1," * 5_000, "has 45007 characters; give at most 200."),
-)
-"""Lines of worlds that are none, and a part of the sentence that refuses each."""
-
-
 @needs_node
-def test_hostile_worlds_are_refused_in_one_sentence() -> None:
-    found = ask([{"kind": "world", "line": line} for line, _ in HOSTILE])
-    for (line, sentence), answer in zip(HOSTILE, found, strict=True):
-        assert sentence in answer["refused"], line
+def test_hostile_worlds_and_names_of_rows_are_refused_in_one_sentence(expected: Expected) -> None:
+    kept = (KEPT / "refused_by_the_page.txt").read_text(encoding="utf-8")
+    asked = [(kind, json.loads(text)) for kind, text in re.findall(r"^\$ (\w+) (.*)$", kept, re.MULTILINE)]
+    *found, endless = ask([{"kind": kind, "line": text, "name": text} for kind, text in [*asked, LONG]])
+    assert endless["refused"].endswith("has 45007 characters; give at most 200.")
+    answers = []
+    for (kind, text), answer in zip(asked, found, strict=True):
         assert len(answer["refused"]) < 400
-        with pytest.raises(ImagineBenchError):
-            registry.task(line)
+        answers += [f"$ {kind} {json.dumps(text)}", answer["refused"]]
+        if kind == "world":
+            with pytest.raises(ImagineBenchError):
+                registry.task(text)
+    expected("refused_by_the_page", "\n".join(answers))
+    assert ask([{"kind": "rowFile", "name": "dqn-f2c3"}]) == ["data/rows/dqn-f2c3.json"]
 
 
 EPISODE = {"start": [3, 1, 2, 0], "actions": [0], "states": [[0, 1, 2, 0]], "success": True}
@@ -213,14 +190,6 @@ def test_rows_are_checked_against_the_rules() -> None:
     sentences = [sentence for *_, sentence in FORGERIES] + [""] * len(nothing)
     for row, sentence, found in zip((*rows, *nothing), sentences, refused, strict=True):
         assert sentence in found["refused"], row
-
-
-@needs_node
-def test_names_of_rows_lead_out_of_no_folder() -> None:
-    names = ("../secret", "..", "a/../b", "/etc/passwd", "https://example.org/x", "a\nb", "A", "", "x" * 81, "a%2f")
-    for name, found in zip(names, ask([{"kind": "rowFile", "name": name} for name in names]), strict=True):
-        assert "There is no row" in found["refused"], name
-    assert ask([{"kind": "rowFile", "name": "dqn-f2c3"}]) == ["data/rows/dqn-f2c3.json"]
 
 
 @pytest.mark.usefixtures("made")

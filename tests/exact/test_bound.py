@@ -122,17 +122,10 @@ def test_a_bound_by_hand() -> None:
     assert bound(RING) == 0
 
 
-@pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
-def test_the_bound_is_below_the_cautious_learner(task: str) -> None:
-    spec = registry.task(task)
-    full = machine(spec.rules)
-    graph = factor_graph(full)
-    cautious = learn(full, graph, spec.horizon, np.random.default_rng(0))
-    assert 0 <= lower_bound(full, graph, spec.horizon) <= cautious.transitions
-
-
 def test_in_the_arrow_puzzle_each_of_the_twelve_pairs_of_names_must_be_known() -> None:
     """3 cubes with 4 directions each: 12 cells of two names. Without chance, a transition shows one pair."""
     spec = registry.task("arrow_puzzle")
     full = machine(spec.rules)
-    assert lower_bound(full, factor_graph(full), spec.horizon) == 12
+    graph = factor_graph(full)
+    assert lower_bound(full, graph, spec.horizon) == 12
+    assert learn(full, graph, spec.horizon, np.random.default_rng(0)).transitions >= 12, "a cautious learner's cost"

@@ -8,7 +8,6 @@ import pytest
 from worlds import WORLDS
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.interfaces import EXECUTIONS
 
 KINEMATIC = {"execution": "kinematic"}
@@ -69,18 +68,3 @@ def test_every_size_shows_the_same_view():
     contrast = np.abs(images[2] - images[2].mean(axis=(0, 1))).mean()
     for image in images[:2]:
         assert np.abs(image - images[2]).mean() < 0.4 * contrast  # sensor noise is each pixel's own
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"observation": "pixels"}, UnknownNameError, "frame, human, state, proprio"),
-        ({"observation": "frame, state"}, UnknownNameError, "Did you mean 'state'"),
-        ({"observation": "state,frame,state"}, InvalidValueError, "names a part twice"),
-        ({"size": 31}, InvalidValueError, "Observation size 31 must be an integer from 32 to 256 pixels"),
-        ({"size": 64.0}, InvalidValueError, "64.0"),
-    ],
-)
-def test_what_cannot_be_observed_is_refused(options, error, message):
-    with pytest.raises(error, match=message):
-        make(**options)

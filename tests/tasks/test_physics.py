@@ -14,8 +14,7 @@ from imagine_bench.tasks.pick_place.scene import compile_pick_scene
 from imagine_bench.tasks.scenes.constants import HOME_QPOS_RAD, TABLE_HEIGHT_M
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError, UnknownNameError
-from imagine_bench.interfaces import PHYSICS_RANGES, PhysicsSettings
+from imagine_bench.interfaces import PhysicsSettings
 from imagine_bench.testing.physics import as_ruled, walk
 
 COMPILE = {"arrow_puzzle": compile_arrow_scene, "pick_place": compile_pick_scene}
@@ -52,23 +51,6 @@ def test_objects_alone_become_heavier(task):
         assert env.model.body(name).mass == 5 * built.model.body(name).mass
         np.testing.assert_allclose(5 * env.model.body(name).invweight0, built.model.body(name).invweight0)
     assert env.model.body("right_hand").mass == built.model.body("right_hand").mass
-
-
-@pytest.mark.parametrize(
-    ("given", "error", "message"),
-    [
-        ({"pad_fiction": 1}, UnknownNameError, "No physics setting 'pad_fiction'. Did you mean 'pad_friction'?"),
-        ({"sense": "blind"}, UnknownNameError, "No sense 'blind'.* Known: true, nominal"),
-        (3, InvalidValueError, "Physics 3 is no mapping; give some of pad_friction, finger_force_n"),
-        *(({name: PHYSICS_RANGES[name][1] + 1}, InvalidValueError, f"setting {name} is") for name in PHYSICS_RANGES),
-        ({"object_mass": 0}, InvalidValueError, "object_mass is 0; give a number from 0.01 to 100"),
-        ({"pad_friction": float("nan")}, InvalidValueError, "pad_friction is nan; give a number from 0 to 10"),
-        ({"pad_friction": "1"}, InvalidValueError, "pad_friction is '1'; give a number"),
-    ],
-)
-def test_wrong_settings_name_what_is_allowed(given, error, message):
-    with pytest.raises(error, match=message):
-        make("arrow_puzzle", physics=given)
 
 
 @pytest.mark.parametrize(

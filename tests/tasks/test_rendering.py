@@ -79,37 +79,27 @@ def test_the_table_stands_on_the_floor(world):
     np.testing.assert_allclose(heights, [[world.data.geom("floor").xpos[2], underside]] * 4)
 
 
-def test_renderers_of_one_scene_and_view_share_a_context(world, made):
-    twin = ArrowWorld(appearance("clean"))
+def test_renderers_share_a_context_if_scene_and_quality_are_the_same(world, made):
+    """Whatever the camera; sharing, an end and a new context change no frame."""
+    twin, other = ArrowWorld(appearance("clean")), PickWorld(appearance("clean"))
     twin.place((3, 3, 0, 2), np.random.default_rng(0))
-    worlds = world, twin, PickWorld(appearance("clean"))
-    cameras = [own_camera(each.model) for each in worlds]
-    frames = [camera.frame(each.data) for camera, each in zip(cameras, worlds, strict=True)]
-    assert len(made) == 2, "pick-and-place has other meshes"
-    cameras[0].close()
-    assert np.array_equal(cameras[1].frame(twin.data), frames[1])
-    rendering.close_contexts()
-    for camera, each, frame in zip(cameras, worlds, frames, strict=True):
-        assert np.array_equal(camera.frame(each.data), frame), "a new context draws the same"
-    assert len(made) == 4
-
-
-def test_views_from_other_cameras_share_a_context_and_views_of_other_quality_do_not(world, made):
     wrist = agent_camera_view(62)
-    views = [wrist, replace(wrist, camera="human", groups=DRAWN_GROUPS)]
-    others = [replace(wrist, width=63), replace(wrist, shadow_px=256), replace(wrist, samples=4)]
+    shared = [(world, wrist), (twin, wrist), (world, replace(wrist, camera="human", groups=DRAWN_GROUPS))]
+    better = [replace(wrist, width=63), replace(wrist, shadow_px=256), replace(wrist, samples=4)]
+    several = [*shared, (other, wrist), *((world, view) for view in better)]  # pick-and-place has other meshes
     alone = []
-    for view in views:
-        alone.append(Renderer(world.model, view).frame(world.data))
+    for scene, view in several:
+        alone.append(Renderer(scene.model, view).frame(scene.data))
         rendering.close_contexts()
     made.clear()
-    cameras = [Renderer(world.model, view) for view in views]
-    for camera, frame in zip(cameras * 2, alone * 2, strict=True):
-        assert np.array_equal(camera.frame(world.data), frame)
-    assert len(made) == 1
-    for view in others:
-        Renderer(world.model, view).frame(world.data)
-    assert len(made) == 1 + len(others)
+    cameras = [Renderer(scene.model, view) for scene, view in several]
+    for count in (5, 10):
+        for camera, (scene, _), frame in zip(cameras, several, alone, strict=True):
+            assert np.array_equal(camera.frame(scene.data), frame)
+        assert len(made) == count
+        cameras[0].close()
+        assert np.array_equal(cameras[1].frame(twin.data), alone[1])
+        rendering.close_contexts()
 
 
 @pytest.fixture

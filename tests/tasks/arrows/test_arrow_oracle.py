@@ -15,6 +15,8 @@ WORLDS = [
     "arrow_puzzle_easy",
     "arrows:cubes=2,fickle=0.5",
     "arrows:slip=0.2",
+    "arrows:forbid=agent",
+    "arrows:goal=toward_agent,forbid=neighbours",
     "arrows:goal=all,forbid=none,coupling=neighbour,shuffle=5",
     "arrows:goal=012,slip=0.1,fickle=0.3",
     "arrows:cubes=4,goal=toward_agent,fickle=1",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from imagine_bench.tasks.arrows.rules import ArrowRules, Arrows
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
@@ -22,29 +21,6 @@ def test_counts_of_macrostates():
     assert [sum(map(rules.is_goal, rules.states)) for rules in FAMILY] == [18, 6, 18, 6]
     assert [len(rules.start_states) for rules in FAMILY] == [54, 66, 54, 66]
     assert not any(map(is_random, FAMILY))
-
-
-@pytest.mark.parametrize("cubes", [2, 3, 4, 5, 6])
-def test_a_row_without_equal_neighbours_is_one_of_4_times_3_to_the_rest(cubes):
-    """The first arrow has any of 4 directions, each further one any but that of the cube before it."""
-    rules = ArrowRules(Arrows(cubes=cubes, forbid="neighbours"))
-    assert sum(map(rules.is_legal, rules.states)) == cubes * 4 * 3 ** (cubes - 1)
-
-
-@pytest.mark.parametrize(
-    ("goal", "forbid", "goals"),
-    [
-        ("pointed", "none", 3 * 4 * 4),
-        ("pointed", "agent", 3 * 3 * 3),
-        ("clockwise", "none", 3 * 3 * 3),  # the others right, toward the agent or left
-        ("clockwise", "agent", 3 * 2 * 2),  # the others right or left
-        ("clockwise", "neighbours+agent", 3),  # right, left, right and left, right, left
-        ("toward_agent", "neighbours", 3 * 36 // 4),
-    ],
-)
-def test_goals_of_three_cubes_are_as_many_as_counted_by_hand(goal, forbid, goals):
-    rules = ArrowRules(Arrows(goal=goal, forbid=forbid))
-    assert sum(map(rules.is_goal, rules.states)) == goals
 
 
 @ALL

@@ -11,13 +11,13 @@ import pytest
 from by_hand import FAMILIES, FREE, STARTS, carry_out, environment
 from imagine_bench.tasks.arrows.world import MAX_OFF_SLOT_M
 from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
-from imagine_bench.tasks.continuous.env import MotionEnv, steps_in_period
+from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench.tasks.continuous.segments import least_seconds, measure
 from imagine_bench.tasks.world import Reading
 
 from imagine_bench.arrays import Floats
-from imagine_bench.errors import InvalidValueError, UnknownKeywordError
+from imagine_bench.errors import InvalidValueError
 
 
 @pytest.mark.parametrize("control", CONTROL_NAMES)
@@ -36,15 +36,6 @@ def test_the_best_macro_actions_by_hand_are_one_event_each_as_ruled(family: str,
     assert event["success"]
 
 
-@pytest.mark.parametrize(
-    ("rate_hz", "named"), [(30.0, "25 or 31.25"), (26, "25 or 31.25"), (0, "number"), ("x", "number")]
-)
-def test_a_rate_that_is_no_whole_number_of_steps_names_the_nearest(rate_hz: Any, named: str) -> None:
-    with pytest.raises(InvalidValueError, match=named):
-        steps_in_period(rate_hz, 0.008)
-    assert (steps_in_period(25.0, 0.008), steps_in_period(1 / 0.064, 0.008)) == (5, 8)
-
-
 @pytest.mark.parametrize("control", CONTROL_NAMES)
 def test_commands_keep_the_limits_of_speed_and_range_whatever_is_asked(control: str) -> None:
     env, _ = environment("arrows", control=control, **FREE["arrows"])
@@ -59,30 +50,6 @@ def test_commands_keep_the_limits_of_speed_and_range_whatever_is_asked(control: 
         joints_rad = env.servo_targets()[:7]
         assert (np.abs(joints_rad - before[:7]) <= env.controls._most_rad + 1e-12).all()
         assert (joints_rad == joints_rad.clip(*env.model.jnt_range[:7].T)).all()
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ({"shuffle": 3}, "leave it out"),
-        ({"coupling": "neighbour"}, "leave it out"),
-        ({"appearance": "patched"}, "'patched' patches images"),
-        ({"appearance": "harsh"}, "has nuisances, .*; give clean, mild, strong or light, colors, camera"),
-        ({"appearance": {"reward_noise": 1}}, "has nuisances"),
-        ({"appearance": "reward_steps=1"}, "has nuisances"),
-        ({"split": "plan_length=2"}, "unexpected keyword argument 'split'"),
-        ({"execution": "kinematic"}, "unexpected keyword argument 'execution'"),
-        ({"motion_hz": 10}, "unexpected keyword argument 'motion_hz'"),
-        ({"cubes": 7}, "give an integer from 1 to 6"),
-        ({"goal": "all", "forbid": "equal"}, "no start"),
-        ({"rate_hz": 2}, "from 5 to 125"),
-        ({"placement": 0.05}, "give metres from 0 to 0.04"),
-        ({"placement": "far"}, "give metres from 0 to 0.04"),
-    ],
-)
-def test_options_without_meaning_for_a_hand_are_refused(option: dict[str, Any], words: str) -> None:
-    with pytest.raises((InvalidValueError, UnknownKeywordError), match=words):
-        gymnasium.make("imagine_bench/ArrowsMotion-v0", **option)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 from contextlib import closing
 
 import gymnasium
 import numpy as np
-import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
 from imagine_bench.tasks.scenes.appearance import Appearance, appearance
 from imagine_bench.tasks.scenes.fragments import draw_composite
@@ -17,7 +15,6 @@ from imagine_bench import registry
 from imagine_bench.interfaces import HELD_OUT
 
 PHOTO, HELD = appearance("photo"), appearance(HELD_OUT["photo"])
-FIXED = Appearance(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0, pool=1)
 STATE = (2, 0, 1, 1)
 TOP = 34
 
@@ -45,33 +42,14 @@ def test_pools_hold_fifty_hands_and_sixteen_arrows():
         assert not {tuple(pose) for pose in seen} & {tuple(pose) for pose in held}
 
 
-def composite(seed, gray, **fields):
-    """A flat gray frame as a photograph that varies in nothing but what is named."""
-    level = dataclasses.replace(FIXED, **fields)
-    return draw_composite(level, (0, 1, 2), 0, np.random.default_rng(seed)).of(np.full((64, 64, 3), gray, np.uint8))
-
-
-def test_gamma_covers_a_half_to_one_and_a_half():
-    gamma = []
-    for seed in range(300):
-        (level,) = np.unique(composite(seed, 64, gamma_half_width=PHOTO.gamma_half_width))
-        gamma.append(np.log(level / 255) / np.log(64 / 255))
-    assert 0.49 < min(gamma) < 0.52 and 1.48 < max(gamma) < 1.51
-    assert abs(np.mean(gamma) - 1.0) < 0.05
-
-
 def test_light_is_the_fragment_s_and_changes_at_the_seams_alone():
-    image = composite(3, 128, light_fraction=0.15).astype(int)[..., 0]
+    level = Appearance(name="fixed", object_offset_m=0.0, object_yaw_rad=0.0, pool=1, light_fraction=0.15)
+    photograph = draw_composite(level, (0, 1, 2), 0, np.random.default_rng(3))
+    image = photograph.of(np.full((64, 64, 3), 128, np.uint8)).astype(int)[..., 0]
     down, across = np.abs(np.diff(image, axis=0)).max(axis=1), np.abs(np.diff(image[TOP:], axis=1)).max(axis=0)
     assert np.flatnonzero(down > 3).tolist() == [TOP - 1]
     assert np.flatnonzero(across > 4).tolist() == [20, 42]
     assert 108 <= image.min() and image.max() <= 148
-
-
-def test_noise_is_drawn_anew_and_stays_until_then():
-    first, again, second = (composite(seed, 128, noise_std=PHOTO.noise_std) for seed in (0, 0, 1))
-    assert np.array_equal(first, again) and not np.array_equal(first, second)
-    assert (first / 255).std() == pytest.approx(PHOTO.noise_std, rel=0.05)
 
 
 def test_frames_of_macrostates_and_of_environments_are_photographs():
