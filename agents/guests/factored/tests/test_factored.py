@@ -16,7 +16,7 @@ from imagine_bench_factored.agent import ACCEPTED, FactoredAgent
 from imagine_bench_factored.factors import CodeTransition
 from imagine_bench_factored.model import FactoredModel, Moves, Results
 from imagine_bench_factored.planner import TIE, Planner
-from imagine_bench_factored.settings import FactoredSettings
+from imagine_bench_factored.settings import DynamicsSettings, FactoredSettings
 from numpy.typing import NDArray
 
 from imagine_bench.errors import ArtefactError
@@ -162,6 +162,25 @@ def test_a_search_that_ends_early_finds_the_same_best_actions(discount: float) -
             assert np.array_equal(found >= found.max() - TIE, wanted >= wanted.max() - TIE)
             early += ending.expanded < whole.expanded
     assert early > 10, "searches must end early"
+
+
+def novelty(least_unknown: float, times: int) -> float:
+    """Of a lamp that is drawn anew at every step, after each action was tried so often in each code."""
+    settings = FactoredSettings(dynamics=DynamicsSettings(least_unknown=least_unknown))
+    model, rng = FactoredModel((3, 2), 2, settings), np.random.default_rng(0)
+    codes = list(itertools.product(range(3), range(2)))
+    for _, code, action in itertools.product(range(times), codes, range(2)):
+        won = (*code, action) == (2, 1, 0)
+        model.add(CodeTransition(code, action, (int(rng.integers(3)), code[1] ^ action), float(won), won))
+    model.outcomes.fit()
+    planner = Planner(model, PLANNING)
+    return max(planner.values(code, "novelty").max() for code in codes)
+
+
+def test_exploration_rests_once_only_chance_is_left() -> None:
+    default, threshold = DynamicsSettings().least_unknown, PLANNING.exploration_threshold
+    assert novelty(default, 2) > threshold, "two draws of a lamp say little"
+    assert novelty(default, 5) < threshold < novelty(0.0, 5), "of chance there is always more to learn"
 
 
 @pytest.mark.parametrize(("name", "value"), [("code_sizes", [3, 3, 5]), ("n_actions", ACTIONS + 2)])
