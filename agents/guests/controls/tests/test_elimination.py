@@ -100,7 +100,8 @@ def seen(state: State) -> Observation:
 
 def test_the_unknown_is_worth_the_largest_reward_and_nothing_in_tests() -> None:
     agent = learner()
-    here, then = seen((0,)), seen((1,))
+    here = seen((0,))
+    then = seen((1,))
     paid = Transition(observation=here, action=0, reward=5.0, next_observation=then, terminated=True, truncated=False)
     agent.observe(paid, episode=0)
     assert agent.q_values(here).tolist() == [5.0, 0.0]

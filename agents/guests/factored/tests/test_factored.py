@@ -131,7 +131,8 @@ def test_optimism_values_the_unknown_at_the_best_reward_and_r_max_where_it_is_en
 @pytest.mark.parametrize("states", [8, 18])
 def test_a_plan_depends_on_the_model_alone_not_on_what_was_asked_or_learned_before(states: int) -> None:
     planning = dataclasses.replace(PLANNING, states=states)
-    model, seen = fitted([]), rows(starts())
+    model = fitted([])
+    seen = rows(starts())
     used = Planner(model, planning)
     for first in range(0, len(seen), 12):
         for row in seen[first : first + 12]:

@@ -60,6 +60,13 @@ def model() -> FactoredModel:
 PARENTS = {0: ((0,), (0, 1)), 1: ((1,), (0, 1))}
 
 
+def shares(counts: Floats, spread: Floats) -> tuple[Floats, Floats, float]:
+    """Of counts of the next value: the expectation with pseudo counts, the seen value, the weight of the prior."""
+    pseudo = DYNAMICS.concentration * len(counts)
+    total = counts.sum()
+    return (counts + pseudo * spread) / (total + pseudo), counts / max(total, 1), pseudo / (total + pseudo)
+
+
 def structures(
     factor: int, code: Code, rows: list[CodeTransition], pooled: list[CodeTransition], fails: float
 ) -> list[tuple[Floats, Floats, float]]:
@@ -68,28 +75,29 @@ def structures(
     It stays; changes by itself; tables; tables whose rows are alike. Each is the expected value, the seen one, and the
     weight of the prior.
     """
-    values, own, pseudo = SIZES[factor], code[factor], DYNAMICS.concentration * SIZES[factor]
-    stays, others = np.eye(values)[own], 1.0 - np.eye(values)[own]
-    expected = stays * 0.98 + others * 0.02 / (values - 1)
-    found, alike = [(expected, stays * bool(rows), 0.0)], []
-    turns = np.zeros(values)
-    for row in pooled:
-        turns[row.following[factor]] += row.code[factor] == own
-    total = turns.sum() + pseudo
-    found.append(((turns + 0.5) / total, turns / max(turns.sum(), 1) * bool(rows), pseudo / total))
+    values = SIZES[factor]
+    stays = np.eye(values)[code[factor]]
+    others = 1.0 - stays
+    uniform = np.full(values, 1.0 / values)
+
+    def following(some: list[CodeTransition], parents: tuple[int, ...]) -> Floats:
+        alike = [row for row in some if all(row.code[parent] == code[parent] for parent in parents)]
+        return np.bincount([row.following[factor] for row in alike], minlength=values)
+
+    expected, seen, unknown = shares(following(pooled, (factor,)), uniform)
+    found = [(stays * 0.98 + others * 0.02 / (values - 1), stays * bool(rows), 0.0)]
+    found.append((expected, seen * bool(rows), unknown))
+    alike = []
     stayed = sum(row.following[factor] == row.code[factor] for row in rows)
-    rate, frequency = (stayed + 4.0 * fails) / (len(rows) + 4.0), stayed / max(len(rows), 1)
+    rate = (stayed + 4.0 * fails) / (len(rows) + 4.0)
+    frequency = stayed / max(len(rows), 1)
+    *_, of_rate = shares(np.full(values, len(rows) / values), uniform)
     for parents in PARENTS[factor]:
-        here = np.zeros(values)
-        for row in rows:
-            if all(row.code[parent] == code[parent] for parent in parents):
-                here[row.following[factor]] += 1
-        total, moves = here.sum(), here * others
-        found.append(((here + 0.5) / (total + pseudo), here / max(total, 1), pseudo / (total + pseudo)))
-        goes = others * (moves + pseudo / (values - 1)) / (moves.sum() + pseudo)
-        unknown = (1 - rate) * pseudo / (moves.sum() + pseudo) + rate * pseudo / (len(rows) + pseudo)
-        went = (1 - frequency) * moves / max(moves.sum(), 1)
-        alike.append((rate * stays + (1 - rate) * goes, frequency * stays + went, unknown))
+        here = following(rows, parents)
+        found.append(shares(here, uniform))
+        goes, went, unknown = shares(here * others, others / (values - 1))
+        expected = rate * stays + (1 - rate) * goes
+        alike.append((expected, frequency * stays + (1 - frequency) * went, (1 - rate) * unknown + rate * of_rate))
     return found + alike
 
 
@@ -198,6 +206,11 @@ def test_where_a_step_leads_is_as_probable_as_its_factors_say_and_without_a_tria
     assert not untried.likeliest(np.array(CODES))[1].any()
 
 
+def unsure(factors: list[FactorPrediction], untested: float) -> float:
+    """The probability that something unknown decides: a factor, or the outcome."""
+    return 1.0 - math.prod(1.0 - factor.unknown for factor in factors) * (1.0 - untested)
+
+
 def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
     moves = model.moves(np.array(CODES))
     found = model.results(np.array(CODES), moves)
@@ -213,16 +226,17 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
         goes_on = {}
         for after, share in likely.items():
             weight = share / sum(likely.values())
-            chance, unsure = brought(model, code, action, after)
+            chance, open_here = brought(model, code, action, after)
             over = sum(share for outcome, share in chance.items() if causes.outcomes[outcome][1])
             reward += weight * sum(share * causes.outcomes[outcome][0] for outcome, share in chance.items())
-            ends, untested, goes_on[after] = ends + weight * over, untested + weight * unsure, weight * (1.0 - over)
+            ends += weight * over
+            untested += weight * open_here
+            goes_on[after] = weight * (1.0 - over)
         branches = zip(map(tuple, moves.following[row, action].tolist()), found.p_continues[row, action], strict=True)
         assert {after: share for after, share in branches if share > 0.0} == pytest.approx(goes_on)
         assert found.reward[row, action] == pytest.approx(reward)
         assert found.p_terminated[row, action] == pytest.approx(ends)
-        known = (1.0 - factors[0].unknown) * (1.0 - factors[1].unknown)
-        assert found.unknown[row, action] == pytest.approx(1.0 - known * (1.0 - untested))
+        assert found.unknown[row, action] == pytest.approx(unsure(factors, untested))
     assert dropped > 0
     for each in lived()[:3]:
         (probability,), (unknown,) = model.probabilities([each])
@@ -230,8 +244,7 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
         chance, untested = brought(model, each.code, each.action, each.following)
         moved = factors[0].expected[each.following[0]] * factors[1].expected[each.following[1]]
         assert probability == pytest.approx(moved * chance[causes.outcomes.index((each.reward, each.terminated))])
-        known = (1.0 - factors[0].unknown) * (1.0 - factors[1].unknown)
-        assert unknown == pytest.approx(1.0 - known * (1.0 - untested))
+        assert unknown == pytest.approx(unsure(factors, untested))
 
 
 def test_a_goal_of_all_values_but_one_is_expected_whatever_that_one_is() -> None:

@@ -54,18 +54,15 @@ def test_rewards_of_a_task_are_classed_as_often_as_those_of_the_first() -> None:
     """Each time of all its transitions, of nothing earlier, which have become a fifth more."""
     learner = agent(3)
     with mock.patch.object(own, "reward_classes", side_effect=own.reward_classes) as classed:
-        live(learner, range(20), np.random.default_rng(3))
-        first = [len(call.args[0]) for call in classed.call_args_list]
-        seen = len(learner.replay)
-        classed.reset_mock()
-        learner.reset_for_new_task()
-        live(learner, range(20, 40), np.random.default_rng(4))
-        second = [len(call.args[0]) for call in classed.call_args_list]
-    wanted = [1]
-    while wanted[-1] < max(seen, len(learner.replay) - seen):
-        wanted.append(math.ceil(1.2 * wanted[-1]))
-    for found, count in ((first, seen), (second, len(learner.replay) - seen)):
-        assert found == [each for each in wanted if each <= count] and len(found) > 8
+        for seed in (3, 4):
+            begin = len(learner.replay)
+            live(learner, range(20), np.random.default_rng(seed))
+            wanted = [1]
+            while (more := math.ceil(1.2 * wanted[-1])) <= len(learner.replay) - begin:
+                wanted.append(more)
+            assert [len(call.args[0]) for call in classed.call_args_list] == wanted and len(wanted) > 8
+            learner.reset_for_new_task()
+            classed.reset_mock()
 
 
 def test_an_earlier_outcome_is_believed_as_far_as_its_tested_causes_hold() -> None:

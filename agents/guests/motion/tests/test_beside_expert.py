@@ -11,7 +11,7 @@ import pytest
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_motion.__main__ import main
 from imagine_bench_motion.cloned_env import BUNDLED
-from imagine_bench_motion.control.beside_expert import Compared, Played, record_beside_expert
+from imagine_bench_motion.control.beside_expert import record_beside_expert
 from imagine_bench_motion.trials import MOST_PERIODS
 from recordings import contents, times
 from scripted_clone import ScriptedClone
@@ -46,12 +46,6 @@ def test_a_clone_that_does_as_the_expert_has_its_hand_where_the_experts_is(
     shown = {"/scene/hand_target", "/scene/expert_hand_target", "/motion/distance/distance_from_the_expert_s_hand_mm"}
     assert set(contents(tmp_path / "alike.rrd")) >= shown
     assert len(times(tmp_path / "alike.rrd", "/scene/expert_hand_target", "env_step")) == again.clone.periods
-
-
-def test_hands_are_compared_in_the_periods_that_both_motions_have() -> None:
-    clone = Played(done=False, periods=3, hand_m=np.array([[0, 0, 0], [3, 4, 0], [9, 9, 9]]))
-    expert = Played(done=True, periods=2, hand_m=np.zeros((2, 3)))
-    assert Compared(clone=clone, expert=expert).apart_m.tolist() == [0.0, 5.0]
 
 
 def test_the_command_records_the_bundled_clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

@@ -64,7 +64,8 @@ def test_demonstrations_ask_for_the_turns_and_after_each_to_go_back() -> None:
 
 
 def test_demonstrations_depend_on_the_seed_alone_and_come_back_from_their_file(tmp_path: Path) -> None:
-    data, again = demonstrations(), collect(4, seed=5, observation=VECTORS)
+    data = demonstrations()
+    again = collect(4, seed=5, observation=VECTORS)
     np.testing.assert_array_equal(again.numbers, data.numbers)
     np.testing.assert_array_equal(again.commands, data.commands)
     assert not np.array_equal(collect(1, seed=6, observation=VECTORS).numbers[0], data.numbers[0])

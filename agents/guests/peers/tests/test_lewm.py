@@ -60,16 +60,14 @@ class Exact(torch.nn.Module):
 
     def encode(self, pixels: torch.Tensor) -> torch.Tensor:
         quarters = pixels[:, 0, 0, ::32, ::32].flatten(1)[:, [0, 1, 3, 2]]
-        return self._angles(quarters.argmax(dim=1)).unsqueeze(1)
+        return self._points(quarters.argmax(dim=1, keepdim=True) * torch.pi / 2)
 
     def rollout(self, z: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        places = [(torch.atan2(z[:, 0, 1], z[:, 0, 0]) / (torch.pi / 2)).round()]
-        for taken in actions.argmax(dim=2).unbind(1):
-            places.append(places[-1] + taken - 1)
-        return torch.stack([self._angles(place) for place in places], dim=1)
+        start = torch.atan2(z[:, :1, 1], z[:, :1, 0])
+        turned = (actions.argmax(dim=2) - 1).cumsum(dim=1) * torch.pi / 2
+        return self._points(torch.cat([start, start + turned], dim=1))
 
-    def _angles(self, places: torch.Tensor) -> torch.Tensor:
-        angles = places * torch.pi / 2
+    def _points(self, angles: torch.Tensor) -> torch.Tensor:
         return torch.stack([angles.cos(), angles.sin()], dim=-1)
 
 

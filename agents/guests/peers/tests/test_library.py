@@ -139,7 +139,8 @@ def test_the_library_sees_rewards_of_about_one(world: gymnasium.Env[Any, Any]) -
     agent = LibraryAgent(context_of(spec("sb3_dqn")), f"{__name__}:LISTENER")
     agent.train(world, episodes=1, horizon=30, on_episode=lambda solved, length: False)
     given = LISTENER.call_args.args[1]
-    seen, paid = [], []
+    seen: list[float] = []
+    paid: list[float] = []
     for env, rewards in ((given, seen), (world, paid)):
         env.reset(seed=5)
         rewards.extend(float(env.step(action)[1]) for action in (0, 1, 2))

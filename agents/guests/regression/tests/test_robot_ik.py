@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import mujoco
@@ -100,10 +101,10 @@ def test_decisions_are_carried_out_by_the_arm(monkeypatch: pytest.MonkeyPatch) -
 
     def predict(points: np.ndarray, purpose: str) -> Prediction:
         shape, rng = points.shape[:2], np.random.default_rng(len(purpose))
-        said: dict[str, Any] = {name: rng.random((*shape, 3)) for name in ("mean", "epistemic", "aleatoric", "modal")}
-        said |= {name: rng.random(shape) for name in ("stationarity", "sampled_variance", "nll")}
-        said |= dict.fromkeys(("weights", "means", "sigmas", "drawn"), np.zeros(0))
-        return Prediction(prediction=rng.uniform(ik.LOW_RAD, ik.HIGH_RAD, (*shape, 3)), **said)
+        said: dict[str, Any] = {field.name: rng.random(shape) for field in dataclasses.fields(Prediction)}
+        said |= {name: rng.random((*shape, 3)) for name in ("mean", "epistemic", "aleatoric", "modal")}
+        said["prediction"] = rng.uniform(ik.LOW_RAD, ik.HIGH_RAD, (*shape, 3))
+        return Prediction(**said)
 
     monkeypatch.setattr(ik, "DECISIONS", 5)
     monkeypatch.setattr(ik, "GRID", 9)
