@@ -98,6 +98,12 @@ def row(honest: Path, tmp_path: Path) -> OpenMotions:
     return OpenMotions(shutil.copytree(honest, tmp_path / "rows" / honest.name))
 
 
+@pytest.fixture
+def few_replays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two disturbed replays of a test in place of sixteen, where their number does not matter."""
+    monkeypatch.setattr(motions, "DISTURBED", 2)
+
+
 def test_an_honest_row_holds_and_says_what_happened(row: OpenMotions, tmp_path: Path) -> None:
     read = read_motions(row.folder)
     assert [each.solved for each in read.motions] == [True, False, True, False]
@@ -118,6 +124,7 @@ def test_an_honest_row_holds_and_says_what_happened(row: OpenMotions, tmp_path: 
     assert "holds" in str(row.check()) and read_motions(row.folder).world == read.world, "the same world in other words"
 
 
+@pytest.mark.usefixtures("few_replays")
 @pytest.mark.parametrize("control", ["twist", "joint_delta", "pose"])
 def test_whatever_control_a_policy_has_its_joint_commands_play_again(tmp_path: Path, control: str) -> None:
     mild = {"light": 0.5, "pose": 0.5, "hand": 0.5}
@@ -199,6 +206,7 @@ FORGERIES: dict[str, Callable[[OpenMotions], object]] = {
 }
 
 
+@pytest.mark.usefixtures("few_replays")
 @pytest.mark.parametrize("mujoco", ["", "999.0.0"])
 @pytest.mark.parametrize("forgery", FORGERIES)
 def test_forged_rows_never_hold_whatever_mujoco_they_name(row: OpenMotions, forgery: str, mujoco: str) -> None:
@@ -252,6 +260,7 @@ def test_a_test_that_ends_in_another_way_is_excused_only_if_disturbed_replays_do
     assert found.vouched.successes == row.card["vouched"]["successes"] - 1 == 1
 
 
+@pytest.mark.usefixtures("few_replays")
 def test_a_row_of_another_mujoco_is_not_vouched_for_and_never_holds(
     row: OpenMotions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -275,6 +284,7 @@ def test_a_row_of_another_mujoco_is_not_vouched_for_and_never_holds(
     assert found.is_refused and ": refused: test 1: its fingerprint is" in str(found), "as before, with its version"
 
 
+@pytest.mark.usefixtures("few_replays")
 @pytest.mark.parametrize(("total_reward", "least"), [(50.0, -5.0), (-40.0, -40.0)])
 def test_a_marked_test_may_end_otherwise_with_another_mujoco_and_has_failed(
     row: OpenMotions, total_reward: float, least: float
