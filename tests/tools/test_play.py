@@ -207,6 +207,9 @@ def test_a_model_brings_its_task_and_its_looks_and_what_cannot_be_played_is_refu
     keyboard("1")
     assert "The model foresaw 0 of 1 macrostates." in play(None, model=tmp_path)
     assert (made[0]["execution"], made[0]["appearance"]) == ("kinematic", "mild")
+    keyboard("1")
+    play(None, model=tmp_path, execution="physics", appearance="strong")
+    assert (made[1]["execution"], made[1]["appearance"]) == ("physics", "strong"), "options are above the model's"
     with pytest.raises(InvalidValueError, match=r"There is nothing to play; give a task or --model\."):
         play(None)
     with pytest.raises(
