@@ -85,6 +85,24 @@ def test_goals_are_the_frames_that_earned_most() -> None:
     assert np.array_equal(goals, [seen(2).frame, seen(3).frame]), "the latest two of those that earned 3"
 
 
+def test_goals_are_read_again_after_an_update(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = learner(learning_starts=2)
+    practise(agent, 12)
+    read: list[int] = []
+    encode = agent._model.encode
+    monkeypatch.setattr(agent._model, "encode", lambda pixels: read.append(len(pixels)) or encode(pixels))
+    agent.act(seen(0), explore=False)
+    before = agent.updates
+    agent.observe(ended(0, 1, -1.0, 0), episode=12)
+    assert agent.updates > before
+    read.clear()
+    agent.act(seen(0), explore=False)
+    goals = len(agent.state().arrays["replay/goals"])
+    assert read == [goals, 1], "the goals, then the frame"
+    agent.act(seen(1), explore=False)
+    assert read == [goals, 1, 1], "the network is the same"
+
+
 def planner(model: torch.nn.Module, horizon: int) -> LeWMPlanner:
     agent = learner(horizon=horizon, learning_starts=100)
     agent._model = model
