@@ -59,27 +59,23 @@ def walk_both(one, other, steps, n_actions, *, mask):
 
 
 SAME_STEP = AutoresetMode.SAME_STEP
+SHORT = {"max_episode_steps": 2}
 
 
 @pytest.mark.parametrize(
     ("name", "execution", "mode", "steps", "world"),
     [
         ("Arrows", "kinematic", SAME_STEP, 16, {"cubes": 1}),
-        (
-            "Arrows", "kinematic", SAME_STEP, 16, {"cubes": 5, "gesture": 0.5, "lag": 2, "slip": 0.3, "fickle": 0.3}
-        ),
+        ("Arrows", "kinematic", SAME_STEP, 16, {"cubes": 5, "gesture": 0.5, "lag": 2, "slip": 0.3, "fickle": 0.3}),
         ("PickPlace", "kinematic", SAME_STEP, 16, {"gesture": "first", "distractors": 2}),
         ("Arrows", "physics", SAME_STEP, 3, {"cubes": 5, "coupling": "neighbour", "slip": 0.3, "distractors": 3}),
         ("PickPlace", "physics", SAME_STEP, 4, {"gesture": 0.5, "lag": 1, "slip": 0.5}),
         ("PickPlace", "kinematic", AutoresetMode.NEXT_STEP, 8, {"observation": "frame,state,proprio", "size": 32}),
-        *(("ArrowPuzzle", "kinematic", mode, 16, {"max_episode_steps": 2}) for mode in MODES),
-        ("PickPlace", "kinematic", MODES[0], 16, {"max_episode_steps": 2}),
-        *(
-            pytest.param("PickPlace", "kinematic", mode, 16, {"max_episode_steps": 2}, marks=pytest.mark.slow)
-            for mode in MODES[1:]
-        ),
+        *(("ArrowPuzzle", "kinematic", mode, 16, SHORT) for mode in MODES),
+        ("PickPlace", "kinematic", MODES[0], 16, SHORT),
+        *(pytest.param("PickPlace", "kinematic", mode, 16, SHORT, marks=pytest.mark.slow) for mode in MODES[1:]),
     ],
-)  # fmt: skip
+)
 def test_lanes_of_any_world_step_as_sync_in_every_mode(name, execution, mode, steps, world):
     """Through ends by rule and by the limit, with any observation."""
     options = {"execution": execution, "appearance": "strong", "max_episode_steps": 3, **world}
@@ -88,7 +84,7 @@ def test_lanes_of_any_world_step_as_sync_in_every_mode(name, execution, mode, st
     vector = make_vec(f"imagine_bench/{name}-vector-v0", threads=3, autoreset_mode=mode)
     n_actions = int(sync.single_action_space.n)
     ended = walk_both(sync, vector, steps, n_actions, mask=mode == AutoresetMode.DISABLED)
-    assert (ended > 0).all() if world == {"max_episode_steps": 2} else ended.sum() > 0
+    assert (ended > 0).all() if world == SHORT else ended.sum() > 0
     assert vector.action_names == sync.envs[0].unwrapped.action_names
     for one, other in zip(sync.envs, vector.envs, strict=True):
         for field in ("qpos", "qvel", "mocap_pos"):
@@ -194,22 +190,35 @@ def test_copies_play_on_and_none_is_made_of_acting_lanes(copied, execution):
     twin.close()
 
 
-NO_LANES = (3, {0: 1}, "a", [0.5], [None], [-1], ())
-NO_ACTIONS = (None, 3, {0: 1, 1: 1, 2: 1}, [0, 1], [0, 1, None], np.array(3), {0, 1, 2}, np.ma.masked_all(3, int))
-NO_SEEDS = (1.5, -1, "a", {0: 1}, [1, 2], [1, 2, 3.5], [1, 2, -3])
-
-
-def test_what_cannot_be_done_moves_nothing():
+def test_what_cannot_be_made_is_refused():
     for options, message in (
         ({"n": 0}, "num_envs is 0; give an integer from 1 on"),
-        ({"threads": 0}, "threads is 0; give an integer from 1 on"),
         ({"threads": 1.5}, r"threads is 1\.5; give an integer from 1 on"),
-        ({"max_episode_steps": "x"}, "max_episode_steps is 'x'; give an integer from 1 on"),
         ({"max_episode_steps": -1}, "max_episode_steps is -1; give an integer from 1 on"),
         ({"autoreset_mode": "same_step"}, r"No autoreset mode 'same_step'\. Did you mean 'SameStep'\?"),
     ):
         with pytest.raises(ImagineBenchError, match=message):
             make(**options, **KINEMATIC)
+
+
+NO_CALLS = (
+    (
+        "send",
+        "Lanes .*give different integers from 0 to 2|A lane is",
+        "ids",
+        [[3], 3, {0: 1}, "a", [0.5], [None], [-1]],
+    ),
+    ("step", "Action", "actions", [[0, 1, 6], None, 3, {0: 1}, [0, 1], [0, 1, None], np.ma.masked_all(3, int)]),
+    ("recv", "0 lanes cannot be received: 0 are acting|n is 'x'; give an integer from 1 on", "n", [None, "x"]),
+    ("reset", "give an integer from 0 on|give a sequence of 3", "seed", [1.5, -1, "a", {0: 1}, [1, 2], [1, 2, 3.5]]),
+    ("reset", "are no mapping; give", "options", ["abc", [1], 3]),
+    ("reset", "in which one at least is True", "options", [{"reset_mask": np.zeros(3, bool)}]),
+    ("reset", r"give a bool array of shape \(3,\)", "options", [{"reset_mask": np.ones(3)}]),
+)
+"""A method, its answer, and values that one of its arguments cannot have."""
+
+
+def test_what_cannot_be_done_moves_nothing():
     vector = make(**KINEMATIC)
     with pytest.raises(InvalidValueError, match="Lane 0 has no episode to go on with; reset it first"):
         vector.step(np.zeros(3, dtype=int))
@@ -217,27 +226,13 @@ def test_what_cannot_be_done_moves_nothing():
         vector.reset(options={"reset_mask": np.array([True, False, False])})
     vector.reset(seed=0)
     before = [lane.get_state().world.physics for lane in vector.envs]
-    for call, message in (
-        (lambda: vector.step(np.array([0, 1, 6])), "Action 6 does not exist; give an integer from 0 to 5"),
-        (lambda: vector.send([0, 0], [1, 1]), "give different integers from 0 to 2"),
-        (lambda: vector.send([0], [3]), r"Lanes \[3\]: give different integers from 0 to 2"),
-        *((lambda ids=ids: vector.send([0], ids), "Lanes .*: give different integers|A lane is") for ids in NO_LANES),
-        (vector.recv, "0 lanes cannot be received: 0 are acting"),
-        (lambda: vector.recv("x"), "n is 'x'; give an integer from 1 on"),
-        *(
-            (lambda each=each: vector.step(each), r"Actions .*: give a sequence of 3|Action .*not exist")
-            for each in NO_ACTIONS
-        ),
-        *(
-            (lambda seed=seed: vector.reset(seed=seed), "give an integer from 0 on|give a sequence of 3")
-            for seed in NO_SEEDS
-        ),
-        *((lambda given=given: vector.reset(options=given), "are no mapping; give") for given in ("abc", [1], 3)),
-        (lambda: vector.reset(options={"reset_mask": np.zeros(3, bool)}), "in which one at least is True"),
-        (lambda: vector.reset(options={"reset_mask": np.ones(3)}), r"give a bool array of shape \(3,\)"),
-    ):
-        with pytest.raises(InvalidValueError, match=message):
-            call()
+    for method, message, argument, values in NO_CALLS:
+        others = {"actions": [0]} if method == "send" else {}
+        for value in values:
+            with pytest.raises(InvalidValueError, match=message):
+                getattr(vector, method)(**others, **{argument: value})
+    with pytest.raises(InvalidValueError, match="give different integers from 0 to 2"):
+        vector.send([0, 0], [1, 1])
     assert_same([lane.get_state().world.physics for lane in vector.envs], before)
     vector.send([0], [1])
     with pytest.raises(InvalidValueError, match="Lane 1 is acting; receive it first"):
@@ -245,12 +240,19 @@ def test_what_cannot_be_done_moves_nothing():
     vector.close()
 
 
-@pytest.mark.parametrize("seed", [np.int64(7), np.uint8(7), [np.int32(7), None, 8], np.array([7, 8, 9])])
-@pytest.mark.parametrize("actions", [(0, 1, 2), [np.int8(0), np.uint64(1), 2], np.array([0, 1, 2], np.uint8), range(3)])
-def test_numbers_of_numpy_are_numbers(seed, actions):
-    vector = make(threads=np.int64(1), max_episode_steps=np.int64(3), **KINEMATIC)
-    expected = [vector.reset(seed=[7, 8, 9])[0][0], vector.step([0, 1, 2])[0][0]]
-    assert_same([vector.reset(seed=seed)[0][0], vector.step(actions)[0][0]], expected)
+def test_numbers_of_numpy_are_numbers():
+    world = {"cubes": np.int64(2), "lag": np.int32(0), "slip": np.float32(0), "horizon": np.uint8(9)}
+    seen = {"size": np.uint8(40), "motion_hz": np.float32(5), "appearance": {"light": np.float32(0.5)}}
+    physics = {"pad_friction": np.float32(1), "object_mass": np.int64(1)}
+    vector = make("arrows", threads=np.int64(1), physics=physics, **world, **seen)
+    expected = [vector.reset(seed=[7, 8, 9])[0], vector.step([0, 1, 2])[0]]
+    for seed, actions in (
+        (np.uint8(7), (0, 1, 2)),
+        ([np.int32(7), None, 9], [np.int8(0), np.uint64(1), 2]),
+        (np.array([7, 8, 9]), np.array([0, 1, 2], np.uint8)),
+    ):
+        found = [vector.reset(seed=seed)[0], vector.step(actions)[0]]
+        assert_same([each[0] for each in found], [each[0] for each in expected])
     vector.close()
 
 
