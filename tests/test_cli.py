@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import pickle
 import re
@@ -24,15 +23,9 @@ from small_runs import Inline
 from imagine_bench import cli, errors, registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
-from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
-from imagine_bench.protocols.control import protocol
 from imagine_bench.registry import AGENTS, TASKS, WORLD_MODELS
 from imagine_bench.registry.entries import AgentConfiguration, parse_configuration
-from imagine_bench.running.bench import task_types
-from imagine_bench.running.launchers.jobs import LAUNCHERS
 from imagine_bench.store.bench_folder import newest_bench
-from imagine_bench.store.encoders import bundled
-from imagine_bench.sweep.grid import GRIDS
 from imagine_bench.tools.describe import describe
 from imagine_bench.values import dotted
 from imagine_bench.version import __version__
@@ -145,30 +138,15 @@ def test_a_bench_ends_with_a_table_a_report_and_recordings(
 ) -> None:
     words = bench_words(tmp_path, "--agents", "random", "oracle", "--evaluation-episodes", "10")
     assert main(words) == 0
-    said = capsys.readouterr()
-    assert "oracle" in said.out and "100" in said.out
+    said = capsys.readouterr().out
     folder = newest_bench(tmp_path)
-    assert f"Report:     {folder}/report/index.html" in said.out
+    assert re.search(r"^oracle +100", said, re.MULTILINE)
+    assert f"Report:     {folder}/report/index.html" in said
     assert (folder / "report" / "index.html").stat().st_size > 10_000
     assert len(list(folder.glob("*/seed_0/recording.rrd"))) == 2
-    assert json.loads((folder / "sessions.json").read_text())["environment"]["versions"]["mujoco"].startswith("3.17")
     assert main(words) == 0
     assert len(inline.order) == 2, "a finished bench is not run again"
-    assert capsys.readouterr().out.splitlines()[-4:] == said.out.splitlines()[-4:]
-
-
-def test_list_describes_everything_in_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["list"]) == 0
-    out = capsys.readouterr().out
-    named = {line.split()[0] for line in out.splitlines() if line.startswith("  ") and len(line.split()) > 1}
-    for kind in task_types().values():
-        assert named >= {*kind.tasks(), *kind.learners(), *kind.presets}
-    assert named >= {*GRIDS, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *WORLD_MODELS, *bundled()}
-    default = protocol("arrow_puzzle")
-    counts = [len(default.seeds_of(agent)) for agent in default.agents]
-    assert f"seeds: {min(counts)} to {max(counts)}, by agent" in out
-    assert main(["describe"]) == 0
-    assert capsys.readouterr() == (out, "")
+    assert capsys.readouterr().out.splitlines()[-4:] == said.splitlines()[-4:]
 
 
 @pytest.mark.parametrize("group", [registry.TASK_GROUP, registry.AGENT_GROUP, registry.WORLD_MODEL_GROUP])
@@ -194,40 +172,22 @@ def test_words_of_a_caller_are_read_instead_of_those_of_the_process(
     assert ended.value.code == 2
 
 
-@pytest.mark.parametrize("command", ["bench", "sweep"])
-def test_whoever_launches_names_every_launcher(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main([command, "--help"])
-    said = capsys.readouterr().out
-    assert f"--launcher {{{','.join(LAUNCHERS)}}}" in said
-
-
 @pytest.mark.parametrize("offered", [registry.agents, registry.world_models, registry.regressors])
-def test_describe_says_what_every_setting_means(
-    offered: Callable[[], Mapping[str, Any]], capsys: pytest.CaptureFixture[str]
+def test_a_described_setting_is_typed_as_it_stands_there_and_has_a_meaning(
+    offered: Callable[[], Mapping[str, Any]],
 ) -> None:
-    """Each as it is typed, with a meaning beside its range; those of an agent are all that its settings name."""
     for name, entry in offered().items():
-        if ":" not in name:
-            assert main(["describe", name]) == 0
-        page = describe(name)
-        form = f"{name}:ARGUMENT" if getattr(entry, "argument", "") else name
-        found = page.partition("\nSettings of the preset quick")[2]
-        heads = re.findall(r"\n  (\S+) = (\S+)", found)
-        assert not heads or f" as {form}{',' if ':' in form else ':'}NAME=VALUE\n" in page
+        found = describe(name).partition("\nSettings of the preset quick")[2]
+        heads = dict(re.findall(r"\n  (\S+) = (\S+)", found))
         assert len(re.findall(r"\n {6}(?!must|may|one of| )", found)) >= len(heads), name
         if target := getattr(entry, "settings", ""):
             settings = registry.load(target)
-            assert {head for head, _ in heads} == settings.names()
             group = name if name in settings.groups else "chapter_5"
             default = dotted(dataclasses.asdict(settings.resolve("fast", {}, group)))
-            for head, value in heads:
+            assert heads.keys() == settings.names()
+            for head, value in heads.items():
                 typed = f"{name}{',' if ':' in name else ':'}{head}={value}"
                 assert str(parse_configuration(typed)) == str(AgentConfiguration(name, {head: default[head]})), typed
-    assert "controller.epsilon_decay = 0.003 (preset thesis: 0.03; pick_place: 0.001;" in describe("dqn")
-    capsys.readouterr()
-    assert main(["describe", "dqm"]) == 2
-    assert "No task, agent or world model 'dqm'. Did you mean 'dqn'?" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -4,7 +4,6 @@ time.
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 import sys
@@ -179,19 +178,6 @@ def test_the_container_installs_what_drawing_needs() -> None:
     assert gl_packages is not None
     (installs,) = re.findall(r"apt-get install (.*)", steps)
     assert {"make", "git", *gl_packages[1].split()} <= set(installs.split())
-
-
-def test_the_development_container_is_that_image_and_sets_up_its_own_checkout() -> None:
-    """Its checkout is mounted, without an environment; the environment of the editor is the one that setup makes."""
-    folder = _TOP / ".devcontainer"
-    said = json.loads((folder / "devcontainer.json").read_text())
-    assert (folder / said["build"]["dockerfile"]).resolve() == _TOP / ".ci/Dockerfile"
-    assert (folder / said["build"]["context"]).resolve() == _TOP
-    assert said["postCreateCommand"] == "make setup"
-    left_out = (_TOP / ".dockerignore").read_text().split()
-    assert {".venv/", "runs/", "datasets/"} <= set(left_out), "files that a checkout has made stay out of the image"
-    interpreter = said["customizations"]["vscode"]["settings"]["python.defaultInterpreterPath"]
-    assert interpreter == "${containerWorkspaceFolder}/.venv/bin/python"
 
 
 def test_version_and_authors_are_those_of_changelog_and_citation() -> None:

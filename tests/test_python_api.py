@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import functools
 import io
-import itertools
 import subprocess
 import sys
 import threading
@@ -226,16 +226,16 @@ def test_a_frame_is_the_table_of_the_report(results: api.Comparison, monkeypatch
     assert {path.stem for path in page.parent.glob("*.csv")} == set(results.tables)
     for name, text in results.tables.items():
         assert (page.parent / f"{name}.csv").read_text() == text
-        rows = list(csv.DictReader(io.StringIO(text)))
+        header, *rows = csv.reader(io.StringIO(text))
         frame = results.frame(name)
-        assert list(frame) == list(rows[0])
-        for row, column in itertools.product(range(len(rows)), frame):
-            value, cell = frame[column][row], rows[row][column]
-            assert column != "solved" or value == cell, "digits that are a text"
-            if cell in ("", "nan"):
-                assert value == "" or np.isnan(value), (name, column)
-            else:
-                assert type(value)(cell) == value, (name, column)
+        assert list(frame) == header
+        for column, cells in zip(header, zip(*rows, strict=True), strict=True):
+            for value, cell in zip(frame[column], cells, strict=True):
+                if cell in ("", "nan"):
+                    assert value == "" or np.isnan(value), (name, column)
+                else:
+                    assert type(value)(cell) == value, (name, column)
+    assert all(isinstance(value, str) for value in results.frame()["solved"]), "digits that are a text"
     pandas = ModuleType("pandas")
     vars(pandas)["DataFrame"] = lambda columns: ("pandas", columns)
     monkeypatch.setitem(sys.modules, "pandas", pandas)
@@ -254,8 +254,10 @@ def test_a_folder_gives_the_same_results_again(results: api.Comparison) -> None:
         results.plot("sucess")
     with pytest.raises(ArtefactError, match=r"no recording 'dqn'; it has Shifting/seed_0/recording.rrd, random/seed"):
         results.show_recording("dqn")
-    with pytest.raises(ArtefactError, match="the folder of one run"):
-        imagine_bench.load(results.folder / "random/seed_0")
+    refused = {"random/seed_0": "the folder of one run", "random": "holds no results; give the folder of a bench"}
+    for place, words in refused.items():
+        with pytest.raises(ArtefactError, match=words):
+            imagine_bench.load(results.folder / place)
 
 
 @pytest.mark.parametrize(
@@ -264,17 +266,16 @@ def test_a_folder_gives_the_same_results_again(results: api.Comparison) -> None:
 def test_kept_results_are_loaded_as_they_were_written(kept: str) -> None:
     folder = ROOT / "docs/results" / kept
     results = imagine_bench.load(folder)
-    name = next(iter(results.tables))
-    with (folder / f"{name}.csv").open() as file:
-        rows = list(csv.DictReader(file))
     frame = results.frame()
-    assert set(frame) == set(rows[0]) and len(rows) == len(frame[next(iter(frame))]) > 5
+    with (folder / f"{next(iter(results.tables))}.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert set(frame) == set(rows[0]) and len(rows) > 5
     for column in set(frame) - {"agent"}:  # labels that were renamed are today's
         for value, row in zip(frame[column], rows, strict=True):
             text = row[column]
             assert str(value) == text or float(text or "nan") == value or not text, (column, value, text)
     if kept == "arrow_puzzle-quick":
-        assert "dqn" in results.verdict() and results.plot()
+        assert results.plot()
         assert "--budgets 100 250 500 --seeds" in results.verdict(), "the bench that is kept, not today's preset"
     else:
         for method in (results.verdict, results.plot, results.report):
@@ -282,25 +283,15 @@ def test_kept_results_are_loaded_as_they_were_written(kept: str) -> None:
                 method()
 
 
-def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "commands.csv").write_text("name,command\n")
-    for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(ArtefactError, match="holds no results; give the folder of a bench"):
-            imagine_bench.load(folder)
-
-
 def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
     """With the same protocol; a mapping stands for its words."""
     pairs: list[tuple[str, Mapping[str, Any]]] = [
         ("--physics pad_friction=0.5", {"physics": {"pad_friction": 0.5}}),
-        ("--set controller.discount=0.9", {"set": {"controller.discount": 0.9}}),
         ("--set controller.discount=0.9", {"set": ["controller.discount=0.9"]}),
         ("--seeds 0 1 2", {"seeds": 3}),
         ("--seeds 4 7", {"seeds": np.array([4, 7])}),
         ("--budgets 1 2 3", {"budgets": range(1, 4)}),
-        ("--budgets 4", {"budgets": 4}),
         ("--seeds 0 1", {"seeds": (seed for seed in range(2))}),
-        ("--seeds 0 1", {"seeds": np.array(2)}),
         ("--seeds 3", {"seeds": (np.int64(3),), "appearance": Path("clean")}),
         ("--set controller.discount=0.5", {"set": {"controller.discount": np.float32(0.5)}}),
         ("--appearance mild --demonstrations 2", {"appearance": "mild", "demonstrations": 2}),
@@ -320,19 +311,12 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"seeds": -1}, "seeds is -1; give their number"),
         ({"seeds": 1 << 70}, "give their number, 1 to 16777216"),
-        ({"seeds": {0, 1}}, "give a whole number or a list of them"),
         ({"budgets": [True]}, "give a whole number or a list of them"),
-        ({"evaluation_episodes": True}, "give a whole number"),
         ({"workers": "2"}, "workers is '2'; give a whole number"),
         ({"until_decided": "false"}, "give True or False"),
-        ({"split": {"plan_length": 2}}, "give a text"),
         ({"out": None}, "out is None"),
-        ({"set": [("controller.discount", 0.9)]}, "give a mapping of names to values"),
         ({"agents": {"dqn", "random"}}, "give a name, a class or a function, or a list of them"),
-        ({"agents": 3}, "agents is 3; give a name"),
         ({"set": "controller.discount=0.9"}, "give a mapping of names to values"),
-        ({"physics": 3}, "give a mapping of names to values"),
-        ({"agents": "dqnn"}, "No agent 'dqnn'"),
         ({"until_decided": True, "most_seeds": 0}, "give at least 10"),
         ({"most_seeds": 3}, "--most-seeds goes with --until-decided"),
     ]
@@ -351,6 +335,7 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         ("sb3_dqn", Shifting, {}, "There is an agent 'sb3_dqn' already"),
         ("my agent", Shifting, {}, "cannot be called 'my agent'"),
         ("mine", 3, {}, "made by a class or a function; 3 is neither"),
+        ("<lambda>", Shifting, {}, "cannot be called '<lambda>'"),
         ("mine", functools.partial(Shifting, _LOCK), {}, "cannot be sent to worker processes"),
         ("_mine", Shifting, {}, "begins with one of a to z"),
         ("mine", Shifting, {"needs_encoder": "no"}, "needs_encoder is 'no'; give True or False"),
@@ -410,37 +395,28 @@ def test_a_class_without_a_method_is_named_before_anything_is_played(tmp_path: P
         imagine_bench.bench("arrow_puzzle", agents=[Half], out=tmp_path, **_FEW)
 
 
-@pytest.mark.parametrize(("action", "said"), [([1], "[1]"), (1.0, "1.0"), (None, "None")])
-def test_an_action_that_is_no_integer_is_refused(action: object, said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        *((kind, "") for kind in (np.int64, np.uint8, np.array)),
+        (lambda action: np.array([1]), r"The agent gave array\(\[1\]\) as an action. An action is one integer"),
+        (lambda action: None, "The agent gave None as an action. An action is one integer"),
+        (float, r"The agent gave \d\.0 as an action. An action is one integer"),
+        (lambda action: 1 // 0, r"Odd seed 0 in arrow_puzzle: ZeroDivisionError: .*\. Log: .*log.txt"),
+    ],
+)
+def test_any_single_integer_is_an_action_and_nothing_else_is(
+    given: Callable[[int], Any], said: str, tmp_path: Path
+) -> None:
     """An array of one number or a float would go through some parts of a bench and stop others."""
 
     class Odd(Shifting):
         def act(self, observation: Any, *, explore: bool) -> Any:
-            return np.array(action) if isinstance(action, list) else action
-
-    with pytest.raises(RunFailedError, match=r"The agent gave .* as an action. An action is one integer") as found:
-        imagine_bench.bench("arrow_puzzle", agents=[Odd], out=tmp_path, **_FEW)
-    assert said in str(found.value)
-
-
-@pytest.mark.parametrize("kind", [np.int64, np.uint8, np.array])
-def test_any_single_integer_is_an_action(kind: Callable[[int], Any], tmp_path: Path) -> None:
-    class Wrapped(Shifting):
-        def act(self, observation: Any, *, explore: bool) -> Any:
-            return kind(super().act(observation, explore=explore))
+            return given(super().act(observation, explore=explore))
 
         def observe(self, transition: Any, *, episode: int) -> None:
             assert type(transition.action) is int
 
-    imagine_bench.bench("arrow_puzzle", agents=[Wrapped], out=tmp_path, **_FEW)
-
-
-def test_a_class_that_fails_is_named_and_its_log(tmp_path: Path) -> None:
-    class Failing(Shifting):
-        def act(self, observation: Any, *, explore: bool) -> int:
-            raise RuntimeError("boom")
-
-    with pytest.raises(RunFailedError, match=r"Failing seed 0 in arrow_puzzle: RuntimeError: boom. Log: .*log.txt"):
-        imagine_bench.bench("arrow_puzzle", agents=[Failing], out=tmp_path, **_FEW)
-    with pytest.raises(InvalidValueError, match="cannot be called '<lambda>'"):
-        imagine_bench.bench("arrow_puzzle", agents=[lambda context: Shifting(context).act], out=tmp_path, **_FEW)
+    fails = pytest.raises(RunFailedError, match=said) if said else contextlib.nullcontext()
+    with fails:
+        imagine_bench.bench("arrow_puzzle", agents=[Odd], out=tmp_path, **_FEW)

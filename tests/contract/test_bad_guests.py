@@ -6,13 +6,11 @@ from pathlib import Path
 
 import pytest
 from guest_packages import Guests
-from small_runs import Inline
+from small_runs import benched
 
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.running.bench import bench, plan
 
-_FEW = {"budgets": (2,), "evaluation_episodes": 2, "open_loop_starts": 0, "recorded_episodes": 0}
 _TASK, _AGENT = ("task", "lamps"), ("agent", "clumsy")
 _FRAME = "return self._board.frame(self._state)"
 
@@ -60,9 +58,8 @@ def test_frames_and_rewards_that_go_wrong_later_end_the_run(
     guests: Guests, tmp_path: Path, new: str, sentence: str
 ) -> None:
     guests.new(*_TASK, (f"{_FRAME}, outcome.reward,", new))
-    wanted, paths = plan("lamps", "smoke", agents=("random",), execution="kinematic", **_FEW)
     with pytest.raises(InvalidValueError, match=sentence):
-        bench(wanted, paths, root=tmp_path, launcher=Inline())
+        benched(tmp_path, "lamps", "random", budgets=(2,), evaluation_episodes=2)
 
 
 @pytest.mark.parametrize(

@@ -10,17 +10,15 @@ import shutil
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from fake_reader import read_nothing
 from guest_packages import Guests
-from small_runs import Inline
+from small_runs import benched
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.judge import judgement
-from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.trained import load_trained
 from imagine_bench.store.results import RunResult
 
@@ -30,7 +28,6 @@ DIGESTS = {
     "recaller": "2d7058650b54f25b78266a75390719ac50ac611fd649ee59f609484bd072c656",
 }
 """SHA-256 of each package's files. A package that has to be edited is a contract that was broken."""
-TEN = {"evaluation_episodes": 10, "open_loop_starts": 0, "recorded_episodes": 0}
 
 
 def digest(folder: Path) -> str:
@@ -80,8 +77,7 @@ def test_a_frozen_package_passes_check(words: str, capsys: pytest.CaptureFixture
     "task", ["five_cubes", pytest.param("five_cubes_covered", marks=pytest.mark.slow)]
 )  # the exact facts of a world that hides something take half a minute
 def test_the_frozen_worlds_are_benched(task: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wanted, paths = plan(task, "smoke", agents=("random", "oracle"), budgets=(5,), **TEN)
-    result = bench(wanted, paths, root=tmp_path, launcher=Inline())
+    result = benched(tmp_path, task, "random", "oracle", budgets=(5,), evaluation_episodes=10)
     solved = {run.agent: run.checkpoints[-1].success_rate for run in result.runs}
     assert solved["oracle"] > 0.8 > solved["random"], "the optimum is at least 0.95, chance 0.15"
     assert main(["report", str(result.folder)]) == 0
@@ -91,11 +87,9 @@ def test_the_frozen_worlds_are_benched(task: str, tmp_path: Path, capsys: pytest
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """The frozen agent after twelve episodes, with one setting of its own."""
-    few: dict[str, Any] = {"budgets": (12,), "evaluation_episodes": 2, "open_loop_starts": 2, "recorded_episodes": 1}
-    agent = "recaller:recalling.depth=5"
-    wanted, paths = plan("arrow_puzzle", "smoke", agents=(agent,), seeds=(0,), execution="kinematic", **few)
-    (run,) = bench(wanted, paths, root=tmp_path_factory.mktemp("runs"), launcher=Inline()).runs
-    return run
+    few = {"budgets": (12,), "evaluation_episodes": 2, "open_loop_starts": 2, "recorded_episodes": 1}
+    folder = tmp_path_factory.mktemp("runs")
+    return benched(folder, "arrow_puzzle", "recaller:recalling.depth=5", seeds=(0,), **few).runs[0]
 
 
 def test_the_frozen_agent_is_benched_with_what_it_imagines(learned: RunResult) -> None:

@@ -14,14 +14,13 @@ import pytest
 from bench_fakes import Pupil
 from guest_packages import Guests
 from numpy.typing import NDArray
-from small_runs import Inline, collected, context, do, written
+from small_runs import benched, collected, context, do, written
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import SetupError
 from imagine_bench.interfaces import Observation
 from imagine_bench.registry.machine import versions
-from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.collect import Policy, collect
 from imagine_bench.store.bench_folder import newest_bench
 
@@ -147,9 +146,8 @@ def a_pupil(tmp_path: Path, agent: str, **protocol: Any) -> object:
 
 def of_dataset(tmp_path: Path) -> object:
     written(tmp_path / "set")
-    few = {"execution": "kinematic", "appearance": "mild", "evaluation_episodes": 1, "recorded_episodes": 0}
-    wanted, paths = plan("arrow_puzzle", "smoke", agents=("pupil",), seeds=(0,), dataset=tmp_path / "set", **few)
-    bench(wanted, paths, root=tmp_path / "runs", launcher=Inline())
+    changes = {"seeds": (0,), "dataset": tmp_path / "set", "appearance": "mild", "evaluation_episodes": 1}
+    benched(tmp_path / "runs", "arrow_puzzle", "pupil", **changes)
     return Pupil.made[-1].shown
 
 

@@ -12,7 +12,7 @@ from guest_packages import Guests
 from imagine_bench.agents.encoders import training
 from imagine_bench.agents.encoders.encoder import Encoder
 from imagine_bench_motion.judge.interface import GROUP, motion_model_entry, motion_models
-from small_runs import Inline
+from small_runs import benched
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
@@ -20,7 +20,7 @@ from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.registry.machine import versions
 from imagine_bench.regression.runner import run
-from imagine_bench.running.bench import bench, plan
+from imagine_bench.running.bench import plan
 from imagine_bench.running.trained import load_trained
 from imagine_bench.store import encoders
 
@@ -92,25 +92,23 @@ def test_all_are_listed_and_named_in_results(capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.parametrize("agent", ["dqn", pytest.param("imagination", marks=pytest.mark.slow)])
 def test_an_own_representation_trains_an_agent(tmp_path: Path, capsys: pytest.CaptureFixture[str], agent: str) -> None:
-    few = {"budgets": (2,), "evaluation_episodes": 2, "execution": "kinematic"}
-    few |= {"open_loop_starts": 2, "recorded_episodes": 0}
-    wanted, paths = plan("arrow_puzzle", "smoke", agents=(agent,), encoder="tiles", **few)
-    assert "The scale and the probe of tiles for arrow_puzzle at clean are made" in capsys.readouterr().out
-    again, _ = plan("arrow_puzzle", "smoke", agents=(agent,), encoder="tiles", **few)
-    assert again == wanted and capsys.readouterr().out == "", "found again"
-    assert str(wanted.encoder).startswith("tiles-arrow_puzzle-clean@")
-    (result,) = bench(wanted, paths, root=tmp_path, launcher=Inline()).runs
-    assert (result.checkpoints[0].open_loop is None) == (agent == "dqn")
-    assert load_trained(result.folder).spec.encoder == paths["latents"]
+    few = {"budgets": (2,), "evaluation_episodes": 2, "open_loop_starts": 2, "encoder": "tiles"}
+    first, second = (benched(tmp_path / place, "arrow_puzzle", agent, **few) for place in ("first", "second"))
+    assert capsys.readouterr().out.count("The scale and the probe of tiles for arrow_puzzle at clean are made") == 1
+    assert second.protocol == first.protocol, "found again"
+    assert str(first.protocol.encoder).startswith("tiles-arrow_puzzle-clean@")
+    (run,) = first.runs
+    assert (run.checkpoints[0].open_loop is None) == (agent == "dqn")
+    path = load_trained(run.folder).spec.encoder
+    assert path is not None
 
-    encoder, spec = Encoder.load(paths["latents"]), registry.task("arrow_puzzle")
+    encoder, spec = Encoder.load(path), registry.task("arrow_puzzle")
     states = np.array(spec.rules.states[:50])
     frames = spec.render_macrostates(states, "clean", np.random.default_rng(1))
     mu, sigma = encoder.encode(frames)
     assert mu.shape == (50, 48) and float(sigma.max()) < 1e-3 and float(mu.abs().median()) < 3.0
-    pictures = encoder.decode(mu)
     expected = frames.reshape(50, 4, 16, 4, 16, 3).mean(axis=(2, 4)) / 255.0
-    assert pictures.shape == (50, 64, 64, 3) and np.abs(pictures[:, ::16, ::16] - expected).max() < 0.01
+    assert np.abs(encoder.decode(mu)[:, ::16, ::16] - expected).max() < 0.01
     right = (encoder.read_macrostate(mu) == states).all(axis=1).mean()
     assert right > 0.2 > 4 / len(spec.rules.states)
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import functools
 import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import FunctionType
 from typing import Any
 
@@ -16,18 +14,16 @@ import information_cells
 import judge_cells
 import numpy as np
 import speed_cells
+from kept import RESULTS, certificate_of, facts, table
 
 from imagine_bench import reference, registry, rules, statistics
 from imagine_bench.exact import motion
-from imagine_bench.exact.certificate import Certificate, certificate
 from imagine_bench.registry.entries import agent_label, label_today
 from imagine_bench.report.page import over_seeds
 from imagine_bench.running.bench import read_protocol
 from imagine_bench.store import encoders
 from imagine_bench.sweep.grid import STUDIES
 
-ROOT = Path(__file__).parents[2]
-RESULTS = ROOT / "docs" / "results"
 KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json") if path.parent.name != "report")
 """The folders of kept benches."""
 
@@ -45,18 +41,6 @@ class Compared:
     bold: bool = True  # false where a difference to that side is no finding
 
 
-@functools.cache
-def table(path: str) -> list[dict[str, str]]:
-    """The rows of a kept CSV file."""
-    with (RESULTS / path).open() as file:
-        return list(csv.DictReader(file))
-
-
-@functools.cache
-def _json(path: str) -> Any:
-    return json.loads((RESULTS / path).read_text())
-
-
 def picked(path: str, **wanted: str) -> list[dict[str, str]]:
     """The rows of a kept CSV file that have these values; agents by today's names."""
     labels = [{**row, "agent": label_today(row["agent"])} if "agent" in row else row for row in table(path)]
@@ -72,7 +56,7 @@ def runs(where: str) -> Runs:
     folder, _, agent = where.rpartition("/")
     found: Runs = {}
     for row in table(f"{folder}/results.csv"):
-        if agent_label(row["agent"], _json(f"{folder}/bench.json")["protocol"]) == agent:
+        if agent_label(row["agent"], facts(f"{folder}/bench.json")["protocol"]) == agent:
             found.setdefault(int(row["episodes"]), []).append(row)
     if not found:
         raise ValueError(f"{where}: no such runs")
@@ -155,14 +139,14 @@ def worst_best(budget: str, where: str) -> str:
 
 def scaled(budget: str, where: str) -> str:
     """Mean over seeds between the exact chance of the bench's world (0) and its optimum (1)."""
-    exact = _json(f"{where.rpartition('/')[0]}/bench.json")["certificate"]
+    exact = facts(f"{where.rpartition('/')[0]}/bench.json")["certificate"]
     found = (scores(budget, where).mean() - exact["chance_level"]) / (exact["optimum"] - exact["chance_level"])
     return f"{found:.2f}".replace("-", "−")
 
 
 def bounds(where: str) -> str:
     """Chance and optimum of a bench's world, %."""
-    exact = _json(f"{where}/bench.json")["certificate"]
+    exact = facts(f"{where}/bench.json")["certificate"]
     return f"{percent(exact['chance_level'])} / {percent(exact['optimum'])}"
 
 
@@ -226,7 +210,7 @@ def price_to(where: str, level: str, what: str) -> str:
 
 def coverage(law: str, what: str, count: str) -> str:
     """A rate of the simulation of intervals and tests at so many seeds, %; of too few an en dash."""
-    kept = _json("coverage/coverage.json")
+    kept = facts("coverage/coverage.json")
     rows = {(row["law"], row["seeds"]): row for row in kept["rows"] + kept["power"]}
     rate = rows[law, int(count)].get(what, "")
     return "–" if rate == "" else percent(rate)
@@ -306,7 +290,7 @@ def _success(folder: str, variant: str, budget: str) -> list[float]:
 
 def answers(folder: str, agent: str, path: str) -> str:
     """A score of a bench's models, %: mean [95 % interval over seeds], or with few seeds (lowest to highest)."""
-    runs = _json(f"{folder}/generalisation.json")["runs"]
+    runs = facts(f"{folder}/generalisation.json")["runs"]
     values: list[Any] = [run for run in runs if label_today(run["agent"]) == agent]
     for name in path.split("/"):
         values = [value[name] for value in values]
@@ -327,7 +311,7 @@ def caused(agent: str, episodes: str, cause: str) -> str:
     A folder may stand before the agent.
     """
     folder, _, agent = agent.rpartition("/")
-    kept = _json(f"{folder or 'arrow_puzzle-mild-why'}/why.json")
+    kept = facts(f"{folder or 'arrow_puzzle-mild-why'}/why.json")
     own = [run["failures"] for run in kept["runs"] if agent_label(run["agent"], kept) == agent]
     runs = [failures[episodes] for failures in own if episodes in failures]
     count = sum(sum(run.values()) for run in runs)
@@ -338,7 +322,7 @@ def caused(agent: str, episodes: str, cause: str) -> str:
 
 def plans(folder: str, agent: str, key: str, episodes: str = "") -> str:
     """A count over the plans of an agent; ``solved`` with Wilson's interval where they are of one run."""
-    found = [each for each in _json(f"{folder}/plans.json") if label_today(each["agent"]) == agent]
+    found = [each for each in facts(f"{folder}/plans.json") if label_today(each["agent"]) == agent]
     found = [each for each in found if episodes in ("", str(each["episodes"]))]
     if key == "as_imagined":
         return f"{sum(each['steps_as_imagined'] for each in found):,} of {sum(each['steps'] for each in found):,}"
@@ -420,14 +404,14 @@ def probe(cubes: str, kind: str) -> str:
 
 def margin(task: str, setting: str, value: str) -> str:
     """Macro-actions as ruled at a value of a setting, % [95 %, Wilson]."""
-    curve = _json(f"margins/{task}.json")["curves"][setting]
+    curve = facts(f"margins/{task}.json")["curves"][setting]
     (point,) = (point for point in curve if point["value"] == float(value))
     return interval(point["as_ruled"] / point["trials"], *statistics.wilson(point["as_ruled"], point["trials"]))
 
 
 def walked(task: str, sense: str) -> str:
     """Macro-actions as ruled without a reset; furthest drift of an object; every length where a fault ended a walk."""
-    (found,) = [each for each in _json(f"margins/{task}.json")["walks"] if each["sense"] == sense]
+    (found,) = [each for each in facts(f"margins/{task}.json")["walks"] if each["sense"] == sense]
     text = f"{found['as_ruled']:,} of {found['actions']:,}; {found['drift_mm']:.1f} mm"
     return f"{text}; walks of {', '.join(map(str, found['lengths']))}" if found["faults"] else text
 
@@ -466,14 +450,9 @@ def shortest(task: str) -> str:
     return f"{_facts(task).mean_plan_length:.3f}"
 
 
-@functools.cache
-def _certificate(world: str) -> Certificate:
-    return certificate(registry.task(world))
-
-
 def certified(world: str, field: str) -> str:
     """A success probability of a world's certificate, %."""
-    return percent(getattr(_certificate(world), field))
+    return percent(getattr(certificate_of(world), field))
 
 
 CELLS: dict[str, Callable[..., str | list[Compared]]] = {

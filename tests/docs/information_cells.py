@@ -2,24 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from imagine_bench import registry
-from imagine_bench.exact.certificate import Certificate, certificate
-
-_NUISANCES = Path(__file__).parents[2] / "docs" / "results" / "nuisances" / "nuisances.json"
-_FLOORS = Path(__file__).parents[2] / "docs" / "results" / "floors" / "floors.json"
-
-
-@cache
-def _certificate(task: str) -> Certificate:
-    return certificate(registry.task(task))
+from kept import certificate_of, facts
 
 
 def task_of(where: str) -> str:
@@ -29,19 +16,19 @@ def task_of(where: str) -> str:
 
 def needed_by_any(where: str) -> str:
     """The lower bound of any learner, in macro-actions."""
-    return f"{_certificate(task_of(where)).lower_bound}"
+    return f"{certificate_of(task_of(where)).lower_bound}"
 
 
 def needed_by_cautious(where: str, what: str) -> str:
     """The mean transitions or episodes of the cautious learner."""
-    floor = _certificate(task_of(where)).floor
+    floor = certificate_of(task_of(where)).floor
     assert floor is not None
     return f"{getattr(floor, what):.0f}"
 
 
 def worlds_learned(what: str) -> str:
     """How far ``factored`` came in the worlds of the benchmark suite, of five seeds each."""
-    rows = json.loads(_FLOORS.read_text())
+    rows = facts("floors/floors.json")
     every = [run for row in rows for run in row["transitions"]]
     never = [all(run is None for run in row["transitions"]) for row in rows]
     ratios = []
@@ -60,8 +47,7 @@ def _behind(nuisance: str) -> list[dict[str, Any]]:
     """The kept runs of ``factored`` behind nuisances joined by ``+``; of another agent after ``AGENT behind``."""
     agent, _, appearance = nuisance.rpartition(" behind ")
     wanted = (agent or "factored", appearance.replace("+", ","))
-    kept: list[dict[str, Any]] = json.loads(_NUISANCES.read_text())
-    runs = [run for run in kept if (run["agent"], run["appearance"]) == wanted]
+    runs = [run for run in facts("nuisances/nuisances.json") if (run["agent"], run["appearance"]) == wanted]
     if not runs:
         raise ValueError(f"No run of {wanted[0]} behind {wanted[1]} is kept.")
     return runs

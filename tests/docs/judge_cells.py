@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import json
-from pathlib import Path
-from typing import Any
-
 import numpy as np
+from kept import facts, table
 
 from imagine_bench.report.page import over_seeds
 from imagine_bench.sweep.grid import LADDER
 
-_RESULTS = Path(__file__).parents[2] / "docs" / "results"
 _EXACT = 0.005
 """Total variation below which a program is exact."""
 
@@ -33,8 +28,7 @@ def written(experiment: str, seen: str, column: str) -> str:
     The writer was shown ``macrostates``, or read ``codes`` of an encoder, or of its ``own`` perception.
     """
     worlds = _worlds(experiment, seen)
-    kept: list[dict[str, Any]] = json.loads((_RESULTS / "programs" / "written.json").read_text())["rows"]
-    rows = [row for row in kept if (row["task"], row["codes"]) in worlds]
+    rows = [row for row in facts("programs/written.json")["rows"] if (row["task"], row["codes"]) in worlds]
     measured = {(row["task"], row["codes"]) for row in rows}
     if column == "worlds":
         return f"{len(measured)} of {len(worlds)}"
@@ -61,8 +55,8 @@ def asked(folder: str, model: str, transitions: str, family: str) -> str:
 
     The columns ``chance``, ``copy`` and ``exact`` of the file can be given in place of a model.
     """
-    with (_RESULTS / folder / "worlds.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["family"] == family and row["transitions"] == transitions]
+    every = table(f"{folder}/worlds.csv")
+    rows = [row for row in every if row["family"] == family and row["transitions"] == transitions]
     if model in ("chance", "copy", "exact"):
         return _whole(float(rows[0][model]))
     found = [float(row["right"]) for row in rows if row["model"] == model and row["right"]]

@@ -6,8 +6,6 @@ import csv
 import json
 import re
 import shlex
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -25,7 +23,6 @@ from small_runs import do
 import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import ELSEWHERE, Bench, parsed
-from imagine_bench.protocols.control import PRESETS
 from imagine_bench.registry import AGENTS, has_task, regressions, task_of_motion
 
 WRITTEN = [*PAGES, ROOT / "CHANGELOG.md"]
@@ -58,15 +55,6 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_paths_in_the_checkout_exist(page: Path) -> None:
     named = re.findall(r"`((?:agents|tasks|imagine_bench|assets|tests|docs)/[\w./-]*)`", page.read_text())
     assert not [path for path in named if path != "imagine_bench/" and not (ROOT / path).exists()]
-
-
-def test_every_page_is_in_the_site() -> None:
-    """Each is in the table of contents of some page."""
-    listed = {ROOT / "docs" / "index.md"}
-    for page in PAGES[1:]:
-        for contents in re.findall(r"^```{toctree}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
-            listed |= {page.parent / f"{entry}.md" for entry in contents.split()}
-    assert set(PAGES[1:]) <= listed
 
 
 def commands_of(page: Path) -> list[str]:
@@ -131,22 +119,10 @@ def test_the_ten_lines_define_an_agent(tmp_path: Path, monkeypatch: pytest.Monke
     assert do(tmp_path / "seed_0", "mine", agents=("mine",)).checkpoints
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("words", [["my_agent.py"], ["-"]])
-def test_the_ten_lines_bench_an_agent(words: list[str], tmp_path: Path) -> None:
-    code = script().replace('preset="smoke"', SHORT)
-    (tmp_path / "my_agent.py").write_text(code)
-    command = [sys.executable, *words]
-    done = subprocess.run(command, cwd=tmp_path, input=code, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "MyAgent" in done.stdout and "dqn" in done.stdout
-    assert list(tmp_path.glob("runs/arrow_puzzle/*/MyAgent/seed_1/DONE"))
-
-
-def notebook() -> list[str]:
-    """The code of its cells."""
-    cells = json.loads((ROOT / "docs/tutorial/notebook.ipynb").read_text())["cells"]
-    return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+def cells() -> list[dict[str, Any]]:
+    """The cells of the notebook that hold code."""
+    found = json.loads((ROOT / "docs/tutorial/notebook.ipynb").read_text())["cells"]
+    return [cell for cell in found if cell["cell_type"] == "code"]
 
 
 @pytest.mark.usefixtures("without_shadows")
@@ -154,37 +130,31 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
     matplotlib.use("agg")
-    _, *cells = notebook()
     short = 'agents=["random", MyAgent], launcher="this_process", ' + SHORT
-    code = "\n".join(cells).replace('agents=["random", "dqn", MyAgent], preset="smoke"', short)
+    code = "\n".join("".join(cell["source"]) for cell in cells()[1:])
+    code = code.replace('agents=["random", "dqn", MyAgent], preset="smoke"', short)
     assert SHORT in code
-    variables: dict[str, object] = {}
-    exec(code, variables)
+    exec(code, {})
     pyplot.close("all")
     assert len(list(tmp_path.glob("runs/arrow_puzzle/*/MyAgent/seed_1/DONE"))) == 1
 
 
 def test_the_notebook_keeps_the_outputs_of_a_run_without_errors(capsys: pytest.CaptureFixture[str]) -> None:
     """The printed steps are those that the environment gives; the site shows these outputs."""
-    cells = json.loads((ROOT / "docs/tutorial/notebook.ipynb").read_text())["cells"]
-    _, first, *others = [cell for cell in cells if cell["cell_type"] == "code"]
-    assert all(cell["outputs"] for cell in (first, *others) if "class MyAgent" in "".join(cell["source"]))
-    assert "error" not in {each["output_type"] for cell in cells for each in cell.get("outputs", [])}
-    assert sum("image/png" in each.get("data", {}) for cell in others for each in cell["outputs"]) == 2
+    _, first, *_ = cells()
+    outputs = [output for cell in cells() for output in cell["outputs"]]
+    assert "error" not in {each["output_type"] for each in outputs}
+    assert sum("image/png" in each.get("data", {}) for each in outputs) == 2
     exec("".join(first["source"]), {})
     assert capsys.readouterr().out == "".join(first["outputs"][0]["text"]) and "reward 50.0" in str(first["outputs"])
 
 
 def test_the_first_cell_of_the_notebook_installs_this_checkout() -> None:
     """As IPython carries it out, where the package is not installed yet; the notebook's folder is the current one."""
-    (line,) = (line.strip() for line in notebook()[0].splitlines() if line.strip().startswith("%pip"))
-    magic, install, quiet, target = shlex.split(line)
-    path, _, extras = target.partition("[")
-    assert (magic, install, quiet) == ("%pip", "install", "-q")
+    ((path, extras),) = re.findall(r'^ *%pip install -q "(\S+)\[(.*)\]"', "".join(cells()[0]["source"]), re.MULTILINE)
     project = tomllib.loads((ROOT / "docs/tutorial" / path / "pyproject.toml").read_text())["project"]
     assert project["name"] == "imagine-bench"
-    assert set(extras.rstrip("]").split(",")) <= set(project["optional-dependencies"])
-    assert 'find_spec("imagine_bench") is None' in notebook()[0]
+    assert set(extras.split(",")) <= set(project["optional-dependencies"])
 
 
 def test_the_elements_of_the_thesis_are_where_they_are_said_to_be() -> None:
@@ -202,11 +172,8 @@ def test_planted_bugs_are_noticed_or_have_a_reason() -> None:
         rows = list(csv.DictReader(file))
     reasons = [row["why"] for row in rows if row["result"] == "passed"]
     assert all(reasons) and len(reasons) <= 0.08 * len(rows)
-    said = (
-        f"plants {len(rows)} small bugs and",
-        f": {len(rows) - len(reasons)}, and each of the other {len(reasons)} has",
-    )
-    assert all(words in (ROOT / "CONTRIBUTING.md").read_text() for words in said)
+    said = f"plants {len(rows)} small bugs.*: {len(rows) - len(reasons)}, and each of the other {len(reasons)} has"
+    assert re.search(said, (ROOT / "CONTRIBUTING.md").read_text())
 
 
 def test_kept_numbers_are_what_every_json_reader_can_read() -> None:
@@ -220,46 +187,16 @@ def test_kept_numbers_are_what_every_json_reader_can_read() -> None:
 def test_pages_of_environments_say_what_their_rules_say(page: Path) -> None:
     text, spec = page.read_text(), registry.task(page.stem)
     facts = spec.facts()
-    said = {
-        "chance": re.findall(r"macro-actions solve (?:1 of 46 episodes \()?([\d.]+) %", text),
-        "plan": re.findall(r"with ([\d.]+) macro-actions on average", text),
-        "starts": re.findall(r"Each of the (\d+) macrostates", text),
-        "actions": re.findall(r"`Discrete\((\d+)\)`", text),
-        "horizon": re.findall(r"Truncated\* after (\d+) macro-actions", text),
-    }
     true = {
-        "chance": 100 * facts.chance_level,
-        "plan": facts.mean_plan_length,
-        "starts": len(spec.rules.start_states),
-        "actions": spec.rules.n_actions,
-        "horizon": spec.horizon,
+        r"macro-actions solve (?:1 of 46 episodes \()?([\d.]+) %": 100 * facts.chance_level,
+        r"with ([\d.]+) macro-actions on average": facts.mean_plan_length,
+        r"Each of the (\d+) macrostates": len(spec.rules.start_states),
+        r"`Discrete\((\d+)\)`": spec.rules.n_actions,
+        r"Truncated\* after (\d+) macro-actions": spec.horizon,
     }
-    for fact, values in said.items():
-        assert all(round(true[fact], len(value.partition(".")[2])) == float(value) for value in values), (fact, values)
-    assert sum(map(len, said.values())) >= (0 if page.stem == "arrows" else 3)
-
-
-@pytest.mark.parametrize(
-    ("page", "sentence"),
-    [
-        (
-            "README.md",
-            "`dqn_more_updates` {dqn_more_updates}, `imagination` {imagination}, `dqn` {dqn}, each other agent one",
-        ),
-        (
-            "docs/reference/agents.md",
-            "{dqn_more_updates} seeds of `dqn_more_updates`, {imagination} of `imagination`, {dqn} of `dqn`, "
-            "one of each other agent",
-        ),
-    ],
-)
-def test_pages_say_how_many_seeds_the_default_bench_has(page: str, sentence: str) -> None:
-    words = {6: "six", 7: "seven", 10: "ten"}
-    few = PRESETS["quick"]["few_seeds"]
-    headlines = {agent for pair in PRESETS["quick"]["headlines"] for agent in pair}
-    assert {few[agent] for agent in few if agent not in headlines} == {1}, "the pages say that these have one seed"
-    seeds = {agent: words[number] for agent, number in few.items() if number > 1}
-    assert sentence.format(**seeds) in (ROOT / page).read_text()
+    said = [(value, fact) for pattern, fact in true.items() for value in re.findall(pattern, text)]
+    assert len(said) >= (0 if page.stem == "arrows" else 3)
+    assert not [(value, fact) for value, fact in said if round(fact, len(value.partition(".")[2])) != float(value)]
 
 
 def test_the_front_page_has_the_links_of_its_address() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from doc_cells import ROOT
 from imagine_bench.agents.encoders.encoder import Encoder
-from small_runs import Inline
+from small_runs import Inline, benched
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
@@ -26,7 +26,6 @@ from imagine_bench.judge.questions import one_step
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.judge.truth import expected_reward
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.sweep.grid import read_grid
@@ -50,9 +49,7 @@ def example(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 def success(folder: Path, task: str, agent: str, *budgets: int) -> list[float]:
     """Success rates of a seed at these budgets, 50 tests each."""
-    few = {"execution": "kinematic", "open_loop_starts": 0, "recorded_episodes": 0, "evaluation_episodes": 50}
-    wanted, paths = plan(task, "smoke", agents=(agent,), budgets=budgets, **few)
-    (run,) = bench(wanted, paths, root=folder, launcher=Inline()).runs
+    (run,) = benched(folder, task, agent, budgets=budgets, evaluation_episodes=50).runs
     return [row.success_rate for row in run.checkpoints]
 
 

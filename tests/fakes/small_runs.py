@@ -19,24 +19,19 @@ from imagine_bench.interfaces import AgentContext, AgentState
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.protocols.data import Failure, Job, OnProgress, RunSpec
+from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.collect import collect, policy_of
 from imagine_bench.running.runner import run
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import run_folder
-from imagine_bench.store.results import RunResult
+from imagine_bench.store.results import BenchResult, RunResult
 from imagine_bench.store.run_folder import load_newest
+
+QUICK: dict[str, Any] = {"execution": "kinematic", "open_loop_starts": 0, "recorded_episodes": 0}
 
 
 def small(**changes: Any) -> Protocol:
-    few: dict[str, Any] = {
-        "agents": ("table",),
-        "seeds": (0,),
-        "budgets": (4, 9),
-        "evaluation_episodes": 5,
-        "execution": "kinematic",
-        "open_loop_starts": 0,
-        "recorded_episodes": 0,
-    }
+    few = {"agents": ("table",), "seeds": (0,), "budgets": (4, 9), "evaluation_episodes": 5, **QUICK}
     return protocol("arrow_puzzle", "smoke", **{**few, **changes})
 
 
@@ -120,6 +115,12 @@ class Inline:
             except RuntimeError as error:
                 failures.append(Failure(job=job, reason=str(error)))
         return tuple(failures)
+
+
+def benched(root: Path, task: str, *agents: str, **changes: Any) -> BenchResult:
+    """A small bench, planned as the command does, and run in this process."""
+    wanted, paths = plan(task, "smoke", agents=agents, **{**QUICK, **changes})
+    return bench(wanted, paths, root=root, launcher=Inline())
 
 
 FORMATS = ("npz", "lerobot", "minari")

@@ -4,8 +4,8 @@
 
 ``PEERS`` is a folder of virtual environments, one a suite, made as ``tests/measure/peers/README.md`` says. Each
 measurement is a process of its own, bound to one core; in every round each suite is measured once, in turn. A ratio is
-taken within a round, and the median over rounds is kept, so a busy machine slows both sides of it. Results go to
-``runs/control_speed.json``.
+taken within a round, and the median over rounds is kept, so a busy machine slows both sides of it. Every round goes to
+``runs/control_speed.json``, from which ``speed_cells.py`` makes the tables of absolute figures.
 """
 
 from __future__ import annotations
@@ -233,12 +233,6 @@ def ratio(rounds: Sequence[Rows], key: str, peer: str, images: str) -> float:
     return float(np.median(each))
 
 
-def median(rounds: Sequence[Rows], key: str, what: str) -> float | None:
-    """The median over rounds, None where a suite has no such figure."""
-    found = [float(row[key][what]) for row in rounds if what in row[key]]
-    return float(np.median(found)) if found else None
-
-
 def figures(rounds: Sequence[Rows]) -> Iterator[Figure]:
     """The judged ratios of each of our tasks: beside the best peer, and beside MuJoCo alone."""
     for key in [each for each in OURS if each in rounds[0]]:
@@ -286,36 +280,6 @@ def beside_mujoco(rounds: Sequence[Rows], key: str, images: str) -> Figure:
     return figure_of(f"{task_of(key)}: a step, times {alone}", value, ".2f", sign, most, more)
 
 
-def table(rounds: Sequence[Rows], lanes: Rows) -> Iterator[str]:
-    """Lines of a Markdown table of absolute figures, a row a suite."""
-    columns = ["no image", "hand, plain", "front, plain", "both, plain", "hand", "front"]
-    more = [
-        "reset",
-        "import, s",
-        "make, s",
-        "MiB",
-        "MiB a lane more",
-        "two processes: steps a s",
-        "MuJoCo",
-        "physics steps",
-    ]
-    yield "| suite | " + " | ".join([f"{each}, CPU ms" for each in columns] + more) + " |"
-    yield "|---" * (len(columns) + len(more) + 1) + "|"
-    for key in rounds[0]:
-        facts = rounds[0][key]
-        cells = [_number(median(rounds, key, f"step_s {images}"), 1e3) for images in IMAGES]
-        cells += [_number(median(rounds, key, "reset_s none"), 1e3)]
-        cells += [_number(median(rounds, key, name), 1.0) for name in ("import_s", "made_s none")]
-        cells += [_number(float(lanes[key][name]), 1.0) for name in ("one_mib", "more_mib")]
-        cells += [_number(median(rounds, key, "two per_wall_s"), 1.0), str(facts["mujoco"])]
-        cells += [f"{facts['physics_steps']} of {float(facts['physics_step_ms']):g} ms"]
-        yield f"| {SUITES[key].name} | " + " | ".join(cells) + " |"
-
-
-def _number(value: float | None, factor: float) -> str:
-    return "–" if value is None else f"{factor * value:.3g}"
-
-
 def versions(processes: Processes, suites: Sequence[str]) -> dict[str, list[str]]:
     """The packages of each suite's virtual environment."""
     code = "from importlib.metadata import distributions as d; print(*sorted(f'{x.name}=={x.version}' for x in d()))"
@@ -324,7 +288,7 @@ def versions(processes: Processes, suites: Sequence[str]) -> dict[str, list[str]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print both tables, keep every round; 1 if a target is missed."""
+    """Measure, print the judged ratios, keep every round; 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("peers", type=Path, help="folder of the suites' virtual environments")
     parser.add_argument("--rounds", type=int, default=5)
@@ -350,8 +314,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         kept["figures"] = [asdict(figure) for figure in judged]
         write_json(chosen.out, kept)
         print(f"round {index + 1} of {chosen.rounds}", file=sys.stderr, flush=True)
-    print("\n".join(table(rounds, kept["memory"])))
-    print(f"\n{HEAD}", *(figure.row for figure in judged), sep="\n")
+    print(HEAD, *(figure.row for figure in judged), sep="\n")
     return int(not all(figure.met for figure in judged))
 
 

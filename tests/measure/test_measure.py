@@ -15,8 +15,6 @@ import pytest
 import scipy
 import speed
 from fake_results import bench_result, rewritten
-from imagine_bench.tasks.continuous.env import MotionEnv
-from imagine_bench_board.motions import MotionTests
 
 from imagine_bench import registry, statistics
 from imagine_bench.errors import InvalidValueError
@@ -194,21 +192,3 @@ def test_two_versions_part_where_more_than_rounding_is_between_them() -> None:
     there[2:, 1] = [1e-6, 1e-3, 1.0]
     assert other_mujoco.parted_by(here, there) == 1e-6
     assert other_mujoco.parted_by(here[:2], there) is None, "the shorter path ends before"
-
-
-def test_paths_of_a_row_are_those_of_its_tests(tmp_path: Path) -> None:
-    env = MotionTests("arrows:cubes=1", control="joint", observation="proprio", tests=1, seed=3)
-    env.reset()
-    motion = env.unwrapped
-    assert isinstance(motion, MotionEnv)
-    rest = np.append(motion.servo_targets()[:-1], 1.0)
-    truncated = False
-    while not truncated:
-        truncated = env.step(rest)[3]
-    end = motion.data.qpos.copy()
-    env.write(tmp_path / "rows", "still", agent="nobody")
-    other_mujoco.write_paths(tmp_path / "rows", tmp_path / "paths.npz")
-    found = np.load(tmp_path / "paths.npz")
-    assert set(found) == {"still 0", "ends still 0"} and found["ends still 0"]
-    assert len(found["still 0"]) == 751
-    assert np.array_equal(found["still 0"][-1], end)

@@ -14,7 +14,11 @@ from whole_outputs import KEPT, Expected
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
-from imagine_bench.registry import AGENTS, TASKS
+from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
+from imagine_bench.running.bench import task_types
+from imagine_bench.running.launchers.jobs import LAUNCHERS
+from imagine_bench.store.encoders import bundled
+from imagine_bench.sweep.grid import GRIDS
 from imagine_bench.tools.describe import describe
 
 WORLDS = {"arrow_puzzle_hard": 180, "arrow_puzzle_easy": 4, "arrows:slip=0.1,lag=1": 165, "ArrowPuzzleMotion": 165}
@@ -31,9 +35,15 @@ def _ours_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_list(expected: Expected, capsys: pytest.CaptureFixture[str]) -> None:
+    """Everything has a line of its own."""
     assert main(["list"]) == 0
     listed = capsys.readouterr().out
-    assert all(f"\n  {name} " in listed for name in (*TASKS, *AGENTS))
+    names = {line.split()[0] for line in listed.splitlines() if line.startswith("  ")}
+    for kind in task_types().values():
+        assert names >= {*kind.tasks(), *kind.learners(), *kind.presets}
+    assert names >= {*GRIDS, *EXECUTIONS, *LAUNCHERS, *APPEARANCES, *registry.WORLD_MODELS, *bundled()}
+    assert main(["describe"]) == 0
+    assert capsys.readouterr().out == listed
     expected("list", listed)
 
 

@@ -116,22 +116,6 @@ def test_frames_in_coarse_cells(task: str, expected: Expected) -> None:
     expected(f"frames_{task}", "\n".join(lines), exactly=False)
 
 
-def test_lanes_of_a_vector_environment(expected: Expected) -> None:
-    """Two lanes of each task; one that ended begins again in the same step, and keeps the end's observation."""
-    lines: list[list[object]] = []
-    for task in ("ArrowPuzzle", "PickPlace"):
-        options = {"num_envs": 3, "execution": "kinematic", "observation": "state"}
-        with contextlib.closing(gymnasium.make_vec(f"imagine_bench/{task}-v0", **options)) as lanes:
-            _, info = lanes.reset(seed=2)
-            lines += [[task, lanes.metadata["autoreset_mode"].value], ["reset", info["macrostate"]]]
-            actions = np.random.default_rng(0).integers(lanes.single_action_space.n, size=(8, 3))
-            for given in actions:
-                _, reward, terminated, truncated, info = lanes.step(given)
-                ends = info["final_info"]["macrostate"] if "final_info" in info else ""
-                lines.append([given, info["macrostate"], reward, terminated | truncated, ends])
-    expected("lanes", "\n".join("  ".join(map(rounded, line)) for line in lines))
-
-
 @pytest.mark.parametrize(("task", "actions"), [("ArrowPuzzle", (0, 2, 5)), ("PickPlace", (2, 2, 1))])
 def test_macro_actions_in_contact_physics(task: str, actions: tuple[int, ...], expected: Expected) -> None:
     """How long each takes, where the hand ends and how far objects are from where they should be."""
