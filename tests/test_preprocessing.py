@@ -22,6 +22,11 @@ def test_joined_strips_are_the_gray_frame():
     np.testing.assert_allclose(join_cells(gray_cells(frames)), gray, atol=1e-6)
 
 
+def test_a_column_of_two_strips_is_joined_from_the_left_one():
+    strips = np.broadcast_to(np.arange(3.0)[:, None, None], (3, 64, 22))
+    np.testing.assert_array_equal(join_cells(strips)[0], np.repeat([0.0, 1.0, 2.0], [22, 21, 21]))
+
+
 @pytest.mark.parametrize("cubes", range(1, 7))
 def test_joined_cells_are_cut_into_the_same_cells(cubes):
     frames = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)

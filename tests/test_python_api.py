@@ -18,8 +18,8 @@ from typing import Any
 import cloudpickle
 import numpy as np
 import pytest
-from doc_cells import ROOT
 from imagine_bench.agents.baselines import RandomAgent
+from kept import ROOT
 
 import imagine_bench
 from imagine_bench import api, cli, registry

@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from imagine_bench import reference
 from imagine_bench.errors import UnknownNameError
-
-
-def test_section_3_2_3_gives_no_standard_deviation() -> None:
-    (dqn,), (only,) = (reference.success("pick_place", agent).values() for agent in ("dqn", "imagination_only"))
-    assert (dqn[0], only[0]) == (0.98, 0.78)
-    assert np.isnan([dqn[1], only[1]]).all()
-    assert reference.success_source("pick_place").startswith("section 3.2.3")
-    assert reference.success_source("robot_ik") == ""
 
 
 def test_tables_5_2_and_5_4_are_what_5_1_and_5_3_imply() -> None:

@@ -6,8 +6,8 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
+from subprocess import PIPE, STDOUT
 
 import pytest
 
@@ -60,8 +60,8 @@ class Checkout:
         done = subprocess.run(
             [str(self.folder / ".ci/setup.sh")],
             env={"PATH": str(self.path)} | variables,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
+            stdout=PIPE,
+            stderr=STDOUT,
             text=True,
             timeout=60,
             check=False,
@@ -200,26 +200,12 @@ def test_an_activated_environment_is_not_made_with_itself(ready: Checkout) -> No
     assert not (ready.folder / ".venv/bin/python3").exists() and (ready.folder / ".venv/bin/python").exists()
 
 
-@pytest.fixture
-def make() -> Callable[..., tuple[int, str]]:
-    """Exit code and output of make, which only prints its commands."""
-    kept = ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL")  # make's own variables would reach the inner make
-    environment = {name: os.environ[name] for name in kept if name in os.environ}
-
-    def run(*words: str, **variables: str) -> tuple[int, str]:
-        command = ["make", "-n", *words]
-        done = subprocess.run(
-            command,
-            cwd=ROOT,
-            env=environment | variables,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            check=False,
-        )
-        return done.returncode, done.stdout.splitlines()[-1].rstrip()
-
-    return run
+def make(*words: str, **variables: str) -> tuple[int, str]:
+    """Exit code and last line of make, which only prints its commands; its own variables would reach the inner make."""
+    kept = {name: os.environ[name] for name in ("PATH", "HOME", "TMPDIR", "LANG", "LC_ALL") if name in os.environ}
+    command = ["make", "-n", *words]
+    done = subprocess.run(command, cwd=ROOT, env=kept | variables, stdout=PIPE, stderr=STDOUT, text=True, check=False)
+    return done.returncode, done.stdout.splitlines()[-1].rstrip()
 
 
 @pytest.mark.parametrize(
@@ -235,13 +221,13 @@ def make() -> Callable[..., tuple[int, str]]:
         ("test ARGS=-k+setup", "-m pytest -n auto --dist worksteal -k setup"),
     ],
 )  # fmt: skip
-def test_variables_become_options(make: Callable[..., tuple[int, str]], words: str, expected: str) -> None:
+def test_variables_become_options(words: str, expected: str) -> None:
     code, command = make(*(word.replace("+", " ") for word in words.split()))
     did = command.partition("imagine-bench ")[2] or command.partition("python ")[2]
     assert (code, did) == (0, expected.format("arrow_puzzle"))
 
 
-def test_variables_of_the_environment_count_and_unknown_ones_are_refused(make: Callable[..., tuple[int, str]]) -> None:
+def test_variables_of_the_environment_count_and_unknown_ones_are_refused() -> None:
     assert make("report", TASK="pick_place")[1].endswith("report --task pick_place")
     code, error = make("bench", "AGENT=dqn", "SEEDS=0")
     assert code == 2 and "'make bench' takes no AGENT. It takes AGENTS APPEARANCE ARGS BUDGETS " in error

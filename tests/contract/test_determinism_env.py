@@ -40,14 +40,8 @@ def full_state(env):
 
 
 def walk(env, actions):
-    """Frames, rewards and full states along a walk."""
-    frames, rewards, states = [], [], []
-    for action in actions:
-        frame, reward, *_ = env.step(int(action) % int(env.action_space.n))
-        frames.append(frame)
-        rewards.append(reward)
-        states.append(full_state(env))
-    return np.array(frames), rewards, np.array(states)
+    """The results of each step, and the full state after it."""
+    return [(env.step(action % int(env.action_space.n)), full_state(env)) for action in actions]
 
 
 @pytest.mark.parametrize("appearance", ["clean", "photo"])
@@ -72,11 +66,7 @@ def test_equal_seeds_give_equal_bits_whatever_was_before(task, execution, appear
     dirty.world.data.qvel[:] = 0.3
     dirty.world.data.qacc_warmstart[:] = 7.0
     dirty.world.data.ctrl[:] = 0.1
-    frames = [env.reset(seed=4)[0] for env in (dirty, fresh)]
-    assert np.array_equal(*frames)
-    assert np.array_equal(full_state(dirty), full_state(fresh))
-    for one, other in zip(walk(dirty, (1, 4)), walk(fresh, (1, 4)), strict=True):
-        assert np.array_equal(one, other)
+    assert_same(*((env.reset(seed=4), full_state(env), walk(env, (1, 4))) for env in (dirty, fresh)))
     dirty.close()
     fresh.close()
 
@@ -85,46 +75,45 @@ def test_equal_seeds_give_equal_bits_whatever_was_before(task, execution, appear
 def test_a_reused_outcome_has_the_bits_of_a_simulated_one(task, monkeypatch):
     """A bench reuses outcomes; whatever repeats an earlier episode then simulates nothing."""
     env = make(task, execution="physics")
-    runs = []
-    for reuses in (False, True, True):
-        if reuses:
-            env.reuse_outcomes()
+
+    def episodes():
         found = []
-        for actions in ([0, 4, 2], [1, 0, 4]):
-            env.reset(seed=3)
-            found += [*walk(env, actions), env.latest.sim_time_s]
-        runs.append(found)
-        if reuses:
-            monkeypatch.setattr("mujoco.rollout.rollout", None)  # the last time nothing can be simulated
+        for actions in ((0, 4, 2), (1, 0, 4)):
+            found.append((env.reset(seed=3), walk(env, actions), env.latest.sim_time_s))
+        return found
+
+    simulated = episodes()
+    env.reuse_outcomes()
+    assert_same(episodes(), simulated)
+    monkeypatch.setattr("mujoco.rollout.rollout", None)  # nothing can be simulated
+    assert_same(episodes(), simulated)
+    assert env.latest.sim_time_s > 0.1
     env.close()
-    assert_same(runs[0], runs[1])
-    assert_same(runs[0], runs[2])
-    assert runs[0][-1] > 0.1
 
 
 @pytest.mark.parametrize("task", WORLDS)
 def test_both_executions_walk_the_same_macrostates(task):
-    physics, kinematic = (make(task, execution=execution) for execution in EXECUTIONS)
+    envs = [make(task, execution=execution) for execution in EXECUTIONS]
     generator, moved = np.random.default_rng(5), 0
     for seed in range(3):
-        (_, start), (before, again) = (env.reset(seed=seed) for env in (physics, kinematic))
-        walked = [start["macrostate"].tolist()]
-        assert walked == [again["macrostate"].tolist()]
+        (_, start), (before, again) = (env.reset(seed=seed) for env in envs)
+        assert_same(start["macrostate"], again["macrostate"])
+        at = start["macrostate"].tolist()
         for action in generator.integers(registry.task(task).n_actions, size=5):
-            one, other = physics.step(int(action)), kinematic.step(int(action))
+            one, other = (env.step(int(action)) for env in envs)
             assert one[1:4] == other[1:4]
             assert not one[4]["fault"]
-            assert one[4]["macrostate"].tolist() == other[4]["macrostate"].tolist()
-            walked.append(one[4]["macrostate"].tolist())
+            assert_same(one[4]["macrostate"], other[4]["macrostate"])
             apart = share_of_other_pixels(one[0], other[0])
             assert apart < 0.03
-            if walked[-1] != walked[-2]:
+            if at != one[4]["macrostate"].tolist():
                 assert apart < 0.5 * share_of_other_pixels(one[0], before), "the frame of the step before is further"
                 moved += 1
+            at = one[4]["macrostate"].tolist()
             before = other[0]
     assert moved > 0
-    physics.close()
-    kinematic.close()
+    for env in envs:
+        env.close()
 
 
 def share_of_other_pixels(one, other):
@@ -145,8 +134,7 @@ def test_a_state_goes_on_to_the_same_bits(task, execution, appearance):
     actions = (0, 2, 1) if execution == "physics" else (0, 2, 1, 3, 0)
 
     def goes_on(each):
-        seen = [each.agent_view(), *(each.step(action) for action in actions), each.reset(), each.data.qpos.copy()]
-        return [list(part) if isinstance(part, tuple) else part for part in seen]
+        return [each.agent_view(), *(each.step(action) for action in actions), each.reset(), each.data.qpos.copy()]
 
     state = pickle.loads(pickle.dumps(env.get_state()))
     expected = goes_on(env)
@@ -227,12 +215,12 @@ def assert_copies_play_on(task, **options):
         action = 0 if spec.rules.is_terminal(state) else spec.rules.optimal_action(state)
         *after, info = env.step(action)
         for twin in twins:
-            assert_same([*after, info], list(twin.step(action)), f"{task}, step {step}")
+            assert_same((*after, info), twin.step(action), f"{task}, step {step}")
         if after[2] or after[3]:
             began = env.reset()
             info = began[1]
             for twin in twins:
-                assert_same(list(began), list(twin.reset()), f"{task}, start after step {step}")
+                assert_same(began, twin.reset(), f"{task}, start after step {step}")
         if step == 1:
             twins = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
     for each in (env, *twins):

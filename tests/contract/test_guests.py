@@ -36,7 +36,12 @@ def project(folder: Path) -> dict[str, Any]:
     return found
 
 
-@pytest.fixture(scope="module", params=FOLDERS, ids=lambda folder: folder.name)
+FEW = ("controls", "motion")
+"""Guests whose wheels the fast tests build; ``make build`` and the slow tests build all, which have one layout."""
+WHEELS = [pytest.param(folder, marks=[pytest.mark.slow] * (folder.name not in FEW)) for folder in FOLDERS]
+
+
+@pytest.fixture(scope="module", params=WHEELS, ids=lambda folder: folder.name)
 def installed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Distribution]:
     """A guest's folder, and the guest as a wheel leaves it in an empty environment."""
     source, out, site = (tmp_path_factory.mktemp(name) for name in ("source", "wheel", "site"))

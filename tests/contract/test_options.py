@@ -9,9 +9,7 @@ import imagine_bench.agents.dqn  # noqa: F401 - loads torch, which no test's tim
 import pytest
 
 from imagine_bench import registry
-from imagine_bench.errors import InvalidValueError
 from imagine_bench.registry.builtin import guests
-from imagine_bench.running.control import plan_control
 from imagine_bench.testing.checks import NotOffered, checked_agent
 from imagine_bench.testing.options import OPTION_ROWS, CheckedOptions, require_every_field, watching_teaches_as_living
 
@@ -82,9 +80,3 @@ def test_watching_episodes_teaches_as_living_them(agent: str) -> None:
         watching_teaches_as_living(checked_agent(agent, TASK))
     except NotOffered:
         assert not entry.learns or entry.external_training_loop, "only those learn from no episodes that are shown"
-
-
-@pytest.mark.parametrize("option", [{"demonstrations": 2}, {"queries": 1}, {"feedback": 1.0}, {"after": (TASK,)}])
-def test_options_of_training_are_refused_where_no_agent_learns(option: dict[str, object]) -> None:
-    with pytest.raises(InvalidValueError, match="No agent of this bench learns"):
-        plan_control(TASK, "smoke", agents=("random", "oracle"), **option)

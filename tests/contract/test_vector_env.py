@@ -40,21 +40,19 @@ def make_sync(mode, **options):
     return gymnasium.make_vec("imagine_bench/ArrowPuzzle-v0", **options)
 
 
-def walk_both(one, other, steps, n_actions, *, mask):
+def walk_both(envs, steps, n_actions, *, mask):
     """Step two vector environments alike and compare their results: how many episodes ended by rule and limit."""
-    for each in zip(one.reset(seed=3), other.reset(seed=3), strict=True):
-        assert_same(*each)
+    assert_same(*(env.reset(seed=3) for env in envs))
     rng, ended = np.random.default_rng(0), np.zeros(2, dtype=int)
     for step in range(steps):
-        actions = rng.integers(n_actions, size=one.num_envs)
-        its, own = one.step(actions), other.step(actions)
-        for each in zip(its, own, strict=True):
-            assert_same(*each, f"step {step}")
+        actions = rng.integers(n_actions, size=envs[0].num_envs)
+        its, own = (env.step(actions) for env in envs)
+        assert_same(its, own, f"step {step}")
         over = its[2] | its[3]
         ended += its[2].sum(), (its[3] & ~its[2]).sum()
         if mask and over.any():
-            for each in zip(*(env.reset(options={"reset_mask": over.copy()}) for env in (one, other)), strict=True):
-                assert_same(*each, f"reset after step {step}")
+            again = (env.reset(options={"reset_mask": over.copy()}) for env in envs)
+            assert_same(*again, f"reset after step {step}")
     return ended
 
 
@@ -83,12 +81,11 @@ def test_lanes_of_any_world_step_as_sync_in_every_mode(name, execution, mode, st
     sync = make_vec(f"imagine_bench/{name}-v0", vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode})
     vector = make_vec(f"imagine_bench/{name}-vector-v0", threads=3, autoreset_mode=mode)
     n_actions = int(sync.single_action_space.n)
-    ended = walk_both(sync, vector, steps, n_actions, mask=mode == AutoresetMode.DISABLED)
+    ended = walk_both((sync, vector), steps, n_actions, mask=mode == AutoresetMode.DISABLED)
     assert (ended > 0).all() if world == SHORT else ended.sum() > 0
     assert vector.action_names == sync.envs[0].unwrapped.action_names
-    for one, other in zip(sync.envs, vector.envs, strict=True):
-        for field in ("qpos", "qvel", "mocap_pos"):
-            assert np.array_equal(getattr(one.unwrapped.data, field), getattr(other.data, field))
+    for field in ("qpos", "qvel", "mocap_pos"):
+        assert_same(*([getattr(lane.unwrapped.data, field) for lane in env.envs] for env in (sync, vector)))
     assert mode == AutoresetMode.DISABLED or vector.observation_space.contains(vector.step(np.zeros(2, dtype=int))[0])
     sync.close()
     vector.close()
@@ -163,8 +160,7 @@ def test_a_lane_that_blows_up_is_its_own_fault_and_ends_as_a_single_environment(
             vector.step(np.zeros(3, dtype=int))
         for env in (sync, vector):
             env.reset(options={"reset_mask": truncated})
-    for each in zip(*(env.step(np.full(3, first)) for env in (sync, vector)), strict=True):
-        assert_same(*each)
+    assert_same(*(env.step(np.full(3, first)) for env in (sync, vector)))
     sync.close()
     vector.close()
 
@@ -181,8 +177,7 @@ def test_copies_play_on_and_none_is_made_of_acting_lanes(copied, execution):
     vector.step(np.array([0, 1]))
     twin = copied(RecordEpisodeStatistics(vector)).env
     for action in range(4):
-        for each in zip(*(env.step(np.full(2, action)) for env in (vector, twin)), strict=True):
-            assert_same(*each)
+        assert_same(*(env.step(np.full(2, action)) for env in (vector, twin)))
     vector.send([0], [1])
     with pytest.raises(InvalidValueError, match=r"Lanes \[1\] are acting; receive them before you copy or pickle"):
         copied(vector)

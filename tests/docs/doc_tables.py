@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from doc_cells import CELLS, ROOT, Compared
+from doc_cells import CELLS, Compared
+from kept import ROOT
 
 from imagine_bench import statistics
 

@@ -7,7 +7,8 @@ import re
 from importlib import resources
 
 import pytest
-from doc_cells import ROOT, price_to, scores
+from doc_cells import price_to, scores
+from kept import ROOT
 
 from imagine_bench.tools.describe import describe_task
 

@@ -15,8 +15,8 @@ import matplotlib
 import pytest
 import repository
 import thesis_elements
-from doc_cells import ROOT
 from doc_tables import PAGES
+from kept import ROOT
 from matplotlib import pyplot
 from small_runs import do
 

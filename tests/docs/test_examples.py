@@ -14,8 +14,8 @@ from types import ModuleType
 import gymnasium
 import numpy as np
 import pytest
-from doc_cells import ROOT
 from imagine_bench.agents.encoders.encoder import Encoder
+from kept import ROOT
 from small_runs import Inline, benched
 
 from imagine_bench import registry

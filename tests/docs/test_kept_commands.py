@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from doc_cells import KEPT, RESULTS, table
+from doc_cells import KEPT
+from kept import RESULTS, table
 
 from imagine_bench.cli import exit_code as main
 from imagine_bench.cli import parsed

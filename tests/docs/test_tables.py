@@ -7,9 +7,10 @@ import runpy
 from pathlib import Path
 
 import pytest
-from doc_cells import KEPT, RESULTS, ROOT, iqm
+from doc_cells import KEPT, iqm
 from doc_tables import PAGES, tables, unmarked
 from information_cells import needed_by_any
+from kept import RESULTS, ROOT
 from matplotlib.figure import Figure
 
 from imagine_bench.registry import TASKS

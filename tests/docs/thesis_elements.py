@@ -11,7 +11,8 @@ import itertools
 import re
 from collections import Counter
 
-from doc_cells import CELLS, ROOT, Compared
+from doc_cells import CELLS, Compared
+from kept import ROOT
 
 ELEMENTS, PAGE = ROOT / "docs" / "thesis.csv", ROOT / "docs" / "thesis.md"
 VERDICTS = {

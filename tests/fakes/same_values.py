@@ -6,14 +6,14 @@ import numpy as np
 
 
 def assert_same(one, other, where=""):
-    """Nested dicts, lists and arrays, equal to the bit and of the same types."""
+    """Nested dicts, lists, tuples and arrays, equal to the bit and of the same types."""
     assert type(one) is type(other), where
     if isinstance(one, dict):
         assert set(one) == set(other), where
         for key in one:
             assert_same(one[key], other[key], f"{where}/{key}")
         return
-    if isinstance(one, list) or (isinstance(one, np.ndarray) and one.dtype.hasobject):
+    if isinstance(one, list | tuple) or (isinstance(one, np.ndarray) and one.dtype.hasobject):
         for each, its in zip(one, other, strict=True):
             assert_same(each, its, where)
         return

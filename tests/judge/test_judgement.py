@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from doc_cells import ROOT
 from fake_reader import read_nothing
 from guest_packages import Guests
+from kept import ROOT
 from recordings import contents, times, view_names
 from small_runs import Inline, small
 

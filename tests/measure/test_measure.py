@@ -16,7 +16,7 @@ import scipy
 import speed
 from fake_results import bench_result, rewritten
 
-from imagine_bench import registry, statistics
+from imagine_bench import statistics
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 from imagine_bench.protocols.control import Protocol
@@ -113,12 +113,6 @@ def test_rates_are_kept_and_nothing_to_draw_from_is_said(tmp_path: Path) -> None
     assert len(kept["power"]) == len(interval_coverage.SEEDS) * len(interval_coverage.PAIRS)
     with pytest.raises(InvalidValueError, match="no learner has five seeds; give a folder of kept results"):
         interval_coverage.populations(tmp_path)
-
-
-def test_a_frame_costs_little_more_than_mujocos_drawing_alone() -> None:
-    frame, step = speed.drawing(registry.task("arrow_puzzle"))
-    assert frame.met and step.met
-    assert " against " in frame.measured and frame.measured.endswith("CPU ms)")
 
 
 def test_a_busy_machine_changes_no_ratio_between_suites() -> None:

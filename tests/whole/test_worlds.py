@@ -13,7 +13,7 @@ from collections import Counter
 import gymnasium
 import numpy as np
 import pytest
-from doc_cells import RESULTS
+from kept import RESULTS
 from whole_outputs import Expected, rounded, tabulated
 
 from imagine_bench import registry
