@@ -28,7 +28,6 @@ from imagine_bench.errors import (
     ImagineBenchError,
     InvalidValueError,
     RunFailedError,
-    UnknownKeywordError,
     UnknownNameError,
 )
 from imagine_bench.interfaces import AgentContext
@@ -267,7 +266,9 @@ def test_kept_results_are_loaded_as_they_were_written(kept: str) -> None:
     folder = ROOT / "docs/results" / kept
     results = imagine_bench.load(folder)
     frame = results.frame()
-    with (folder / f"{next(iter(results.tables))}.csv").open() as file:
+    main = next(iter(results.tables))
+    assert main in ("results", "scores")
+    with (folder / f"{main}.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert set(frame) == set(rows[0]) and len(rows) > 5
     for column in set(frame) - {"agent"}:  # labels that were renamed are today's
@@ -304,54 +305,11 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         assert wanted == command.planned()[0], words
     variants = {"variants": [np.int64(50), "100"]}
     assert api.protocol_changes(variants) == {"variants": ("50", "100")}
-    with pytest.raises(UnknownKeywordError, match=r"'episodes'.*evaluation_episodes"):
-        imagine_bench.bench("arrow_puzzle", episodes=3)
-    with pytest.raises(UnknownKeywordError, match=r"'worker'. Did you mean 'workers'"):
-        imagine_bench.bench("arrow_puzzle", worker=2)
-    wrong: list[tuple[dict[str, Any], str]] = [
-        ({"seeds": -1}, "seeds is -1; give their number"),
-        ({"seeds": 1 << 70}, "give their number, 1 to 16777216"),
-        ({"budgets": [True]}, "give a whole number or a list of them"),
-        ({"workers": "2"}, "workers is '2'; give a whole number"),
-        ({"until_decided": "false"}, "give True or False"),
-        ({"out": None}, "out is None"),
-        ({"agents": {"dqn", "random"}}, "give a name, a class or a function, or a list of them"),
-        ({"set": "controller.discount=0.9"}, "give a mapping of names to values"),
-        ({"until_decided": True, "most_seeds": 0}, "give at least 10"),
-        ({"most_seeds": 3}, "--most-seeds goes with --until-decided"),
-    ]
-    for options, sentence in wrong:
-        with pytest.raises(ImagineBenchError, match=sentence):
-            imagine_bench.bench("arrow_puzzle", **{"out": tmp_path, **options})
-    with pytest.raises(InvalidValueError, match="task is None"):
-        imagine_bench.bench(None)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("name", "make", "options", "sentence"),
-    [
-        ("dqn", Shifting, {}, "There is an agent 'dqn' already"),
-        ("sb3_dqn", Shifting, {}, "There is an agent 'sb3_dqn' already"),
-        ("my agent", Shifting, {}, "cannot be called 'my agent'"),
-        ("mine", 3, {}, "made by a class or a function; 3 is neither"),
-        ("<lambda>", Shifting, {}, "cannot be called '<lambda>'"),
-        ("mine", functools.partial(Shifting, _LOCK), {}, "cannot be sent to worker processes"),
-        ("_mine", Shifting, {}, "begins with one of a to z"),
-        ("mine", Shifting, {"needs_encoder": "no"}, "needs_encoder is 'no'; give True or False"),
-        ("mine", Shifting, {"observes": 3}, "observes is 3; give a text"),
-        ("mine", Shifting, {"encoder_kind": "q"}, "No kind of encoder 'q'. Known: latents, codes."),
-        ("mine", Shifting, {"observes": "pixels"}, "No part of an observation 'pixels'"),
-        ("mine", Shifting, {"relative_cost": 0.0}, "relative_cost is 0.0; give a number above 0."),
-        ("mine", Shifting, {"learn": False}, "'learn'. Did you mean 'learns'?"),
-    ],
-)
-def test_what_cannot_be_registered_is_one_sentence(
-    name: str, make: Callable[..., Any], options: dict[str, Any], sentence: str
-) -> None:
-    with pytest.raises((InvalidValueError, UnknownKeywordError, UnknownNameError)) as found:
-        imagine_bench.register_agent(name, make, **options)
-    assert sentence in str(found.value)
+    for wrong in ({"seeds": {0, 1}}, {"agents": {"dqn", "random"}}):
+        with pytest.raises(InvalidValueError, match="or a list of them"):
+            imagine_bench.bench("arrow_puzzle", out=tmp_path, **wrong)
+    with pytest.raises(InvalidValueError, match="cannot be sent to worker processes"):
+        imagine_bench.register_agent("mine", functools.partial(Shifting, _LOCK))
 
 
 def test_a_class_that_is_changed_keeps_its_name_and_fields(monkeypatch: pytest.MonkeyPatch) -> None:

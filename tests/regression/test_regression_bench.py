@@ -207,28 +207,6 @@ def test_the_command_ends_in_a_table_and_a_report(tmp_path: Path, capsys: pytest
     assert any(path.startswith("/scene") for path in named)
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["--task", "toy_regression", "--agents", "dqn"], "No regressor 'dqn'. Known: ensemble, mc_dropout."),
-        (
-            ["--task", "toy_regression", "--networks", "0"],
-            "networks is 0 and test_points 50; they must lie in [1, 1000",
-        ),
-        (["--task", "toy_regression", "--encoder", "x"], "toy_regression takes no --encoder; leave it out."),
-        (["--task", "toy_regression", "--set", "members=1"], "Settings members is 1 and dropout is 0: all weight"),
-        (["--task", "toy_regression", "--set", "hidden=[64]"], "dropout acts between hidden layers, so it needs at"),
-    ],
-)
-def test_wrong_words_get_one_line_and_write_nothing(
-    words: list[str], sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["bench", *words, "--preset", "smoke", "--out", str(tmp_path / "runs")]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert sentence in line
-    assert not (tmp_path / "runs").exists()
-
-
 @pytest.mark.parametrize("name", ["minimal", "fast", "published"])
 def test_an_ensemble_is_compared_fairly_with_one_network(name: str) -> None:
     """It never costs more; dropout is of the one, members of the other; published, both sample as many values."""

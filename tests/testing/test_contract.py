@@ -24,8 +24,6 @@ def test_our_agents_keep_the_contract(agent: str) -> None:
 
 
 def test_the_command_says_what_holds(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check"]) == 2
-    assert "give --task, --agent or --model" in capsys.readouterr().err
     assert main(["check", "--agent", "random"]) == 0
     assert capsys.readouterr().out.startswith("ok     it is made\n")
 

@@ -11,21 +11,9 @@ import pytest
 from imagine_bench.agents.world_models.limits import Copy
 
 from imagine_bench import registry
-from imagine_bench.cli import exit_code as main
-from imagine_bench.errors import InvalidValueError, UnknownNameError
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.model import Imagined
 from imagine_bench.testing.contract import checks
-
-
-def test_the_command_says_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", "--task", "arrow_puzzle_easy", "--model", "copy"]) == 0
-    assert capsys.readouterr().out.startswith("ok     it is made, with fit, imagine and parameters\n")
-    with pytest.raises(UnknownNameError, match="No world model 'dqn'"):
-        checks(model="dqn")
-    with pytest.raises(InvalidValueError, match="one at a time; give --agent or --model"):
-        checks(agent="dqn", model="copy")
-    with pytest.raises(InvalidValueError, match="World model exact is given the rules"):
-        checks(model="exact")
 
 
 class _Wrong(Copy):

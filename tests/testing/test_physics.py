@@ -8,11 +8,9 @@ import pytest
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
-from imagine_bench.errors import InvalidValueError, UnknownNameError
 from imagine_bench.testing import physics
 from imagine_bench.testing.physics import (
     Fidelity,
-    check_physics,
     fidelity_figures,
     figure_of,
     measure_fidelity,
@@ -109,12 +107,3 @@ def test_a_figure_meets_its_target_or_not():
         found = [figure_of("what", value, ".2f", sign, 0.5) for value in (0.4999, 0.5, 0.5001)]
         assert tuple(figure.met for figure in found) == met
         assert (found[0].required, found[0].measured) == (f"{sign} 0.5", "0.50"), "a rounded value decides nothing"
-
-
-def test_wrong_numbers_and_names_are_refused(tmp_path):
-    with pytest.raises(InvalidValueError, match="give at least 1 macro-action"):
-        check_physics("pick_place", tmp_path / "x.json", turns=0, trials=0)
-    with pytest.raises(InvalidValueError, match=r"is a folder; give the JSON file to write\."):
-        check_physics("pick_place", tmp_path)
-    with pytest.raises(UnknownNameError, match="No appearance 'dark'"):
-        check_physics("pick_place", tmp_path / "x.json", appearances=("dark",))

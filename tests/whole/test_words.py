@@ -6,14 +6,20 @@ beside the thesis' own in ``tests/agents/test_settings.py``.
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+from imagine_bench.agents.baselines import RandomAgent
+from storms import one_sentence
 from whole_outputs import KEPT, Expected
 
+import imagine_bench
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
+from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import APPEARANCES, EXECUTIONS
 from imagine_bench.running.bench import task_types
 from imagine_bench.running.launchers.jobs import LAUNCHERS
@@ -73,14 +79,34 @@ def test_described_learners(expected: Expected) -> None:
     expected("describe_learners", "\n\n".join(pages))
 
 
+def asked(name: str) -> list[str]:
+    """The questions of a kept file, which stand above their answers."""
+    return re.findall(r"^\$ (.*)$", (KEPT / f"{name}.txt").read_text(encoding="utf-8"), re.MULTILINE)
+
+
 def test_answers_to_wrong_words(tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: Expected) -> None:
     """One line each, exit code 2, and nothing is written; the words stand in the kept file, HERE is an empty folder."""
-    kept = (KEPT / "wrong_words.txt").read_text(encoding="utf-8")
     answers = []
-    for words in re.findall(r"^\$ (.*)$", kept, re.MULTILINE):
+    for words in asked("wrong_words"):
         code = main([word.replace("HERE", str(tmp_path)) for word in words.split()])
         said = capsys.readouterr()
         assert (code, said.out, len(said.err.splitlines())) == (2, "", 1), words
         answers += [f"$ {words}", said.err.replace(str(tmp_path), "HERE")]
     assert not list(tmp_path.iterdir())
     expected("wrong_words", "\n".join(answers))
+
+
+def test_answers_to_wrong_keywords(tmp_path: Path, expected: Expected) -> None:
+    """Of the Python API; a line of the kept file is a function with its keywords as JSON."""
+    usual: dict[str, dict[str, Any]] = {
+        "bench": {"task": "arrow_puzzle", "out": tmp_path},
+        "register_agent": {"name": "mine", "make": RandomAgent},
+    }
+    answers = []
+    for call in asked("wrong_keywords"):
+        name, _, given = call.partition(" ")
+        with pytest.raises(ImagineBenchError) as caught:
+            getattr(imagine_bench, name)(**{**usual[name], **json.loads(given)})
+        answers += [f"$ {call}", one_sentence(caught.value), ""]
+    assert not list(tmp_path.iterdir())
+    expected("wrong_keywords", "\n".join(answers))

@@ -37,11 +37,10 @@ def make(images: Images) -> Lane:
         moment = env.step(action)
         return moment.last(), [moment.observation[name][0] for name in names]
 
-    def reset() -> None:
-        env.reset()
-
     spec = env.action_spec()
-    return Lane(reset, step, spec.minimum, spec.maximum, env.physics.model._model, task.physics_steps_per_control_step)
+    return Lane(
+        env.reset, step, spec.minimum, spec.maximum, env.physics.model._model, task.physics_steps_per_control_step
+    )
 
 
 if __name__ == "__main__":

@@ -29,11 +29,8 @@ def make(images: Images) -> Lane:
             frames.append(env.render())
         return terminated or truncated, frames
 
-    def reset() -> None:
-        env.reset()
-
     space = env.action_space
-    return Lane(reset, step, space.low, space.high, inner.model, inner.n_substeps)
+    return Lane(env.reset, step, space.low, space.high, inner.model, inner.n_substeps)
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ class Images:
 class Lane:
     """One environment, or several at once, in the manner of its own suite."""
 
-    reset: Callable[[], None]
+    reset: Callable[[], object]
     step: Callable[[np.ndarray], tuple[bool, list[np.ndarray]]]  #: whether the episode is over, and the images
     low: np.ndarray
     high: np.ndarray
@@ -73,6 +73,15 @@ def without_effects(model: mujoco.MjModel) -> None:
     model.mat_reflectance[:] = 0
     model.vis.quality.shadowsize = 0
     model.vis.quality.offsamples = 0
+
+
+def warm(lane: Lane) -> np.ndarray:
+    """Reset a lane and step it a few times; returns the actions."""
+    lane.reset()
+    actions = actions_of(lane)
+    for action in actions[:5]:
+        lane.step(action)
+    return actions
 
 
 def actions_of(lane: Lane) -> np.ndarray:
@@ -98,9 +107,7 @@ def steps(make: Make, images: Images, seconds: float) -> dict[str, str | float]:
     lane.reset()
     made_s = time.process_time() - start
     check(lane, images)
-    actions = actions_of(lane)
-    for action in actions[:5]:  # warms up
-        lane.step(action)
+    actions = warm(lane)
     step_s = reset_s = 0.0
     n_steps = n_resets = 0
     while step_s < seconds:
@@ -145,9 +152,7 @@ def memory(make: Make, images: Images, lanes: int) -> dict[str, float]:
     kept = []
     for count in range(lanes + 1):
         lane = make(images)
-        lane.reset()
-        for action in actions_of(lane)[:5]:
-            lane.step(action)
+        warm(lane)
         kept.append(lane)
         if count == 0:
             first_mib = resident_mib()
@@ -157,10 +162,7 @@ def memory(make: Make, images: Images, lanes: int) -> dict[str, float]:
 def wall(make: Make, images: Images, seconds: float) -> dict[str, float]:
     """Steps, with the resets between them, from a signal on standard input on; so two processes start at once."""
     lane = make(images)
-    lane.reset()
-    actions = actions_of(lane)
-    for action in actions[:5]:
-        lane.step(action)
+    actions = warm(lane)
     print("ready", flush=True)
     sys.stdin.readline()
     n_steps = 0

@@ -26,12 +26,9 @@ def make(images: Images) -> Lane:
             frames.append(inner.render(camera="front"))
         return terminated or truncated, frames
 
-    def reset() -> None:
-        env.reset()
-
     space = env.action_space
     n_steps = round(inner.control_timestep() / inner.physics_timestep())
-    return Lane(reset, step, space.low, space.high, inner.model, n_steps, 20.0)
+    return Lane(env.reset, step, space.low, space.high, inner.model, n_steps, 20.0)
 
 
 if __name__ == "__main__":

@@ -59,13 +59,10 @@ def vector(images: Images) -> Lane:
         seen, *_ = envs.step(np.tile(action, (LANES, 1)))
         return False, [seen[name][0] for name in cameras]
 
-    def reset() -> None:
-        envs.reset()
-
     space = envs.single_action_space
     model = envs.envs[0].model
     n_steps = round(envs.envs[0].period_s / model.opt.timestep)
-    return Lane(reset, step, space.low, space.high, model, n_steps, RATE_HZ, LANES)
+    return Lane(envs.reset, step, space.low, space.high, model, n_steps, RATE_HZ, LANES)
 
 
 def lane_of(env: gymnasium.Env, images: Images) -> Lane:
@@ -76,13 +73,10 @@ def lane_of(env: gymnasium.Env, images: Images) -> Lane:
         seen, _, terminated, truncated, _ = env.step(action)
         return terminated or truncated, [seen[name] for name in cameras]
 
-    def reset() -> None:
-        env.reset()
-
     space = env.action_space
     model = env.unwrapped.model
     n_steps = round(env.unwrapped.period_s / model.opt.timestep)
-    return Lane(reset, step, space.low, space.high, model, n_steps, RATE_HZ)
+    return Lane(env.reset, step, space.low, space.high, model, n_steps, RATE_HZ)
 
 
 class MujocoAlone:

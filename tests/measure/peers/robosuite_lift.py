@@ -37,12 +37,9 @@ def make(images: Images) -> Lane:
         seen, _, done, _ = env.step(action)
         return done, [seen[f"{name}_image"] for name in cameras]
 
-    def reset() -> None:
-        env.reset()
-
     low, high = env.action_spec
     return Lane(
-        reset,
+        env.reset,
         step,
         low,
         high,
