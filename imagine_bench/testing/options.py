@@ -1,9 +1,8 @@
 """The contract of an agent and every option of a protocol: the option has an effect on it, or is refused.
 
 A row for each option: two short runs from equal seeds, with it and without, must differ in the agent's actions, rewards
-    or learned arrays. Fields of the protocol without a row are in :data:`WITHOUT_ROW`, each with the reason; a new
-    field that is
-in neither fails the contract.
+or learned arrays. Fields of the protocol without a row are in :data:`WITHOUT_ROW`, each with the reason; a new field
+that is in neither fails the contract.
 """
 
 from __future__ import annotations
@@ -82,6 +81,7 @@ OPTION_ROWS: Mapping[str, OptionRow] = {
     "transfer": OptionRow(fields=("after", "after_episodes"), changes={"after": (_TASK,), "after_episodes": 1}),
     "unannounced": OptionRow(
         fields=("unannounced",),
+        without={"after": (_TASK,), "after_episodes": 2},
         changes={"after": (_TASK,), "after_episodes": 2, "unannounced": True},
     ),
     "split": OptionRow(fields=("split",), changes={"split": "plan_length=1"}, shown=True),

@@ -43,6 +43,14 @@ def test_every_field_of_a_protocol_has_a_row_or_a_reason() -> None:
     require_every_field()
 
 
+def test_two_runs_of_a_row_differ_in_its_option_alone() -> None:
+    for name, row in OPTION_ROWS.items():
+        keys = row.changes.keys() | row.without.keys()
+        differ = {key for key in keys if row.changes.get(key) != row.without.get(key)}
+        assert differ == set(row.fields) - {"execution"}, name
+        assert bool(row.world) != bool(differ), "a field of the protocol, or an option of the world"
+
+
 @functools.cache
 def checked_options(agent: str) -> CheckedOptions:
     """The options of an agent, whose run without any is carried out once."""

@@ -32,7 +32,7 @@ from imagine_bench.judge.worlds.families import (
 )
 from imagine_bench.judge.worlds.graph import edges_of_rules, hamming_distance
 from imagine_bench.judge.worlds.making import LOOK, QUERIES, WorldQuestions, world_questions
-from imagine_bench.judge.worlds.scores import MARGIN, scores_right, world_scores
+from imagine_bench.judge.worlds.scores import GRAPH, MARGIN, graph_scores, scores_right, world_scores
 from imagine_bench.judge.worlds.tables import Transitions, TransitionTable, likelihood
 from imagine_bench.rules import Dynamics, Rules, states_of_play
 
@@ -261,6 +261,7 @@ def test_the_hamming_distance_counts_edges_whatever_factors_are_called() -> None
     assert hamming_distance(dataclasses.replace(learned, edges=other), edges, states) == 1
     nothing = dataclasses.replace(learned, edges=np.zeros_like(edges))
     assert hamming_distance(nothing, edges, states) == edges.sum()
+    assert graph_scores(nothing, edges, states)[GRAPH] == {"edges_wrong": edges.sum(), "edges": edges.sum()}
     wide = np.zeros((len(edges), 5, 5), dtype=bool)
     wide[:, :4, :4] = learned.edges
     wide[1, 4, 4] = True  # a factor that shows nothing of the macrostate

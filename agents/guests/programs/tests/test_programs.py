@@ -40,6 +40,7 @@ HOSTILE = {
     "calls the C library": (f"{REACHES}['ctypes'].CDLL(None).fork()", "it calls ctypes.dlopen"),
     "opens a socket": (f"{REACHES}['socket'].socket()", "it calls socket.__new__"),
     "imports a module that is loaded": ("import os", "it imports os; a program may import bisect, "),
+    "imports a part that no program needs": ("import numpy.ctypeslib", "it imports numpy.ctypeslib; a program may"),
     "imports a part of one": ("from os import path", "it imports os; a program may"),
     "imports when it is asked": ("def outcomes(s, a):\n from time import time", "it imports time; a program may"),
     "imports by a function": ("__import__('random')", "it imports random; a program may"),
@@ -62,8 +63,16 @@ HOSTILE = {
 }
 
 
-@pytest.mark.slow  # twenty processes, half a second of CPU each
-@pytest.mark.parametrize(("source", "said"), HOSTILE.values(), ids=HOSTILE)
+_FAST = {"imports a part that no program needs", "imports a part of one", "gives fewer symbols"}
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] * (name not in _FAST))  # half a CPU second each
+        for name, case in HOSTILE.items()
+    ],
+)
 def test_a_hostile_program_gets_one_sentence(source: str, said: str, tmp_path: Path) -> None:
     file = tmp_path / "hostile.py"
     file.write_text(source)
