@@ -12,7 +12,6 @@ from imagine_bench_board.daily import world_of_day
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code
-from imagine_bench.errors import InvalidValueError
 
 DAYS = [str(date(2026, 12, 1) + timedelta(days=number)) for number in range(3)]
 
@@ -36,11 +35,6 @@ def test_a_secret_hides_the_world_and_the_digest_binds_it() -> None:
 def test_today_is_the_day_by_default() -> None:
     with on(date(2026, 12, 3)):
         assert world_of_day() == world_of_day("2026-12-03")
-
-
-def test_no_day_is_said() -> None:
-    with pytest.raises(InvalidValueError, match=r"'2026-13-01' is no day; write it as 2026-12-24\."):
-        world_of_day("2026-13-01")
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from imagine_bench_board.rows import read_row
 from imagine_bench_board.submit import file_agents, submit
 from small_runs import Inline, small
 
-from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.running.bench import bench
 
@@ -61,6 +60,8 @@ def test_days_decide_what_may_be_done(finished: Path, tmp_path: Path) -> None:
     folder, secret = opened(tmp_path)
     with on(BEFORE), pytest.raises(InvalidValueError, match="closes on 2026-12-24; reveal its seed from then on"):
         rounds.reveal(folder, secret)
+    with on(AFTER), pytest.raises(InvalidValueError, match="2026-12-24 is not after today, 2026-12-24"):
+        rounds.open_round(tmp_path / "late", closes=CLOSES, tests=TESTS, secret=tmp_path / "other.json")
     with on(AFTER), pytest.raises(InvalidValueError, match="closed on 2026-12-24; file in a later one"):
         file_agents(finished, folder)
     with on(date(2026, 12, 23)):
@@ -82,28 +83,3 @@ def test_only_what_was_filed_and_promised_is_published(finished: Path, tmp_path:
         rounds.reveal(folder, secret)
     with pytest.raises(ArtefactError, match="was not filed in the round winter before its seed was published"):
         submit(finished, tmp_path / "rows", author="", round_folder=folder, encoder=None)
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ("open HERE/winter", "'board open' needs --closes, a day such as 2026-12-24; give it too."),
-        ("open HERE/winter --closes 2020-01-01", "2020-01-01 is not after today"),
-        ("open HERE/winter --closes soon", "'soon' is no day; write it as 2026-12-24."),
-        ("open HERE/Winter --closes 2999-01-01", "A round cannot be called 'Winter'"),
-        ("open HERE --closes 2999-01-01", "exists; give another."),
-        ("open HERE/winter --closes 2999-01-01 --tests 0", "tests is 0; give 1 to 10,000,000."),
-        ("file HERE", "'board file' needs --round, the folder of a round; give it too."),
-        ("look HERE", "No action 'look'. Known: check, page, open, file, reveal."),
-        ("reveal HERE", "There is no HERE/round.json, a round of a board."),
-        ("check HERE", "HERE holds no rows"),
-    ],
-)
-def test_wrong_words_get_one_line(
-    words: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert exit_code(["board", *(word.replace("HERE", str(tmp_path)) for word in words.split())]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("imagine-bench: ") and sentence.replace("HERE", str(tmp_path)) in line
-    assert not (tmp_path / "winter").exists()

@@ -90,12 +90,6 @@ def test_babbling_is_what_was_reached_and_the_joints_with_noise() -> None:
     assert (data.targets - commanded).std() == pytest.approx(ik.NOISE_RAD, rel=0.1)
 
 
-@pytest.mark.parametrize("variant", ["19", "1e3"])
-def test_sample_counts_out_of_range_name_the_range(variant: str) -> None:
-    with pytest.raises(InvalidValueError, match=rf"in \[20, 1000000\], such as 2000, not '{variant}'"):
-        ik.samples_of(variant)
-
-
 def test_decisions_are_carried_out_by_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of networks with any output: the arm rests where equation 4.29 puts the joints, and misses by that."""
 

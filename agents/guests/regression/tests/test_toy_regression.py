@@ -7,8 +7,6 @@ import pytest
 from imagine_bench_regression import toy_regression as toy
 from scipy import stats
 
-from imagine_bench.errors import UnknownNameError
-
 
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
@@ -36,8 +34,3 @@ def test_noise_is_three_times_as_large_in_the_noisy_region_only() -> None:
     x = np.array([-10.1, -10.0, 0.0, 10.0, 10.1])
     np.testing.assert_array_equal(toy.noise_sigma("high_noise", x), [1, 3, 3, 3, 1])
     np.testing.assert_array_equal(toy.noise_sigma("base", x), np.ones(5))
-
-
-def test_a_variant_that_does_not_exist_is_named_with_the_closest() -> None:
-    with pytest.raises(UnknownNameError, match=r"No variant of toy_regression 'lowdata'. Did you mean 'low_data'\?"):
-        toy.training("lowdata", rng())
