@@ -40,7 +40,7 @@ HOSTILE = {
     "calls the C library": (f"{REACHES}['ctypes'].CDLL(None).fork()", "it calls ctypes.dlopen"),
     "opens a socket": (f"{REACHES}['socket'].socket()", "it calls socket.__new__"),
     "imports a module that is loaded": ("import os", "it imports os; a program may import bisect, "),
-    "imports a part that no program needs": ("import numpy.ctypeslib", "it imports numpy.ctypeslib; a program may"),
+    "imports a part that no program needs": ("import numpy.lib", "it imports numpy.lib; a program may"),
     "imports a part of one": ("from os import path", "it imports os; a program may"),
     "imports when it is asked": ("def outcomes(s, a):\n from time import time", "it imports time; a program may"),
     "imports by a function": ("__import__('random')", "it imports random; a program may"),
