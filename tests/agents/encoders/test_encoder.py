@@ -169,6 +169,13 @@ def test_beta_warms_up_and_the_thesis_has_no_schedule() -> None:
 # --- the probe -------------------------------------------------------------------------------------------------------
 
 
+def test_every_frame_has_a_draw_of_its_own() -> None:
+    latents = Latents(torch.tensor([[1.0, -2.0]]).expand(4000, 2), torch.tensor([[0.5, 3.0]]).expand(4000, 2))
+    drawn = latents.sample(torch.Generator().manual_seed(0))
+    assert torch.allclose(drawn.mean(dim=0), latents.mu[0], atol=0.2)
+    assert torch.allclose(drawn.std(dim=0), latents.sigma[0], rtol=0.05)
+
+
 @pytest.mark.parametrize("clear", [True, False])
 def test_probe_reads_separable_latents_and_not_noise(clear: bool) -> None:
     rng = np.random.default_rng(0)
