@@ -22,7 +22,6 @@ from imagine_bench.errors import (
     ArtefactError,
     InvalidValueError,
     RunFailedError,
-    SetupError,
     UnknownNameError,
     plain,
     require_modules,
@@ -226,8 +225,8 @@ def task_type(task: str) -> TaskType[ProtocolData]:
         if task in kind.tasks() or task.partition(":")[0] in kind.tasks():
             return kind
     for group in (registry.TASK_GROUP, registry.REGRESSION_GROUP):
-        if isinstance(error := registry.offers(group).get(task), SetupError):
-            raise error
+        with suppress(UnknownNameError):
+            registry.offered(task, {}, group)
     raise UnknownNameError("task", task, [name for kind in task_types().values() for name in kind.tasks()])
 
 

@@ -62,7 +62,8 @@ def describe(name: str) -> str:
             pages.append(_learner(name, known[name]))
         learners |= known
     if not pages:
-        for group in (registry.TASK_GROUP, registry.AGENT_GROUP, registry.WORLD_MODEL_GROUP):
+        tasks = (registry.TASK_GROUP, registry.REGRESSION_GROUP)
+        for group in (*tasks, registry.AGENT_GROUP, registry.REGRESSOR_GROUP, registry.WORLD_MODEL_GROUP):
             if registry.guest_with(group, name) is not None:
                 registry.offered(name, {}, group)  # raises
         moving = [each.env_id for each in registry.tasks().values() if each.motion]

@@ -322,20 +322,15 @@ def test_render_macrostates_refuses_what_is_none(macrostates, message):
 # --- scene reader ------------------------------------------------------------------------------------------------
 
 
-def test_shapes_and_motion_describe_the_scene():
+def test_the_motion_describes_the_scene():
+    """Its shapes, their places and colors are in the kept recording of tests/whole."""
     env = make().unwrapped
     assert isinstance(env, SceneReader)
     env.reset(seed=0, options={"macrostate": (0, 1, 2, 1)})
-    shapes, still = {shape.name: shape for shape in env.shapes()}, env.motion()
-    assert len(shapes) == len(env.shapes()) and {"cube_0_box", "hand_smooth_skin", "floor"} <= set(shapes)
-    assert {"right_l3"} <= {shape.body for shape in shapes.values()} <= set(still.body_names)
-    for name, shape in shapes.items():
-        assert (shape.vertices is None) == (shape.faces is None) == (shape.kind != "mesh")
-        assert shape.faces is None or shape.faces.max() < len(shape.vertices)
-        geom = env.model.geom(name)
-        is_plane = geom.type[0] == mujoco.mjtGeom.mjGEOM_PLANE
-        below_m = np.array([0.0, 0.0, shape.size[2] if is_plane else 0.0])  # a plane is the top of a thin box
-        np.testing.assert_array_equal(shape.pose_in_body, [*(geom.pos - below_m), *geom.quat])
+    still = env.motion()
+    shapes = env.shapes()
+    assert {"right_l3"} <= {shape.body for shape in shapes} <= set(still.body_names)
+    assert all(shape.faces is None or shape.faces.max() < len(shape.vertices) for shape in shapes)
     for name, pose in zip(still.body_names, still.poses_in_world[0], strict=True):
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, pose[3:])

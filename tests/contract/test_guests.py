@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from guest_packages import Guests
 from packaging.requirements import Requirement
+from whole_outputs import Expected, masked, questions
 
 import imagine_bench
 from imagine_bench import registry
@@ -101,7 +102,7 @@ def without_guests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.mark.usefixtures("without_guests")
 def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: Expected
 ) -> None:
     assert main(["describe"]) == 0
     marked = capsys.readouterr().out.partition("\nNot installed\n")[2].partition("\n\n")[0].splitlines()
@@ -111,25 +112,11 @@ def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_l
     with pytest.raises(InvalidValueError, match="There is an agent 'factored' already"):
         imagine_bench.register_agent("factored", "some:agent")
     write_json(tmp_path / "card.json", sealed({"control": "twist"}))  # of demonstrations
-    for words, guest in (
-        ("describe factored", "factored"),
-        ("describe structured", "factored"),
-        ("bench --task arrow_puzzle --agents dqn dreamer_v3:replay_ratio=2", "peers"),
-        ("judge ArrowPuzzleMotion", "motion"),
-        ("play ArrowPuzzleMotion", "motion"),
-        ("dataset ArrowPuzzleMotion --policy expert --episodes 0", "motion"),
-        (f"dataset --describe {tmp_path}", "motion"),
-        (f"verify {tmp_path}", "motion"),
-        (f"view {tmp_path}", "motion"),
-        ("daily", "board"),
-        ("board check docs/board", "board"),
-        ("submit runs", "board"),
-        ("serve arrow_puzzle", "serving"),
-    ):
-        assert main(words.split()) == 2
-        install = f"Install it with: pip install -e {ROOT / 'agents' / 'guests' / guest}"
-        said = f"package imagine-bench-{guest}, which is not installed. {install}"
-        assert said in capsys.readouterr().err, words
+    answers = []
+    for words in questions("not_installed"):
+        assert main([word.replace("HERE", str(tmp_path)) for word in words.split()]) == 2
+        answers += [f"$ {words}", masked(capsys.readouterr().err, ROOT)]
+    expected("not_installed", "\n".join(answers))
 
 
 @pytest.mark.usefixtures("without_guests")

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from imagine_bench.agents.baselines import RandomAgent
 from storms import one_sentence
-from whole_outputs import KEPT, Expected
+from whole_outputs import Expected, questions
 
 import imagine_bench
 from imagine_bench import registry
@@ -79,15 +79,10 @@ def test_described_learners(expected: Expected) -> None:
     expected("describe_learners", "\n\n".join(pages))
 
 
-def asked(name: str) -> list[str]:
-    """The questions of a kept file, which stand above their answers."""
-    return re.findall(r"^\$ (.*)$", (KEPT / f"{name}.txt").read_text(encoding="utf-8"), re.MULTILINE)
-
-
 def test_answers_to_wrong_words(tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: Expected) -> None:
     """One line each, exit code 2, and nothing is written; the words stand in the kept file, HERE is an empty folder."""
     answers = []
-    for words in asked("wrong_words"):
+    for words in questions("wrong_words"):
         code = main([word.replace("HERE", str(tmp_path)) for word in words.split()])
         said = capsys.readouterr()
         assert (code, said.out, len(said.err.splitlines())) == (2, "", 1), words
@@ -103,7 +98,7 @@ def test_answers_to_wrong_keywords(tmp_path: Path, expected: Expected) -> None:
         "register_agent": {"name": "mine", "make": RandomAgent},
     }
     answers = []
-    for call in asked("wrong_keywords"):
+    for call in questions("wrong_keywords"):
         name, _, given = call.partition(" ")
         with pytest.raises(ImagineBenchError) as caught:
             getattr(imagine_bench, name)(**{**usual[name], **json.loads(given)})

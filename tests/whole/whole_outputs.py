@@ -85,6 +85,11 @@ def _sections(file: Path) -> dict[str, str]:
     return found | dict(zip(others[::2], others[1::2], strict=True))
 
 
+def questions(name: str) -> list[str]:
+    """The lines of a kept file behind ``$``; the answer to each stands below it."""
+    return re.findall(r"^\$ (.*)$", (KEPT / f"{name}.txt").read_text(encoding="utf-8"), re.MULTILINE)
+
+
 def masked(text: str, folder: Path | None = None) -> str:
     """A text without digests, and with HERE for a folder."""
     text = text if folder is None else text.replace(str(folder), "HERE")

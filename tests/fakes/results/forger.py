@@ -47,8 +47,12 @@ def share_weights(folder: Path) -> None:
     mend(folder / "table" / "seed_1")
 
 
-def one_run(bench: Path, rng: np.random.Generator) -> Path:
-    return rng.choice(sorted(path.parent for path in bench.glob("*/seed_*/DONE")))  # type: ignore[arg-type]
+def all_runs(bench: Path, agent: str = "*") -> list[Path]:
+    return sorted(path.parent for path in bench.glob(f"{agent}/seed_*/DONE"))
+
+
+def one_run(bench: Path, rng: np.random.Generator, agent: str = "*") -> Path:
+    return rng.choice(all_runs(bench, agent))  # type: ignore[arg-type]
 
 
 def rewrite(run: Path, rows: Sequence[Checkpoint], **values: Any) -> None:
@@ -165,24 +169,27 @@ def change_checkpoint(run: Path, change: Callable[[dict[str, Any], Arrays], None
     mend(run)
 
 
-def learner(bench: Path, rng: np.random.Generator) -> Path:
-    return rng.choice(sorted(path.parent for path in bench.glob("table/seed_*/DONE")))  # type: ignore[arg-type]
-
-
 def in_training(name: str) -> Forge:
     """One more somewhere in an array of the training episodes, or another number in a list of them."""
 
-    def forge(bench: Path, rng: np.random.Generator) -> None:
-        def change(values: dict[str, Any], arrays: Arrays) -> None:
-            if name in values:
-                index = int(rng.integers(len(values[name])))
-                values[name][index] = 1 - values[name][index]
-            else:
-                array = arrays[name]
-                index = int(rng.integers(array.size))
-                array.flat[index] = not array.flat[index] if array.dtype == bool else (array.flat[index] + 1) % 6
+    def change(values: dict[str, Any], arrays: Arrays, rng: np.random.Generator) -> None:
+        if name in values:
+            index = int(rng.integers(len(values[name])))
+            values[name][index] = 1 - values[name][index]
+        else:
+            array = arrays[name]
+            index = int(rng.integers(array.size))
+            array.flat[index] = not array.flat[index] if array.dtype == bool else (array.flat[index] + 1) % 6
 
-        change_checkpoint(learner(bench, rng), change)
+    return in_checkpoint(change)
+
+
+def in_checkpoint(change: Callable[[dict[str, Any], Arrays, np.random.Generator], None]) -> Forge:
+    """Change the checkpoint of a learner."""
+
+    def forge(bench: Path, rng: np.random.Generator) -> None:
+        run = one_run(bench, rng, "table")
+        change_checkpoint(run, lambda values, arrays: change(values, arrays, rng))
 
     return forge
 
@@ -191,60 +198,54 @@ def no_digests(bench: Path, rng: np.random.Generator) -> None:
     (one_run(bench, rng) / "DONE").write_text(json.dumps(sealed({"format": "imagine_bench run 3", "sha256": {}})))
 
 
-def tried(bench: Path, rng: np.random.Generator) -> None:
+def tried(values: dict[str, Any], arrays: Arrays, rng: np.random.Generator) -> None:
     """A macro-action was tried an episode later than it was."""
-
-    def change(values: dict[str, Any], arrays: Arrays) -> None:
-        values["tried"][str(rng.choice(list(values["tried"])))] += 1
-
-    change_checkpoint(learner(bench, rng), change)
+    del arrays
+    values["tried"][str(rng.choice(list(values["tried"])))] += 1
 
 
 def without(beginning: str) -> Forge:
     """The arrays of a learner's checkpoint whose names begin so are deleted, though its format says they are kept."""
 
-    def forge(bench: Path, rng: np.random.Generator) -> None:
-        def change(values: dict[str, Any], arrays: Arrays) -> None:
-            for name in [name for name in arrays if name.startswith(beginning)]:
-                del arrays[name]
+    def change(values: dict[str, Any], arrays: Arrays, rng: np.random.Generator) -> None:
+        del values, rng
+        for name in [name for name in arrays if name.startswith(beginning)]:
+            del arrays[name]
 
-        change_checkpoint(learner(bench, rng), change)
+    return in_checkpoint(change)
 
-    return forge
+
+def protocol_of(bench: Path) -> dict[str, Any]:
+    return dict(json.loads((bench / "protocol.json").read_text()))
+
+
+def rewrite_config(run: Path, **values: Any) -> None:
+    """Other values in what a run says of itself."""
+    config = json.loads((run / "config.json").read_text()) | values
+    config.pop("seal")
+    (run / "config.json").write_text(json.dumps(sealed(config)))
+    mend(run)
 
 
 def rewrite_protocol(bench: Path, **values: Any) -> Path:
     """Other values in every copy of a bench's protocol, and in its hash; returns where the bench lies then."""
-    protocol = json.loads((bench / "protocol.json").read_text()) | values
+    protocol = protocol_of(bench) | values
     (bench / "protocol.json").write_text(json.dumps(protocol))
-    for run in sorted(path.parent for path in bench.glob("*/seed_*/DONE")):
-        config = json.loads((run / "config.json").read_text())
-        config.pop("seal")
-        config |= {"protocol": protocol, "protocol_hash": digest(protocol)}
-        (run / "config.json").write_text(json.dumps(sealed(config)))
-        mend(run)
+    for run in all_runs(bench):
+        rewrite_config(run, protocol=protocol, protocol_hash=digest(protocol))
     return bench.rename(bench.with_name(f"{protocol['preset']}-{digest(protocol)}"))
 
 
 def seed(bench: Path, rng: np.random.Generator) -> None:
     """A run is of another seed, here alone or in everything that names it, the protocol and its hash included."""
     other, run = int(rng.integers(1, 99)), one_run(bench, rng)
-    runs = [run] if rng.random() < 0.5 else sorted(path.parent for path in bench.glob("*/seed_*/DONE"))
-    whole = len(runs) > 1 or len(list(bench.glob("*/seed_*"))) == 1
-    protocol = json.loads((bench / "protocol.json").read_text())
-    if whole:
-        protocol["seeds"] = [other]
-        (bench / "protocol.json").write_text(json.dumps(protocol))
+    runs = [run] if rng.random() < 0.5 else all_runs(bench)
     for each in runs:
-        config = json.loads((each / "config.json").read_text())
-        config.pop("seal")
-        config |= {"seed": other, "protocol": protocol, "protocol_hash": digest(protocol)}
-        (each / "config.json").write_text(json.dumps(sealed(config)))
-        mend(each)
-        if whole:
+        rewrite_config(each, seed=other)
+    if len(runs) == len(all_runs(bench)):
+        for each in runs:
             each.rename(each.with_name(f"seed_{other}"))
-    if whole:
-        bench.rename(bench.with_name(f"smoke-{digest(protocol)}"))
+        rewrite_protocol(bench, seeds=[other])
 
 
 def table(bench: Path, rng: np.random.Generator) -> None:
@@ -286,5 +287,5 @@ IN_TRAINING: dict[str, Forge] = {
     "training length": in_training("length"), "training faults": in_training("training/faults"),
     "training return": in_training("training/returns"), "simulated time": in_training("training/sim_times_s"),
     "nothing": without("training/"), "no simulated time": without("training/sim_times_s"),
-    "no simulated time of tests": without("rows/0/kept/sim_times_s"), "tried": tried,
+    "no simulated time of tests": without("rows/0/kept/sim_times_s"), "tried": in_checkpoint(tried),
 }  # fmt: skip
