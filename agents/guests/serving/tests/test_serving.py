@@ -8,6 +8,7 @@ import io
 import json
 import os
 import random
+import re
 import socket
 import subprocess
 import sys
@@ -26,12 +27,14 @@ from imagine_bench_serving.server import MOST_BYTES, Server, serve
 from imagine_bench_serving.sockets import accept_key
 from imagine_bench_serving.words import briefing, seen_in_words
 from PIL import Image
+from whole_outputs import KEPT, expected_of
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, SetupError
 from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.judge.verify import verify_runs
 from imagine_bench.running.player import played_run, protocol_of_player
+from imagine_bench.version import __version__
 
 SPEC = registry.task("arrow_puzzle")
 
@@ -152,6 +155,14 @@ def test_a_viewer_is_shown_the_frame_and_no_words_of_it(tmp_path: Path) -> None:
         assert (status, shown["words"]) == (200, "Test 1 of 3.")
         image = np.array(Image.open(io.BytesIO(base64.b64decode(shown["png"]))))
         assert "Seen now" not in ask(one, "/step", {"action": 2})[1]["observation"]["words"]
+        call = {
+            "jsonrpc": "2.0",
+            "id": 1,
+            "method": "tools/call",
+            "params": {"name": "step", "arguments": {"action": 2}},
+        }
+        content = ask(one, "/mcp", call)[1]["result"]["content"]
+        assert [part["type"] for part in content] == ["text", "image"]
     wanted = protocol_of_player("arrow_puzzle", "viewer", "cy", tests=3, execution="kinematic")
     with played_run(wanted, tmp_path) as run:
         np.testing.assert_array_equal(run.reset()[0], image)
@@ -173,29 +184,19 @@ def test_a_player_comes_back_to_another_server(tmp_path: Path) -> None:
     played_bench(tmp_path, "ann")
 
 
-def test_the_model_context_protocol(tmp_path: Path) -> None:
-    def call(method: str, **params: object) -> Any:
-        message = {"jsonrpc": "2.0", "id": 7, "method": method, "params": params}
-        status, answer = ask(one, "/mcp", message)
-        assert (status, answer["id"]) == (200, 7)
-        return answer.get("result", answer.get("error"))
-
-    with served(tmp_path, observation="png", player="bo") as one:
-        begun = call("initialize", protocolVersion="2025-06-18", capabilities={}, clientInfo={})
-        assert begun["protocolVersion"] == "2025-06-18" and SPEC.description in begun["instructions"]
-        assert call("initialize", protocolVersion="1999-01-01")["protocolVersion"] == "2025-11-25"
-        assert ask(one, "/mcp", {"jsonrpc": "2.0", "method": "notifications/initialized"}) == (202, "")
-        assert [tool["name"] for tool in call("tools/list")["tools"]] == ["reset", "step", "state"]
-        shown = call("tools/call", name="reset", arguments={})
-        assert [part["type"] for part in shown["content"]] == ["text", "image"]
-        wrong = call("tools/call", name="step", arguments={"action": 9})
-        assert wrong["isError"] and "give a number from 0 to 5" in wrong["content"][0]["text"]
-        assert not call("tools/call", name="step", arguments={"action": 2})["isError"]
-        assert "test 1 of 3" in call("tools/call", name="state")["content"][0]["text"]
-        assert call("tools/call", name="fly")["code"] == -32602
-        assert call("server/discover")["code"] == -32601
-        assert ask(one, "/mcp", [1])[1]["error"]["code"] == -32600
-        assert ask(one, "/mcp")[0] == 405, "no stream is offered"
+@pytest.mark.parametrize(
+    ("body", "headers", "status"),
+    [
+        (b"[" * 60_000, {}, 400),
+        (b"9" * 60_000, {}, 400),
+        (b"x" * (MOST_BYTES + 1), {}, 413),
+        (b"", {"Content-Length": "9" * 5000}, 413),
+    ],
+    ids=["deep", "digits", "long", "said to be long"],
+)
+def test_large_requests_are_refused(refusing: Server, body: bytes, headers: dict[str, str], status: int) -> None:
+    found, answer = ask(refusing, "/reset", body, **headers)
+    assert found == status and set(answer) == {"error"}
 
 
 class Line:
@@ -223,74 +224,59 @@ class Line:
             size = int.from_bytes(self._answers.read(2))
         return kind & 15, self._answers.read(size)
 
-    def say(self, **message: object) -> Any:
-        self.send(1, json.dumps(message).encode())
+    def say(self, message: bytes) -> Any:
+        self.send(1, message)
         return json.loads(self.frame()[1])
 
-    def __enter__(self) -> Line:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._answers.close()
         self._line.close()
 
 
-def test_openenvs_websocket(server: Server) -> None:
-    assert accept_key("dGhlIHNhbXBsZSBub25jZQ==") == "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=", "the example of RFC 6455"
-    with Line(server) as line:
-        begun = line.say(type="reset", data={"player": "ann"})
-        assert begun["type"] == "observation" and set(begun["data"]) == {"observation", "reward", "done", "metadata"}
-        line.send(9, b"beat")
-        assert line.frame() == (10, b"beat")
-        assert line.say(type="step", data={"action": 2})["data"]["reward"] in (-1.0, -5.0, 50.0)
-        assert line.say(type="state")["data"]["step_count"] == 1
-        assert line.say(type="step", data={"action": "fly"})["data"]["code"] == "VALIDATION_ERROR"
-        assert "A message has the type" in line.say(type="dance")["data"]["message"]
+def test_answers_to_requests(server: Server, pytestconfig: pytest.Config) -> None:
+    """One after the other; a line of the kept file is a path, headers and, where it is sent by POST, the body.
+
+    Plain HTTP, the Model Context Protocol, whose codes of errors are those of JSON-RPC 2.0, and OpenEnv's WebSocket.
+    """
+    kept = (KEPT / "requests.txt").read_text(encoding="utf-8")
+    answers = []
+    codes = set()
+    talk = Line(server)
+    for line in re.findall(r"^\$ (.*)$", kept, re.MULTILINE):
+        path, headers, *body = line.split(" ", 2)
+        content = body[0].encode() if body else None
+        said = path == "/ws" and content is not None
+        status, answer = (101, talk.say(content)) if said else ask(server, path, content, **json.loads(headers))
+        refused = answer["error"] if isinstance(answer, dict) and "error" in answer else ""
+        if isinstance(refused, dict):
+            codes.add(refused["code"])
+        else:
+            assert (status >= 400) == bool(refused) and "\n" not in refused, line
+        answers += [f"$ {line}", f"{status} {json.dumps(answer)}", ""]
+    talk.close()
+    assert codes == {-32600, -32601, -32602}
+    text = "\n".join(answers).replace(json.dumps(briefing(SPEC))[1:-1], "BRIEFING").replace(__version__, "VERSION")
+    expected_of(pytestconfig)("requests", text)
 
 
 @pytest.mark.parametrize(
-    ("kind", "content", "more", "code"),
-    [(1, b"\xff", 0, 1007), (1, b"", MOST_BYTES + 1, 1009), (8, b"\x03\xe8", 0, 1000)],
-    ids=["no text", "too long", "closed"],
-)
-def test_a_websocket_is_closed_with_the_reason(
-    refusing: Server, kind: int, content: bytes, more: int, code: int
-) -> None:
-    with Line(refusing) as line:
-        line.send(kind, content, more)
-        assert line.frame() == (8, code.to_bytes(2))
-
-
-@pytest.mark.parametrize(
-    ("path", "body", "headers", "status", "complaint"),
+    ("kind", "content", "more", "answer"),
     [
-        ("/nowhere", None, {}, 404, "There is no such page; there are /,"),
-        ("/reset", None, {}, 405, "/reset takes POST alone"),
-        ("/reset", {}, {}, 400, 'The player is None; give a name as "player"'),
-        ("/reset", {"player": "../../etc"}, {}, 400, "A player cannot be called '../../etc'"),
-        ("/reset", {"player": "ann", "seed": 3}, {}, 400, "leave the seed out"),
-        ("/reset", [], {}, 400, "Give a mapping"),
-        ("/reset", b"{", {}, 400, "The body is no JSON"),
-        ("/reset", b"[" * 60_000, {}, 400, "The body is no JSON"),
-        ("/reset", b"9" * 60_000, {}, 400, "The body is no JSON"),
-        ("/reset", b'{"player": NaN}', {}, 400, "The body is no JSON"),
-        ("/reset", b"x" * (MOST_BYTES + 1), {}, 413, "more than 65,536 bytes"),
-        ("/reset", b"", {"Content-Length": "9" * 5000}, 413, "more than 65,536 bytes"),
-        ("/reset", b"", {"Content-Length": "-1"}, 400, "The Content-Length is no number"),
-        ("/reset", b"", {"Transfer-Encoding": "chunked"}, 411, "Content-Length"),
-        ("/reset", {"player": "ann"}, {"Origin": "http://evil.example"}, 403, "other origins"),
-        ("/", None, {"Host": "evil.example"}, 403, "127.0.0.1 and localhost alone"),
-        ("/step", {"player": "new", "action": 0}, {}, 400, "No episode goes on; reset begins the next one"),
-        ("/step", {"player": "new", "action": True}, {}, 400, "Action True does not exist"),
-        ("//[", None, {}, 404, "There is no such page"),
-        ("/ws", None, {}, 426, "/ws is a WebSocket"),
+        (9, b"beat", 0, (10, b"beat")),
+        (1, b"\xff", 0, (8, (1007).to_bytes(2))),
+        (1, b"", MOST_BYTES + 1, (8, (1009).to_bytes(2))),
+        (8, b"\x03\xe8", 0, (8, b"\x03\xe8")),
     ],
+    ids=["ping", "no text", "too long", "closed"],
 )
-def test_bad_requests_get_one_sentence(
-    path: str, body: object, headers: dict[str, str], status: int, complaint: str, refusing: Server
+def test_frames_of_a_websocket(
+    refusing: Server, kind: int, content: bytes, more: int, answer: tuple[int, bytes]
 ) -> None:
-    found, answer = ask(refusing, path, body, **headers)
-    assert found == status and complaint in answer["error"]
+    assert accept_key("dGhlIHNhbXBsZSBub25jZQ==") == "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=", "the example of RFC 6455"
+    line = Line(refusing)
+    line.send(kind, content, more)
+    assert line.frame() == answer
+    line.close()
 
 
 @pytest.fixture(scope="module")
