@@ -26,7 +26,7 @@ from imagine_bench.judge.policies.agreement import dense
 from imagine_bench.judge.policies.exploit import Exploit
 from imagine_bench.judge.policies.fidelity import fidelity
 from imagine_bench.judge.policies.film import Expected, Film, course
-from imagine_bench.judge.policies.levels import SCORES, level_scores
+from imagine_bench.judge.policies.levels import SCORES, level_scores, without_model
 from imagine_bench.judge.policies.policy_set import PolicyWorld
 from imagine_bench.judge.predictions import Predictions, transition_table
 from imagine_bench.judge.questions import FRAMES, RANKED, EvalSet
@@ -265,15 +265,16 @@ def policy_scores(
         predictions: The model's answers.
         rules: The task's rules.
         table: The counts of the data that the model learned from.
-        seeds: Has a generator for each search.
+        seeds: Has a generator for each search, and for training on the data.
     """
     found = {f"{name}{kind}": math.nan for name in SCORES for kind in ("", "_ruled")} | {"fidelity": math.nan}
     if world is None:
         return found, None
     models = imagined_models(questions, predictions, rules)
+    without = None if table is None else without_model(world, table, seeds.child("data").generator())
     exploits = {}
     for kind, model in models.items():
-        scores, exploits[kind] = level_scores(world, model, table, seeds.child(kind).generator())
+        scores, exploits[kind] = level_scores(world, model, without, seeds.child(kind).generator())
         found |= {f"{name}{'_ruled' if kind == 'ruled' else ''}": value for name, value in scores.items()}
     found["fidelity"] = fidelity(world, dense(models["ruled"]))
     shown = "own" if "own" in models else "ruled"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from imagine_bench.arrays import Ints
+from imagine_bench.arrays import Floats, Ints
 from imagine_bench.exact.values import NEVER, Model, rows_of, values_of_planning
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.judge.policies.agreement import dense, kendall, pearson, values_of
@@ -17,14 +18,27 @@ from imagine_bench.judge.policies.training import trained
 SCORES = ("policy_r", "policy_tau", "policy_error", "lift", "lift_trained", "exploit", "exploit_bound")
 
 
+class WithoutModel(NamedTuple):
+    """Returns, in the truth, of learning from a model's data without the model."""
+
+    planned: Floats  #: of the plan that is optimal in the counts of the data, from each macrostate; shape (S,)
+    trained: float  #: of agents that train on the data, from a start; the mean
+
+
+def without_model(world: PolicyWorld, table: Model, rng: np.random.Generator) -> WithoutModel:
+    """The returns of learning from the data of which ``table`` are the counts."""
+    planned = values_of_planning(world.truth, table, world.horizon)
+    return WithoutModel(planned, _mean_return(world, trained(table, rng)))
+
+
 def level_scores(
-    world: PolicyWorld, held: Model, table: Model | None, rng: np.random.Generator
+    world: PolicyWorld, held: Model, without: WithoutModel | None, rng: np.random.Generator
 ) -> tuple[dict[str, float], Exploit]:
     """The scores of a model, and the policy that it overrates most. Returns are expected, from a start, undiscounted.
 
     ``policy_r`` and ``policy_tau`` compare the returns of the world's policies in model and truth, and ``policy_error``
     is their mean absolute difference. ``lift`` is the return, in the truth, of the plan that is optimal in the model,
-    less that of the plan that is optimal in ``table``, the counts of the model's data; NaN without a table.
+    less that of the plan that is optimal in the counts of the model's data; NaN where ``without`` is None.
     ``lift_trained`` is the same of agents that train there, the mean of :data:`.training.AGENTS`. ``exploit`` and
     ``exploit_bound`` enclose the largest difference that any policy has between model and truth.
     """
@@ -32,13 +46,11 @@ def level_scores(
     imagined = values_of(model, world.policies.tables, world.horizon) @ world.starts
     found = largest_exploit(model, world.dense_truth, world.starts, world.policies.tables, world.horizon, rng)
     lift = lift_trained = math.nan
-    if table is not None:
+    if without is not None:
         (draws,) = rng.spawn(1)
-        agents = (trained(held, draws, (world.starts, world.horizon)), trained(table, draws))
-        returns = [(values_of(world.dense_truth, each, world.horizon) @ world.starts).mean() for each in agents]
-        lift_trained = float(returns[0] - returns[1])
-        in_model, in_table = (values_of_planning(world.truth, each, world.horizon) for each in (held, table))
-        lift = float((in_model - in_table) @ world.starts)
+        agents = trained(held, draws, (world.starts, world.horizon))
+        lift_trained = _mean_return(world, agents) - without.trained
+        lift = float((values_of_planning(world.truth, held, world.horizon) - without.planned) @ world.starts)
     scores = (
         pearson(imagined, world.real),
         kendall(imagined, world.real),
@@ -49,6 +61,11 @@ def level_scores(
         float(upper_bound(model, world.dense_truth, world.horizon) @ world.starts),
     )
     return dict(zip(SCORES, scores, strict=True)), found
+
+
+def _mean_return(world: PolicyWorld, policies: Floats) -> float:
+    """The mean return of policies in the truth, from a start."""
+    return float((values_of(world.dense_truth, policies, world.horizon) @ world.starts).mean())
 
 
 def counted_table(episodes: Episodes, macrostates: Ints, transitions: int, world: PolicyWorld) -> Model:

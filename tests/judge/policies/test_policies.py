@@ -15,14 +15,15 @@ from scipy.stats import kendalltau
 
 from imagine_bench import registry
 from imagine_bench.arrays import Floats
-from imagine_bench.exact.values import NEVER, values_of_planning
+from imagine_bench.exact.values import NEVER, Model, values_of_planning
 from imagine_bench.interfaces import Outcome, State
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.interfaces.model import WorldModel
+from imagine_bench.judge.policies import levels
 from imagine_bench.judge.policies.agreement import DenseModel, kendall, pearson, values_of
 from imagine_bench.judge.policies.exploit import largest_exploit, upper_bound
 from imagine_bench.judge.policies.film import Expected, Film, course
-from imagine_bench.judge.policies.levels import SCORES, counted_table, level_scores
+from imagine_bench.judge.policies.levels import SCORES, counted_table, level_scores, without_model
 from imagine_bench.judge.policies.policy_set import PolicyWorld, policy_world
 from imagine_bench.judge.policies.training import AGENTS, trained
 from imagine_bench.judge.scores import policy_scores
@@ -276,8 +277,24 @@ def test_an_agent_that_trains_on_data_tries_nothing_that_the_data_has_not() -> N
 def test_training_in_a_wrong_model_pays_less_than_training_on_the_data() -> None:
     world = world_of(ARROWS)
     wrong = world.truth._replace(reward=-world.truth.reward)
+    without = without_model(world, world.truth, np.random.default_rng(1))
     scores = {
-        name: level_scores(world, held, world.truth, np.random.default_rng(0))[0]["lift_trained"]
+        name: level_scores(world, held, without, np.random.default_rng(0))[0]["lift_trained"]
         for name, held in (("wrong", wrong), ("true", world.truth))
     }
     assert scores["wrong"] < -20.0 and scores["true"] == pytest.approx(0.0, abs=0.1)
+
+
+def test_agents_train_once_on_the_data_of_a_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    judged, world = judged_world(ARROWS), world_of(ARROWS)
+    trains_in = []
+
+    def counted(model: Model, rng: np.random.Generator, episodes: tuple[Floats, int] | None = None) -> Floats:
+        trains_in.append("data" if episodes is None else "model")
+        return trained(model, rng, episodes)
+
+    monkeypatch.setattr(levels, "trained", counted)
+    predictions = judged.predictions(Exact(judged.spec, judged.index), judged.one_step)
+    found, _ = policy_scores(world, judged.one_step, predictions, judged.spec.rules, world.truth, SeedTree(0))
+    assert sorted(trains_in) == ["data", "model", "model"], "in the model by its own rewards, and by the rules'"
+    assert abs(found["lift_trained"]) < 0.1 and abs(found["lift_trained_ruled"]) < 0.1
