@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -11,6 +12,7 @@ from bench_fakes import TableAgent
 from small_runs import Inline, collected, do
 
 from imagine_bench import registry
+from imagine_bench.arrays import Frame, Info
 from imagine_bench.cli import exit_code as main
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import InvalidValueError
@@ -25,21 +27,24 @@ TASK = registry.task("arrow_puzzle")
 @pytest.mark.parametrize("policy", ["mixed", "uniform"])
 def test_replaying_the_actions_gives_every_frame_again(policy: str) -> None:
     episodes, apart, _ = collected(policy)
-    hidden, shown = apart["privileged"], []
+    hidden, frames, states = apart["privileged"], [], []
+
+    def noted(frame: Frame, info: Info) -> None:
+        frames.append(frame)
+        states.append(info["macrostate"])
+
     with gymnasium.make(TASK.env_id, execution="kinematic", appearance="mild") as env:
         for index, seed in enumerate(hidden["seeds"].tolist()):
-            steps, frames = episodes.steps(index)
-            options = {"macrostate": hidden["macrostates"][frames][0]} if policy == "uniform" else None
-            frame, info = env.reset(seed=seed, options=options)
-            shown.append((frame, info["macrostate"]))
+            steps, rows = episodes.steps(index)
+            options = {"macrostate": hidden["macrostates"][rows][0]} if policy == "uniform" else None
+            noted(*env.reset(seed=seed, options=options))
             for step in range(steps.start, steps.stop):
                 frame, reward, terminated, truncated, info = env.step(int(episodes.actions[step]))
-                shown.append((frame, info["macrostate"]))
+                noted(frame, info)
                 assert (reward, terminated) == (episodes.rewards[step], episodes.terminated[step])
                 assert truncated == episodes.truncated[step] or policy == "uniform"
             assert info["is_success"] == episodes.success[index]
-    assert np.array_equal([frame for frame, _ in shown], episodes.frames)
-    assert np.array_equal([state for _, state in shown], hidden["macrostates"])
+    assert np.array_equal(frames, episodes.frames) and np.array_equal(states, hidden["macrostates"])
 
 
 def test_one_seed_is_one_content_and_another_is_another() -> None:
@@ -78,21 +83,16 @@ def test_uniform_is_one_action_from_any_open_macrostate() -> None:
     assert np.bincount(episodes.actions, minlength=6).min() > 15
 
 
-def test_a_trained_agent_acts_greedily(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trained_agent_acts_greedily(tmp_path: Path) -> None:
     do(tmp_path / "run", agent="table")
     policy = policy_of(str(tmp_path / "run"), TASK, 0)
-    (agent, _), explored = policy.players[0], []
-    act = TableAgent.act
-
-    def noted(self: TableAgent, observation: Observation, *, explore: bool) -> int:
-        explored.append((explore, observation.macrostate))
-        return act(self, observation, explore=explore)
-
-    monkeypatch.setattr(TableAgent, "act", noted)
-    episodes, _, card = collect(TASK, policy, episodes=3, seed=0, execution="kinematic", appearance="clean")
-    assert explored == [(False, None)] * len(episodes.actions), "greedy, and shown no macrostate"
-    wanted = [act(agent, Observation(frame=frame), explore=False) for frame in episodes.frames[episodes.rows[0]]]
-    assert wanted == episodes.actions.tolist()
+    agent, _ = policy.players[0]
+    with mock.patch.object(TableAgent, "act", autospec=True, side_effect=TableAgent.act) as act:
+        episodes, _, card = collect(TASK, policy, episodes=3, seed=0, execution="kinematic", appearance="clean")
+    shown = [(call.kwargs["explore"], call.args[1].macrostate) for call in act.call_args_list]
+    assert shown == [(False, None)] * len(episodes.actions), "greedy, and shown no macrostate"
+    seen = [Observation(frame=frame) for frame in episodes.frames[episodes.rows[0]]]
+    assert [agent.act(each, explore=False) for each in seen] == episodes.actions.tolist()
     assert card["policy"] == "table" and card["played"] == "greedy after 9 episodes of seed 0"
     with pytest.raises(InvalidValueError, match="learned arrow_puzzle, not pick_place; give a run of pick_place"):
         policy_of(str(tmp_path / "run"), registry.task("pick_place"), 0)
@@ -117,14 +117,9 @@ def test_the_command_collects_and_describes(tmp_path: Path, capsys: pytest.Captu
     said = capsys.readouterr().out
     assert main(["dataset", "--describe", str(out)]) == 0
     assert capsys.readouterr().out == said.partition("\n")[2], "the read dataset is the written one"
-    for part in ("oracle (optimal macro-actions by the rules), seed 0", "100.0% of episodes [34.2%", "chance 4.6%"):
-        assert part in said
-    assert describe(read_dataset(out)) in said and read_dataset(out).episodes.hash in said
+    assert describe(read_dataset(out)) in said and "100.0% of episodes [34.2%" in said and "chance 4.6%" in said
     assert main([*words, "--out", str(out)]) == 2
-    assert (
-        capsys.readouterr().err
-        == f"imagine-bench: {out} exists; give another folder with --out. Nothing was written.\n"
-    )
+    assert f"{out} exists; give another folder with --out. Nothing was written." in capsys.readouterr().err
 
 
 def test_standard_sets_are_of_three_strengths_and_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,25 +132,3 @@ def test_standard_sets_are_of_three_strengths_and_are_kept(tmp_path: Path, monke
     assert cards[1]["played"] == "greedy after 3 episodes of seed 1000" and cards[2]["successes"] == 4
     monkeypatch.setattr(standard_data, "collect", None)
     assert list(standard_data.standard_sets(tmp_path, "npz", 4)) == folders
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ([], "Give exactly one of a task to collect episodes of, --describe and --standard."),
-        (["arrow_puzzle", "--describe", "nowhere"], "Give exactly one of"),
-        (["--standard", "--describe", "nowhere"], "Give exactly one of"),
-        (["arrow_puzzle", "--policy", "best"], "No policy 'best'. Known: random, uniform, oracle, mixed, or a run's"),
-        (["arrow_puzzle", "--policy", "."], "a run's configuration; give a run's folder"),
-        (["arrow_puzzle", "--motion-hz", "5000", "--episodes", "1"], "Motion cannot be captured at 5000.0 Hz"),
-        (["--describe", "nowhere"], "nowhere is no dataset; give a folder with episodes.npz (npz), meta/info.json"),
-    ],
-)
-def test_a_wrong_command_is_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], sentence: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["dataset", *words]) == 2
-    said = capsys.readouterr().err
-    assert sentence in said and said.count("\n") == 1
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]

@@ -113,7 +113,6 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("npz", bytes_of("episodes.npz", lambda old: old[:-1000]), "is not an archive of episodes"),
     ("npz", archive(actions=np.array([[1], [1, 2]], dtype=object)), "pickle"),
     ("npz", archive(rewards=None), "it lacks 'rewards'"),
-    ("npz", archive(rewards=None, success=None), "it lacks 'rewards' and 'success'"),
     ("npz", archive(more=_LONG), "it has 'more', which is unknown"),
     ("npz", with_item("rewards", 2, np.nan), "reward 2 is not finite"),
     ("npz", with_item("actions", 0, 6), "actions must lie from 0 to 5"),
@@ -129,20 +128,17 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("lerobot", lambda folder: (folder / "final_frames.parquet").unlink(), "copy it from the dataset that this"),
     ("lerobot", lambda folder: shutil.rmtree(folder / "data"), "and 0 are, in 0 files data/*/*.parquet; is one missi"),
     ("lerobot", table(lambda old: replaced(old, "timestamp", [9.0] * len(old))), "row 0 has frame_index 0 and times"),
-    ("lerobot", table(lambda old: replaced(old, "timestamp", [float("nan")] * len(old))), "timestamp nan, but is row"),
     ("lerobot", table(lambda old: replaced(old, "frame_index", [0] * len(old))), "row 1 has frame_index 0 and timesta"),
     ("lerobot", info(fps=30), "row 1 has frame_index 1 and timestamp 1, but is row 1 of its episode, at 30 a second"),
     ("lerobot", info(total_episodes=7), "7 episodes are said to be in it and 6 are"),
     ("lerobot", table(lambda old: old[1:], "final_frames.parquet"), "has no last frame of episode 0; LeRobot's"),
-    ("lerobot", table(lambda old: old[:-1]), "rows are said to be in it and"),
-    ("lerobot", table(lambda old: old.take(list(range(len(old)))[::-1])), "its rows are not in order"),
     ("lerobot", table(lambda old: replaced(old, "episode_index", old["episode_index"][::-1])), "rows are not in order"),
     ("lerobot", table(lambda old: replaced(old, "action", [0.5] * len(old))), "an action is no integer"),
     ("lerobot", table(with_image(b"not a PNG")), "cannot identify image"),
     ("lerobot", table(with_image(png((6400, 64)))), "an image is RGB of (6400, 64) pixels"),
     ("lerobot", info(codebase_version="v2.1"), "it is of version v2.1"),
     ("lerobot", info(features={"action": {}, "observation.images.top": {}}), "it has no next.reward, which 'imagine"),
-    ("lerobot", info(total_frames=10**9), "1000000000 rows are said to be in it"),
+    ("lerobot", info(total_frames=10**9), "1000000000 rows are said to be in it and"),
     ("minari", bytes_of("*/data/metadata.json", lambda old: b"{}"), "is not a Minari dataset of macro-actions"),
     ("minari", bytes_of("*/data/metadata.json", steps_less_one), "steps are not those that it holds"),
     ("minari", lambda folder: shutil.rmtree(next(folder.glob("*/data/5"))), "a file of it is missing"),
@@ -210,12 +206,9 @@ def test_writers_of_one_name_do_not_mix(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_no_value_changes_with_its_type() -> None:
     """Others may keep actions as floats and rewards as integers; a number that is no action is refused."""
-    episodes = collected()[0]
-    steps, frames = episodes.steps(0)
-    part = {name: getattr(episodes, name)[steps] for name in ("actions", "rewards", "terminated", "truncated")}
-    part |= {"frames": episodes.frames[frames], "action_masks": episodes.action_masks[frames].astype(np.bool_)}
-    part["success"] = episodes.success[0]
-    floats = joined([{**part, "actions": part["actions"].astype(np.float32)}])
-    assert floats.hash == joined([part]).hash
+    episodes = collected(episodes=1)[0]
+    part: dict[str, Any] = {**episodes.arrays(), "success": episodes.success[0]}
+    del part["lengths"]
+    assert joined([{**part, "actions": part["actions"].astype(np.float32)}]).hash == episodes.hash
     with pytest.raises(InvalidValueError, match="actions holds float64, not int64"):
         joined([{**part, "actions": part["actions"] + 0.5}])

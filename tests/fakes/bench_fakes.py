@@ -117,6 +117,7 @@ class Pupil(TableAgent):
     def __init__(self, context: AgentContext) -> None:
         super().__init__(context)
         self.optimal_policy = context.optimal_policy
+        self.told = context.observation
         self.asking = np.random.default_rng(0)
         self.shown: list[tuple[int, Transition]] = []
         self.seen: list[Observation] = []

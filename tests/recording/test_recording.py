@@ -6,6 +6,7 @@ import dataclasses
 import subprocess
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -24,13 +25,12 @@ from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
 from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording import episodes, stream
-from imagine_bench.recording.episodes import q_table, record_run
-from imagine_bench.recording.stream import entity_name, log_motion, log_shapes, open_in_viewer, recording_file
+from imagine_bench.recording.episodes import record_run
+from imagine_bench.recording.stream import log_motion, log_shapes, open_in_viewer, recording_file
 from imagine_bench.rules import ending
 from imagine_bench.running.bench import bench
 from imagine_bench.seeding import episode_seed
 
-REAL = {"/real/frame", "/real/text", "/real/reward", "/scene/cube_0", "/scene/cube_1/cube_1_arrow", "/scene/right_l3"}
 NOTHING = lambda _: rrb.Vertical()  # noqa: E731
 
 
@@ -53,16 +53,14 @@ def test_verifies(imagined: Path) -> None:
     assert checked.returncode == 0, checked.stderr
 
 
-def by_step(path: Path, entity: str, column: str) -> list[tuple[int, object]]:
-    """The values that were logged for an entity, each with its real step, in their order."""
-    batches = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity]
-    found = [
-        pair
-        for batch in batches
-        if {column, "env_step"} <= set(batch.schema.names)
-        for pair in zip(batch.column("env_step").to_pylist(), batch.column(column).to_pylist(), strict=True)
-    ]
-    return sorted(found, key=lambda pair: pair[0])
+def by_step(path: Path, entity: str, column: str) -> list[Any]:
+    """The values that were logged for an entity, in the order of its real steps."""
+    found = []
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and {column, "env_step"} <= set(batch.schema.names):
+            found += zip(batch.column("env_step").to_pylist(), batch.column(column).to_pylist(), strict=True)
+    return [value for _, (value,) in sorted(found, key=lambda pair: pair[0])]
 
 
 class _HandsOver(FakeImaginer):
@@ -97,7 +95,7 @@ def test_how_it_learned_to_see_comes_before_it_acts_and_what_it_does_not_know_be
     looked, acted = times(path, "/seen/factors", "sim_time"), times(path, "/real/reward", "sim_time")
     assert len(looked) == 2 and max(looked) < min(acted)
     asked = {step - 1 for step in times(path, "/real/reward", "env_step")}
-    assert len(asked) >= 2 and times(path, "/real/novelty/turn_the_left_cube_clockwise", "env_step") == asked
+    assert times(path, "/real/novelty/turn_the_left_cube_clockwise", "env_step") == asked
     assert not any("novelty" in path or "seen" in path for path in contents(imagined))
     view = "Unknown share of each macro-action"
     assert view in view_names(path) and view not in view_names(imagined)
@@ -118,9 +116,9 @@ class _Repeats(FakeAgent):
 def test_the_first_solved_and_the_first_lost_episode_are_kept_as_they_were_seen(tmp_path: Path, action: int) -> None:
     path = tmp_path / "recording.rrd"
     with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")) as env:
-        given = {"name": "random", "env": env, "seed": 3, "appearance": "clean"}
-        kept = record_run("arrow_puzzle", _Repeats(action), path=path, episodes=12, **given)  # type: ignore[arg-type]
-        played = []
+        given: dict[str, Any] = {"name": "random", "env": env, "seed": 3, "appearance": "clean", "episodes": 12}
+        kept = record_run("arrow_puzzle", _Repeats(action), path=path, **given)
+        wanted: dict[bool, tuple[list[Frame], list[float]]] = {}
         for episode in range(1, 13):
             seen, info = env.reset(seed=episode_seed("recording", 3, episode))
             frames, rewards, over = [seen], [], False
@@ -129,9 +127,8 @@ def test_the_first_solved_and_the_first_lost_episode_are_kept_as_they_were_seen(
                 frames.append(seen)
                 rewards.append(reward)
                 over = terminated or truncated
-            played.append((bool(info["is_success"]), np.array(frames), rewards))
-    wanted = {success: (frames, rewards) for success, frames, rewards in reversed(played)}
-    assert {bool(each.success) for each in kept} == set(wanted) and len(kept) == len(wanted)
+            wanted.setdefault(bool(info["is_success"]), (frames, rewards))
+    assert sorted(bool(each.success) for each in kept) == sorted(wanted)
     for each in kept:
         frames, rewards = wanted[bool(each.success)]
         assert np.array_equal(each.frames, frames) and each.rewards.tolist() == rewards
@@ -146,45 +143,6 @@ def test_several_rollouts_are_shown_only_where_rules_are_random(imagined: Path, 
         )
     assert contents(path)["/imagined/sampled_rollouts"] >= {"sim_time", "env_step", "episode"}
     assert "/imagined/sampled_rollouts" not in contents(imagined)
-    (store,) = RrdReader(imagined).blueprints()
-    assert store.application_id == "imagine_bench_arrow_puzzle"
-
-
-def logged(path: Path) -> dict[tuple[str, str], list[str]]:
-    """The logged values, by entity and column; how rows are cut into chunks depends on the clock and does not count."""
-    found: dict[tuple[str, str], list[str]] = {}
-    for chunk in RrdReader(path).stream():
-        batch = chunk.to_record_batch()
-        for name in set(batch.schema.names) - {"rerun.controls.RowId", "log_time"}:
-            if not chunk.entity_path.startswith("/__"):  # its start time
-                found.setdefault((chunk.entity_path, name), []).extend(map(str, batch.column(name).to_pylist()))
-    return {key: sorted(values) for key, values in found.items()}
-
-
-def test_two_recordings_of_one_seed_are_the_same(imagined: Path, tmp_path: Path) -> None:
-    again, other = (record(FakeImaginer(seed), tmp_path / f"{seed}.rrd") for seed in (0, 1))
-    assert logged(again) == logged(imagined)
-    assert logged(other) != logged(imagined)
-
-
-def test_agents_that_neither_value_nor_imagine(tmp_path: Path) -> None:
-    found = contents(record(FakeAgent(), tmp_path / "plain.rrd", name="random", episodes=1))
-    assert set(found) >= REAL
-    assert not any(path.startswith(("/imagined", "/real/q_")) for path in found)
-
-
-@pytest.mark.parametrize(("name", "told"), [("oracle", True), ("dqn", False)])
-def test_only_privileged_agents_see_the_macrostate(name: str, told: bool, tmp_path: Path) -> None:
-    seen: list[bool] = []
-
-    class Spy(FakeAgent):
-        def act(self, observation: Observation, *, explore: bool) -> int:
-            assert not explore
-            seen.append(observation.macrostate is not None)
-            return super().act(observation, explore=explore)
-
-    record(Spy(), tmp_path / "spied.rrd", name=name, episodes=1)
-    assert set(seen) == {told}
 
 
 def test_a_failure_leaves_a_closed_partial_file_and_what_was_there(tmp_path: Path) -> None:
@@ -203,8 +161,6 @@ def test_a_failure_leaves_a_closed_partial_file_and_what_was_there(tmp_path: Pat
 
 
 def test_viewing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ArtefactError, match=r"No recording .*none\.rrd"):
-        open_in_viewer(tmp_path / "none.rrd")
     there = tmp_path / "there.rrd"
     there.write_bytes(b"no recording")
     with pytest.raises(ArtefactError, match=r"there\.rrd is no recording of Rerun"):
@@ -229,38 +185,18 @@ def test_a_module_in_the_current_folder_is_no_viewer(tmp_path: Path, monkeypatch
     assert (tmp_path / "ran").read_text() == "path"
 
 
-def test_q_table_marks_the_chosen_one_and_orders_bars() -> None:
-    _, left, right, *_ = q_table(("left", "right turn"), np.array([-1.0, 2.5], dtype=np.float32), 1).splitlines()
-    assert left.startswith("  left") and right.startswith("> right turn   +2.50 ")
-    assert (left.count("█"), right.count("█")) == (5, 11), "as long as their values are large: 1 to 2.5"
-    assert left.index("│") == right.index("│"), "all bars begin at one zero"
-    assert left.rindex("█") < left.index("│") < right.index("█")
-    rows = q_table(("a", "b"), np.array([-1.0, -4.0], dtype=np.float32), 0).splitlines()[1:3]
-    assert all(row[row.index("│") - 1] == "█" for row in rows), "a short bar begins at zero, too"
-    assert "nan" not in q_table(("a", "b"), np.zeros(2, dtype=np.float32), 0)
-
-
 @pytest.mark.parametrize(
     ("info", "terminated", "words"),
     [
         ({"is_success": True}, True, "solved"),
         ({"is_success": False}, True, "lost, because the rules forbid the result of the last macro-action"),
-        ({"is_success": False, "fault_reason": ""}, False, "lost, because no macro-actions are left"),
         ({"is_success": False, "fault": False}, False, "lost, because no macro-actions are left"),
         ({"is_success": False, "fault": True}, False, "lost, because of a fault"),
-        (
-            {"is_success": False, "fault_reason": "the simulation blew up"},
-            False,
-            "lost, because the simulation blew up",
-        ),
+        ({"is_success": False, "fault_reason": "it blew up"}, False, "lost, because it blew up"),
     ],
 )
 def test_an_episode_that_is_lost_says_why(info: dict[str, object], terminated: bool, words: str) -> None:
     assert ending(info, terminated=terminated) == words
-
-
-def test_entity_names_are_lower_snake() -> None:
-    assert entity_name("Turn left (cube 1)") == "turn_left_cube_1"
 
 
 def shape(kind: str, **changes: object) -> Shape3D:
@@ -305,7 +241,7 @@ def test_compared_rollouts_follow_the_rules_as_late_as_the_agent_s_frames_and_hi
     spec = dataclasses.replace(registry.task("arrows:gesture=first,lag=2"), render_macrostates=labelled)
     rng, episode = np.random.default_rng(0), [spec.rules.start_states[0]]
     for _ in range(before):
-        moves = [each[0] for each in (spec.rules.outcomes(episode[-1], action) for action in range(spec.n_actions))]
+        moves = [spec.rules.outcomes(episode[-1], action)[0] for action in range(spec.n_actions)]
         episode.append(next(each.macrostate for each in moves if not each.terminated))
     frame = np.zeros((64, 64, 3), np.uint8)
     rollout = FakeImaginer().imagine(frame, actions=None, depth=6, rng=rng)
@@ -341,17 +277,16 @@ def test_a_recording_shows_what_the_agent_sees_and_says_what_is_true(tmp_path: P
             action = agent.act(Observation(frame=frame, macrostate=None), explore=False)
             frame, _, terminated, truncated, info = env.step(action)
             frames, infos, over = [*frames, frame], [*infos, info], terminated or truncated
-    shown = [
-        np.array(buffer, np.uint8).reshape(64, 64, 3) for _, (buffer,) in by_step(path, "/real/frame", "Image:buffer")
-    ]
-    np.testing.assert_array_equal(shown, frames)
-    texts = [str(text) for _, (text,) in by_step(path, "/real/text", "TextDocument:text")]
+    shown = np.array(by_step(path, "/real/frame", "Image:buffer"), np.uint8)
+    np.testing.assert_array_equal(shown.reshape(-1, 64, 64, 3), frames)
+    texts = by_step(path, "/real/text", "TextDocument:text")
     spec = registry.task(task)
     for text, info in zip(texts, infos, strict=True):
         truth, seen = (spec.value_names(info[each]) for each in ("macrostate", "shown"))
         for name, now, late in zip(spec.macrostate_names, truth, seen, strict=True):
             assert f"- {name}: {now}{'' if now == late else f' (frame: {late})'}\n" in text
     assert "(frame: " in "".join(texts) and "(frame: " not in texts[0]
+    assert not any(each.startswith(("/imagined", "/real/q_")) for each in contents(path)), "it does neither"
 
 
 def test_of_so_many_seeds_alone_runs_are_recorded(tmp_path: Path) -> None:

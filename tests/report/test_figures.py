@@ -108,4 +108,3 @@ def test_no_two_agents_have_the_same_line() -> None:
     compared = protocol("arrow_puzzle", "quick").agents
     assert len({figures.color(agent) for agent in compared}) == len(set(compared))
     assert figures.color("an agent that nobody registered").startswith("#")
-    assert figures.line_styles(["dqn"])["dqn"] == figures.line_style("dqn")

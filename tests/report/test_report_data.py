@@ -14,9 +14,9 @@ from fake_results import WIDE, bench_result, rewritten
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report.bench import bench_page, cost, success
+from imagine_bench.report.bench import bench_page, cost
 from imagine_bench.report.data import DIFFERENCE, SCORE, collect, frames_before, known_agent, open_loop_means
-from imagine_bench.report.page import DASH, count, seconds
+from imagine_bench.report.page import count, seconds
 from imagine_bench.rules import fewest_actions
 from imagine_bench.store import encoders
 from imagine_bench.store.results import BenchResult, Checkpoint, KeptEpisodes, RunResult
@@ -41,18 +41,17 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> BenchResult:
 @pytest.mark.parametrize("agent", ["random", "imagination"])
 def test_costs_are_means_over_seeds(result: BenchResult, agent: str) -> None:
     data, runs = collect(result), result.of(agent)
-    learns, columns = agent != "random", zip(*(run.checkpoints for run in runs), strict=True)
     records = data.of(agent)
-    for record, rows in zip(records, columns, strict=True):
-        assert record["env_steps"] == pytest.approx(np.mean([row.env_steps for row in rows]))
-        assert record["train_cpu_s"] == pytest.approx(np.mean([row.train_cpu_s for row in rows]))
-        updates = np.mean([row.diagnostics["gradient_updates"] for row in rows]) if learns else math.nan
-        assert record["gradient_updates"] == pytest.approx(updates, nan_ok=True)
-    tests = [row for run in runs for row in run.checkpoints[: 3 if learns else 1]]
+    for record, rows in zip(records, zip(*(run.checkpoints for run in runs), strict=True), strict=True):
+        for name in ("env_steps", "train_cpu_s"):
+            assert record[name] == pytest.approx(np.mean([getattr(row, name) for row in rows]))
+        updates = [row.diagnostics.get("gradient_updates", math.nan) for row in rows]
+        assert record["gradient_updates"] == pytest.approx(np.mean(updates), nan_ok=True)
+    tests = [row for run in runs for row in run.checkpoints[: 1 if agent == "random" else 3]]
     steps = round(sum(row.test_episodes * row.mean_length for row in tests))
     shown = {row[0]: row[1:] for row in cost(data).tables[0].rows}[agent]
-    faults = f"{sum(row.faults for row in tests)} of {steps:,}"
     counts = map(count, (records[-1]["env_steps"], frames_before(data, agent), records[-1]["gradient_updates"]))
+    faults = f"{sum(row.faults for row in tests)} of {steps:,}"
     assert shown == [*counts, seconds(records[-1]["train_cpu_s"]), faults]
 
 
@@ -106,17 +105,6 @@ def test_areas_begin_at_the_chance_level(tmp_path: Path) -> None:
     assert last["area"] == pytest.approx(1.0 - (1.0 - chance) / 2.0 * first["episodes"] / last["episodes"])
 
 
-def test_a_seed_solves_the_task_from_where_every_test_reaches_its_threshold(result: BenchResult) -> None:
-    agent = result.protocol.agents[-1]
-    lowest = min(row.success_rate for run in result.of(agent) for row in run.checkpoints)
-    assert 0.0 < lowest < 1.0
-    for threshold, reached in ((lowest, "250"), (1.0, DASH)):
-        data = collect(result)
-        data = dataclasses.replace(data, spec=dataclasses.replace(data.spec, success_threshold=threshold))
-        (seeds,) = (table for table in success(data).tables if table.name == "seeds")
-        assert [row[-1] for row in seeds.rows if row[0] == agent] == [reached] * statistics.FEWEST
-
-
 # Start by start ----------------------------------------------------------------------------------------------------
 
 
@@ -166,9 +154,9 @@ def test_the_same_starts_are_compared(tmp_path: Path) -> None:
     rules = protocol.spec(testing=True).rules
     fewest = {start: fewest_actions(rules, start) for start in rules.start_states}
     for record in data.records:
-        rows = [run.checkpoints[protocol.budgets.index(record["episodes"])].kept for run in result.of(record["agent"])]
+        place = protocol.budgets.index(record["episodes"])
         beyond = []
-        for row in rows:
+        for row in (run.checkpoints[place].kept for run in result.of(record["agent"])):
             beyond += [row.lengths[test] - fewest[tuple(row.starts[test])] for test in np.flatnonzero(row.success)]
         assert record["excess_macro_actions"] == pytest.approx(np.mean(beyond))
 
@@ -183,14 +171,10 @@ def test_an_agent_of_fewer_seeds_is_paired_where_both_have_one(result: BenchResu
     protocol = dataclasses.replace(known.protocol, few_seeds=((few, last),))
     runs = tuple(run for run in known.runs if run.agent != few or run.seed <= last)
     fewer = dataclasses.replace(known, protocol=protocol, runs=runs)
-    mine, base = ([run for run in runs if run.agent == name and run.seed <= last] for name in (agent, "dqn"))
-    alone = sum(
-        ours == "1" and theirs == "0"
-        for one, other in zip(mine, base, strict=True)
-        for ours, theirs in zip(one.checkpoints[0].solved, other.checkpoints[0].solved, strict=True)
-    )
+    solved = (solved_by(known, name, 0)[: -known.protocol.evaluation_episodes] for name in (agent, "dqn"))
+    pairs = Counter(zip(*solved, strict=True))
     (record, *_) = [record for record in collect(fewer).records if record["agent"] == agent]
-    assert record["alone"] == alone > 0
+    assert record["alone"] == pairs["1", "0"] > 0
     assert bench_page(fewer).summary
 
 

@@ -55,8 +55,6 @@ def test_a_configurations_settings_are_its_own_and_checked() -> None:
     assert registry.agent_entry(SLOW).title == "DQN (discount 0.99)" and color(SLOW) != color("dqn")
     with pytest.raises(UnknownNameError, match=r"'controller\.discont'"):
         plan("arrow_puzzle", "smoke", agents=("dqn:controller.discont=0.99",))
-    with pytest.raises(InvalidValueError, match="discount"):
-        plan("arrow_puzzle", "smoke", agents=("dqn:controller.discount=7",))
     with pytest.raises(InvalidValueError, match="none of them twice"):
         protocol("arrow_puzzle", agents=(SLOW, "dqn:controller.discount=0.990"))
 
@@ -76,7 +74,3 @@ def test_physics_is_said_in_one_way_and_felt() -> None:
     wanted = protocol("arrow_puzzle", physics=(("pad_friction", 0.5), ("object_mass", 1.0)))
     assert wanted.physics == (("pad_friction", 0.5),)
     assert wanted.world == {"execution": "physics", "physics": {"pad_friction": 0.5}}
-    with pytest.raises(InvalidValueError, match="change nothing in kinematic execution"):
-        protocol("arrow_puzzle", execution="kinematic", physics=(("pad_friction", 0.5),))
-    with pytest.raises(UnknownNameError, match="physics setting"):
-        protocol("arrow_puzzle", physics=(("friction", 0.5),))

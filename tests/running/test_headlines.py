@@ -41,12 +41,10 @@ def result_of(wanted: Protocol, root: Path, gap: int) -> BenchResult:
 
 
 def test_headlines_of_a_preset_are_about_its_own_agents() -> None:
-    assert protocol("arrow_puzzle").headlines == PAIRS and len(protocol("arrow_puzzle").seeds) >= 6
-    assert protocol("arrow_puzzle", seeds=(7, 8)).headlines == PAIRS
-    assert protocol("arrow_puzzle", agents=("dqn", "imagination")).headlines == ()
-    assert protocol("arrow_puzzle", "smoke").headlines == protocol("pick_place").headlines == ()
-    assert protocol("arrow_puzzle", agents=("dqn",)).few_seeds == protocol("pick_place").few_seeds == ()
-    assert len(protocol("arrow_puzzle", agents=("dqn",)).seeds) == 6 < len(protocol("arrow_puzzle").seeds)
+    assert protocol("arrow_puzzle", seeds=(7, 8)).headlines == protocol("arrow_puzzle").headlines == PAIRS
+    others = [protocol("arrow_puzzle", agents=("dqn", "imagination")), protocol("arrow_puzzle", "smoke")]
+    assert {each.headlines for each in (*others, protocol("pick_place"))} == {()}
+    assert protocol("arrow_puzzle", agents=("dqn",)).few_seeds == ()
     assert protocol("arrow_puzzle", seeds=(7,)).few_seeds == (), "nobody has more seeds than there are"
 
 

@@ -4,17 +4,17 @@ reported.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_agents import FakeAgent
+from bench_fakes import Pupil
 from recordings import contents
 from small_runs import Inline
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.interfaces import Agent, AgentContext, Observation, Transition
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.trained import load_trained
@@ -22,53 +22,29 @@ from imagine_bench.running.trained import load_trained
 _FEW: dict[str, Any] = {"budgets": (3,), "evaluation_episodes": 2, "execution": "kinematic", "recorded_episodes": 1}
 
 
-class Witness(FakeAgent):
-    """Notes its observations."""
-
-    seen: list[Observation]
-    contexts: list[AgentContext]
-
-    def act(self, observation: Observation, *, explore: bool) -> int:
-        self.seen.append(observation)
-        return super().act(observation, explore=explore)
-
-    def observe(self, transition: Transition, *, episode: int) -> None:
-        self.seen += [transition.observation, transition.next_observation]
-
-
-@pytest.fixture
-def witness(monkeypatch: pytest.MonkeyPatch) -> Witness:
-    """Registered as an agent that takes all but the human's view."""
-    agent, usual = Witness(), registry.make_agent
-    agent.seen, agent.contexts = [], []
-
-    def make(name: str, context: AgentContext) -> Agent:
-        if name != "witness":
-            return usual(name, context)
-        agent.contexts.append(context)
-        return agent
-
-    entry = registry.AgentEntry(make="none:none", needs_encoder=False, observes=("frame", "state", "proprio"))
-    monkeypatch.setitem(registry.AGENTS, "witness", entry)
-    monkeypatch.setattr(registry, "make_agent", make)
-    return agent
+@pytest.fixture(autouse=True)
+def pupils(monkeypatch: pytest.MonkeyPatch) -> list[Pupil]:
+    """Those that are made, as an agent that takes all but the human's view."""
+    entry = dataclasses.replace(registry.AGENTS["pupil"], observes=("frame", "state", "proprio"))
+    monkeypatch.setitem(registry.AGENTS, "pupil", entry)
+    Pupil.made.clear()
+    return Pupil.made
 
 
 @pytest.mark.parametrize(("choice", "size"), [("frame", 64), ("frame", 96), ("state", 64), ("proprio,frame", 64)])
-def test_agents_are_shown_what_is_chosen(tmp_path: Path, witness: Witness, choice: str, size: int) -> None:
+def test_agents_are_shown_what_is_chosen(tmp_path: Path, pupils: list[Pupil], choice: str, size: int) -> None:
     shown = {"observation": choice, "observation_size": size}
-    wanted, paths = plan("arrow_puzzle", "smoke", agents=("witness",), **_FEW, **shown)
+    wanted, paths = plan("arrow_puzzle", "smoke", agents=("pupil",), **_FEW, **shown)
     result = bench(wanted, paths, root=tmp_path, launcher=Inline())
     shapes = {"frame": (size, size, 3), "state": (15,), "proprio": (16,)}
-    parts = choice.split(",")
-    assert witness.contexts[-1].observation == {part: shapes[part] for part in parts} and len(witness.seen) > 10
-    for each in witness.seen:
-        assert each.frame.shape == (shapes["frame"] if "frame" in parts else (0, 0, 3))
-        assert {name: part.shape for name, part in each.more.items()} == {
-            part: shapes[part] for part in parts if part != "frame"
-        }
+    parts = {part: shapes[part] for part in choice.split(",")}
+    told = parts.pop("frame", (0, 0, 3)), parts
+    pupil = pupils[-1]
+    assert pupil.told == {part: shapes[part] for part in choice.split(",")} and len(pupil.shown) > 5
+    for each in (*pupil.seen, *(transition.next_observation for _, transition in pupil.shown)):
+        assert (each.frame.shape, {name: part.shape for name, part in each.more.items()}) == told
         assert each.macrostate is None and ("state" not in parts or each.more["state"].sum() == 4.0)
-    assert "/real/frame" in contents(result.folder / "witness/seed_0/recording.rrd")
+    assert "/real/frame" in contents(result.folder / "pupil/seed_0/recording.rrd")
 
 
 def test_choices_in_any_order_are_one_bench() -> None:
@@ -78,32 +54,13 @@ def test_choices_in_any_order_are_one_bench() -> None:
     assert one == other and one.world["observation"] == "frame,state" and "privileged" in one.looks
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "words"),
-    [
-        ({"observation_size": 16}, InvalidValueError, "observation_size is 16; give 32 to 256 pixels"),
-        (
-            {"observation": "human", "agents": ("witness",)},
-            InvalidValueError,
-            "takes frame, state, proprio alone; leave it out",
-        ),
-        (
-            {"observation": "state", "agents": ("dqn",)},
-            InvalidValueError,
-            "Agent 'dqn' takes 64 x 64 frames alone; leave",
-        ),
-    ],
-)
-@pytest.mark.usefixtures("witness")
-def test_what_cannot_be_shown_is_one_sentence(changes: dict[str, Any], error: type[Exception], words: str) -> None:
-    with pytest.raises(error) as caught:
-        plan("arrow_puzzle", "smoke", **{"agents": ("witness",), **changes})
-    assert words in str(caught.value)
+def test_what_an_agent_cannot_be_shown_is_one_sentence() -> None:
+    with pytest.raises(InvalidValueError, match="takes frame, state, proprio alone; leave it out"):
+        plan("arrow_puzzle", "smoke", agents=("pupil",), observation="human")
 
 
-@pytest.mark.usefixtures("witness")
 def test_a_run_that_saw_something_else_is_not_asked_with_frames(tmp_path: Path) -> None:
-    wanted, paths = plan("arrow_puzzle", "smoke", agents=("witness",), observation="state", **_FEW)
-    folder = bench(wanted, paths, root=tmp_path, launcher=Inline()).folder / "witness/seed_0"
+    wanted, paths = plan("arrow_puzzle", "smoke", agents=("pupil",), observation="state", **_FEW)
+    folder = bench(wanted, paths, root=tmp_path, launcher=Inline()).folder / "pupil/seed_0"
     with pytest.raises(InvalidValueError, match="is of an agent that sees state at 64 pixels, and it would be asked"):
         load_trained(folder)

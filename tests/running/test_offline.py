@@ -13,7 +13,6 @@ from bench_fakes import Pupil
 from small_runs import collected, final_arrays, measured, run_observed, written
 
 from imagine_bench import registry
-from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.data import OnProgress, RunSpec
@@ -56,15 +55,12 @@ def test_the_learner_sees_the_transitions_and_no_state(tmp_path: Path) -> None:
     episodes = collected()[0]
     result = run(tmp_path / "run", spec_of(written(tmp_path / "set").folder))
     pupil = Pupil.made[-1]
-    before, _ = episodes.rows
-    wanted = [
-        (
-            episodes.frames[row].tobytes(), episodes.frames[row + 1].tobytes(), episodes.actions[step],
-            episodes.rewards[step], episodes.terminated[step], episodes.truncated[step],
-        )
-        for step, row in enumerate(before)
-    ]  # fmt: skip
-    assert [facts(transition) for _, transition in pupil.shown] == wanted
+    before, after = episodes.rows
+    wanted = zip(
+        [frame.tobytes() for frame in episodes.frames[before]], [frame.tobytes() for frame in episodes.frames[after]],
+        episodes.actions, episodes.rewards, episodes.terminated, episodes.truncated, strict=True,
+    )  # fmt: skip
+    assert [facts(transition) for _, transition in pupil.shown] == list(wanted)
     assert [episode for episode, _ in pupil.shown] == np.repeat(np.arange(6), episodes.lengths).tolist()
     for _, transition in pupil.shown:
         assert transition.observation.macrostate is None and transition.next_observation.macrostate is None
@@ -116,25 +112,22 @@ def test_a_dataset_that_changed_since_is_refused(tmp_path: Path) -> None:
         run(tmp_path / "run", spec)
 
 
-def test_what_cannot_learn_from_a_dataset_is_refused(tmp_path: Path) -> None:
-    folder = written(tmp_path / "set").folder
-    with pytest.raises(InvalidValueError, match="is shown true macrostates; leave --dataset out, or that agent"):
-        plan("arrow_puzzle", "smoke", dataset=folder, **_FEW, agents=("q_learning_macrostate",))
-    with pytest.raises(InvalidValueError, match="Both a dataset and demonstrations would come first; give one"):
-        plan("arrow_puzzle", "smoke", dataset=folder, **_FEW, demonstrations=2)
+@pytest.mark.parametrize(
+    ("task", "changes", "words"),
+    [
+        ("arrow_puzzle", {"agents": ("q_learning_macrostate",)}, "is shown true macrostates; leave --dataset out, or"),
+        ("arrow_puzzle", {"demonstrations": 2}, "Both a dataset and demonstrations would come first; give one"),
+        # an encoder for clean frames would make nothing of these
+        ("arrow_puzzle", {"appearance": "clean"}, "frames of appearance mild, not clean; give --appearance mild, and"),
+        ("pick_place", {}, "is of arrow_puzzle with 6 macro-actions; give one of pick_place, which has"),
+        ("arrow_puzzle_hard", {}, "is of arrow_puzzle with 6 macro-actions; give one of arrow_puzzle_hard, which has"),
+    ],
+)
+def test_what_cannot_be_learned_from_is_refused(tmp_path: Path, task: str, changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidValueError, match=words):
+        plan(task, "smoke", dataset=written(tmp_path / "set").folder, **{**_FEW, **changes})
 
 
-def test_a_dataset_of_another_task_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = written(tmp_path / "set").folder
-    for task in ("pick_place", "arrow_puzzle_hard"):
-        assert main(["bench", "--task", task, "--dataset", str(folder)]) == 2
-        assert f"is of arrow_puzzle with 6 macro-actions; give one of {task}, which has" in capsys.readouterr().err
-
-
-def test_frames_that_look_otherwise_are_refused(tmp_path: Path) -> None:
-    """An encoder for clean frames would make nothing of them; tests may look otherwise."""
-    folder = written(tmp_path / "set").folder
-    with pytest.raises(InvalidValueError, match="frames of appearance mild, not clean; give --appearance mild, and"):
-        plan("arrow_puzzle", "smoke", dataset=folder, **{**_FEW, "appearance": "clean"})
-    wanted, _ = plan("arrow_puzzle", "smoke", dataset=folder, **_FEW, test_appearance="clean")
-    assert (wanted.appearance, wanted.test_appearance) == ("mild", "clean")  # type: ignore[attr-defined]
+def test_tests_may_look_otherwise_than_a_dataset(tmp_path: Path) -> None:
+    wanted = spec_of(written(tmp_path / "set").folder, test_appearance="clean").protocol
+    assert (wanted.appearance, wanted.test_appearance) == ("mild", "clean")

@@ -9,7 +9,7 @@ from bench_fakes import FakeRunSpec
 from small_runs import small
 
 from imagine_bench.protocols.data import Phase, Progress
-from imagine_bench.running.bench import Counted, ProgressBar
+from imagine_bench.running.bench import ProgressBar
 
 WORK = 9 + 2 * 5
 """Of a learner: training episodes, and tests at two budgets."""
@@ -67,12 +67,3 @@ def test_a_share_that_is_solved_is_of_tests_alone(
         now_s[0] = 20.0
         show(far(0, 4, phase, episode=6, success=0.4))
     assert capsys.readouterr().err.splitlines()[-1].endswith(words)
-
-
-def test_what_is_counted_says_the_time_gone_and_the_time_left(
-    now_s: list[float], capsys: pytest.CaptureFixture[str]
-) -> None:
-    with Counted("fits judged", total=4) as counted:
-        now_s[0] = 100.0
-        counted.step()
-    assert capsys.readouterr().err.splitlines() == ["fits judged: 1 of 4, 01:40 gone, 05:00 left"]

@@ -1,10 +1,11 @@
 """Protocols: complete, hashed, and strict about their values."""
 
+import copy
 import dataclasses
 
 import pytest
 
-from imagine_bench.errors import ArtefactError, InvalidValueError, UnknownNameError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.registry import TASKS, task
@@ -36,34 +37,15 @@ def test_quick_finds_encoders_at_every_appearance(name, appearance):
 
 
 def test_any_change_changes_the_hash():
-    base = protocol("arrow_puzzle", overrides=(("imagination.depth", 5),))
-    changes = {
-        "task": "arrow_puzzle_hard", "preset": "smoke", "hyperparameters": "minimal", "config_group": "chapter_3",
-        "agents": ("dqn",),
-        "seeds": (5,), "budgets": (7,),
-        "evaluation_episodes": 3, "execution": "kinematic", "appearance": "mild",
-        "overrides": (("imagination.depth", 6),), "open_loop_starts": 1, "sampled_futures": 1, "recorded_episodes": 1,
-        "encoder": "other@0123456789ab", "codes": "other@0123456789ab", "device": "cuda",
-        "after": ("arrow_puzzle",), "demonstrations": 1, "queries": 1, "feedback": 1.0, "split": "plan_length=2",
-        "dataset": "random-3@0123456789ab", "settings_digest": "0123456789ab", "test_appearance": "strong",
-        "physics": (("pad_friction", 0.5),), "observation": "state", "observation_size": 128,
-        "headlines": (("imagination", "dqn"),), "most_looks": 2, "recorded_seeds": 2, "few_seeds": (("dqn", 0),),
-        "code": (("my_agent", "0123456789ab"),),
-    }  # fmt: skip
-    others = {
-        "after_episodes",
-        "unannounced",
-        "feedback_error",
-        "agent_names",
-    }  # the last one says how names are written
-    assert {*changes, *others} >= {field.name for field in dataclasses.fields(Protocol)}
-    after = dataclasses.replace(base, after=("arrow_puzzle",))
-    assert dataclasses.replace(after, after_episodes=7).hash != after.hash
-    assert dataclasses.replace(after, unannounced=True).hash != after.hash
-    taught = dataclasses.replace(base, feedback=1.0)
-    assert dataclasses.replace(taught, feedback_error=0.1).hash != taught.hash
-    hashes = {dataclasses.replace(base, **{name: value}).hash for name, value in changes.items()}
-    assert len(hashes | {base.hash}) == len(changes) + 1
+    """Of whatever field, before a protocol refuses or completes it; the spelling of names is tested in tests/store."""
+    base = protocol("arrow_puzzle", after=("arrow_puzzle",), feedback=1.0)
+    names = [field.name for field in dataclasses.fields(Protocol) if field.name != "agent_names"]
+    hashes = {base.hash}
+    for name in names:
+        changed = copy.copy(base)
+        object.__setattr__(changed, name, ("another",))
+        hashes.add(changed.hash)
+    assert len(hashes) == 1 + len(names) > 30
 
 
 @pytest.mark.parametrize(
@@ -100,24 +82,3 @@ def test_agents_of_a_file_that_are_no_names_are_refused():
     for agents in (-1, "dqn", [5], None):
         with pytest.raises(InvalidValueError, match="agents was given"):
             Protocol.from_dict({**protocol("arrow_puzzle").as_dict(), "agents": agents})
-
-
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        ({"task": "arrow_puzle"}, UnknownNameError, r"No task 'arrow_puzle'. Did you mean 'arrow_puzzle'\?"),
-        (
-            {"preset": "fast"},
-            UnknownNameError,
-            "No preset 'fast'.* Known: smoke, quick, thesis, full, ",
-        ),
-        ({"budgets": (100, 100)}, InvalidValueError, r"budgets \(100, 100\) must be .* ascending"),
-        ({"seeds": (999, 1000)}, InvalidValueError, "mix tuning seeds .from 1000 on"),
-        ({"seeds": (2**24,)}, InvalidValueError, "must be one or more different integers from 0 to 16777215"),
-        ({"after_episodes": 50}, InvalidValueError, "after_episodes is 50, but no task comes before"),
-    ],
-)
-def test_bad_fields_say_what_is_allowed(changes, error, message):
-    fields = {"task": "arrow_puzzle", **changes}
-    with pytest.raises(error, match=message):
-        protocol(fields.pop("task"), fields.pop("preset", "quick"), **fields)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bench_fakes import TableAgent
-from fake_results import bench_result
+from fake_results import bench_result, rewritten
 from small_runs import do, final_arrays, small
 
 from imagine_bench import registry
@@ -27,12 +27,7 @@ TASK = registry.task("arrow_puzzle")
 
 
 def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
-    tiny = (
-        ("imagination.weight_samples", 3),
-        ("model.batch_size", 8),
-        ("model.dynamics_hidden", (16,)),
-        ("model.updates_per_step", 1),
-    )
+    tiny = (("imagination.weight_samples", 3), ("model.batch_size", 8), ("model.dynamics_hidden", (16,)))
     encoder = encoders.own(TASK, "clean")
     agent = "imagination_uncertainty"
     named = encoders.identity(encoder)
@@ -95,9 +90,6 @@ def test_of_runs_that_end_alike_the_earlier_one_is_taken(tmp_path: Path) -> None
     wanted = protocol("arrow_puzzle", agents=("imagination",), seeds=(0, 1), budgets=(1, 2, 3))
     result = bench_result(tmp_path, protocol=wanted)
     for counts, best in ((((9, 9, 10), (1, 10, 10)), 1), (((1, 1, 10), (9, 9, 9)), 0), (((5, 5, 5), (5, 5, 5)), 0)):
-        runs = []
-        for one, solved in zip(result.runs, counts, strict=True):
-            pairs = zip(one.checkpoints, solved, strict=True)
-            tests = tuple(dataclasses.replace(test, successes=count) for test, count in pairs)
-            runs.append(dataclasses.replace(one, checkpoints=tests))
-        assert best_run(dataclasses.replace(result, runs=tuple(runs))).seed == best
+        solved = iter(sum(counts, ()))
+        changed = rewritten(result, lambda _, row, solved=solved: dataclasses.replace(row, successes=next(solved)))
+        assert best_run(changed).seed == best

@@ -30,17 +30,6 @@ def unfinished(folder: Path) -> Path:
     return checkpoint
 
 
-def change(path: Path, **values: Any) -> None:
-    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
-
-
-@pytest.mark.parametrize("values", [{"episode": 8}, {"agent": {}}, {"runner": {}}, {"seal": "0"}])
-def test_a_changed_state_of_a_checkpoint_is_refused(tmp_path: Path, values: dict[str, Any]) -> None:
-    change(unfinished(tmp_path) / "state.json", **values)
-    with pytest.raises(ArtefactError, match=r"state\.json is damaged"):
-        load_so_far(tmp_path)
-
-
 _SEALED = ["config.json", "metrics.csv", "imagined.npz", "agent.safetensors", "runner.safetensors", "state.json"]
 
 
@@ -92,21 +81,17 @@ def test_what_killed_writers_left_is_swept(tmp_path: Path) -> None:
     assert not any(path.exists() for path in litter)
 
 
-@pytest.mark.parametrize("name", [".lock", ".lock.holder"])
-def test_a_lock_follows_no_link(tmp_path: Path, name: str) -> None:
-    precious = tmp_path / "precious"
-    precious.write_text("precious")
-    (tmp_path / name).symlink_to(precious)
-    with pytest.raises(SetupError, match="is not a file of ours"), lock(tmp_path / ".lock", "It"):
-        pass
-    assert precious.read_text() == "precious"
-
-
-def test_a_file_half_written_by_a_link_is_not_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", [".lock", ".lock.holder", ".a.json.7.partial"])
+def test_neither_a_lock_nor_a_file_half_written_follows_a_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     monkeypatch.setattr("os.getpid", lambda: 7)
     precious = tmp_path / "precious"
     precious.write_text("precious")
-    (tmp_path / ".a.json.7.partial").symlink_to(precious)
+    (tmp_path / name).symlink_to(precious)
+    if "lock" in name:
+        with pytest.raises(SetupError, match="is not a file of ours"), lock(tmp_path / ".lock", "It"):
+            pass
     write_bytes(tmp_path / "a.json", b"1")
     assert precious.read_text() == "precious" and (tmp_path / "a.json").read_bytes() == b"1"
 
@@ -137,18 +122,28 @@ def test_a_protocol_stands_for_its_folder_and_its_runs(tmp_path: Path) -> None:
         load_bench(elsewhere)
 
 
-@pytest.mark.parametrize("name", ["environment.json", "sessions.json"])
-def test_changed_facts_of_a_bench_are_refused(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("state.json", {"episode": 8}),
+        ("state.json", {"agent": {}}),
+        ("state.json", {"runner": {}}),
+        ("state.json", {"seal": "0"}),
+        ("config.json", {"settings": {"rate": 0.1}}),
+        ("environment.json", {"commit": "other"}),
+        ("sessions.json", {"commit": "other"}),
+    ],
+)
+def test_changed_facts_are_refused(tmp_path: Path, name: str, values: dict[str, Any]) -> None:
     folder = tmp_path / "bench"
     shutil.copytree(WHOLE, folder)
-    change(folder / name, commit="other")
-    with pytest.raises(ArtefactError, match=rf"{name} is damaged"):
-        load_bench(folder)
-
-
-def test_changed_settings_of_an_unfinished_run_are_refused(tmp_path: Path) -> None:
-    unfinished(tmp_path)
-    change(tmp_path / "config.json", settings={"rate": 0.1})
-    for read in (load_so_far, do):
-        with pytest.raises(ArtefactError, match=r"config\.json is damaged"):
-            read(tmp_path)
+    run = folder / "table/seed_0"
+    (run / "DONE").unlink()
+    (path,) = folder.rglob(name)
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+    for read, where in (
+        (load_so_far_of_bench, folder),
+        *(((load_so_far, run), (do, run)) if run in path.parents else ()),
+    ):
+        with pytest.raises(ArtefactError, match=rf"{name} is damaged"):
+            read(where)

@@ -53,12 +53,9 @@ def test_what_looks_otherwise_is_trained_for_itself(trained):
     ]
     places = {encoders.own(registry.task(name), appearance, kind) for name, appearance, kind in wanted}
     assert len(places) == len(wanted) == len(trained)
-    spec = registry.task("arrows:cubes=2")
-    for settings in (
-        {"config_group": "chapter_3"},
-        {"preprocessing": "small_rgb"},
-    ):  # and encoders that are trained otherwise
-        assert encoders.cached(dataclasses.replace(spec, **settings), "clean", "codes") not in places
+    for settings in ({"config_group": "chapter_3"}, {"preprocessing": "small_rgb"}):  # encoders are trained otherwise
+        spec = dataclasses.replace(registry.task("arrows:cubes=2"), **settings)
+        assert encoders.cached(spec, "clean", "codes") not in places
 
 
 @pytest.mark.parametrize("name", ["arrows", "arrows:slip=0.2", "arrows:goal=012,forbid=none"])
@@ -67,14 +64,11 @@ def test_three_cubes_have_the_bundled_one(trained, name):
     assert place == encoders.bundled()["arrow_puzzle-clean"] and not trained
 
 
-@pytest.mark.parametrize(("share", "doubted"), [(0.0345, True), (0.8999, True), (0.9, False), (1.0, False)])
+@pytest.mark.parametrize(("share", "doubted"), [(0.8999, True), (0.9, False)])
 def test_an_encoder_that_reads_few_frames_right_is_named(tmp_path, share, doubted):
     path = tmp_path / "theirs.safetensors"
     save_file({"a": np.zeros(1)}, path, {"card": json.dumps({"probe": {"mlp": share}})})
-    words = encoders.reading_warning(path)
-    assert bool(words) == doubted
-    assert encoders.mark(encoders.low_share(path)) == (f" (encoder reads {share:.1%})" if doubted else "")
-    assert not doubted or (f"reads only {share:.1%} of new frames right" in words and "theirs" in words)
+    assert bool(encoders.reading_warning(path)) == bool(encoders.mark(encoders.low_share(path))) == doubted
 
 
 def test_a_bench_and_its_report_name_an_encoder_that_misreads(tmp_path, capsys):
@@ -105,7 +99,6 @@ def test_an_artefact_says_itself_what_it_gives(tmp_path, kind):
     ("given", "home", "sentence"),
     [
         (None, "/dev/null/nowhere", "A folder of encoders may be named in IMAGINE_BENCH_CACHE"),
-        ("/dev/null/cache", "/tmp", "A folder of encoders may be named in IMAGINE_BENCH_CACHE"),
         ("~nobody_at_all/x", "/tmp", "the system knows no such home folder; give a path without '~'"),
         (None, None, "This user has no home folder; name one for encoders in IMAGINE_BENCH_CACHE"),
     ],

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
-from unittest import mock
+from unittest.mock import ANY, patch
 
 import bench_fakes  # noqa: F401 - registers its agents
 import pytest
@@ -22,388 +23,280 @@ from imagine_bench.cli import benches, parsed
 from imagine_bench.cli import exit_code as main
 from imagine_bench.judge.judgement import Judgement
 
-HERE = Path("here")
-RUNS = Path("runs")
-
 
 class ReachedError(Exception):
     """The function that does the work was called."""
 
 
-class Call(NamedTuple):
-    """A command, the function that it should call, and what this should be given."""
+class Wire(NamedTuple):
+    """A command, options that say what it does without them, others, and the function that is given all of them."""
 
-    words: str
+    line: str
+    default: str
+    others: str
     target: str
-    given: tuple[Any, ...]
-    named: Mapping[str, Any]
+    places: Mapping[str, str | int]  # the argument of an option, where it has another name or none
 
 
-def call(words: str, target: str, *given: Any, **named: Any) -> Call:
-    return Call(words, target, given, named)
+def wire(line: str, default: str, others: str, target: str, **places: str | int) -> Wire:
+    return Wire(line, default, others, target, places)
 
 
-_PHYSICS = (("pad_friction", 0.5), ("plan_error_mm", 3))
+def meant(word: str) -> Any:
+    try:
+        return ast.literal_eval(word)
+    except (ValueError, SyntaxError):
+        return word
+
+
+def chosen(line: str) -> dict[str, Any]:
+    """The options of a command line and their values: of ``--motion-hz 5 --sizes 2 3``, ``motion_hz`` is 5."""
+    found: dict[str, Any] = {}
+    for option in f" {line}".split(" --")[1:]:
+        name, *words = option.split()
+        values = tuple(map(meant, words))
+        found[name.replace("-", "_")] = values if len(values) > 1 else values[0] if values else True
+    return found
+
+
 _JUDGING = "imagine_bench.cli.judging"
 _TOOLS = "imagine_bench.cli.tools"
 _BENCHES = "imagine_bench.cli.benches"
 _AUDITS = "imagine_bench.tools.audits"
 _PLAY = "imagine_bench.tools.play"
-_PLANS = {"task": None, "count": 100, "recorded": 5, "execution": None, "max_epistemic": None, "encoder": None}
-_COLLECTED = {"episodes": 200, "seed": 0, "execution": "physics", "appearance": "clean", "motion_hz": 0.0}
-_SHOWN = {"policy": "expert", "episodes": 200, "seed": 0, "appearance": "clean", "size": 64, "format": "npz"}
-_RETRAINED = {"recipe": "default", "appearance": "clean", "steps": None, "batch": None, "latents": None}
-_KEPT = {"tests": None, "training": None, "seed": 0, "like": None, "execution": None, "appearance": None}
-_GAME = {"model": None, "seed": 0, "camera": "human", "execution": None, "appearance": None, "encoder": None}
-_SERVED = {
-    "task": None, "observation": "words", "player": None, "tests": None, "training": None, "like": None,
-    "execution": None, "appearance": None, "most_players": 16, "host": "127.0.0.1", "port": 8765, "out": RUNS,
-}  # fmt: skip
-_BOARD = {
-    "action": "open", "path": HERE, "out": Path("build/board"), "closes": None, "tests": 100, "round": None,
-    "secret": Path("secret.json"),
-}  # fmt: skip
-_JUDGED: dict[str, Any] = {
-    "task": "pick_place", "models": ("copy",), "sizes": (2, 3), "seeds": (4, 5), "samples": 6, "appearance": "mild",
-    "policy": "mixed", "order": 7,
-}  # fmt: skip
-CALLS = [
-    call(
-        "judge --models copy",
-        f"{_JUDGING}.judge",
-        Judgement(task="arrow_puzzle", models=("copy",)),
-        Path("runs/judge"),
-        workers=mock.ANY,
-    ),
-    call(
-        "judge pick_place --models copy --sizes 2 3 --seeds 4 5 --samples 6 --appearance mild --policy mixed --order 7 "
+_CONTROL = "imagine_bench_motion.control"
+_TESTING = "imagine_bench.testing"
+_BOARD = "imagine_bench_board.commands"
+WIRES = [
+    wire(
+        "judge pick_place --models gaussian copy",
+        "--seeds 0 1 2 --samples 8 --appearance clean --policy random --order 0 --out runs/judge",
+        "--sizes 2 3 --seeds 4 5 --samples 6 --appearance mild --policy mixed --order 7 --encoder pick_place-mild "
         "--workers 1 --out here",
         f"{_JUDGING}.judge",
-        Judgement(**_JUDGED),
-        HERE,
-        workers=1,
+        out=1,
     ),
-    call(
-        "judge pick_place --models gaussian --encoder pick_place-mild",
-        f"{_JUDGING}.judge",
-        Judgement(task="pick_place", models=("gaussian",), encoder="pick_place-mild"),
-        Path("runs/judge"),
-        workers=mock.ANY,
+    wire("judge --models copy gaussian", "--task arrow_puzzle", "--task pick_place", f"{_JUDGING}.judge"),
+    wire(
+        "verify tests --train 2 --nonce word", "", "--dataset here --encoder e", f"{_JUDGING}.Retraining", train="runs"
     ),
-    call(
-        "verify tests --train 2 --nonce word --dataset here --encoder e",
-        f"{_JUDGING}.Retraining",
-        runs=2,
-        nonce="word",
-        launcher=mock.ANY,
-        encoder="e",
-        dataset=HERE,
-    ),
-    call("verify tests --train 2 --workers 3", f"{_JUDGING}.launcher", "local", 3),
-    call("verify", f"{_AUDITS}.chosen", None, RUNS, None),
-    call("verify --out here --task arrows", f"{_AUDITS}.chosen", None, HERE, "arrows"),
-    call("verify here --causes --encoder e", f"{_AUDITS}.why_report", HERE, root=RUNS, task=None, encoder="e"),
-    call("plan", f"{_AUDITS}.plan_report", None, root=RUNS, **_PLANS),
-    call(
-        "plan --task pick_place --out here --count 3 --recorded 0 --execution kinematic --max-epistemic 0.5 "
-        "--encoder e",
+    wire("verify tests --train 2", "", "--workers 3", f"{_JUDGING}.launcher", workers=1),
+    wire("verify", "--out runs", "--out here --task arrows", f"{_AUDITS}.chosen", out=1, task=2),
+    wire("verify here --causes", "", "--encoder e", f"{_AUDITS}.why_report"),
+    wire(
+        "plan",
+        "--out runs --count 100 --recorded 5",
+        "--task pick_place --out here --count 3 --recorded 0 --execution kinematic --max-epistemic 0.5 --encoder e",
         f"{_AUDITS}.plan_report",
-        None,
-        root=HERE,
-        task="pick_place",
-        count=3,
-        recorded=0,
-        execution="kinematic",
-        max_epistemic=0.5,
-        encoder="e",
+        out="root",
     ),
-    call("dataset arrow_puzzle", f"{_TOOLS}.collect", mock.ANY, mock.ANY, **_COLLECTED),
-    call(
-        "dataset arrow_puzzle --episodes 3 --seed 4 --execution kinematic --appearance mild --motion-hz 5",
+    wire(
+        "dataset arrow_puzzle",
+        "--episodes 200 --seed 0 --execution physics --appearance clean --motion-hz 0",
+        "--episodes 3 --seed 4 --execution kinematic --appearance mild --motion-hz 5",
         f"{_TOOLS}.collect",
-        mock.ANY,
-        mock.ANY,
-        episodes=3,
-        seed=4,
-        execution="kinematic",
-        appearance="mild",
-        motion_hz=5.0,
     ),
-    call("dataset arrow_puzzle", f"{_TOOLS}.policy_of", "random", mock.ANY, 0, None),
-    call("dataset arrow_puzzle --policy here --seed 4 --encoder e", f"{_TOOLS}.policy_of", "here", mock.ANY, 4, "e"),
-    call("dataset arrow_puzzle --out here", f"{_TOOLS}.require_new", HERE),
-    call("dataset arrow_puzzle --policy mixed", f"{_TOOLS}.require_new", Path("datasets/arrow_puzzle-mixed")),
-    call("dataset arrow_puzzle --format minari", f"{_TOOLS}.require_format", "minari"),
-    call("dataset --standard", f"{_TOOLS}.standard_sets", Path("datasets"), "npz", 200),
-    call("dataset --standard --out here --format lerobot --episodes 7", f"{_TOOLS}.standard_sets", HERE, "lerobot", 7),
-    call("dataset --describe here", f"{_TOOLS}.read_dataset", HERE),
-    call(
-        "dataset ArrowPuzzleMotion --policy expert",
-        "imagine_bench_motion.control.datasets.collect",
-        "arrow_puzzle",
-        folder=Path("datasets/ArrowPuzzleMotion-expert"),
-        workers=None,
-        **_SHOWN,
+    wire(
+        "dataset arrow_puzzle",
+        "--policy random --seed 0",
+        "--policy here --seed 4 --encoder e",
+        f"{_TOOLS}.policy_of",
+        policy=0,
+        seed=2,
+        encoder=3,
     ),
-    call(
-        "dataset ArrowPuzzleMotion --policy noisy --episodes 3 --seed 4 --appearance mild --size 96 "
-        "--out here --workers 2",
-        "imagine_bench_motion.control.datasets.collect",
-        "arrow_puzzle",
-        policy="noisy",
-        episodes=3,
-        seed=4,
-        appearance="mild",
-        size=96,
-        format="npz",
-        folder=HERE,
-        workers=2,
-    ),
-    call(
-        "encoder arrow_puzzle",
-        "imagine_bench.agents.encoders.cli.retrain",
-        mock.ANY,
-        device="cpu",
-        seed=0,
-        out=Path("encoders"),
-        **_RETRAINED,
-    ),
-    call(
-        "encoder arrow_puzzle --recipe codes --appearance mild --steps 1 --batch 2 --latents 3 --device cuda --seed 4 "
+    wire(
+        "dataset arrow_puzzle --policy mixed",
+        "--out datasets/arrow_puzzle-mixed",
         "--out here",
+        f"{_TOOLS}.require_new",
+        out=0,
+    ),
+    wire("dataset arrow_puzzle", "--format npz", "--format minari", f"{_TOOLS}.require_format", format=0),
+    wire(
+        "dataset --standard",
+        "--out datasets --format npz --episodes 200",
+        "--out here --format lerobot --episodes 7",
+        f"{_TOOLS}.standard_sets",
+        out=0,
+        format=1,
+        episodes=2,
+    ),
+    wire(
+        "dataset ArrowPuzzleMotion --policy noisy",
+        "--episodes 200 --seed 0 --appearance clean --size 64 --format npz --out datasets/ArrowPuzzleMotion-noisy",
+        "--episodes 3 --seed 4 --appearance mild --size 96 --format minari --out here --workers 2",
+        f"{_CONTROL}.datasets.collect",
+        out="folder",
+    ),
+    wire(
+        "encoder arrow_puzzle",
+        "--recipe default --appearance clean --device cpu --seed 0 --out encoders",
+        "--recipe codes --appearance mild --steps 1 --batch 2 --latents 3 --device cuda --seed 4 --out here",
         "imagine_bench.agents.encoders.cli.retrain",
-        mock.ANY,
-        recipe="codes",
-        appearance="mild",
-        steps=1,
-        batch=2,
-        latents=3,
-        device="cuda",
-        seed=4,
-        out=HERE,
     ),
-    call("view", f"{_TOOLS}.newest_recording", RUNS, None),
-    call("view --task arrows --out here", f"{_TOOLS}.newest_recording", HERE, "arrows"),
-    call("view here.rrd", "imagine_bench.recording.stream.open_in_viewer", Path("here.rrd")),
-    call("describe", f"{_TOOLS}.names"),
-    call("describe dqn", f"{_TOOLS}.describe", "dqn"),
-    call("play arrow_puzzle", f"{_PLAY}.play", "arrow_puzzle", **_GAME),
-    call(
-        "play --model here --execution kinematic --appearance mild --encoder e --camera far --seed 4",
+    wire("view", "--out runs", "--task arrows --out here", f"{_TOOLS}.newest_recording", out=0, task=1),
+    wire(
+        "play arrow_puzzle",
+        "--camera human --seed 0",
+        "--model here --execution kinematic --appearance mild --encoder e --camera far --seed 4",
         f"{_PLAY}.play",
-        None,
-        model=HERE,
-        seed=4,
-        camera="far",
-        execution="kinematic",
-        appearance="mild",
-        encoder="e",
     ),
-    call(
-        "play ArrowPuzzleMotion --seed 4 --camera far --appearance mild",
-        "imagine_bench_motion.control.keyboard.play_motion",
-        "arrow_puzzle",
-        seed=4,
-        appearance="mild",
-        camera="far",
+    wire(
+        "play ArrowPuzzleMotion",
+        "--seed 0 --camera human",
+        "--seed 4 --camera far --appearance mild",
+        f"{_CONTROL}.keyboard.play_motion",
     ),
-    call(
+    wire(
         "play arrow_puzzle --film",
+        "--out film.gif --seed 0 --appearance clean --camera human",
+        "--out here --seed 4 --appearance mild --camera far",
         f"{_PLAY}.film",
-        "arrow_puzzle",
-        Path("film.gif"),
-        seed=0,
-        appearance="clean",
-        camera="human",
+        out=1,
     ),
-    call(
-        "play arrow_puzzle --film --out here --seed 4 --appearance mild --camera far",
-        f"{_PLAY}.film",
-        "arrow_puzzle",
-        HERE,
-        seed=4,
-        appearance="mild",
-        camera="far",
-    ),
-    call(
-        "play arrow_puzzle --quiz 3 --seed 4 --appearance mild",
+    wire(
+        "play arrow_puzzle --quiz 3",
+        "--seed 0 --appearance clean",
+        "--seed 4 --appearance mild",
         "imagine_bench.tools.quiz.quiz",
-        "arrow_puzzle",
-        3,
-        seed=4,
-        appearance="mild",
+        quiz=1,
     ),
-    call("play arrow_puzzle --keep anna", f"{_TOOLS}.protocol_of_player", "arrow_puzzle", "person", "anna", **_KEPT),
-    call(
-        "play arrow_puzzle --keep anna --tests 3 --training 4 --seed 5 --like here --execution kinematic "
-        "--appearance mild",
+    wire(
+        "play arrow_puzzle --keep anna",
+        "--seed 0",
+        "--tests 3 --training 4 --seed 5 --like here --execution kinematic --appearance mild",
         f"{_TOOLS}.protocol_of_player",
-        "arrow_puzzle",
-        "person",
-        "anna",
-        tests=3,
-        training=4,
-        seed=5,
-        like=HERE,
-        execution="kinematic",
-        appearance="mild",
+        keep=2,
     ),
-    call("play arrow_puzzle --keep anna", f"{_PLAY}.keep_playing", mock.ANY, RUNS, camera="human"),
-    call(
-        "play arrow_puzzle --keep anna --out here --camera far", f"{_PLAY}.keep_playing", mock.ANY, HERE, camera="far"
+    wire(
+        "play arrow_puzzle --keep anna",
+        "--out runs --camera human",
+        "--out here --camera far",
+        f"{_PLAY}.keep_playing",
+        out=1,
     ),
-    call("serve", "imagine_bench_serving.server.serve_command", **_SERVED),
-    call(
-        "serve pick_place --observation png --player anna --tests 3 --training 4 --like here --execution kinematic "
+    wire(
+        "serve",
+        "--observation words --most-players 16 --host 127.0.0.1 --port 8765 --out runs",
+        "--task pick_place --observation png --player anna --tests 3 --training 4 --like here --execution kinematic "
         "--appearance mild --most-players 5 --host 0.0.0.0 --port 6 --out here",
         "imagine_bench_serving.server.serve_command",
-        task="pick_place",
-        observation="png",
-        player="anna",
-        tests=3,
-        training=4,
-        like=HERE,
-        execution="kinematic",
-        appearance="mild",
-        most_players=5,
-        host="0.0.0.0",
-        port=6,
-        out=HERE,
     ),
-    call("check arrow_puzzle", "imagine_bench.testing.contract.checks", "arrow_puzzle", None, None),
-    call(
-        "check arrow_puzzle --agent dqn --model copy",
-        "imagine_bench.testing.contract.checks",
-        "arrow_puzzle",
-        "dqn",
-        "copy",
-    ),
-    call(
+    wire("check arrow_puzzle", "", "--agent dqn --model copy", f"{_TESTING}.contract.checks", agent=1, model=2),
+    wire(
         "check arrow_puzzle --physics",
-        "imagine_bench.testing.physics.check_physics",
-        "arrow_puzzle",
-        Path("runs/margins.json"),
-        turns=2_000,
-        trials=200,
-        appearances=("clean",),
+        "--turns 2000 --trials 200 --appearances clean --out runs/margins.json",
+        "--turns 3 --trials 4 --appearances mild strong --out here",
+        f"{_TESTING}.physics.check_physics",
+        out=1,
     ),
-    call(
-        "check arrow_puzzle --physics --turns 3 --trials 4 --appearances mild strong --out here",
-        "imagine_bench.testing.physics.check_physics",
-        "arrow_puzzle",
-        HERE,
-        turns=3,
-        trials=4,
-        appearances=("mild", "strong"),
+    wire(
+        "check ArrowPuzzleMotion --physics",
+        "--random 100",
+        "--turns 3 --trials 4 --random 5 --out here",
+        f"{_TESTING}.physics.check_motion",
+        random="random_episodes",
+        out=1,
     ),
-    call(
-        "check ArrowPuzzleMotion --physics --turns 3 --trials 4 --random 5",
-        "imagine_bench.testing.physics.check_motion",
-        "ArrowPuzzleMotion",
-        Path("runs/margins.json"),
-        turns=3,
-        trials=4,
-        random_episodes=5,
-        appearances=("clean",),
+    wire("new agent mine", "--out .", "--out here", "imagine_bench.tools.new.new_package", out=2),
+    wire("report", "--out runs", "--task arrows --out here", f"{_BENCHES}.newest_bench", out=0, task=1),
+    wire("report here --track wandb", "", "", f"{_BENCHES}.track", track=1),
+    wire("sweep", "--out runs", "--agents dqn random --out here", f"{_BENCHES}.run_suite", agents=1, out="root"),
+    wire("sweep arrow_puzzle", "--out runs", "--out here", f"{_BENCHES}.run_study", out="root"),
+    wire(
+        "bench arrow_puzzle",
+        "--launcher local",
+        "--workers 2 --launcher ray",
+        "imagine_bench.cli.options.launcher",
+        launcher=0,
+        workers=1,
     ),
-    call("new agent mine", "imagine_bench.tools.new.new_package", "agent", "mine", Path()),
-    call("new model mine --out here", "imagine_bench.tools.new.new_package", "model", "mine", HERE),
-    call("report", f"{_BENCHES}.newest_bench", RUNS, None),
-    call("report --task arrows --out here", f"{_BENCHES}.newest_bench", HERE, "arrows"),
-    call("report here", f"{_BENCHES}.load_so_far", HERE),
-    call("report here --track wandb", f"{_BENCHES}.track", HERE, "wandb"),
-    call("sweep", f"{_BENCHES}.run_suite", mock.ANY, mock.ANY, root=RUNS, launcher=mock.ANY),
-    call(
-        "sweep --agents dqn --out here --workers 1",
-        f"{_BENCHES}.run_suite",
-        mock.ANY,
-        ("dqn",),
-        root=HERE,
-        launcher=mock.ANY,
-    ),
-    call(
-        "sweep arrow_puzzle --out here",
-        f"{_BENCHES}.run_study",
-        mock.ANY,
-        "arrow_puzzle",
-        root=HERE,
-        launcher=mock.ANY,
-    ),
-    call("bench arrow_puzzle --workers 2 --launcher ray", "imagine_bench.cli.options.launcher", "ray", 2),
-    call("bench arrow_puzzle", "imagine_bench.cli.options.launcher", "local", None),
-    call("bench arrow_puzzle", f"{_BENCHES}.bench", mock.ANY, mock.ANY, root=RUNS, launcher=mock.ANY),
-    call("bench arrow_puzzle --out here", f"{_BENCHES}.bench", mock.ANY, mock.ANY, root=HERE, launcher=mock.ANY),
-    call("bench arrow_puzzle --track wandb", f"{_BENCHES}.Tracked", mock.ANY, "wandb", "arrow_puzzle"),
-    call("bench arrow_puzzle --until-decided", f"{_BENCHES}.until_decided", mock.ANY, mock.ANY, most=19, root=RUNS),
-    call(
-        "bench arrow_puzzle --until-decided --most-seeds 9 --out here",
+    wire("bench arrow_puzzle", "--out runs", "--out here", f"{_BENCHES}.bench", out="root"),
+    wire("bench arrow_puzzle --track wandb", "", "", f"{_BENCHES}.Tracked", track=1),
+    wire(
+        "bench arrow_puzzle --until-decided",
+        "--most-seeds 19 --out runs",
+        "--most-seeds 9 --out here",
         f"{_BENCHES}.until_decided",
-        mock.ANY,
-        mock.ANY,
-        most=9,
-        root=HERE,
+        most_seeds="most",
+        out="root",
     ),
-    call(
-        "submit here",
-        "imagine_bench_board.commands.submit",
-        run=HERE,
-        out=Path("rows"),
-        author="",
-        round=None,
-        encoder=None,
+    wire("submit here", "--out rows", "--out there --author me --encoder e --round r", f"{_BOARD}.submit"),
+    wire(
+        "board open here",
+        "--out build/board --tests 100 --secret secret.json",
+        "--out there --tests 5 --secret word.json --closes 2026-12-24",
+        f"{_BOARD}.board",
     ),
-    call("board open here", "imagine_bench_board.commands.board", **_BOARD),
-    call(
-        "daily --date 2026-12-24 --secret word", "imagine_bench_board.commands.daily", date="2026-12-24", secret="word"
-    ),
+    wire("daily", "", "--date 2026-12-24 --secret word", f"{_BOARD}.daily"),
 ]
 
 
-@pytest.mark.parametrize("one", CALLS, ids=lambda one: f"{one.words} {one.target.rpartition('.')[2]}")
-def test_a_command_gives_its_options_to_the_function_that_does_its_work(one: Call, tmp_path: Path) -> None:
-    with contextlib.chdir(tmp_path), mock.patch(one.target, side_effect=ReachedError) as reached:
-        with pytest.raises(ReachedError):
-            main(one.words.split())
-    reached.assert_called_once_with(*one.given, **one.named)
+def arguments(line: str, target: str) -> dict[str | int, Any]:
+    """Those of the function that a command calls, by place or name; of a judgement its fields, too."""
+    with patch(target, side_effect=ReachedError) as function, pytest.raises(ReachedError):
+        main(line.split())
+    given, named = function.call_args
+    found = {**dict(enumerate(given)), **named}
+    for each in given:
+        found |= vars(each) if isinstance(each, Judgement) else {}
+    plain = {name: str(value) if isinstance(value, Path) else value for name, value in found.items()}
+    return {
+        name: value for name, value in plain.items() if value is None or isinstance(value, str | float | int | tuple)
+    }
 
 
-OPTIONS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "execution": ("--execution kinematic", {"execution": "kinematic"}),
-    "appearance": ("--appearance mild", {"appearance": "mild"}),
-    "physics": ("--physics pad_friction=0.5 --physics plan_error_mm=3", {"physics": _PHYSICS}),
-    "observation": ("--observation frame,proprio", {"observation": "frame,proprio"}),
-    "observation_size": ("--observation-size 96", {"observation_size": 96}),
-    "agents": ("--agents pupil random", {"agents": ("pupil", "random")}),
-    "after": ("--after arrow_puzzle", {"after": ("arrow_puzzle",)}),
-    "after_episodes": (
-        "--after arrow_puzzle --after-episodes 7",
-        {"after": ("arrow_puzzle",), "after_episodes": 7},
-    ),
-    "unannounced": ("--after arrow_puzzle --unannounced", {"after": ("arrow_puzzle",), "unannounced": True}),
-    "demonstrations": ("--demonstrations 2", {"demonstrations": 2}),
-    "queries": ("--queries 3", {"queries": 3}),
-    "feedback": ("--feedback 1.5", {"feedback": 1.5}),
-    "feedback_error": ("--feedback 1.5 --feedback-error 0.25", {"feedback": 1.5, "feedback_error": 0.25}),
-    "seeds": ("--seeds 3-5 8", {"seeds": (3, 4, 5, 8)}),
-    "budgets": ("--budgets 5 25", {"budgets": (5, 25)}),
-    "evaluation_episodes": ("--evaluation-episodes 7", {"evaluation_episodes": 7}),
-    "test_appearance": ("--test-appearance mild", {"test_appearance": "mild"}),
-    "split": ("--split plan_length=2", {"split": mock.ANY}),
-}
-"""Words for each option of a bench of agents, and the fields of the protocol that they set."""
-OF_ANY_FRAME = ("observation", "observation_size")
-"""The options that refuse an agent that learns from usual frames."""
+@pytest.mark.parametrize("one", WIRES, ids=lambda one: f"{one.line} {one.target.rpartition('.')[2]}")
+def test_an_option_reaches_its_argument_and_no_other_and_left_out_is_what_its_help_says(
+    one: Wire, tmp_path: Path
+) -> None:
+    with contextlib.chdir(tmp_path):
+        before, same, after = (arguments(f"{one.line} {more}", one.target) for more in ("", one.default, one.others))
+    assert same == before
+    given, others = ({one.places.get(n, n): v for n, v in chosen(words).items()} for words in (one.line, one.others))
+    assert {name: value for name, value in after.items() if value != before[name]} == others
+    assert all(before[name] == value for name, value in given.items() if name in before or name in one.places.values())
+
+
+_PUPIL = "arrow_puzzle --preset smoke --agents pupil"
+_RANDOM = "arrow_puzzle --preset smoke --agents random"  # takes other frames than the usual
+_DQN = "arrow_puzzle --preset smoke --agents dqn"
+_AFTER = {"after": ("arrow_puzzle",)}
+_PHYSICS = (("pad_friction", 0.5), ("plan_error_mm", 3))
+_DISCOUNT = (("controller.discount", 0.9),)
+OPTIONS: list[tuple[str, str, Mapping[str, Any]]] = [
+    (_PUPIL, "--execution kinematic", {}),
+    (_PUPIL, "--appearance mild", {}),
+    (_PUPIL, "--physics pad_friction=0.5 --physics plan_error_mm=3", {"physics": _PHYSICS}),
+    (_RANDOM, "--observation frame,proprio", {"observation": "frame,proprio"}),
+    (_RANDOM, "--observation-size 96", {}),
+    (_PUPIL, "--agents pupil random", {}),
+    (_PUPIL, "--after arrow_puzzle", _AFTER),
+    (_PUPIL, "--after arrow_puzzle --after-episodes 7", _AFTER),
+    (_PUPIL, "--after arrow_puzzle --unannounced", _AFTER),
+    (_PUPIL, "--demonstrations 2", {}),
+    (_PUPIL, "--queries 3", {}),
+    (_PUPIL, "--feedback 1.5", {}),
+    (_PUPIL, "--feedback 1.5 --feedback-error 0.25", {}),
+    (_PUPIL, "--seeds 3-5 8", {"seeds": (3, 4, 5, 8)}),
+    (_PUPIL, "--budgets 5 25", {}),
+    (_PUPIL, "--evaluation-episodes 7", {}),
+    (_PUPIL, "--test-appearance mild", {}),
+    (_PUPIL, "--split plan_length=2", {"split": ANY}),
+    (_DQN, "--set controller.discount=0.9", {"set": ANY, "overrides": _DISCOUNT, "settings_digest": ANY}),
+    (_DQN, "--encoder arrow_puzzle-mild", {"encoder": ANY}),
+    ("toy_regression --preset smoke", "--networks 3", {}),
+]
+"""A bench, words for an option, and the fields of the protocol that are not named and given as the words are."""
 OF_OTHERS = {
-    "set": "an agent with settings, below",
-    "encoder": "an agent that sees through one, below",
     "dataset": "a folder, tests/running/test_offline.py",
     "device": "an accelerator, tests/running/test_runner.py",
-    "variants": "regression tasks, below",
-    "networks": "regression tasks, below",
+    "variants": "regression tasks",
     "until_decided": "the commands above",
     "most_seeds": "the commands above",
 }
-"""The options that need more than an agent, and where they are tested."""
+"""The options that need more, and where they are tested."""
 
 
 @functools.cache
@@ -414,48 +307,27 @@ def planned(words: str) -> dict[str, Any]:
     return {each.name: getattr(command.planned()[0], each.name) for each in dataclasses.fields(command.planned()[0])}
 
 
-@pytest.mark.parametrize(
-    ("agent", "words", "given"),
-    [
-        *(
-            (f"arrow_puzzle --preset smoke --agents {'random' if name in OF_ANY_FRAME else 'pupil'}", *row)
-            for name, row in OPTIONS.items()
-        ),
-        (
-            "arrow_puzzle --preset smoke --agents dqn",
-            "--set controller.discount=0.9",
-            {"overrides": (("controller.discount", 0.9),), "settings_digest": mock.ANY},
-        ),
-        ("arrow_puzzle --preset smoke --agents dqn", "--encoder arrow_puzzle-mild", {"encoder": mock.ANY}),
-        ("toy_regression --preset smoke", "--networks 3", {"networks": 3}),
-    ],
-)
+@pytest.mark.parametrize(("bench", "words", "otherwise"), OPTIONS)
 def test_an_option_of_a_bench_sets_its_fields_of_the_protocol_and_no_other(
-    agent: str, words: str, given: Mapping[str, Any]
+    bench: str, words: str, otherwise: Mapping[str, Any]
 ) -> None:
-    before, after = planned(agent), planned(f"{agent} {words}")
+    before, after = planned(bench), planned(f"{bench} {words}")
+    given = {**chosen(words), **otherwise}
+    given.pop("set", None)
     assert {name: value for name, value in after.items() if value != before[name]} == given
 
 
 def test_every_option_of_a_bench_has_a_row_or_a_reason() -> None:
     sections = (benches.WorldOptions, benches.Learner, benches.Budget, benches.Tests)
     names = {each.name for section in sections for each in dataclasses.fields(section)}
-    assert names == OPTIONS.keys() | OF_OTHERS.keys()
+    rows = set().union(*(chosen(words) for _, words, _ in OPTIONS))
+    assert names == rows | OF_OTHERS.keys()
 
 
 def test_a_bench_is_by_default_what_its_help_says() -> None:
-    before = planned("arrow_puzzle --agents pupil")
-    said = {
-        "preset": "quick",
-        "execution": "physics",
-        "appearance": "clean",
-        "observation": "frame",
-        "observation_size": 64,
-        "demonstrations": 0,
-        "queries": 0,
-        "feedback": 0.0,
-        "feedback_error": 0.0,
-        "device": "cpu",
-    }
-    assert {name: before[name] for name in said} == said
+    said = chosen(
+        "--preset quick --execution physics --appearance clean --observation frame --observation-size 64 "
+        "--demonstrations 0 --queries 0 --feedback 0 --feedback-error 0 --device cpu"
+    )
+    assert planned("arrow_puzzle --agents pupil").items() >= said.items()
     assert planned("arrow_puzzle --agents pupil --after arrow_puzzle")["after_episodes"] == 100

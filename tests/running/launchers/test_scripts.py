@@ -92,13 +92,10 @@ def test_a_module_that_runs_a_command_when_imported_is_named(tmp_path: Path, mon
 @pytest.mark.parametrize(
     ("text", "from_stdin", "code", "said"),
     [
-        (script("mine"), False, 0, "Report:"),
         (script("__main__"), False, 0, "Report:"),
         (script("mine", "raise RuntimeError('boom')"), False, 1, "mine seed 0 in arrow_puzzle: RuntimeError: boom"),
-        (script("mine", guard=False), False, 1, "mine runs a command when it is imported"),
         (script("__main__", guard=False), False, 1, "mine runs a command when it is imported"),
         (script("__main__", guard=False), True, 1, "write the code to a file"),
-        ("from imagine_bench.cli import main\n" + _BENCH.format(agent="random"), False, 0, "Report:"),
         ("from imagine_bench.cli import main\n" + _BENCH.format(agent="random"), True, 0, "Report:"),
         ("from imagine_bench.cli import main\n" + _JUDGE, True, 0, "Recording:"),
         ("from imagine_bench.cli import main\nmain(['bench', 'nowhere'])\n", False, 2, "No task 'nowhere'"),
