@@ -70,7 +70,7 @@ def anna(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_persons_run_is_verified_explained_and_reported(anna: Path, tmp_path: Path) -> None:
     folder = tmp_path / "runs" / anna.parents[1].name
     shutil.copytree(anna.parents[1], folder)
-    (row,) = run_folder.load_run(anna).checkpoints
+    row = run_folder.load_run(anna).checkpoints[0]
     assert (row.test_episodes, row.solved, row.env_steps) == (4, "0101", 0)
     assert [verdict.complaint for verdict in verify_runs(folder)] == ["", ""]
     assert not any(verdict.unshown for verdict in verify_runs(folder))

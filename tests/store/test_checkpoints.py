@@ -48,7 +48,8 @@ def variants(hint: Any) -> list[Any]:
         choices = itertools.product(*(variants(each) for each in get_type_hints(hint).values()))
         return [hint(**dict(zip(get_type_hints(hint), chosen, strict=True))) for chosen in choices]  # type: ignore[operator]
     if origin in (list, tuple):
-        return [origin(), origin(variants(arguments[0]))]
+        several = origin(variants(arguments[0]))
+        return [origin(), several] if dataclasses.is_dataclass(arguments[0]) else [several]
     is_mapping = origin is not None and issubclass(origin, Mapping)
     return [{"b c": 0.25, "a": 2}] if is_mapping else [SCALARS[hint]]
 
