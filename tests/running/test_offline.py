@@ -56,11 +56,10 @@ def test_the_learner_sees_the_transitions_and_no_state(tmp_path: Path) -> None:
     result = run(tmp_path / "run", spec_of(written(tmp_path / "set").folder))
     pupil = Pupil.made[-1]
     before, _ = episodes.rows
-    wanted = zip(
-        [frame.tobytes() for frame in episodes.frames[before]], [frame.tobytes() for frame in episodes.frames[before + 1]],
-        episodes.actions, episodes.rewards, episodes.terminated, episodes.truncated, strict=True,
-    )  # fmt: skip
-    assert [facts(transition) for _, transition in pupil.shown] == list(wanted)
+    frames = [frame.tobytes() for frame in episodes.frames]
+    steps = zip(episodes.actions, episodes.rewards, episodes.terminated, episodes.truncated, strict=True)
+    wanted = [(frames[row], frames[row + 1], *step) for row, step in zip(before, steps, strict=True)]
+    assert [facts(transition) for _, transition in pupil.shown] == wanted
     assert [episode for episode, _ in pupil.shown] == np.repeat(np.arange(6), episodes.lengths).tolist()
     for _, transition in pupil.shown:
         assert transition.observation.macrostate is None and transition.next_observation.macrostate is None
