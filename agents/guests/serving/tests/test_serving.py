@@ -155,12 +155,7 @@ def test_a_viewer_is_shown_the_frame_and_no_words_of_it(tmp_path: Path) -> None:
         assert (status, shown["words"]) == (200, "Test 1 of 3.")
         image = np.array(Image.open(io.BytesIO(base64.b64decode(shown["png"]))))
         assert "Seen now" not in ask(one, "/step", {"action": 2})[1]["observation"]["words"]
-        call = {
-            "jsonrpc": "2.0",
-            "id": 1,
-            "method": "tools/call",
-            "params": {"name": "step", "arguments": {"action": 2}},
-        }
+        call = {"jsonrpc": "2.0", "id": 1, "method": "tools/call", "params": {"name": "reset"}}
         content = ask(one, "/mcp", call)[1]["result"]["content"]
         assert [part["type"] for part in content] == ["text", "image"]
     wanted = protocol_of_player("arrow_puzzle", "viewer", "cy", tests=3, execution="kinematic")
