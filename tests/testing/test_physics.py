@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import gymnasium
 import pytest
@@ -88,6 +89,22 @@ def test_fidelity_of_any_world_counts_what_slips():
     turned = sum(not slipped for slipped, _ in found.slips)
     assert 8 < turned < 20
     assert turned < len(found.error_deg) < 2 * turned  # all but turns of the last cube turn two
+
+
+@pytest.mark.parametrize(("worst", "passes"), [("clean", False), ("mild", False), (None, True)])
+def test_every_appearance_decides_a_check_of_continuous_control(worst, passes, monkeypatch, tmp_path):
+    def segments(make, levels, trials, turns):
+        return {
+            level: {"as_ruled": 98 if level == worst else 99, "faults": {}, "random_episodes": 0} for level in levels
+        }
+
+    def exact_facts(spec, kept):
+        return SimpleNamespace(as_ruled=kept["as_ruled"], segments=100, shown=1.0)
+
+    monkeypatch.setattr(physics, "_segments", segments)
+    monkeypatch.setattr(physics, "motion", SimpleNamespace(certificate=exact_facts, evidence=str, chance=str))
+    wanted = {"turns": 0, "trials": 1, "random_episodes": 0, "appearances": ("clean", "mild")}
+    assert physics.check_motion("ArrowPuzzleEasyMotion", tmp_path / "x.json", **wanted) is passes
 
 
 def test_a_task_without_targets_is_only_measured():
