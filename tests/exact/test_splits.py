@@ -13,10 +13,12 @@ from imagine_bench.exact.splits import Split, split_of
 RULES = Wheels()
 
 
-def test_held_out_pairs_are_never_trained_on_but_their_values_are():
-    split = split_of(RULES, "pairs=0:3:3")
-    trained, tested = ({(s[0], s[3]) for s in starts} for starts in (split.train, split.test))
-    assert len(tested) == 3 and not trained & tested
+@pytest.mark.parametrize(("first", "second"), [(0, 3), (3, 0)])
+@pytest.mark.parametrize("held_out", [3, 6])
+def test_held_out_pairs_are_never_trained_on_but_their_values_are(first, second, held_out):
+    split = split_of(RULES, f"pairs={first}:{second}:{held_out}")
+    trained, tested = ({(s[first], s[second]) for s in starts} for starts in (split.train, split.test))
+    assert len(tested) == held_out and not trained & tested
     for i in (0, 1):
         assert {pair[i] for pair in tested} <= {pair[i] for pair in trained}
 

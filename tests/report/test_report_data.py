@@ -7,15 +7,25 @@ import json
 import math
 from collections import Counter
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from fake_results import WIDE, bench_result, rewritten
 
 from imagine_bench import reference, registry, statistics
+from imagine_bench.errors import SetupError, UnknownNameError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.report.bench import bench_page, cost
-from imagine_bench.report.data import DIFFERENCE, SCORE, collect, frames_before, known_agent, open_loop_means
+from imagine_bench.report.data import (
+    DIFFERENCE,
+    SCORE,
+    collect,
+    frames_before,
+    known_agent,
+    known_task,
+    open_loop_means,
+)
 from imagine_bench.report.page import count, seconds
 from imagine_bench.rules import fewest_actions
 from imagine_bench.store import encoders
@@ -183,6 +193,14 @@ def test_an_agent_whose_tests_are_not_known_leaves_nothing_to_pair(result: Bench
     runs = [run if run.agent == "dqn" else each for run, each in zip(result.runs, known.runs, strict=True)]
     data = collect(dataclasses.replace(known, runs=tuple(runs)))
     assert not any("alone" in record for record in data.records)
+
+
+@pytest.mark.parametrize("error", [UnknownNameError("task", "theirs", ()), SetupError("It cannot be loaded.")])
+def test_a_task_of_an_absent_package_has_no_facts(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "task", mock.Mock(side_effect=error))
+    found = known_task("their_task")
+    assert (found.id, found.title, found.horizon) == ("their_task", "their task", 0)
+    assert math.isnan(found.facts().chance_level)
 
 
 def test_an_agent_of_an_absent_package_has_an_entry_that_makes_nothing() -> None:

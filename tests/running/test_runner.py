@@ -61,6 +61,7 @@ def test_an_episode_begins_where_its_seed_says_unless_a_start_is_asked_for() -> 
     ("seed", "looks", "tests"),
     [
         (0, {"test_appearance": "mild"}, ("evaluation", "mild")),
+        (0, {"test_appearance": "patched"}, ("evaluation", "photo_held_out")),
         (TUNING_SEEDS, {"appearance": "photo"}, ("tuning", "photo_held_out")),  # shown tuning starts alone
     ],
 )

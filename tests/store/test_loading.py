@@ -97,6 +97,13 @@ def test_seeds_of_two_benches_are_those_of_one_in_any_order(tmp_path: Path) -> N
         assert np.array_equal(joined.success_rates(agent), whole.success_rates(agent))
 
 
+def test_headlines_may_differ(tmp_path: Path) -> None:
+    first = do(tmp_path, "oracle", "random", seeds=(0,), headlines=(("oracle", "random"),))
+    second = do(tmp_path / "other", "oracle", "random", seeds=(2,))
+    for folders in ([first, second], [second, first]):
+        assert load_merged(folders, tmp_path).protocol.seeds == (0, 2)
+
+
 def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
     here, there = do(tmp_path, "oracle", seeds=(0, 1)), do(tmp_path, "oracle", seeds=(2,))
     shutil.rmtree(here / "oracle" / "seed_1")
