@@ -23,6 +23,7 @@ from imagine_bench.interfaces import Observation
 from imagine_bench.registry.machine import versions
 from imagine_bench.running.collect import Policy, collect
 from imagine_bench.store.bench_folder import newest_bench
+from imagine_bench.store.run_folder import load_run
 
 _ONE = {registry.AGENT_GROUP: {"their_agent": "their_package:ENTRY"}}
 _MODULE = '''
@@ -69,22 +70,21 @@ def test_a_packages_agent_is_compared_like_one_of_ours(
 ) -> None:
     assert main(["list"]) == 0
     assert "their_agent" in capsys.readouterr().out
-    words = ["bench", "--task", "arrow_puzzle", "--preset", "smoke", "--execution", "kinematic", "--workers", "1"]
-    size = ["--agents", "their_agent", "--budgets", "2", "--evaluation-episodes", "2"]
-    assert main([*words, *size, "--out", str(tmp_path / "runs")]) == 0
+    few = "--preset smoke --execution kinematic --workers 1 --budgets 2 --evaluation-episodes 2"
+    words = ["bench", "arrow_puzzle", "--agents", "their_agent", *few.split(), "--out", str(tmp_path / "runs")]
+    assert main(words) == 0
     folder = newest_bench(tmp_path / "runs")
     noted = json.loads((folder / "sessions.json").read_text())["environment"]["versions"]["their_package"]
     assert re.fullmatch(r"1\.2\+[0-9a-f]{8}", noted) and versions()["their_package"] == noted
     assert "their_agent" in (folder / "report" / "index.html").read_text()
-    metrics = (folder / "their_agent/seed_0/metrics.csv").read_text().splitlines()
-    row = dict(zip(metrics[0].split(","), metrics[-1].split(","), strict=True))
-    assert float(row["diagnostics/real_transitions"]) == float(row["env_steps"]) > 0
+    row = load_run(folder / "their_agent" / "seed_0").checkpoints[-1]
+    assert row.diagnostics["real_transitions"] == row.env_steps > 0
     guests.offer(site, {})
     assert main(["report", str(folder)]) == 0, "results can be read without the package"
     said = capsys.readouterr().out
     assert "Not installed here: agent their_agent. Numbers that need missing code are not shown." in said
     assert re.search(r"^their_agent +\d", said, re.MULTILINE)
-    assert main([*words, *size, "--out", str(tmp_path / "runs")]) == 2
+    assert main(words) == 2
     assert "No agent 'their_agent'" in capsys.readouterr().err
 
 

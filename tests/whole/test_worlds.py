@@ -7,17 +7,16 @@ worked out by hand in ``tests/tasks``.
 from __future__ import annotations
 
 import contextlib
-import csv
 from collections import Counter
 
 import gymnasium
 import numpy as np
 import pytest
-from kept import RESULTS
+from kept import table
 from whole_outputs import Expected, rounded, tabulated
 
 from imagine_bench import registry
-from imagine_bench.rules import evaluate, horizon_optimum, shortest_plans, tabulate
+from imagine_bench.rules import facts, shortest_plans, tabulate
 from imagine_bench.sweep.grid import LADDER, SEPARATING
 
 LARGE = 1_500  # macrostates, as of more than four cubes: they take seconds
@@ -40,11 +39,9 @@ EPISODES = (
 
 
 def test_exact_facts_of_all_experiments(expected: Expected) -> None:
-    with (RESULTS / "suite" / "levels.csv").open() as file:
-        kept = {(row["task"], round(float(row["chance"]), 9)) for row in csv.DictReader(file)}
-    rows: list[list[object]] = [
-        ["world", "macrostates", "ends", "starts", "horizon", "chance", "seen", "return", "plans: starts"]
-    ]
+    kept = {(row["task"], round(float(row["chance"]), 9)) for row in table("suite/levels.csv")}
+    columns = ["world", "macrostates", "ends", "starts", "horizon", "chance", "seen", "return", "length"]
+    rows: list[list[object]] = [[*columns, "plans: starts"]]
     compared = 0
     experiments = (*LADDER.experiments, *SEPARATING.experiments)
     for task in sorted({level.task for experiment in experiments for level in experiment.levels}):
@@ -52,16 +49,14 @@ def test_exact_facts_of_all_experiments(expected: Expected) -> None:
         tables = tabulate(spec.rules)
         if len(tables.index) > LARGE:
             continue
-        chance = evaluate(tables, np.full(tables.reward.shape, 1.0 / spec.n_actions), spec.horizon)
-        best = horizon_optimum(tables, spec.horizon)
-        level, most = (float(each.success[tables.starts].mean()) for each in (chance, best))
-        compared += (task, round(level, 9)) in kept  # levels of a split have another
+        found = facts(spec.rules, spec.horizon)
+        compared += (task, round(found.chance_level, 9)) in kept  # levels of a split have another
         lengths = Counter(shortest_plans(tables)[tables.starts].tolist())
         plans = " ".join(f"{length}:{lengths[length]}" for length in sorted(lengths))
         ends = sum(map(spec.rules.is_terminal, tables.index))
-        returns = float(best.returns[tables.starts].mean())
         sizes = [len(tables.index), ends, len(tables.starts), spec.horizon]
-        rows.append([spec.id, *sizes, f"{level:.5f}", f"{most:.5f}", f"{returns:.3f}", plans])
+        means = (found.chance_level, found.optimum, found.optimal_return, found.mean_plan_length)
+        rows.append([spec.id, *sizes, *(f"{mean:.5f}" for mean in means), plans])
     assert compared > 20
     expected("facts_of_experiments", tabulated(rows), exactly=False)
 
