@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from fake_agents import FakeAgent
 from numpy.typing import NDArray
 
 from imagine_bench import registry
@@ -31,7 +32,7 @@ def model_of(rules: Rules, wrong: NDArray[np.bool_] | None = None) -> ExpectedOu
     return ExpectedOutcomes(macrostates=macrostates, p_continues=p_continues, reward=reward)
 
 
-class Sound:
+class Sound(FakeAgent):
     """Plays perfectly, and tries everything in training. It is shown macrostates, and the rules."""
 
     settings = None
@@ -64,9 +65,6 @@ class Sound:
     def observe(self, transition: Transition, *, episode: int) -> None:
         assert transition.observation.macrostate is not None
         self.tried[self.rows[tuple(transition.observation.macrostate.tolist())], transition.action] += 1
-
-    def diagnostics(self) -> dict[str, float]:
-        return {}
 
     def state(self) -> AgentState:
         return AgentState(arrays={"tried": self.tried.copy()}, values={})

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from fake_agents import FakeAgent
 from imagine_bench.tasks.arrows.rules import ArrowRules
 from imagine_bench.tasks.macro_env import MacroEnv
 
@@ -87,7 +88,7 @@ def test_wrong_tasks_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert "two episodes of seed 0 differ" in check("same seed")
 
 
-class _Moody:
+class _Moody(FakeAgent):
     """Counts how often it was asked, and forgets half of it."""
 
     asked = 0
@@ -95,12 +96,6 @@ class _Moody:
     def act(self, observation: Any, *, explore: bool) -> int:
         self.asked += 1
         return self.asked % 6
-
-    def observe(self, transition: Any, *, episode: int) -> None:
-        pass
-
-    def diagnostics(self) -> dict[str, float]:
-        return {}
 
     def state(self) -> AgentState:
         return AgentState(arrays={"asked": np.array(self.asked)}, values={})
