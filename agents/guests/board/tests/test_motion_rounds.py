@@ -101,7 +101,7 @@ def test_forged_rows_of_a_round_are_refused(root: Path, changes: dict[str, dict[
     folder = root / "board" / rounds.ROUNDS / ROUND
     row = OpenMotions(root / "board" / ROWS / NAME)
     row.card |= changes.get("card", {})
-    row.card["protocol"] |= changes.get("protocol", {})
+    row.protocol.update(changes.get("protocol", {}))
     files = {"filed": folder / "filed" / f"{NAME}.json", "round": folder / "round.json"}
     for name in files.keys() & changes.keys():
         files[name].write_text(json.dumps(json.loads(files[name].read_text()) | changes[name]))
@@ -115,6 +115,6 @@ def test_open_tests_are_not_called_those_of_a_round(root: Path) -> None:
     row = OpenMotions(played(rows, NAME, control="joint", tests=TESTS, seed=31))
     filed = json.loads((root / "board" / rounds.ROUNDS / ROUND / "filed" / f"{NAME}.json").read_text())
     row.card["policy_sha256"] = filed["policy"]
-    row.card["protocol"] |= {"seed": SEED, "round": ROUND}
+    row.protocol.update(seed=SEED, round=ROUND)
     found = row.check()
     assert found.row is None and "test 0: " in found.verdict.complaint

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import hashlib
-import json
 import shutil
 import sys
 from collections.abc import Callable
@@ -14,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from board_forging import OpenRow
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_board import motions
@@ -22,7 +21,7 @@ from imagine_bench_board.commands import board
 from imagine_bench_board.motion_rows import Motion, MotionRow, read_motions
 from imagine_bench_board.motions import SLACK_PERIODS, MotionTests
 from imagine_bench_board.page import write_board
-from imagine_bench_board.rows import CARD, EPISODES, LONGEST
+from imagine_bench_board.rows import LONGEST
 
 from imagine_bench.arrays import Floats32
 from imagine_bench.errors import CheckFailedError, ImagineBenchError, InvalidValueError
@@ -50,13 +49,8 @@ def played(root: Path, name: str = "expert-and-nobody", **options: Any) -> Path:
     return env.write(root, name, agent="expert", author="a founder")
 
 
-class OpenMotions:
-    """A row's card and tests, open for changes."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.card: dict[str, Any] = json.loads((folder / CARD).read_text())
-        self.parts: list[dict[str, Any]] = json.loads((folder / EPISODES).read_text())
+class OpenMotions(OpenRow):
+    """A row of continuous control, open for changes."""
 
     def commands(self, test: int) -> Any:
         return np.frombuffer(base64.b64decode(self.parts[test]["commands"]), "<f4").reshape(-1, 8).copy()
@@ -65,19 +59,16 @@ class OpenMotions:
         self.parts[test]["commands"] = base64.b64encode(commands.astype("<f4").tobytes()).decode()
 
     def check(self) -> Checked:
-        """The finding about the card as it is now."""
-        (self.folder / CARD).write_text(json.dumps(self.card))
+        """The finding about the row as it is now."""
+        self.write()
         (found,) = check(self.folder)
         return found
 
-    def sealed(self, mujoco: str = "") -> Checked:
-        """The finding once digest and figures were brought up to date, by which version of MuJoCo is said."""
-        content = json.dumps(self.parts).encode()
-        (self.folder / EPISODES).write_bytes(content)
-        self.card["mujoco"] = mujoco or self.card["mujoco"]
-        self.card["episodes_sha256"] = hashlib.sha256(content).hexdigest()
+    def judged(self, mujoco: str = "") -> Checked:
+        """The finding once the figures were brought up to date, by which version of MuJoCo is said."""
         sure = [part for part in self.parts if part["reproducible"]]
         failed = [min(part["total_reward"], -5.0) for part in self.parts if not part["reproducible"]]
+        self.card["mujoco"] = mujoco or self.card["mujoco"]
         self.card["vouched"] = {
             "successes": sum(part["solved"] is True for part in sure),
             "faults": sum(part["fault"] for part in sure),
@@ -111,7 +102,7 @@ def test_an_honest_row_holds_and_says_what_happened(row: OpenMotions, tmp_path: 
     assert all(each.reproducible for each in read.motions)
     assert [each.periods for each in read.motions][1::2] == [750, 750]  # 3 s for each of ten macro-actions
     assert len(row.parts[1]["commands"]) < 750 * 43, "as long as a row allows for"
-    found = row.sealed()
+    found = row.judged()
     assert str(found) == (
         f"{read.name}: holds in {WORLD}, continuous control at 25 Hz, clean; open starts; 4 episodes played again; "
         f"not vouched: {', '.join(NOT_VOUCHED)}"
@@ -120,7 +111,7 @@ def test_an_honest_row_holds_and_says_what_happened(row: OpenMotions, tmp_path: 
     assert "continuous control at 25 Hz" in page
     assert page.count(f'href="{read.name}.html#tests"') == 5, "each number that is vouched for leads to its episodes"
     assert "2 of 4 tests solved" in (tmp_path / "page" / f"{read.name}.html").read_text()
-    row.card["protocol"] |= {"task": f"{WORLD},slip=0", "appearance": "light=0"}
+    row.protocol.update(task=f"{WORLD},slip=0", appearance="light=0")
     assert "holds" in str(row.check()) and read_motions(row.folder).world == read.world, "the same world in other words"
 
 
@@ -169,7 +160,7 @@ def test_every_test_is_played_whole_and_no_more_than_asked(tmp_path: Path, monke
 
 def dropped(row: OpenMotions) -> None:
     row.parts.pop(1)
-    row.card["protocol"]["tests"] -= 1
+    row.protocol["tests"] -= 1
 
 
 def longer(row: OpenMotions) -> None:
@@ -196,13 +187,13 @@ FORGERIES: dict[str, Callable[[OpenMotions], object]] = {
     "a dropped test": dropped,
     "cut commands": lambda row: row.put(1, row.commands(1)[:300]),
     "longer commands": longer,
-    "another seed": lambda row: row.card["protocol"].update(seed=31),
-    "another world": lambda row: row.card["protocol"].update(task="arrows:cubes=2"),
+    "another seed": lambda row: row.protocol.update(seed=31),
+    "another world": lambda row: row.protocol.update(task="arrows:cubes=2"),
     "commands that are no numbers": no_numbers,
     "no commands": lambda row: row.parts[1].update(commands="not base64!"),
-    "a world in a file": lambda row: row.card["protocol"].update(task="arrows:@/etc/passwd"),
+    "a world in a file": lambda row: row.protocol.update(task="arrows:@/etc/passwd"),
     "a text for a flag": lambda row: row.parts[0].update(solved="yes"),
-    "too many tests": lambda row: row.card["protocol"].update(tests=10**9),
+    "too many tests": lambda row: row.protocol.update(tests=10**9),
 }
 
 
@@ -212,7 +203,7 @@ FORGERIES: dict[str, Callable[[OpenMotions], object]] = {
 def test_forged_rows_never_hold_whatever_mujoco_they_name(row: OpenMotions, forgery: str, mujoco: str) -> None:
     """The forger brings digest and figures up to date."""
     FORGERIES[forgery](row)
-    found = row.sealed(mujoco)
+    found = row.judged(mujoco)
     assert found.row is None and found.verdict.complaint and "holds" not in str(found)
     assert found.is_refused or mujoco
     assert "\n" not in str(found) and "Traceback" not in str(found)
@@ -253,7 +244,7 @@ def test_a_test_that_ends_in_another_way_is_excused_only_if_disturbed_replays_do
     row: OpenMotions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other_fingerprint(row, 2)  # of a test that the expert solves
-    assert "refused: test 2: its fingerprint is" in str(row.sealed())
+    assert "refused: test 2: its fingerprint is" in str(row.judged())
     monkeypatch.setattr(motions, "DISTURBANCE", CHAOS_RAD)
     found = marked(row.check())
     assert [each.reproducible for each in found.motions] == [True, True, False, True]
@@ -266,9 +257,9 @@ def test_a_row_of_another_mujoco_is_not_vouched_for_and_never_holds(
 ) -> None:
     """Whether the card tells the truth, lies, or names a version that does not exist."""
     here = row.card["mujoco"]
-    assert "holds" in str(row.sealed(OTHER)), "another version alone is no reason"
+    assert "holds" in str(row.judged(OTHER)), "another version alone is no reason"
     other_fingerprint(row)
-    found = row.sealed()
+    found = row.judged()
     assert found.row is None
     assert str(found) == (
         f"{row.folder.name}: not vouched: made with MuJoCo {OTHER}, checked with {here}, where it does not play again; "
@@ -292,14 +283,14 @@ def test_a_marked_test_may_end_otherwise_with_another_mujoco_and_has_failed(
     """With the MuJoCo of the card the same row is refused. Nobody gains: a policy that does nothing has 0, not -5."""
     honest = read_motions(row.folder).vouched
     row.parts[1] |= {"solved": True, "total_reward": total_reward, "reproducible": False}
-    assert ": refused: test 1: its total reward is" in str(row.sealed())
-    found = marked(row.sealed(OTHER))
+    assert ": refused: test 1: its total reward is" in str(row.judged())
+    found = marked(row.judged(OTHER))
     assert found.vouched.successes == honest.successes
     assert found.vouched.mean_return == honest.mean_return + least / TESTS, "test 1 had a return of 0"
     FORGERIES["cut commands"](row)
-    assert marked(row.sealed()).vouched.mean_return == honest.mean_return + least / TESTS
+    assert marked(row.judged()).vouched.mean_return == honest.mean_return + least / TESTS
     row.parts[1]["reproducible"] = True
-    assert ": not vouched: made with" in str(row.sealed()), "a test that is not marked must end with its commands"
+    assert ": not vouched: made with" in str(row.judged()), "a test that is not marked must end with its commands"
 
 
 def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(
@@ -314,7 +305,7 @@ def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(
     for part in row.parts:
         part["reproducible"] = False
     monkeypatch.setattr(motions, "_played", worse)
-    found = row.sealed(OTHER).row
+    found = row.judged(OTHER).row
     assert isinstance(found, MotionRow)
     assert [each.total_reward for each in found.motions] == [part["total_reward"] - 40.0 for part in row.parts]
 

@@ -1,4 +1,4 @@
-"""The uncertainty of sampled values, and divergences that are known."""
+"""The uncertainty of sampled values, divergences that are known, and the causes of the expected squared error."""
 
 from __future__ import annotations
 
@@ -10,38 +10,51 @@ import torch
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.uncertainty import decompose
+from imagine_bench_regression import toy_regression as toy
 from imagine_bench_regression.uncertainty import jensen_shannon, sampled_component_variance
 from scipy import integrate, stats
+
+Rows = list[list[float]]
+PAIRS = 400_000
+SURE = 4.5
+"""Standard errors beyond which chance is no explanation."""
+X = 12.5
+"""Where all of the causes are worth mentioning: the branches are 13 apart (standard deviation)."""
+
+
+def mixtures(weights: Rows, means: Rows, sigmas: Rows) -> Mixture:
+    """T mixtures of K components for one row of one dimension, from T rows of K numbers."""
+    of_weights, of_means, of_sigmas = (
+        torch.tensor(rows, dtype=torch.float64).unsqueeze(1) for rows in (weights, means, sigmas)
+    )
+    return Mixture(of_weights.log(), of_means.unsqueeze(-1), of_sigmas.log().unsqueeze(-1))
 
 
 def test_a_sampled_value_is_as_uncertain_as_its_component() -> None:
     """Two components far apart: noise 1 and weights that move the mean by 1, noise 9 and weights that agree."""
-    means = torch.tensor([[[[0.0], [100.0]]], [[[2.0], [100.0]]]])  # [T = 2, N = 1, K = 2, Z = 1]
-    log_sigmas = torch.tensor([1.0, 3.0]).log().view(1, 1, 2, 1).expand(2, 1, 2, 1)
-    both = Mixture(torch.full((2, 1, 2), 0.5).log(), means, log_sigmas)
-    for value, variance in ((1.0, 1.0 + 1.0), (100.0, 9.0)):
-        found = sampled_component_variance(both, mdn.average(both), torch.tensor([[value]]))
-        assert found.item() == pytest.approx(variance, rel=1e-5)
-    for value, variance in ((0.0, 1.0), (2.0, 1.0), (100.0, 9.0)):  # two networks, whose components nobody averages
-        found = sampled_component_variance(both, mdn.average(both, 2), torch.tensor([[value]]), members=2)
-        assert found.item() == pytest.approx(variance, rel=1e-5)
+    both = mixtures([[0.5, 0.5]] * 2, [[0.0, 100.0], [2.0, 100.0]], [[1.0, 3.0]] * 2)
+    for members, variances in (
+        (1, {1.0: 1.0 + 1.0, 100.0: 9.0}),
+        (2, {0.0: 1.0, 2.0: 1.0, 100.0: 9.0}),  # two networks, whose components nobody averages
+    ):
+        for value, variance in variances.items():
+            sampled = torch.tensor([[value]], dtype=torch.float64)
+            found = sampled_component_variance(both, mdn.average(both, members), sampled, members=members)
+            assert found.item() == pytest.approx(variance, rel=1e-5)
 
 
-def gaussians(means: list[float], sigma: float) -> Mixture:
-    """T mixtures of one component for one row of one dimension."""
-    count = len(means)
-    values = torch.tensor(means).view(count, 1, 1, 1)
-    return Mixture(torch.zeros(count, 1, 1), values, torch.full_like(values, math.log(sigma)))
+def divergence(found: Mixture, draws: int) -> float:
+    return jensen_shannon(found, draws, torch.Generator().manual_seed(0))[0].item()
 
 
-def divergence(mixtures: Mixture, draws: int) -> float:
-    return jensen_shannon(mixtures, draws, torch.Generator().manual_seed(0))[0].item()
+def gaussians(means: list[float]) -> Mixture:
+    """Mixtures of one component of deviation 1."""
+    return mixtures([[1.0]] * len(means), [[mean] for mean in means], [[1.0]] * len(means))
 
 
 def test_equal_distributions_diverge_by_0_disjoint_ones_by_log_t() -> None:
-    assert divergence(gaussians([1.0] * 5, 1.0), 50) == pytest.approx(0.0, abs=1e-5)
-    apart = gaussians([100.0 * t for t in range(5)], 1.0)
-    assert divergence(apart, 4) == pytest.approx(math.log(5), abs=1e-5)
+    assert divergence(gaussians([1.0] * 5), 50) == pytest.approx(0.0, abs=1e-5)
+    assert divergence(gaussians([100.0 * t for t in range(5)]), 4) == pytest.approx(math.log(5), abs=1e-5)
 
 
 def test_divergence_of_two_gaussians_is_the_integral() -> None:
@@ -51,14 +64,54 @@ def test_divergence_of_two_gaussians_is_the_integral() -> None:
         return 0.5 * (p * np.log(p / m) + q * np.log(q / m))
 
     exact = integrate.quad(integrand, -10, 12)[0]
-    estimate = divergence(gaussians([0.0, 1.5], 1.0), 40_000)
-    assert estimate == pytest.approx(exact, abs=0.005)
+    assert divergence(gaussians([0.0, 1.5]), 40_000) == pytest.approx(exact, abs=0.005)
 
 
 def test_divergence_sees_what_the_variance_of_means_does_not() -> None:
     """Two samples with the same mean, one of two branches and one between them."""
-    weights = torch.tensor([[[0.5, 0.5]], [[0.5, 0.5]]]).log()
-    means = torch.tensor([[[[-3.0], [3.0]]], [[[0.0], [0.0]]]])
-    two = Mixture(weights, means, torch.full((2, 1, 2, 1), -1.0))
+    two = mixtures([[0.5, 0.5]] * 2, [[-3.0, 3.0], [0.0, 0.0]], [[math.exp(-1.0)] * 2] * 2)
     assert decompose(two).epistemic.item() == 0.0
     assert divergence(two, 100) > 0.6
+
+
+# Equation 4.8 (appendix A of the thesis) -----------------------------------------------------------------------------
+
+WEIGHTS = [[0.5, 0.5], [0.9, 0.1], [0.2, 0.8], [0.4, 0.6]]
+MEANS = [[20.0, 45.0], [30.0, 10.0], [35.0, 40.0], [22.0, 50.0]]
+SIGMAS = [[4.0, 6.0], [5.0, 5.0], [7.0, 3.0], [9.0, 2.0]]
+"""Four weight samples, mixtures of two components that lie beside the truth at X."""
+
+
+def causes(sigma: float) -> dict[str, float]:
+    parts = decompose(mixtures(WEIGHTS, MEANS, SIGMAS))
+    mean = float(np.sum(np.multiply(WEIGHTS, MEANS), axis=1).mean())
+    branches = toy.branches(np.array(X))
+    return {
+        "bias²": (branches.mean() - mean) ** 2, "epistemic": float(parts.epistemic), "aleatoric": sigma**2,
+        "modal": float(branches.var()), "spread": float(parts.aleatoric + parts.modal),
+    }  # fmt: skip
+
+
+def drawn(rng: np.random.Generator) -> np.ndarray:
+    """Values of the mixtures of drawn weight samples. Shape (PAIRS,)."""
+    weights, means, sigmas = map(np.array, (WEIGHTS, MEANS, SIGMAS))
+    t = rng.integers(len(weights), size=PAIRS)
+    k = (rng.random(PAIRS) > weights[t, 0]).astype(int)
+    return means[t, k] + sigmas[t, k] * rng.standard_normal(PAIRS)
+
+
+def targets(sigma: float, rng: np.random.Generator) -> np.ndarray:
+    """Of the process of thesis 4.5.1 at X, by its definition. Shape (PAIRS,)."""
+    f = np.array([7 * np.sin(0.75 * X) + 0.5 * X, 3 * np.sin(0.5 * X) + 3 * X - 5, 2 * np.sin(0.3 * X) - 0.2 * X + 20])
+    return f[rng.integers(3, size=PAIRS)] + sigma * rng.standard_normal(PAIRS)
+
+
+def test_the_error_is_the_sum_of_its_causes_and_of_no_fewer() -> None:
+    rng = np.random.default_rng(0)
+    squared = (targets(3.0, rng) - drawn(rng)) ** 2
+    error = squared.std() / np.sqrt(PAIRS)
+    terms = causes(3.0)
+    left = squared.mean() - sum(terms.values())
+    assert abs(left) < SURE * error
+    for name, value in terms.items():
+        assert left + value > SURE * error, f"{name} could be left out"
