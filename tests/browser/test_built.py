@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from imagine_bench.tasks.arrows.rules import ArrowRules
 from imagine_bench.tasks.arrows.scene import compile_arrow_scene
 from imagine_bench.tasks.pick_place.scene import compile_pick_scene
 from page_ready import PLAY, ROOT, served, sizes_bytes
 
 from imagine_bench import registry
+from imagine_bench.interfaces import Rules
 
 NODE = shutil.which("node")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -74,19 +76,6 @@ def test_the_scenes_are_those_of_the_package() -> None:
     assert [each["model"] for each in found] == [[model.nq, model.ngeom] for model in models]
 
 
-def _keys(line: str, start: list[int]) -> str:
-    """Keys of a shortest solution."""
-    rules = registry.task(line).rules
-    state = tuple(start)
-    pressed = []
-    while not rules.is_terminal(state):
-        action = rules.optimal_action(state)
-        (turn,) = rules.world.turns[action]
-        pressed.append(f"{turn.cube + 1} {'ArrowRight' if turn.clockwise else 'ArrowLeft'}")
-        state = rules.turned(state, action)
-    return " ".join(pressed)
-
-
 def visit(address: str, tmp_path: Path, query: str, keys: str = "", width: int = 400) -> Any:
     """A visit without an error, an address elsewhere or a bar to scroll; it presses keys."""
     seen = node("visit.mjs", MODULES, CHROMIUM, address, width, tmp_path / "a.png", query, keys)
@@ -95,25 +84,36 @@ def visit(address: str, tmp_path: Path, query: str, keys: str = "", width: int =
 
 
 @needs_browser
-@pytest.mark.parametrize("width", [1200, 400])
-def test_a_visitor_solves_the_puzzle_by_keys(address: str, width: int, tmp_path: Path) -> None:
-    query = "world=arrow_puzzle&seed=400"
-    looked = visit(address, tmp_path, query, width=width)
-    keys = _keys("arrow_puzzle", [int(each) for each in looked["state"].split(",")])
-    seen = visit(address, tmp_path, query, keys, width)
-    assert (seen["end"], seen["dream"]) == ("solved", "yes")
-    assert "Solved in" in seen["happened"]
-    assert min(looked["ready_s"], seen["ready_s"]) <= MOST_READY_S
+def test_the_page_is_soon_playable(address: str, tmp_path: Path) -> None:
+    assert min(visit(address, tmp_path, "world=arrow_puzzle")["ready_s"] for _ in range(2)) <= MOST_READY_S
+
+
+def keys(rules: Rules, action: int) -> str:
+    """The keys of a macro-action: those of the cube and of the sense of its turn, or one digit."""
+    if not isinstance(rules, ArrowRules):
+        return str(action + 1)
+    (turn,) = rules.world.turns[action]
+    return f"{turn.cube + 1} {'ArrowRight' if turn.clockwise else 'ArrowLeft'}"
 
 
 @needs_browser
 @pytest.mark.parametrize("width", [1200, 400])
-def test_a_visitor_hands_an_object_over_by_keys(address: str, width: int, tmp_path: Path) -> None:
-    rules = registry.task("pick_place").rules
-    table = {",".join(map(str, state)): str(rules.optimal_action(state) + 1) for state in rules.states}
-    seen = visit(address, tmp_path, "world=pick_place&seed=7", json.dumps(table), width)
-    assert (seen["end"], seen["pressed"][-1], len(seen["pressed"]) > 2) == ("solved", "4", True)
-    assert "Solved: handed over after" in seen["happened"]
+@pytest.mark.parametrize(
+    ("task", "dream", "words"),
+    [("arrow_puzzle", "yes", "Solved in"), ("pick_place", None, "Solved: handed over after")],
+)
+def test_a_visitor_solves_it_by_keys(
+    address: str, task: str, dream: str | None, words: str, width: int, tmp_path: Path
+) -> None:
+    rules = registry.task(task).rules
+    table = {
+        ",".join(map(str, state)): keys(rules, rules.optimal_action(state))
+        for state in rules.states
+        if not rules.is_terminal(state)
+    }
+    seen = visit(address, tmp_path, f"world={task}&seed=7", json.dumps(table), width)
+    assert (seen["end"], seen.get("dream")) == ("solved", dream)
+    assert words in seen["happened"] and len(seen["pressed"]) > 2
 
 
 @needs_browser

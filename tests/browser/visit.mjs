@@ -34,7 +34,7 @@ if (keys === 'watch') {
 } else if (keys.startsWith('{')) {
   const table = JSON.parse(keys);
   for (let seen = await page.evaluate(() => ({ ...document.body.dataset })); !seen.end;) {
-    await press(table[seen.state]);
+    for (const key of table[seen.state].split(' ')) await press(key);
     seen = await page.evaluate(() => ({ ...document.body.dataset }));
   }
 } else {

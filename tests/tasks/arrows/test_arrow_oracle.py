@@ -93,25 +93,17 @@ def test_rules_say_what_the_oracle_says(name):
     found, leads, depth = oracle(spec.rules.world)
     rewards = {"illegal": -5.0, "goal": 50.0, "going on": -1.0}
     assert set(spec.rules.states) == {(*directions, pointed) for directions, pointed in found}
-    for (directions, pointed), what in found.items():
-        state = (*directions, pointed)
-        assert spec.rules.is_legal(state) == (what != "illegal") and spec.rules.is_terminal(state) == (
-            what != "going on"
-        )
+    for pair, what in found.items():
+        state = (*pair[0], pair[1])
+        assert (spec.rules.is_legal(state), spec.rules.is_terminal(state)) == (what != "illegal", what != "going on")
         for action in range(spec.n_actions):
-            outcomes = spec.rules.outcomes(state, action)
-            expected = leads[(directions, pointed), action]
-            assert {each.macrostate: each.probability for each in outcomes} == pytest.approx(
-                {(*reached, cube): chance for (reached, cube), chance in expected.items()}
-            )
-            for each in outcomes:
-                then = found[each.macrostate[:-1], each.macrostate[-1]]
-                assert (each.reward, each.terminated, each.success) == (
-                    rewards[then],
-                    then != "going on",
-                    then == "goal",
-                )
-                assert spec.rules.judge(state, action, each.macrostate).reward == each.reward
+            outcomes = {each.macrostate: each for each in spec.rules.outcomes(state, action)}
+            expected = {(*reached, cube): chance for (reached, cube), chance in leads[pair, action].items()}
+            assert {reached: each.probability for reached, each in outcomes.items()} == pytest.approx(expected)
+            for reached, each in outcomes.items():
+                then = found[reached[:-1], reached[-1]]
+                assert each.reward == spec.rules.judge(state, action, reached).reward == rewards[then]
+                assert (each.terminated, each.success) == (then != "going on", then == "goal")
     starts = {(*directions, pointed): length for (directions, pointed), length in depth.items() if length}
     assert set(spec.rules.start_states) == set(starts)
     known = dict(zip(spec.rules.states, spec.rules.plan_lengths.tolist(), strict=True))
