@@ -24,17 +24,15 @@ def collected(envs, total_timesteps, seed=1):
         actions = rng.integers(6, size=envs.num_envs) if explores else np.full(envs.num_envs, global_step % 2)
         next_obs, rewards, terminations, truncations, infos = envs.step(actions)
         over = terminations | truncations
-        assert [info is not None for info in infos.get("final_info", [None] * envs.num_envs)] == over.tolist()
+        ended = infos.get("final_info", [None] * envs.num_envs)
+        assert [info is not None for info in ended] == over.tolist()
         assert np.array_equal(infos.get("_final_observation", np.zeros(envs.num_envs)), over)
         assert not {"final_obs", "_final_obs", "episode", "_episode"} & set(infos)
-        if "final_info" in infos:
-            for info in infos["final_info"]:
-                if info and "episode" in info:
-                    printed.append((global_step, info["episode"]["r"].item(), info["episode"]["l"].item()))
+        episodes = [info["episode"] for info in ended if info and "episode" in info]
+        printed += [(global_step, each["r"].item(), each["l"].item()) for each in episodes]
         real_next_obs = next_obs.copy()
-        for idx, trunc in enumerate(truncations):
-            if trunc:
-                real_next_obs[idx] = infos["final_observation"][idx]
+        for idx in np.flatnonzero(truncations):
+            real_next_obs[idx] = infos["final_observation"][idx]
         stored.append((obs, real_next_obs, actions, rewards, terminations))
         obs = next_obs
     envs.close()

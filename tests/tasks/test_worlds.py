@@ -10,6 +10,7 @@ from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.scenes.appearance import LEVELS, Appearance
 from imagine_bench.tasks.scenes.constants import ARM_GROUP
 from imagine_bench.tasks.scenes.objects import OBJECTS
+from whole_outputs import tabulated
 from worlds import WORLDS
 
 from imagine_bench import registry
@@ -35,6 +36,28 @@ def test_macrostates_are_read_back_at_every_level(name, level):
         world.vary(rng)
         reading = world.read()
         assert (reading.macrostate, reading.problem) == (state, None)
+
+
+DISPLACED = {"x m": (0.014, 0.016, 0.018, 0.021), "z m": (0.005, 0.05), "yaw": (19, 21, 25, 90), "tilt": (8, 12, 90)}
+
+
+def test_what_is_read_of_displaced_objects(expected):
+    """Each object of a scene moved, or turned by degrees, off its place."""
+    rows = []
+    for world in (world_of("arrow_puzzle", FIXED), world_of("pick_place", FIXED)):
+        for index, name in enumerate(world.object_names):
+            for how, amount in ((how, amount) for how, amounts in DISPLACED.items() for amount in amounts):
+                world.place((0, 0, 0, 0), np.random.default_rng(0))
+                row = world.object_qpos[index]
+                if how.endswith("m"):
+                    world.data.qpos[row["xyz".index(how[0])]] += amount
+                else:
+                    quat = np.zeros(4)
+                    mujoco.mju_axisAngle2Quat(quat, np.eye(3)[2 if how == "yaw" else 0], np.radians(amount))
+                    world.data.qpos[row[3:]] = quat
+                reading = world.read()
+                rows.append([name, how, amount, reading.macrostate, reading.problem])
+    expected("displaced_objects", tabulated(rows))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import closing
 
-import mujoco
 import numpy as np
 import pytest
 from imagine_bench.tasks.arrows.world import ArrowWorld
@@ -32,40 +31,6 @@ def camera(world):
 
 def rng():
     return np.random.default_rng(0)
-
-
-# --- reading -----------------------------------------------------------------------------------------------------
-
-
-def _move(world, cube, *, x_m=0.0, yaw_deg=0.0, roll_deg=0.0):
-    start = int(world.model.joint(f"cube_{cube}_joint").qposadr[0])
-    turn, roll, quat = np.zeros(4), np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), np.radians(yaw_deg))
-    mujoco.mju_axisAngle2Quat(roll, np.array([1.0, 0.0, 0.0]), np.radians(roll_deg))
-    mujoco.mju_mulQuat(quat, turn, roll)
-    world.data.qpos[start] += x_m
-    world.data.qpos[start + 3 : start + 7] = quat
-
-
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        ({"x_m": 0.016}, "cube 1 stands 16 mm off its slot"),
-        ({"x_m": 0.014}, None),
-        ({"yaw_deg": 21.0}, "cube 1 stands 21 degrees off a right angle"),
-        ({"yaw_deg": 19.0}, None),
-        ({"roll_deg": 90.0}, "cube 1 is tipped by 90 degrees"),
-    ],
-)
-def test_a_cube_off_its_place_is_a_problem(world, change, problem):
-    world.place((0, 0, 0, 0), rng())
-    _move(world, 1, **change)
-    reading = world.read()
-    assert reading.problem == problem
-    assert reading.macrostate[1] == 0
-
-
-# --- the camera's frames -----------------------------------------------------------------------------------------
 
 
 def test_the_arm_is_out_of_the_agent_s_view(world, camera):

@@ -118,23 +118,23 @@ def test_the_dense_reward_sums_to_the_sparse_one_less_the_potential_of_the_start
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_grip_that_slips_leaves_the_object_where_it_is(family: str) -> None:
-    """Of 14 grips each slips or not, as drawn; a slip is no event and no fault, a firm grip is its macro-action."""
+    """Each grip slips or not, as drawn; a slip is no event and no fault, a firm grip is its macro-action."""
     env, expert = environment(family, slip=0.5, **FREE[family])
-    slipped = 0
-    for seed in range(14):
+    slipped = []
+    for seed in range(7):
         state = (*STARTS[family][:3], seed % 3)
         action = seed % 6 if family == "arrows" else seed % 3
         env.reset(seed=seed, options={"macrostate": state})
-        expert.begin(action)
-        slips = False
-        while not expert.is_done:
-            *_, info = env.step(expert.act())
-            slips |= env.episode.slipping
-        assert not info["fault"]
-        expected = state if slips else env.task.rules.outcomes(state, action)[0].macrostate
-        assert tuple(info["macrostate"])[:-1] == expected[:-1]
-        slipped += slips
-    assert 2 <= slipped <= 12  # 99.8 % of binomial draws
+        while env.episode.events == 0:
+            expert.begin(action)
+            slips = False
+            while not expert.is_done:
+                *_, info = env.step(expert.act())
+                slips |= env.episode.slipping
+            expected = state if slips else env.task.rules.outcomes(state, action)[0].macrostate
+            assert (tuple(info["macrostate"])[:-1], info["fault"]) == (expected[:-1], False)
+            slipped.append(slips)
+    assert 9 <= len(slipped) <= 25  # 97 % of seven waits for a firm grip
 
 
 @pytest.mark.parametrize(
