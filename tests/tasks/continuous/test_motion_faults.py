@@ -110,7 +110,7 @@ def test_copies_and_states_in_the_middle_of_a_grasp_go_on_to_the_bit(family: str
     options = {"observation": "hand,proprio,objects", "size": 32, "slip": 0.99 * slips}
     make = functools.partial(FAMILIES[family], control=control, **options)
     env = make()
-    env.reset(seed=5, options={"macrostate": STARTS[family]})
+    env.reset(seed=6, options={"macrostate": STARTS[family]})
     expert = Expert(env)
     expert.begin(0)
     while not (env.episode.slipping if slips else env._referee.touched().any()):
