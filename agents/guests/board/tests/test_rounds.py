@@ -11,7 +11,7 @@ import pytest
 from board_forging import AFTER, BEFORE, CLOSES, ROUND, TESTS, on, with_round
 from imagine_bench_board import rounds
 from imagine_bench_board.check import check
-from imagine_bench_board.rows import read_row
+from imagine_bench_board.rows import NAME, read_row, row_name
 from imagine_bench_board.submit import file_agents, submit
 from small_runs import Inline, small
 
@@ -45,6 +45,31 @@ def test_a_round_from_promise_to_rows(finished: Path, tmp_path: Path) -> None:
     own = read_row(next((board / "rows").iterdir()))
     fingerprints = own.kept(0).fingerprints.tolist()
     assert not set(fingerprints) & set(read_row(other).kept(1).fingerprints.tolist())
+
+
+@pytest.mark.parametrize("player", ["imagination:" + "deep" * 20, "_best", "__"])
+@pytest.mark.parametrize("ending", ["0123456789ab", "0123456789ab-" + "w" * rounds.LONGEST_ROUND])
+def test_whatever_a_player_is_called_a_row_can_have_its_name(player: str, ending: str) -> None:
+    name = row_name(player, ending)
+    assert NAME.fullmatch(name) and name.endswith(f"-{ending}")
+    assert name != row_name(player + "er", ending), "another player's"
+
+
+def test_a_name_that_leaves_its_rows_no_room_is_none_of_a_round(tmp_path: Path) -> None:
+    with on(BEFORE), pytest.raises(InvalidValueError, match=r"^A round cannot be called 'w+'; give at most 40 of a-z"):
+        rounds.open_round(tmp_path / ("w" * 41), closes=CLOSES, tests=TESTS, secret=tmp_path / "secret.json")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_round_is_known_from_within_its_folder(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, _ = opened(tmp_path)
+    monkeypatch.chdir(folder)
+    with on(BEFORE):
+        assert exit_code(["board", "file", str(finished), "--round", "."]) == 0
+    (filed,) = (folder / "filed").iterdir()
+    assert filed.stem.endswith(f"-{ROUND}")
 
 
 def test_the_promise_does_not_show_the_seed(tmp_path: Path) -> None:

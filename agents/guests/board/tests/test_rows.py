@@ -51,9 +51,12 @@ def test_a_run_is_submitted_with_all_seeds_and_budgets(
     assert [read.kept(3).actions_of(test) for test in range(6)] == [kept.kept.actions_of(test) for test in range(6)]
     assert read.claimed.agent == "table" and read.claimed.author == "a founder"
     assert {each.agent_sha256 for each in read.claimed.prices} != {""}
-    monkeypatch.chdir(run)
-    (again,) = submit(Path(), tmp_path, author="a founder", round_folder=None, encoder=None)
-    assert read_row(again) == read, "the run whose folder one stands in"
+    for place, there in (("here", Path()), ("beside", Path("..") / run.name)):
+        monkeypatch.chdir(run)
+        (again,) = submit(there, tmp_path / place, author="a founder", round_folder=None, encoder=None)
+        assert read_row(again) == read, place
+        monkeypatch.chdir(again)
+        assert exit_code(["board", "check", "."]) == 0
 
 
 def test_a_bench_is_submitted_agent_by_agent(run: Path, tmp_path: Path) -> None:

@@ -13,13 +13,15 @@ from . import submit as submitting
 from .check import NEVER_SHOWN, check
 from .daily import world_of_day
 from .page import write_board
+from .rows import named
 
 _NEEDED = "'board {}' needs {}; give it too."
 
 
 def submit(*, run: Path, out: Path, author: str, round: Path | None, encoder: str | None) -> None:
     """Write rows for a board, and print their folders."""
-    print(*submitting.submit(run, out, author=author, round_folder=round, encoder=encoder), sep="\n")
+    of_round = None if round is None else named(round)
+    print(*submitting.submit(run, out, author=author, round_folder=of_round, encoder=encoder), sep="\n")
 
 
 def board(
@@ -35,13 +37,13 @@ def board(
         case "open":
             if closes is None:
                 raise InvalidValueError(_NEEDED.format("open", "--closes, a day such as 2026-12-24"))
-            print(rounds.open_round(path, closes=closes, tests=tests, secret=secret))
+            print(rounds.open_round(named(path), closes=closes, tests=tests, secret=secret))
         case "file":
             if round is None:
                 raise InvalidValueError(_NEEDED.format("file", "--round, the folder of a round"))
-            print(*submitting.file_agents(path, round), sep="\n")
+            print(*submitting.file_agents(path, named(round)), sep="\n")
         case "reveal":
-            print(rounds.reveal(path, secret))
+            print(rounds.reveal(named(path), secret))
         case _:
             _check(path, out if action == "page" else None)
 
@@ -49,7 +51,7 @@ def board(
 def _check(path: Path, page: Path | None) -> None:
     """Print the verdict on every row, and write the page of the board if a folder for it is given."""
     begun_s = time.process_time()
-    found = check(path)
+    found = check(named(path))
     verdicts = [each.verdict for each in found]
     print(*found, NEVER_SHOWN, cost(verdicts, time.process_time() - begun_s), sep="\n")
     if page is not None:

@@ -31,7 +31,7 @@ from imagine_bench.values import Json
 
 from .motion_rows import COMMAND, FORMAT, RATE_HZ, Motion, MotionFigures, MotionProtocol, MotionRow, columns_of
 from .rounds import POLICY, policy_row, read_round, revealed_seed
-from .rows import CARD, EPISODES, LARGEST, NAME, Claims, one_line
+from .rows import CARD, EPISODES, LARGEST, NAME, Claims, named, one_line
 
 if TYPE_CHECKING:
     from imagine_bench.tasks.continuous.env import MotionEnv, Period
@@ -132,7 +132,7 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._policy_sha256 = ""
         self._row = ""
         if round_folder is not None and policy is not None:
-            folder = Path(round_folder)
+            round_folder = folder = named(Path(round_folder))
             self._policy_sha256 = sha256(Path(policy))
             self._row = policy_row(folder, Path(policy))
             seed, filed = revealed_seed(folder, self._row)

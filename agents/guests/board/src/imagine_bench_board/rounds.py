@@ -8,7 +8,6 @@ were there at their time is shown by the history of the repository in which the 
 from __future__ import annotations
 
 import hashlib
-import re
 import secrets
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -20,13 +19,15 @@ from imagine_bench.protocols.data import MOST, require_types
 from imagine_bench.seeding import SEEDS
 from imagine_bench.store.files import make_folder, read_json, reading, sha256, write_json
 
-from .rows import NAME
+from .rows import NAME, row_name
 
 ROUNDS = "rounds"
 """The folder of a board that holds its rounds."""
 _ROUND = "round.json"
 _FILED = "filed"
 _REVEALED = "revealed.json"
+LONGEST_ROUND = 40
+"""Characters of the name of a round: the names of its rows end with it."""
 POLICY = "policy"
 """The key of the digest of a policy of continuous control, which is one file; agents of benches have their seeds."""
 
@@ -74,8 +75,9 @@ def open_round(folder: Path, *, closes: str, tests: int, secret: Path) -> str:
     for path in (folder, secret):
         if path.exists():
             raise InvalidValueError(f"{path} exists; give another.")
-    if not NAME.fullmatch(folder.name):
-        raise InvalidValueError(f"A round cannot be called {brief(folder.name)}; give a-z, 0-9, and _.,=-")
+    if not NAME.fullmatch(folder.name) or len(folder.name) > LONGEST_ROUND:
+        allowed = f"at most {LONGEST_ROUND} of a-z, 0-9 and _.,=-"
+        raise InvalidValueError(f"A round cannot be called {brief(folder.name)}; give {allowed}.")
     seed = secrets.randbelow(SEEDS)
     salt = secrets.token_hex(32)
     found = Round(closes=closes, tests=tests, sha256=promise(seed, salt))
@@ -108,7 +110,7 @@ def file_agents(folder: Path, row: str, agents: Mapping[int, str] | Mapping[str,
 
 def policy_row(folder: Path, policy: Path) -> str:
     """The name of the row of a policy's file in a round: that of the file without its ending, and the round's."""
-    return f"{re.sub('[^a-z0-9_.,=-]', '-', policy.stem.lower())[:60]}-{folder.name}"
+    return row_name(policy.stem, folder.name)
 
 
 def reveal(folder: Path, secret: Path) -> str:

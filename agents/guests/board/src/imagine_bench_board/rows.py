@@ -43,6 +43,10 @@ VERSION = re.compile(r"(0|[1-9][0-9]{0,3})(\.(0|[1-9][0-9]{0,3})){2}(\.(dev|post
 NAME = re.compile(r"(?!index$)[a-z0-9][a-z0-9_.,=-]{0,79}")
 """Names of rows and rounds: of characters that every file system and every address on the web takes as they are. The
 page of a row called index would replace that of the board."""
+LONGEST_NAME = 80
+"""Characters of a name."""
+_OF_PLAYER = 60
+"""Characters of a row's name that say its player, if there is room."""
 LONGEST = 300
 """Characters of a claim."""
 MOST_FRAMES = 10**12
@@ -144,6 +148,18 @@ class Row:
         return world_words(self.protocol)
 
 
+def row_name(player: str, ending: str) -> str:
+    """The name of a row: its player's in the characters of names, and its ending.
+
+    Where both are too long, the player's is cut, and digits of its digest tell it from others.
+    """
+    safe = re.sub("[^a-z0-9_.,=-]", "-", player.lower()).lstrip("_.,=-") or "row"
+    room = min(_OF_PLAYER, LONGEST_NAME - len(ending) - 1)
+    if len(safe) > room:
+        safe = f"{safe[: room - 7]}-{hashlib.sha256(player.encode()).hexdigest()[:6]}"
+    return f"{safe}-{ending}"
+
+
 def starts_words(round_name: str) -> str:
     """The kind of starts of tests: those of a round, or, without one, open starts."""
     return f"round {round_name}" if round_name else OPEN
@@ -197,6 +213,11 @@ def _log(columns: Mapping[str, Any]) -> EpisodeLog:
     actions = columns["actions"]
     flat = [action for each in actions for action in each]
     return EpisodeLog(**{**columns, "actions": flat, "lengths": [len(each) for each in actions]})
+
+
+def named(folder: Path) -> Path:
+    """The same folder by its own name, which ``.`` and ``..`` do not say."""
+    return folder.resolve() if folder.name in ("", "..") else folder
 
 
 def require_files(folder: Path) -> None:

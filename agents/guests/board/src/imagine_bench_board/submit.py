@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import re
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -23,7 +23,7 @@ from imagine_bench.store.files import sha256
 from imagine_bench.store.results import Checkpoint
 
 from . import rounds
-from .rows import Claims, Figures, Price, Row, one_line, write_row
+from .rows import Claims, Figures, Price, Row, one_line, row_name, write_row
 
 T = TypeVar("T")
 
@@ -42,14 +42,18 @@ class Submitter:
     def __init__(self, bench: Path, agent: str) -> None:
         whole = read_control(bench)
         seeds = whole.seeds_of(agent)
-        safe = re.sub("[^a-z0-9_.,=-]", "-", file_name(agent).lower())
         self.bench = bench
-        self.name = f"{safe[:60]}-{whole.hash}"
+        self.hash = whole.hash
+        self.name = row_name(file_name(agent), whole.hash)
         self.protocol = dataclasses.replace(whole, agents=(agent,), seeds=seeds, headlines=(), few_seeds=())
         self.agent = agent
         self.runs = {seed: BenchStore(bench, whole).run_folder(agent, seed) for seed in seeds}
         for folder in self.runs.values():
             require(run_folder.is_done(folder), f"{folder} is not finished; run its bench again.")
+
+    def name_in(self, round_folder: Path) -> str:
+        """The name of its row in a round."""
+        return row_name(file_name(self.agent), f"{self.hash}-{round_folder.name}")
 
     def digests(self) -> dict[int, str]:
         """The digest of the trained agent of each seed; empty where it has no weights."""
@@ -73,7 +77,7 @@ class Submitter:
         """
         if known_agent(self.agent).external_training_loop:
             raise InvalidValueError(f"{self.agent} cannot be taken up again; submit the tests of its bench.")
-        name = f"{self.name}-{folder.name}"
+        name = self.name_in(folder)
         start_seed, filed = rounds.revealed_seed(folder, name)
         digests = {str(seed): weights for seed, weights in self.digests().items()}
         require(digests == filed, f"The agents of {self.bench} are not those that were filed as {name}.")
@@ -159,10 +163,10 @@ def submitters(path: Path) -> list[Submitter]:
     Raises ArtefactError: the path is neither, or holds kept results without episodes.
     """
     if (path / "config.json").is_file():
-        bench = path.absolute().parents[1]
-        protocol = read_control(bench)
+        run = Path(os.path.abspath(path))
+        protocol = read_control(run.parents[1])
         names = {file_name(protocol.written_name(agent)): agent for agent in protocol.agents}
-        return [Submitter(bench, names[path.absolute().parent.name])]
+        return [Submitter(run.parents[1], names[run.parent.name])]
     protocol = read_control(path)
     if is_archive(path):
         raise ArtefactError(f"{path} holds kept results without episodes; give the folder of a bench of your own.")
@@ -185,7 +189,4 @@ def file_agents(path: Path, round_folder: Path) -> list[Path]:
     """
     if path.is_file():
         return [rounds.file_agents(round_folder, rounds.policy_row(round_folder, path), {rounds.POLICY: sha256(path)})]
-    return [
-        rounds.file_agents(round_folder, f"{each.name}-{round_folder.name}", each.digests())
-        for each in submitters(path)
-    ]
+    return [rounds.file_agents(round_folder, each.name_in(round_folder), each.digests()) for each in submitters(path)]
