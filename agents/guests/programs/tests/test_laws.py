@@ -158,7 +158,7 @@ def test_a_plan_begins_after_the_macro_actions_that_are_not_seen_yet() -> None:
 
 def test_more_macro_actions_are_another_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands, "_learner", lambda spec: 20.0)
-    out = tmp_path / "written.json"
+    out = tmp_path / "new" / "written.json"
     for times in ("1", "2", "1"):
         words = ["programs", "write", "arrow_puzzle_easy", "--seeds", "1", "--times", times, "--out", str(out)]
         monkeypatch.setattr(sys, "argv", words)

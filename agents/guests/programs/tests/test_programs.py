@@ -141,14 +141,31 @@ def test_a_path_may_hold_an_at_sign(mine: Path) -> None:
     assert registry.agent_entry(f"program:{name}").title == f"program (symbols given) {file}"
 
 
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (f"score nosuchtask {ARROWS}", "No task 'nosuchtask'."),
+        ("experience arrow_puzzle_easy FILE", "Cannot write FILE"),
+        ("experience arrow_puzzle_easy new --seed -1", "seed is -1; give an integer from 0 on."),
+        ("write arrow_puzzle_easy --seeds -1", "--seeds is -1; give an integer from 0 on."),
+        ("write arrow_puzzle_easy --times 0", "--times is 0, and the cautious learner of arrow_puzzle_easy has 20"),
+        ("write arrow_puzzle_easy --times nan", "--times is nan, and"),
+        ("write arrow_puzzle_easy --out FILE", "FILE is not a file of 'write'"),
+        ("write arrow_puzzle_easy --out FILE/written.json", "Cannot write"),
+    ],
+)
 def test_an_error_of_a_command_ends_with_its_own_exit_code(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: str, sentence: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["programs", "score", "nosuchtask", str(ARROWS)])
+    monkeypatch.chdir(tmp_path)
+    Path("FILE").write_text("no JSON")
+    monkeypatch.setattr(commands, "_learner", lambda spec: 20.0)
+    monkeypatch.setattr(sys, "argv", ["programs", *words.split()])
     with pytest.raises(SystemExit) as ended:
         commands.main()
     assert ended.value.code == 2
-    assert capsys.readouterr().err.startswith("No task 'nosuchtask'.")
+    assert capsys.readouterr().err.startswith(sentence)
+    assert [path.name for path in tmp_path.iterdir()] == ["FILE"]
 
 
 def test_allowed_modules_and_their_parts_are_imported(tmp_path: Path) -> None:

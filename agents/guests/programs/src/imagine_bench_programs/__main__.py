@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
+import math
 import sys
 import time
 from dataclasses import asdict
@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from imagine_bench.errors import ImagineBenchError, InvalidValueError
+from imagine_bench.errors import ImagineBenchError, InvalidValueError, require_integer
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.interfaces import TaskSpec
 from imagine_bench.registry import task
 from imagine_bench.registry.machine import describe_environment
+from imagine_bench.store.files import read_json, reading, require_writable, write_json
 
 from .experience import See, itself, macro_actions_of, play, write_experience
 from .program import Program
@@ -112,8 +113,9 @@ def _add_write(parser: argparse.ArgumentParser) -> None:
 
 
 def _write(given: argparse.Namespace) -> None:
-    rows = json.loads(given.out.read_text())["rows"] if given.out is not None and given.out.exists() else []
-    done = {(row["task"], row["codes"], row["seed"], row["macro_actions"]) for row in rows}
+    for seed in given.seeds:
+        require_integer("--seeds", seed, 0)
+    rows, done = ([], set()) if given.out is None else _kept(given.out)
     if given.own and not given.codes:
         raise InvalidValueError("--own reads images; name their appearance with --codes, such as --codes clean.")
     kind = f"own {given.codes}" if given.own else given.codes
@@ -124,13 +126,30 @@ def _write(given: argparse.Namespace) -> None:
             raise InvalidValueError(
                 f"The cautious learner does not end in {name}, so there is no budget; leave it out."
             )
+        if not 1.0 <= given.times * learner < math.inf:
+            few = f"--times is {given.times:g}, and the cautious learner of {name} has {learner:.0f} macro-actions"
+            raise InvalidValueError(f"{few}; give more, so that the writer has at least one.")
         budget = int(given.times * learner)
         for seed in [seed for seed in given.seeds if (name, kind, seed, budget) not in done]:
             found = written(spec, budget, seed, given.codes, own=given.own)
             rows.append({"task": name, "codes": kind, "learner": learner, **found})
             print(*(f"{value:.4g}" if isinstance(value, float) else value for value in rows[-1].values()), flush=True)
             if given.out is not None:
-                given.out.write_text(json.dumps({"rows": rows, "environment": describe_environment()}, indent=1))
+                write_json(given.out, {"rows": rows, "environment": describe_environment()})
+
+
+def _kept(out: Path) -> tuple[list[dict[str, Any]], set[tuple[Any, ...]]]:
+    """The rows of a file, and the task, codes, seed and macro-actions of each; none of a new file.
+
+    Raises ArtefactError: it is damaged. SetupError: it cannot be written.
+    """
+    require_writable(out.parent)
+    if not out.exists():
+        return [], set()
+    what = "a file of 'write'"
+    with reading(out, what):
+        rows: list[dict[str, Any]] = read_json(out, what)["rows"]
+        return rows, {(row["task"], row["codes"], row["seed"], row["macro_actions"]) for row in rows}
 
 
 def written(

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, require_integer
 from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.registry import task
+from imagine_bench.store.files import require_writable
 
 from .writing.delay import Row
 
@@ -65,11 +66,14 @@ def write_experience(task_name: str, folder: Path, *, macro_actions: int, seed: 
     """Write the folder of a coding agent: transitions of random macro-actions, tests made from them, and a page.
 
     Raises:
-        InvalidValueError: There is something in the folder, or no macro-action is to be taken.
+        InvalidValueError: There is something in the folder, no macro-action is to be taken, or the seed is below 0.
+        SetupError: The folder cannot be written.
     """
-    if macro_actions < 1 or (folder.exists() and any(folder.iterdir())):
+    require_integer("seed", seed, 0)
+    if macro_actions < 1 or (folder.is_dir() and any(folder.iterdir())):
         raise InvalidValueError(f"{folder} gets {macro_actions} macro-actions; give an empty folder, and at least 1.")
     spec = task(task_name)
+    require_writable(folder)
     rng = np.random.default_rng(seed)
     rows = []
     for row, last in play(spec, lambda _: int(rng.integers(spec.n_actions)), rng):
@@ -83,7 +87,6 @@ def write_experience(task_name: str, folder: Path, *, macro_actions: int, seed: 
         "columns": ["symbols", "action", "symbols after", "reward", "ended", "last of its episode"],
         "transitions": rows,
     }
-    folder.mkdir(parents=True, exist_ok=True)
     (folder / _FILE).write_text(json.dumps(known))
     for name, template in (("test_program.py", "test_program.txt"), ("README.md", "README.md")):
         text = resources.files(__package__).joinpath("folder", template).read_text()
