@@ -15,6 +15,7 @@ from imagine_bench_board.rows import NAME, read_row, row_name
 from imagine_bench_board.submit import file_agents, submit
 from small_runs import Inline, small
 
+from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.running.bench import bench
 
