@@ -55,15 +55,6 @@ def test_a_former_command_runs_the_new_one(
     assert sentence in others[0]
 
 
-def test_a_task_is_the_first_word_or_an_option(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in (["bench", "--preset", "x"], ["judge"], ["sweep"], ["encoder"], ["describe"], ["dataset"], ["play"]):
-        said = set()
-        for task in (["nowhere"], ["--task", "nowhere"], ["--task=nowhere"]):
-            assert main([command[0], *task, *command[1:]]) == 2
-            said.add(capsys.readouterr().err)
-        assert re.search("No task(, agent or world model)? 'nowhere'", said.pop()) and not said
-
-
 @pytest.mark.parametrize("words", ["--seeds 0-2 7 --out 2026-11", "--seeds=0-2 --out=2026-11"])
 def test_a_range_stands_for_its_seeds_and_for_nothing_else(words: str) -> None:
     command = cli.parsed(["bench", "arrow_puzzle", *words.split()])
