@@ -7,6 +7,7 @@ that names a module, such as those of the registry and of ``import_module``.
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import pkgutil
 import re
@@ -105,6 +106,9 @@ _TORCH_DRAWS = {"rand", "randn", "randint", "randperm", "bernoulli", "multinomia
 _TENSOR_DRAWS = {"normal_", "uniform_", "bernoulli_", "exponential_", "random_", "multinomial"}
 
 
+parsed = functools.cache(ast.parse)
+
+
 def sources() -> list[Path]:
     """The Python files of the core."""
     files = (path for room in ("imagine_bench", "tasks", "agents") for path in (_TOP / room).rglob("*.py"))
@@ -127,7 +131,7 @@ def imports(path: Path, source: str) -> Iterator[str]:
     package = module_name(path).split(".")
     if path.name != "__init__.py":
         package.pop()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -163,7 +167,7 @@ def arrows(path: Path, source: str) -> dict[str, str]:
 
 def offences(path: Path, source: str) -> list[str]:
     """Every import and draw of a file that is forbidden."""
-    return [*_upward(path, source), *_foreign(path, source), *_global_draws(ast.parse(source))]
+    return [*_upward(path, source), *_foreign(path, source), *_global_draws(parsed(source))]
 
 
 def guest_offences(path: Path, source: str) -> list[str]:
@@ -183,7 +187,7 @@ def guest_offences(path: Path, source: str) -> list[str]:
             found.append(f"{name} is not listed in docs/reference/api.md")
         if top not in packages:
             found.append(f"{top} is no dependency of {folder.name}")
-    return [*found, *_global_draws(ast.parse(source))]
+    return [*found, *_global_draws(parsed(source))]
 
 
 def _upward(path: Path, source: str) -> Iterator[str]:
@@ -250,7 +254,7 @@ def test_every_import_goes_down_and_every_draw_has_a_generator() -> None:
 def test_no_class_name_is_defined_twice() -> None:
     where: dict[str, list[str]] = {}
     for path in _MODULES.values():
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path.read_text())):
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 where.setdefault(node.name, []).append(str(path.relative_to(_TOP)))
     assert {name: files for name, files in where.items() if len(files) > 1} == {}

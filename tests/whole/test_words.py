@@ -79,16 +79,19 @@ def test_described_learners(expected: Expected) -> None:
     expected("describe_learners", "\n\n".join(pages))
 
 
-def test_answers_to_wrong_words(tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: Expected) -> None:
+@pytest.mark.parametrize("which", ["wrong_words", "wrong_benches"])
+def test_answers_to_wrong_words(
+    which: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: Expected
+) -> None:
     """One line each, exit code 2, and nothing is written; the words stand in the kept file, HERE is an empty folder."""
     answers = []
-    for words in questions("wrong_words"):
+    for words in questions(which):
         code = main([word.replace("HERE", str(tmp_path)) for word in words.split()])
         said = capsys.readouterr()
         assert (code, said.out, len(said.err.splitlines())) == (2, "", 1), words
         answers += [f"$ {words}", said.err.replace(str(tmp_path), "HERE")]
     assert not list(tmp_path.iterdir())
-    expected("wrong_words", "\n".join(answers))
+    expected(which, "\n".join(answers))
 
 
 def test_answers_to_wrong_keywords(tmp_path: Path, expected: Expected) -> None:
