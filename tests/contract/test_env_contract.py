@@ -168,8 +168,6 @@ def test_views_draw_no_random_number():
     env.shapes()
     env.motion()
     assert env.np_random.bit_generator.state == before
-    with pytest.raises(InvalidValueError, match="Image width -1"):
-        env.human_view(-1, 48)
     env.close()
 
 
@@ -252,7 +250,7 @@ def kinematic():
     env.close()
 
 
-@pytest.mark.parametrize("given", [(0, 1, 4, 0), (0.5, 1, 2, 0), None, (np.ma.masked,) * 4, itertools.repeat(0)])
+@pytest.mark.parametrize("given", [(np.ma.masked,) * 4, (0,) * 10**6, itertools.repeat(0)])
 def test_a_wrong_macrostate_is_refused(kinematic, given):
     with pytest.raises(InvalidValueError, match=r"No macrostate .*; give one of the 192 of imagine_b") as caught:
         kinematic.reset(options={"macrostate": given})
@@ -292,18 +290,12 @@ def test_an_unknown_keyword_is_a_type_error_as_pythons_own(env_id):
             make_any(known_as, apearance="mild")
 
 
-def test_wrong_actions_and_reset_options_are_refused(kinematic):
-    for action in (6, -1, 1.5, "left", None, np.array([1, 2]), {0: 1}, np.ma.masked):
+def test_arrays_that_are_no_action_or_seed_are_refused(kinematic):
+    for action in (np.array([1, 2]), np.ma.masked):
         with pytest.raises(InvalidValueError, match="does not exist; give an integer from 0 to 5"):
             kinematic.step(action)
-    with pytest.raises(ImagineBenchError, match=r"No reset option 'macrostat'\. Did you mean 'macrostate'\?"):
-        kinematic.reset(options={"macrostat": (0, 1, 2, 0)})
-    for seed in (1.5, -1, "a", [1], {}, np.float64(3)):
-        with pytest.raises(InvalidValueError, match=r"seed is .*; give an integer from 0 on"):
-            kinematic.reset(seed=seed)
-    for options in ("abc", [1], 0, ""):
-        with pytest.raises(ImagineBenchError, match="are no mapping; give"):
-            kinematic.reset(options=options)
+    with pytest.raises(InvalidValueError, match=r"seed is .*; give an integer from 0 on"):
+        kinematic.reset(seed=np.float64(3))
 
 
 @pytest.mark.parametrize(

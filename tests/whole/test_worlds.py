@@ -7,15 +7,19 @@ worked out by hand in ``tests/tasks``.
 from __future__ import annotations
 
 import contextlib
+import json
 from collections import Counter
 
 import gymnasium
 import numpy as np
 import pytest
 from kept import table
-from whole_outputs import Expected, rounded, tabulated
+from same_values import assert_same
+from storms import one_sentence
+from whole_outputs import Expected, questions, rounded, tabulated
 
 from imagine_bench import registry
+from imagine_bench.errors import ImagineBenchError
 from imagine_bench.rules import facts, shortest_plans, tabulate
 from imagine_bench.sweep.grid import LADDER, SEPARATING
 
@@ -128,3 +132,25 @@ def test_macro_actions_in_contact_physics(task: str, actions: tuple[int, ...], e
             hand = rounded(np.round(scene.data.body(next(each for each in names if "hand" in each)).xpos, 3))
             lines.append([action, info["macrostate"], info["fault_reason"], f"{info['sim_time_s']:.2f}", hand, *places])
     expected(f"physics_{task}", tabulated(lines), exactly=False)
+
+
+def test_calls_that_environments_and_lanes_refuse(expected: Expected) -> None:
+    """A line of the kept file is a method and its arguments as JSON; nothing moves."""
+    with (
+        contextlib.closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic").unwrapped) as env,
+        contextlib.closing(
+            gymnasium.make_vec("imagine_bench/ArrowPuzzle-vector-v0", num_envs=3, execution="kinematic")
+        ) as lanes,
+    ):
+        doors = {"env": env, "lanes": lanes}
+        for each in doors.values():
+            each.reset(seed=0)
+        before = [each.get_state().world.physics for each in (env, *lanes.envs)]
+        answers = []
+        for call in questions("refused_calls"):
+            door, method, given = call.split(" ", 2)
+            with pytest.raises(ImagineBenchError) as caught:
+                getattr(doors[door], method)(**json.loads(given))
+            answers += [f"$ {call}", one_sentence(caught.value)]
+        assert_same([each.get_state().world.physics for each in (env, *lanes.envs)], before)
+    expected("refused_calls", "\n".join(answers))
