@@ -14,6 +14,7 @@ from imagine_bench.interfaces import Observation, Transition
 
 pytest.importorskip("torch_world")
 import torch
+from imagine_bench_peers import lewm
 from imagine_bench_peers.lewm import LeWMPlanner, make
 
 PLACES = 4  # a white quarter of the frame, at one of four places on a ring
@@ -145,6 +146,14 @@ def test_updates_follow_the_ratio_and_the_global_generator_is_left_alone() -> No
     assert [agent.act(seen(place), explore=False) for place in range(PLACES)] == [0] * PLACES, "without a goal, 0"
     practise(agent, 8)
     assert torch.equal(before, torch.get_rng_state()) and agent.updates == 3, "0.7 a step, from the fourth of eight"
+
+
+def test_freed_memory_goes_back_every_fifty_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+    released = []
+    monkeypatch.setattr(lewm, "release_freed_memory", lambda: released.append(agent.updates))
+    agent = learner(replay_ratio=20.0)
+    practise(agent, 9)
+    assert agent.updates == 120 and released == [50, 100]
 
 
 @pytest.mark.parametrize("wrong", [{"model.patch": 7}, {"model.embedding": 22}])

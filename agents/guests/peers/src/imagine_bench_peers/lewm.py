@@ -14,6 +14,7 @@ import torch
 from imagine_bench.agents import snapshot
 from imagine_bench.agents.encoders.perception import prepare_torch
 from imagine_bench.agents.meters import Meters
+from imagine_bench.agents.networks.allocator import release_freed_memory
 from imagine_bench.agents.settings import flatten
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -27,6 +28,12 @@ from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observatio
 from .lent_generator import LentGenerator
 from .lewm_settings import HYPERPARAMETERS, LeWMSettings
 
+_RELEASED_EVERY = 50
+"""Updates after which freed memory goes back to the system.
+
+An update takes and frees some 200 MB. Frames that are kept lie between freed blocks, so the C library asks for more and
+more: a run reached 20 GB.
+"""
 _ROW = {"frame": ((64, 64, 3), np.uint8), "action": ((), np.int64), "next_frame": ((64, 64, 3), np.uint8)}
 
 
@@ -140,6 +147,8 @@ class LeWMPlanner:
             self.meters.add(f"loss/{name.removesuffix('_loss')}", losses[name].item())
         self.updates = self.updates + 1
         self._aims = None
+        if self.updates % _RELEASED_EVERY == 0:
+            release_freed_memory()
 
     def _pixels(self, frames: list[Frame]) -> Tensor:
         """The model's input for N frames. Shape (N, 1, 3, 64, 64), in [0, 1]."""
