@@ -19,7 +19,7 @@ from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import _explore, written
 from imagine_bench_programs.agent import LawsAgent
 from imagine_bench_programs.scores import Codes, ReadRules, score
-from imagine_bench_programs.sight import Hidden, SeeingWriter, SeenCodes, hidden_value
+from imagine_bench_programs.sight import Hidden, SeeingWriter, SeenCodes, hidden_value, still_value
 from imagine_bench_programs.symbol_rules import SymbolRules
 from imagine_bench_programs.symbols import Symbols
 from imagine_bench_programs.writing.delay import Row
@@ -203,6 +203,39 @@ def test_a_value_that_hides_a_factor_is_found_by_its_contradictions() -> None:
     assert hidden_value(shown((1, 1, 1), hidden=3), (4, 1)) is None, "nothing is hidden, and nothing contradicts"
     (first, *_) = Hidden(0, 3).filled(shown((None, 1, 1), hidden=3))
     assert first.now == (-1, 0), "nothing was seen before"
+
+
+def dials(then: Sequence[int], later: Sequence[int]) -> list[Row]:
+    """Three episodes of two steps along a counter, none of which meets the counter's values of another one.
+
+    Each episode has a dial, whose value after both steps is in ``then`` and ``later``; a counter of 8 pays where it is
+    the dial's first value, and ends.
+    """
+    rows = []
+    for dial, (middle, last) in enumerate(zip(then, later, strict=True)):
+        count = 3 * dial
+        rows.append(Row((dial, count), 0, (middle, count + 1), 0.0, False, 0))
+        rows.append(Row((middle, count + 1), 0, (last, (count + 2) % 8), float(dial == 2), False, 1))
+    return rows
+
+
+def test_a_value_that_hides_a_factor_is_found_without_contradictions() -> None:
+    rows = dials((3, 3, 3), (3, 3, 3))
+    assert hidden_value(rows, (4, 8)) is None, "no code comes twice"
+    assert still_value(rows, (4, 8), 1) == (0, 3)
+    assert still_value(dials((0, 1, 2), (0, 1, 2)), (4, 8), 1) is None, "nothing changes"
+    assert still_value(dials((1, 2, 0), (2, 0, 1)), (4, 8), 1) is None, "a dial that turns is not hidden"
+
+
+def test_a_light_that_flips_by_chance_is_not_hidden() -> None:
+    rng = np.random.default_rng(0)
+    lights = np.cumsum(rng.random(201) < 0.2) % 2
+    rows = [
+        Row((int(now), step % 3), 0, (int(then), (step + 1) % 3), 0.0, False, step)
+        for step, (now, then) in enumerate(itertools.pairwise(lights))
+    ]
+    assert not any(each.now[0] != each.then[0] for each in Hidden(0, 1).filled(rows)), "it would never change"
+    assert still_value(rows, (2, 3), 1) is None, "to say which images hide it takes longer"
 
 
 def test_codes_are_read_by_most_images() -> None:

@@ -3,9 +3,10 @@
 The perception looks for factors in the images that were seen, again and again while the writer explores. Whenever it
 finds others, all transitions so far get their new codes, and the writer begins again with these.
 
-A value of a factor may say that the image hides the factor, as where the human points only once. It is found by its
-contradictions: the same codes and macro-action have different outcomes, and hardly any do once the value last seen
-stands in its place.
+A value of a factor may say that the image hides the factor, as where the human points only once. There are two ways to
+find it. It has contradictions: the same codes and macro-action have different outcomes, and hardly any do once the
+value last seen stands in its place. Or the factor never changes once that stands there, and the laws become shorter by
+more than it takes to say which images hide it.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from imagine_bench.interfaces import Frame, State, TaskSpec
 from imagine_bench.rules import states_of
 
 from .writing.delay import Row, complete
+from .writing.laws import Laws, simplest
 from .writing.writer import Writer
 
 _GROWTH = 1.1
@@ -135,7 +137,7 @@ class SeeingWriter:
         """The value of all codes that hides a factor, and the transitions in which the value last seen stands there."""
         self._hidden = None
         rows = self._coded(self._rows)
-        hidden = hidden_value(rows, sizes)
+        hidden = hidden_value(rows, sizes) or still_value(rows, sizes, self._spec.n_actions)
         return hidden, rows if hidden is None else hidden.filled(rows)
 
     def _code(self, number: int) -> State:
@@ -171,6 +173,12 @@ class Hidden(NamedTuple):
             found.append(row._replace(now=now, then=self.fill(row.then, now)))
         return found
 
+    def nats(self, rows: Sequence[Row]) -> float:
+        """The length of saying in which images it stands, the first ones of episodes and the later ones apart."""
+        first = [row.now[self.factor] == self.value for row in rows if not row.step]
+        later = [row.then[self.factor] == self.value for row in rows]
+        return sum(simplest(sum(stands), len(stands) - sum(stands))[1] for stands in (first, later))
+
 
 def hidden_value(rows: Sequence[Row], sizes: Sequence[int]) -> Hidden | None:
     """The value that leaves the fewest contradictions where the value last seen stands in its place, if there is one.
@@ -186,6 +194,24 @@ def hidden_value(rows: Sequence[Row], sizes: Sequence[int]) -> Hidden | None:
             left[each] = _contradicting(filled)
     best = min(left, key=left.__getitem__, default=None)
     return best if best is not None and left[best] < _CLEARER * without else None
+
+
+def still_value(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> Hidden | None:
+    """The value without which its factor never changes, if laws without these changes are shorter.
+
+    The first transition begins an episode.
+    """
+    changed = [factor for factor in range(len(sizes)) if any(row.now[factor] != row.then[factor] for row in rows)]
+    best = None
+    nats = Laws(sizes, n_actions, rows).nats if changed else 0.0
+    for each in (Hidden(factor, value) for factor in changed for value in range(sizes[factor])):
+        filled = complete(each.filled(rows))
+        if 2 * len(filled) <= len(rows) or any(row.now[each.factor] != row.then[each.factor] for row in filled):
+            continue
+        other = Laws(sizes, n_actions, each.filled(rows)).nats + each.nats(rows)
+        if other < nats:
+            best, nats = each, other
+    return best
 
 
 def _contradicting(rows: Sequence[Row]) -> float:

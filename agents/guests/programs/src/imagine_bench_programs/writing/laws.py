@@ -95,7 +95,12 @@ class Laws(SymbolRules):
         """The effects of each macro-action."""
         self.happens = found.happening()
         """Probability with which they come about, by macro-action."""
-        self.ends = ends_of(complete(self.present(rows)), self.sizes, n_actions)
+        present = complete(self.present(rows))
+        self.ends = ends_of(present, self.sizes, n_actions)
+        wrong = sum(self.end(row.now, row.action, row.then)[1:] != (row.reward, row.ended) for row in present)
+        each = _TESTS * math.log(len(_forms(self.sizes, n_actions)[-1]))
+        self.nats = found.nats + len(self.ends) * each + _CONTRADICTED * wrong
+        """The length of the explanation."""
 
     @property
     def count(self) -> int:
