@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 from small_runs import context
 
 from imagine_bench import registry
-from imagine_bench.interfaces import Frame, TaskSpec
-from imagine_bench.interfaces.model import WorldModel
+from imagine_bench.arrays import Ints
+from imagine_bench.interfaces import Frame, State, TaskSpec
+from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.change import Streams, counterfactual_error, streams_of
 from imagine_bench.judge.predictions import Predictions, evaluate
@@ -88,6 +90,23 @@ class JudgedWorld:
         return counterfactual_error(
             self.counterfactuals, [self.predictions(model, each) for each in self.counterfactuals]
         )
+
+
+class Altered(Exact):
+    """Exact, but that ``alter`` is given what it imagines, the frames and the actions, and returns what it says."""
+
+    def __init__(self, world: JudgedWorld, alter: Callable[[Imagined, Frame, Ints], Imagined]) -> None:
+        super().__init__(world.spec, world.index)
+        self.alter = alter
+
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
+        return self.alter(super().imagine(frames, actions, samples, rng), frames, actions)
+
+
+def asked_pairs(world: JudgedWorld, frames: Frame, actions: Ints) -> list[tuple[State, int]]:
+    """What each question begins with: the macrostate of its last frame, and its first macro-action."""
+    states = [tuple(shown(frame, world.spec).tolist()) for frame in frames[:, -1]]
+    return list(zip(states, actions[:, 0].tolist(), strict=True))
 
 
 @functools.cache

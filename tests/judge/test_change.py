@@ -9,10 +9,9 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from imagine_bench.agents.world_models.limits import Exact
-from judged import STILL, judged_world
-from numpy.typing import NDArray
+from judged import STILL, Altered, judged_world
 
+from imagine_bench.arrays import Ints
 from imagine_bench.exact.changed_rules import SLIP, coupled, slipping
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.model import Imagined
@@ -75,21 +74,17 @@ def test_a_model_that_is_always_surprised_notices_nothing() -> None:
     assert all(math.isnan(value) for value in change_detection_delay(None, answers).values())
 
 
-class Unsure(Exact):
-    """Exact, but that nothing changes is as likely to it as all else together; so surprise is never certain."""
-
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        right, still = super().imagine(frames, actions, samples, rng), STILL.imagine(frames, actions, samples, rng)
-        weights = [0.5 * np.asarray(each.probabilities) for each in (right, still)]
-        return Imagined(
-            pictures=np.concatenate([right.pictures, still.pictures], axis=1),
-            probabilities=np.concatenate(weights, axis=1),
-        )
+def unsure(right: Imagined, frames: Frame, actions: Ints) -> Imagined:
+    """Nothing changes is as likely as all else together; so surprise is never certain."""
+    still = STILL.imagine(frames, actions, 1, np.random.default_rng(0))
+    weights = [0.5 * np.asarray(each.probabilities) for each in (right, still)]
+    images = np.concatenate([right.pictures, still.pictures], axis=1)
+    return Imagined(pictures=images, probabilities=np.concatenate(weights, axis=1))
 
 
 def test_false_alarms_are_as_rare_as_promised() -> None:
     there = judged_world("pick_place")
-    answers = there.predictions(Unsure(there.spec, there.index), there.one_step)
+    answers = there.predictions(Altered(there, unsure), there.one_step)
     other_seed = streams_of(dataclasses.replace(there.spec, id="with other streams"), there.one_step)
     assert other_seed is not None
     walks = [there.streams["usual"], other_seed["usual"], there.streams["coupling"]]
@@ -100,40 +95,33 @@ def test_false_alarms_are_as_rare_as_promised() -> None:
 
 
 @BOTH
-def test_exact_knows_every_counterfactual(task: str) -> None:
+def test_copy_is_right_where_two_macro_actions_change_nothing_and_exact_everywhere(task: str) -> None:
     there = judged_world(task)
     assert there.counterfactual_error(there.exact) == 0.0
-
-
-def test_copy_is_right_where_two_macro_actions_change_nothing() -> None:
-    there = judged_world("pick_place")
     rules, states = there.spec.rules, there.counterfactuals[0].states
     stays = [[rules.outcomes(state, a)[0].macrostate == state for a in range(rules.n_actions)] for state in states]
     right = [a and b for row in stays for a, b in itertools.combinations(row, 2)]
     assert there.counterfactual_error(STILL) == pytest.approx(1.0 - np.mean(right))
 
 
-class Unlucky(Exact):
+def unlucky(found: Imagined, _: Frame, actions: Ints) -> Imagined:
     """Right of every macro-action alone, with other luck for odd ones: it draws in the opposite order."""
-
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        found = super().imagine(frames, actions, samples, rng)
-        assert found.probabilities is not None
-        odd = (actions[:, 0] % 2 == 1)[:, None]
-        return Imagined(
-            pictures=np.where(odd[..., None, None, None, None], found.pictures[:, ::-1], found.pictures),
-            probabilities=np.where(odd[..., None], found.probabilities[:, ::-1], found.probabilities),
-        )
+    odd = (actions[:, 0] % 2 == 1)[:, None, None]
+    assert found.probabilities is not None
+    return Imagined(
+        pictures=np.where(odd[..., None, None, None], found.pictures[:, ::-1], found.pictures),
+        probabilities=np.where(odd, found.probabilities[:, ::-1], found.probabilities),
+    )
 
 
 def test_other_draws_are_no_counterfactual() -> None:
     there = judged_world("arrows:cubes=2,slip=0.3")
-    unlucky = Unlucky(there.spec, there.index)
-    answers = [there.predictions(model, there.one_step) for model in (there.exact, unlucky)]
+    other = Altered(there, unlucky)
+    answers = [there.predictions(model, there.one_step) for model in (there.exact, other)]
     for row in range(len(there.one_step.states)):
         assert answers[0].distribution(row, 0) == pytest.approx(answers[1].distribution(row, 0))
     assert there.counterfactual_error(there.exact) == 0.0
-    assert there.counterfactual_error(unlucky) > 0.1
+    assert there.counterfactual_error(other) > 0.1
 
 
 def test_one_number_chooses_from_both_distributions_in_their_order() -> None:

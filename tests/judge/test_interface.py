@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 from fake_reader import BlindReader
-from imagine_bench.agents.world_models.limits import Exact
-from judged import JudgedWorld, judged_world, shown
+from judged import Altered, asked_pairs, judged_world
+from same_values import assert_same
 
 from imagine_bench import registry
 from imagine_bench.arrays import Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame, State
-from imagine_bench.interfaces.episodes import joined
+from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.interfaces.model import Imagined, require_imagined, weights_of
 from imagine_bench.judge import questions
 from imagine_bench.judge.predictions import Predictions, ask_together, evaluate
@@ -40,42 +41,21 @@ def test_what_is_right_is_taken_as_it_is() -> None:
     assert check(pictures=np.ones((*SHAPE, 20, 30), dtype=np.float32)).pictures.shape[3:] == (20, 30)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"pictures": GOOD.pictures[:2]}, "gave pictures of shape (2, 4, 2, 8, 8, 3); give (3, 4, 2, H, W)"),
-        ({"pictures": GOOD.pictures[:, :3], "probabilities": None, "rewards": None, "p_ended": None}, "of shape (3, 3"),
-        ({"pictures": np.full((*SHAPE, 8, 8), 2.0)}, "give uint8, or floats from 0 to 1"),
-        ({"pictures": "a picture"}, "gave pictures of str"),
-        ({"rewards": np.full(SHAPE, np.nan)}, "gave rewards with NaN"),
-        ({"probabilities": np.full(SHAPE, 0.2)}, "sum to 0.8 over S; they must sum to 1"),
-        ({"probabilities": np.full(SHAPE, -0.25)}, "probabilities outside of [0, 1]"),
-        ({"accepted": np.zeros((3, 2))}, "accepted of float64; give an array of bool"),
-        ({"epistemic": np.zeros(3)}, "gave epistemic of shape (3,); give (3, 2)"),
-    ],
-)
-def test_what_is_wrong_is_one_sentence(changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(InvalidValueError) as found:
-        check(**changes)
-    assert str(found.value).startswith("World model theirs: imagine() gave") and words in str(found.value)
-
-
-class Records(Exact):
-    """The exact model, which keeps its questions."""
-
-    def __init__(self, world: JudgedWorld) -> None:
-        super().__init__(world.spec, world.index)
-        self.batches: list[list[State]] = []
-
-    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
-        found = super().imagine(frames, actions, samples, rng)
-        self.batches.append([tuple(shown(frame, judged_world(TASK).spec).tolist()) for frame in frames[:, -1]])
-        frames[...] = 0
-        actions[...] = 0
-        return found
-
-
-TASK = "pick_place"
+def test_what_is_wrong_is_one_sentence() -> None:
+    wrong: tuple[tuple[str, dict[str, Any]], ...] = (
+        ("gave pictures of shape (2, 4, 2, 8, 8, 3); give (3, 4, 2, H, W)", {"pictures": GOOD.pictures[:2]}),
+        ("of shape (3, 3", {"pictures": GOOD.pictures[:, :3], "probabilities": None, "rewards": None, "p_ended": None}),
+        ("give uint8, or floats from 0 to 1", {"pictures": np.full((*SHAPE, 8, 8), 2.0)}),
+        ("gave pictures of str", {"pictures": "a picture"}),
+        ("gave rewards with NaN", {"rewards": np.full(SHAPE, np.nan)}),
+        ("sum to 0.8 over S; they must sum to 1", {"probabilities": np.full(SHAPE, 0.2)}),
+        ("probabilities outside of [0, 1]", {"probabilities": np.full(SHAPE, -0.25)}),
+        ("accepted of float64; give an array of bool", {"accepted": np.zeros((3, 2))}),
+        ("gave epistemic of shape (3,); give (3, 2)", {"epistemic": np.zeros(3)}),
+    )
+    for words, changes in wrong:
+        with pytest.raises(InvalidValueError, match=rf"^World model theirs: imagine\(\) .*{re.escape(words)}"):
+            check(**changes)
 
 
 def test_no_start_is_asked_about_twice_while_another_is_not_at_all() -> None:
@@ -86,28 +66,36 @@ def test_no_start_is_asked_about_twice_while_another_is_not_at_all() -> None:
 
 
 def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:
-    world = judged_world(TASK)
+    world = judged_world("pick_place")
     after = questions.after_the_end(world.spec, world.index.render)
     assert after is not None
     sets = {"one_step": world.one_step, "rollouts": world.rollouts, "after": after}
+    batches: list[list[State]] = []
+
+    def noted(found: Imagined, frames: Frame, actions: Ints) -> Imagined:
+        """The model keeps its questions, and spoils them."""
+        batches.append([state for state, _ in asked_pairs(world, frames, actions)])
+        frames[...] = 0
+        actions[...] = 0
+        return found
 
     def answered(order: int | None) -> tuple[dict[str, Predictions], list[list[State]]]:
-        model = Records(world)
+        batches.clear()
         given: dict[str, Any] = {"samples": 2, "reader": BlindReader(4), "index": world.index}
 
         def ask(asked: EvalSet, name: str) -> Predictions:
             drawn = None if order is None else np.random.default_rng(order)
-            return evaluate(model, name, asked, rng=np.random.default_rng(0), order=drawn, **given)
+            return evaluate(Altered(world, noted), name, asked, rng=np.random.default_rng(0), order=drawn, **given)
 
-        return ask_together(ask, sets), model.batches
+        return ask_together(ask, sets), [*batches]
 
     (plain, in_order), (one, shuffled), (again, repeated), (other, otherwise) = map(answered, (None, 0, 0, 1))
     assert in_order != shuffled == repeated != otherwise
     for name, answers in plain.items():
+        assert len(answers.states) == len(sets[name].states)
         for each in (one, again, other):
-            assert np.array_equal(answers.states, each[name].states) and len(answers.states) == len(sets[name].states)
-            assert np.array_equal(answers.weights, each[name].weights)
-            assert all(np.array_equal(array, each[name].offered[key]) for key, array in answers.offered.items())
+            for field in ("states", "weights", "offered"):
+                assert_same(getattr(answers, field), getattr(each[name], field))
     over = [world.spec.rules.is_terminal(state) for state in shuffled[0]]
     assert any(over) and not all(over), "a batch does not tell that it is about frames after an end"
 
@@ -115,21 +103,20 @@ def test_questions_come_shuffled_and_each_answer_is_put_back() -> None:
 def test_the_first_transitions_are_the_same_ones() -> None:
     def episode(length: int) -> dict[str, Any]:
         frames = np.zeros((length + 1, 64, 64, 3), dtype=np.uint8)
-        frames[:, 0, 0] = np.arange(length + 1)[:, None] + [0, length, 0]
+        frames[:, 0, 0, 0] = np.arange(length + 1) + 10 * length
         ends = [False] * (length - 1) + [True]
         known = {"actions": [0] * length, "rewards": [float(length)] * length, "truncated": [False] * length}
         masks = np.ones((length + 1, 2), dtype=np.int8)
         return {**known, "frames": frames, "action_masks": masks, "terminated": ends, "success": True}
 
+    def transitions(of: Episodes) -> list[list[Any]]:
+        """The frame before and after each, its reward and end."""
+        rows = of.rows[0]
+        return [*zip(of.frames[rows, 0, 0, 0], of.frames[rows + 1, 0, 0, 0], of.rewards, of.terminated, strict=True)]
+
     whole = joined([episode(length) for length in (2, 3, 4)])
     for count in range(1, 10):
-        part = whole.first(count)
-        before = part.rows[0]
-        every = whole.rows[0][:count]
-        assert len(part.actions) == count and np.array_equal(part.rewards, whole.rewards[:count])
-        assert np.array_equal(part.frames[before], whole.frames[every])
-        assert np.array_equal(part.frames[before + 1], whole.frames[every + 1])
-        assert np.array_equal(part.terminated, whole.terminated[:count])
+        assert transitions(whole.first(count)) == transitions(whole)[:count]
     assert whole.first(9).hash == whole.hash
     assert whole.first(4).truncated.tolist() == [False, False, False, True]
     assert whole.first(4).success.tolist() == [True, False]

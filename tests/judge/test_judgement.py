@@ -14,9 +14,8 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -24,6 +23,7 @@ from fake_reader import read_nothing
 from guest_packages import Guests
 from kept import ROOT
 from recordings import contents, times, view_names
+from same_values import assert_same
 from small_runs import Inline, small
 
 import imagine_bench
@@ -31,9 +31,10 @@ from imagine_bench import registry
 from imagine_bench.arrays import Arrays
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.interfaces import State
 from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
-from imagine_bench.judge.models import JudgedModel, model_entry, opened, source_of
+from imagine_bench.judge.models import ModelSource, model_entry, opened, source_of
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.report.judge import COLUMNS, Judged, judged, judgement_page
 from imagine_bench.report.page import DASH
@@ -141,6 +142,9 @@ LATE = WorldModelEntry(make="their_models:late", title="late")
 _MODELS = ("nearest", "spy", "cheat", "raises", "late", "unmade", "exits", "dies", "copy", "exact")
 
 
+_COMMAND = "judge --task pick_place --workers 1 --sizes 60 --seeds 1000 --samples 2".split()
+
+
 class Said(NamedTuple):
     """A judgement by the command: its folder, its exit status and its output."""
 
@@ -176,9 +180,7 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Said]:
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         guests = Guests(folder, patch)
         guests.add(folder)
-        world = ["judge", "--task", "pick_place", "--out", str(root), "--workers", "1"]
-        data = ["--sizes", "60", "--seeds", "1000", "--samples", "2"]
-        status = main([*world, *data, "--models", *_MODELS])
+        status = main([*_COMMAND, "--out", str(root), "--models", *_MODELS])
         (made,) = (path.parent for path in root.glob("*/judgement.json"))
         few = _of("nearest", "copy", "exact")
         assert [judgement.carry_out(few, made, ModelFit(model, 1000, 20)) for model in few.models] == [""] * 3
@@ -190,13 +192,28 @@ def _of(*models: str) -> Judgement:
     return Judgement(task="pick_place", models=models, sizes=(20, 60), seeds=(1000,), samples=2)
 
 
+def _cells(said: Said, *models: str) -> dict[tuple[str, int], dict[str, Any]]:
+    return {(cell["model"], cell["transitions"]): cell for cell in kept(said.folder, _of(*models))}
+
+
+@pytest.fixture
+def copied(said: Said, tmp_path: Path) -> Path:
+    """A copy of the judgement, which a test may change."""
+    folder = tmp_path / said.folder.name
+    shutil.copytree(said.folder, folder)
+    return folder
+
+
 def test_what_models_do_wrong_is_a_sentence_each(said: Said) -> None:
     assert said.status == 1
-    assert "World model raises: fit() failed (RuntimeError: out of luck)." in said.err
-    assert "World model late: imagine() failed (KeyError: 'depth')." in said.err
-    assert "World model unmade (their_models:unmade) cannot be used (AttributeError: " in said.err
-    assert "World model exits: fit() failed (SystemExit: 0)." in said.err
-    assert "World model dies: imagine() failed: its process ended itself with exit code 0." in said.err
+    for sentence in (
+        "World model raises: fit() failed (RuntimeError: out of luck).",
+        "World model late: imagine() failed (KeyError: 'depth').",
+        "World model unmade (their_models:unmade) cannot be used (AttributeError: ",
+        "World model exits: fit() failed (SystemExit: 0).",
+        "World model dies: imagine() failed: its process ended itself with exit code 0.",
+    ):
+        assert sentence in said.err
     assert "Traceback" not in said.err
     assert not list(said.folder.glob("raises-*.json"))
     assert [path.read_text() for path in sorted(said.folder.glob("*.log"))] == ["its last words\\x1b[31m\n"]
@@ -204,8 +221,7 @@ def test_what_models_do_wrong_is_a_sentence_each(said: Said) -> None:
 
 def test_a_model_finds_no_truth_and_changes_nothing_for_the_next(said: Said) -> None:
     """The spy says, too, that nothing changes; it and *cheat* spoil all that they are handed."""
-    models = ("spy", "cheat", "copy", "exact")
-    scores = {(cell["model"], cell["transitions"]): cell for cell in kept(said.folder, _of(*models))}
+    scores = _cells(said, "spy", "cheat", "copy", "exact")
     for one, other in (("spy", "copy"), ("cheat", "exact")):
         for name in ("total_variation", "tv_by_depth", "after_the_end", "value_loss", "data"):
             assert scores[one, 60][name] == scores[other, 60][name], (one, name)
@@ -213,21 +229,17 @@ def test_a_model_finds_no_truth_and_changes_nothing_for_the_next(said: Said) -> 
     assert learned.frames.any(axis=(1, 2, 3)).all(), "the data that this process holds are as they were"
 
 
-def test_a_judgement_is_loaded_from_its_folder(said: Said) -> None:
-    found = imagine_bench.load(said.folder)
-    assert found.tables["scores"] == (said.folder / "report/scores.csv").read_text()
-    assert len(found.frame()["model"]) == len(list(csv.DictReader(io.StringIO(found.tables["scores"]))))
-    assert found.verdict() and found.verdict() in (said.folder / "report/index.html").read_text() + repr(found)
-
-
-def test_privileged_models_are_marked_wherever_they_stand(said: Said) -> None:
+def test_a_judgement_is_loaded_from_its_folder_and_marks_privileged_models_everywhere(said: Said) -> None:
     report = said.folder / "report"
-    rows = list(csv.DictReader((report / "scores.csv").read_text().splitlines()))
+    page = (report / "index.html").read_text()
+    found = imagine_bench.load(said.folder)
+    assert found.tables["scores"] == (report / "scores.csv").read_text()
+    assert found.verdict() and found.verdict() in page + repr(found)
+    rows = list(csv.DictReader(io.StringIO(found.tables["scores"])))
+    assert len(found.frame()["model"]) == len(rows)
     marked = {row["model"] for row in rows if row["privileged"] == "true"}
     assert marked == {"exact", "cheat"} < {row["model"] for row in rows}
-    page = (report / "index.html").read_text()
-    recording = "\n".join(view_names(said.folder / "judgement.rrd"))
-    for text in (said.out, page, recording):
+    for text in (said.out, page, "\n".join(view_names(said.folder / "judgement.rrd"))):
         assert "cheat (privileged)" in text and "exact (privileged)" in text
         assert "frame (privileged)" not in text
 
@@ -235,61 +247,53 @@ def test_privileged_models_are_marked_wherever_they_stand(said: Said) -> None:
 def test_a_cell_says_whether_its_model_was_privileged_when_it_was_judged(
     said: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert kept(said.folder, _of("cheat"))
     entry = registry.world_model_entry("cheat")
+    assert _cells(said, "cheat")
     monkeypatch.setitem(registry.WORLD_MODELS, "cheat", dataclasses.replace(entry, privileged=False))
     with pytest.raises(ArtefactError, match="cheat was privileged when it was judged"):
-        kept(said.folder, _of("cheat"))
+        _cells(said, "cheat")
 
 
 def test_a_command_that_judges_nothing_leaves_the_report_of_others(said: Said) -> None:
     before = {path: path.read_bytes() for path in [said.folder / "judgement.json", *said.folder.glob("report/*")]}
-    words = ["judge", "--task", "pick_place", "--out", str(said.folder.parent), "--workers", "1"]
-    assert main([*words, "--sizes", "60", "--seeds", "1000", "--samples", "2", "--models", "unmade"]) == 1
+    assert main([*_COMMAND, "--out", str(said.folder.parent), "--models", "unmade"]) == 1
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_each_cell_names_reader_and_policies_and_is_not_compared_with_those_of_another(
-    said: Said, tmp_path: Path
-) -> None:
-    folder = tmp_path / said.folder.name
-    shutil.copytree(said.folder, folder)
-    cell = folder / ModelFit("copy", 1000, 60).file
+def test_each_cell_names_reader_and_policies_and_is_not_compared_with_those_of_another(copied: Path) -> None:
+    cell = copied / ModelFit("copy", 1000, 60).file
     before = read_sealed(cell, "a cell")
-    protocol = json.loads((folder / "judgement.json").read_text())
-    assert len(before["policies"]) == 12 and before["policies"] == protocol["policies"]
+    assert len(before["policies"]) == 12
+    assert before["policies"] == json.loads((copied / "judgement.json").read_text())["policies"]
     for name, words in (("reader", "read by different readers"), ("policies", "judged by different policies")):
         write_json(cell, sealed({**before, name: "0123456789ab"}))
         with pytest.raises(ArtefactError, match=rf"{words} \(.*0123456789ab.*\) and cannot be compared"):
-            kept(folder, _of("copy", "exact"))
-        assert kept(folder, _of("exact"))
-    images = folder / ModelFit("exact", 1000, 60).images
+            kept(copied, _of("copy", "exact"))
+        assert kept(copied, _of("exact"))
+    images = copied / ModelFit("exact", 1000, 60).images
     write_arrays(images, {name: np.zeros_like(array) for name, array in read_arrays(images).items()})
     with pytest.raises(ArtefactError, match="is damaged: it is not as it was written"):
-        shown(folder, _of("exact"))
+        shown(copied, _of("exact"))
 
 
 def test_a_model_of_theirs_is_judged(said: Said) -> None:
     assert "nearest frame" in said.out and "exact" in said.out
-    assert len(list(said.folder.glob("nearest-seed*.json"))) == 2
-    recorded = contents(said.folder / "judgement.rrd")
-    assert {"/action", "/real/frame", "/exact/frame", "/nearest/outcomes"} <= recorded.keys()
-    assert times(said.folder / "judgement.rrd", "/exact/frame", "depth") == set(range(11))
-    scored = {(cell["model"], cell["transitions"]): cell for cell in kept(said.folder, _of("copy", "exact"))}
-    assert scored["exact", 60]["value_loss"] == scored["exact", 60]["value_loss_ruled"] == 0.0
-    assert scored["copy", 60]["value_loss"] is None and scored["copy", 60]["value_loss_ruled"] > 0.0
-    futures = scored["exact", 60]["futures"]
-    assert [pytest.approx(each) for each in futures["real"]] == futures["imagined"]
-    assert scored["copy", 20]["data"] == scored["exact", 60]["data"]
-    (theirs,) = (cell for cell in kept(said.folder, _of("nearest")) if cell["transitions"] == 60)
+    recorded = said.folder / "judgement.rrd"
+    assert {"/action", "/real/frame", "/exact/frame", "/nearest/outcomes"} <= contents(recorded).keys()
+    assert times(recorded, "/exact/frame", "depth") == set(range(11))
+    scored = _cells(said, "copy", "exact", "nearest")
+    exact, still, theirs = (scored[model, 60] for model in ("exact", "copy", "nearest"))
+    assert exact["value_loss"] == exact["value_loss_ruled"] == 0.0
+    assert still["value_loss"] is None and still["value_loss_ruled"] > 0.0
+    assert [pytest.approx(each) for each in exact["futures"]["real"]] == exact["futures"]["imagined"]
+    assert scored["copy", 20]["data"] == exact["data"]
     assert 0.0 <= theirs["exploit_ruled"] <= theirs["exploit_bound_ruled"] + 1e-9
-    assert scored["exact", 60]["lift"] == scored["exact", 60]["lift_ruled"] >= theirs["lift_ruled"]
-    assert scored["exact", 60]["film"] is None, "it overrates nothing"
+    assert exact["lift"] == exact["lift_ruled"] >= theirs["lift_ruled"]
+    assert exact["film"] is None, "it overrates nothing"
     film = shown(said.folder, _of("nearest"))["nearest"]
     for course in ("believed", "real"):
         assert len(film[f"film_{course}"]) == 1 + len(film["film"][course]) > 1
     assert (said.folder / "report/film_nearest.png").exists()
-    assert "L7 exploit" in (said.folder / "report/index.html").read_text()
 
 
 _SINCE = re.compile(
@@ -300,51 +304,38 @@ _SINCE = re.compile(
 def test_scores_that_an_older_judgement_lacks_are_dashes(said: Said) -> None:
     one = _of("copy", "exact")
     found = Judged(said.folder, one, registry.task(one.task), {})
-    for cell in kept(said.folder, one):
-        older = {name: value for name, value in cell.items() if not _SINCE.match(name)}
-        found.cells.setdefault((cell["model"], cell["transitions"]), []).append(older)
-    page = judgement_page(found)
-    (short,) = (table for section in page.sections for table in section.tables if table.name == "short")
+    for key, cell in _cells(said, *one.models).items():
+        found.cells[key] = [{name: value for name, value in cell.items() if not _SINCE.match(name)}]
+    (short,) = (
+        table for section in judgement_page(found).sections for table in section.tables if table.name == "short"
+    )
     columns = dict(zip(short.header, zip(*short.rows, strict=True), strict=True))
     lacking = {COLUMNS[name] for name in COLUMNS if _SINCE.match(name)} & columns.keys()
     assert lacking and all(set(columns[name]) == {DASH} for name in lacking)
     assert DASH not in columns[COLUMNS["total_variation"]]
 
 
-def test_what_is_kept_is_not_judged_again(said: Said) -> None:
-    before = {path: path.stat().st_mtime_ns for path in said.folder.glob("*-seed*.json")}
-    assert judge(_of("nearest", "copy", "exact"), said.folder.parent, workers=1) == (said.folder, [])
-    assert {path: path.stat().st_mtime_ns for path in said.folder.glob("*-seed*.json")} == before
-
-
-def test_the_same_seed_gives_the_same_scores(said: Said, tmp_path: Path) -> None:
+def test_lost_cells_and_images_are_made_anew_by_the_same_judgement_and_nothing_else_is(copied: Path) -> None:
+    """To the same figures, but for times."""
+    one, cell, images = (
+        _of("nearest", "copy", "exact"),
+        ModelFit("nearest", 1000, 20),
+        ModelFit("exact", 1000, 60).images,
+    )
+    before = {path: path.stat().st_mtime_ns for path in copied.glob("*-seed*.json")}
+    figures, arrays = read_sealed(copied / cell.file, "a cell"), read_arrays(copied / images)
+    (copied / images).unlink()
+    with pytest.raises(ArtefactError, match=r"^There is no .*exact-seed1000-60\.npz, .* makes lost ones anew\.$"):
+        shown(copied, one)
+    (copied / cell.file).unlink()
     judgement.data_of.cache_clear()
     judgement.prepare.cache_clear()
-    again, _ = judgement.judge_cell(_of("nearest"), tmp_path, ModelFit("nearest", 1000, 20))
-    first = next(cell for cell in kept(said.folder, _of("nearest")) if cell["transitions"] == 20)
-    timed = ("fit_s", "imagine_s_per_1000")
-    assert {name: value for name, value in first.items() if name not in timed} == json.loads(
-        json.dumps(judgement.with_null({name: value for name, value in again.items() if name not in timed}))
-    )
-
-
-def test_lost_images_are_refused_where_they_are_shown_and_made_anew_by_the_same_judgement(
-    said: Said, tmp_path: Path
-) -> None:
-    one = _of("exact")
-    root = tmp_path / "judged"
-    folder = root / one.folder_name
-    shutil.copytree(said.folder, folder)
-    images = folder / ModelFit("exact", 1000, 60).images
-    before = read_arrays(images)
-    images.unlink()
-    with pytest.raises(ArtefactError, match=r"^There is no .*exact-seed1000-60\.npz, .* makes lost ones anew\.$"):
-        shown(folder, one)
-    assert judge(one, root, workers=1) == (folder, [])
-    assert {name: array.tobytes() for name, array in read_arrays(images).items()} == {
-        name: array.tobytes() for name, array in before.items()
-    }
-    assert shown(folder, one).keys() == {"exact"}
+    assert judge(one, copied.parent, workers=1) == (copied, [])
+    assert_same(arrays, read_arrays(copied / images))
+    again = read_sealed(copied / cell.file, "a cell")
+    assert {name for name in figures if figures[name] != again[name]} <= {"fit_s", "imagine_s_per_1000", "seal"}
+    made = {path.name for path in before if path.stat().st_mtime_ns != before[path]}
+    assert made == {cell.file, images.replace(".npz", ".json")}
 
 
 def test_a_cell_judged_at_once_by_several_is_kept_with_the_images_of_the_same_fit(
@@ -381,10 +372,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture
 def _few(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Few questions."""
-    monkeypatch.setattr(questions, "STATES", 10)
-    monkeypatch.setattr(questions, "AFTER_THE_END", 10)
-    monkeypatch.setattr(questions, "ROLLOUTS", 4)
-    monkeypatch.setattr(questions, "PAIRS", 4)
+    for name, count in {"STATES": 10, "AFTER_THE_END": 10, "ROLLOUTS": 4, "PAIRS": 4}.items():
+        monkeypatch.setattr(questions, name, count)
     judgement.prepare.cache_clear()
     yield
     judgement.prepare.cache_clear()
@@ -421,80 +410,72 @@ def test_the_folder_of_an_agent_stands_for_all_its_runs(runs: dict[str, Path], t
     assert list(shown(folder, one)) == [agent]
 
 
-def _open(run: Path, task: str, folder: Path) -> AbstractContextManager[JudgedModel]:
+def _source(name: str, task: str, appearance: str = "clean", encoder: str | None = None) -> ModelSource:
     spec = registry.task(task)
-    index = RenderedFrameIndex(spec, "clean")
-    source = source_of(str(run), spec, index, "clean", SeedTree(0))
-    return opened(source, task, folder=folder, log=folder / "log")
+    return source_of(name, spec, RenderedFrameIndex(spec, appearance), appearance, SeedTree(1000), encoder)
 
 
 def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Path) -> None:
+    def visited(agent: str, task: str) -> set[tuple[State, int]] | None:
+        source = _source(str(runs[agent]), task)
+        with opened(source, task, folder=tmp_path, log=tmp_path / "log") as judged:
+            return judged.visited
+
     assert model_entry(str(runs["table"])).title == "table, seed 0"
-    with pytest.raises(InvalidValueError, match="does not imagine"), _open(runs["table"], "arrow_puzzle", tmp_path):
-        pass
-    words = "learned arrow_puzzle, not pick_place"
-    with pytest.raises(InvalidValueError, match=words), _open(runs["imaginer"], "pick_place", tmp_path):
-        pass
-    with _open(runs["imaginer"], "arrow_puzzle", tmp_path) as judged:
-        visited = judged.visited
-    assert visited is not None
-    assert 0 < len(visited) <= 2 * 20, "its experience is the one that the bench counted"
-    assert all(len(state) == 4 and 0 <= action < 6 for state, action in visited)
-    twice = (str(runs["imaginer"]), str(runs["imaginer"] / ".." / "seed_0"))
-    with pytest.raises(InvalidValueError, match="give each world model or run once"):
-        Judgement(task="arrow_puzzle", models=twice)
+    with pytest.raises(InvalidValueError, match="does not imagine"):
+        visited("table", "arrow_puzzle")
+    with pytest.raises(InvalidValueError, match="learned arrow_puzzle, not pick_place"):
+        visited("imaginer", "pick_place")
+    found = visited("imaginer", "arrow_puzzle")
+    assert found and len(found) <= 2 * 20, "its experience is the one that the bench counted"
+    assert all(len(state) == 4 and 0 <= action < 6 for state, action in found)
 
 
 _TWICE = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:model.dropout=0.1,model.members=2")
 
 
-@pytest.mark.parametrize(
-    ("given", "kind", "words"),
-    [
-        ({"sizes": (30, 20)}, InvalidValueError, "ascending numbers"),
-        ({"task": "arrows:cubes=2,lag=1"}, InvalidValueError, "hide or delay a part .* without the parameters"),
+def test_nonsense_is_refused(runs: dict[str, Path]) -> None:
+    run = runs["imaginer"]
+    nonsense: tuple[tuple[str, dict[str, Any]], ...] = (
+        ("ascending numbers", {"sizes": (30, 20)}),
+        ("hide or delay a part .* without the parameters", {"task": "arrows:cubes=2,lag=1"}),
         (
-            {"models": ("copy", "structured"), "encoder": "pick_place-mild"},
-            InvalidValueError,
-            r"No model of \('copy', 'structured'\) reads latents, which pick_place-",
+            r"No model of \('copy', 'structured'\) reads latents",
+            {"models": ("copy", "structured"), "encoder": _LATENTS},
         ),
-        ({"models": _TWICE}, InvalidValueError, "give each world model or run once"),
-    ],
-)  # fmt: skip
-def test_nonsense_is_refused(given: dict[str, object], kind: type[Exception], words: str) -> None:
-    with pytest.raises(kind, match=words):
-        Judgement(**{"task": "pick_place", "models": ("copy",), **given})  # type: ignore[arg-type]
+        ("give each world model or run once", {"models": _TWICE}),
+        ("give each world model or run once", {"models": (str(run), str(run / ".." / "seed_0"))}),
+    )
+    for words, given in nonsense:
+        with pytest.raises(InvalidValueError, match=words):
+            Judgement(**{"task": "pick_place", "models": ("copy",), **given})
+
+
+_LATENTS = "pick_place-mild"
 
 
 def test_judgements_that_cannot_be_compared_lie_apart() -> None:
-    one = Judgement(task="pick_place", models=("copy",))
+    def folder(**changes: Any) -> str:
+        return Judgement(**{"task": "pick_place", "models": ("gaussian",), **changes}).folder_name
+
     others = {
         "task": "arrow_puzzle", "sizes": (5,), "samples": 3, "appearance": "mild", "policy": "optimal", "order": 1,
+        "encoder": _LATENTS,
     }  # fmt: skip
-    changed = [dataclasses.replace(one, **{name: value}) for name, value in others.items()]
-    folders = {each.folder_name for each in (one, *changed)}
-    assert len(folders) == 1 + len(others)
+    assert len({folder(), *(folder(**{name: value}) for name, value in others.items())}) == 1 + len(others)
     for more in ({"models": ("copy", "exact")}, {"seeds": (7,)}, {"sizes": (2, 10_000)}):
-        assert dataclasses.replace(one, **more).folder_name == one.folder_name, "these are cells of one folder"
+        assert folder(**more) == folder(), "these are cells of one folder"
 
 
 def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> None:
-    judged = Judgement(task="pick_place", models=("gaussian", "structured"), encoder="pick_place-mild")
-    spec = registry.task("pick_place")
-    index = RenderedFrameIndex(spec, "clean")
-    costs = [source_of(name, spec, index, "clean", SeedTree(0), judged.encoder).cost for name in judged.models]
-    assert [cost["encoder"] for cost in costs] == ["pick_place-mild", "pick_place-clean-codes"]
-    assert judged.folder_name != dataclasses.replace(judged, encoder=None).folder_name
+    costs = [_source(name, "pick_place", encoder=_LATENTS).cost for name in ("gaussian", "structured")]
+    assert [cost["encoder"] for cost in costs] == [_LATENTS, "pick_place-clean-codes"]
     assert "encoder_reads" not in costs[0]
+    few = _source("structured", "arrow_puzzle", "strong").cost["encoder_reads"]
+    assert few == pytest.approx(0.115, abs=1e-3)
 
 
-def test_a_judged_model_whose_encoder_reads_few_frames_is_marked_in_its_row(said: Said, tmp_path: Path) -> None:
-    folder = tmp_path / said.folder.name
-    shutil.copytree(said.folder, folder)
-    for path in folder.glob("nearest-*.json"):
-        cell = read_sealed(path, "a cell")
-        write_json(path, sealed({**cell, "encoder_reads": 0.115}))
-    assert "(encoder reads 11.5%)" in judgement_page(judged(folder, _of("nearest", "copy"))).summary
-    spec = registry.task("arrow_puzzle")
-    cost = source_of("structured", spec, RenderedFrameIndex(spec, "strong"), "strong", SeedTree(1000)).cost
-    assert cost["encoder_reads"] == pytest.approx(0.115, abs=1e-3)
+def test_a_judged_model_whose_encoder_reads_few_frames_is_marked_in_its_row(copied: Path) -> None:
+    for path in copied.glob("nearest-*.json"):
+        write_json(path, sealed({**read_sealed(path, "a cell"), "encoder_reads": 0.115}))
+    assert "(encoder reads 11.5%)" in judgement_page(judged(copied, _of("nearest", "copy"))).summary

@@ -12,7 +12,7 @@ from judged import labelled, shown
 from numpy.typing import NDArray
 from small_runs import context
 
-from imagine_bench.interfaces import Frame, Observation, Outcome, TaskSpec
+from imagine_bench.interfaces import Frame, Observation, Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout
 from imagine_bench.judge.open_loop import (
     EXAMPLES,
@@ -25,9 +25,7 @@ from imagine_bench.judge.open_loop import (
 )
 from imagine_bench.judge.questions import EvalSet
 from imagine_bench.judge.truth import shares
-from imagine_bench.rules import is_random
 from imagine_bench.seeding import TUNING_SEEDS, SeedTree, evaluation_split
-from imagine_bench.store.results import ComparedRollout
 
 PUZZLE, PICK_PLACE = labelled("arrow_puzzle"), labelled("pick_place")
 START = (0, 0, 0, 0)
@@ -59,25 +57,6 @@ def test_the_rules_keep_every_rollout_alive(puzzle: EvalSet) -> None:
     assert np.array_equal(again.frames, puzzle.frames) and np.array_equal(again.actions, puzzle.actions)
 
 
-class _Coin:
-    """Two safe states and a pit; action 1 always falls, action 0 falls from state 1 half the time."""
-
-    states = ((0,), (1,), (2,))
-    start_states = ((0,), (1,))
-
-    def outcomes(self, macrostate: tuple[int, ...], action: int) -> tuple[Outcome, ...]:
-        falls = 1.0 if action else 0.5 * macrostate[0]
-        possible = (Outcome(falls, (2,), -5.0, True, False), Outcome(1.0 - falls, (0,), -1.0, False, False))
-        return tuple(outcome for outcome in possible if outcome.probability)
-
-
-def test_random_rules_give_only_starts_that_surely_stay_alive() -> None:
-    coin = dataclasses.replace(PUZZLE, rules=_Coin(), action_names=("stay", "jump"))  # type: ignore[arg-type]
-    found = asked(coin, 8, 3)
-    assert found.states == ((0,),) * 8 and (found.asked == 0).all()
-    assert surviving_actions(coin, starts=0, depth=3, appearance="clean") is None
-
-
 class Told(bench_fakes.RulesImaginer):
     """Imagines the truth of a set, one question after another, but for ``wrong``: (question, depth) pairs."""
 
@@ -98,8 +77,8 @@ class Told(bench_fakes.RulesImaginer):
 
 
 def test_scores_by_depth(puzzle: EvalSet) -> None:
-    wrong = np.broadcast_to(np.arange(10) >= 3, (40, 10))
-    loop = open_loop(Told(puzzle, wrong), puzzle, SeedTree(0))
+    """Uncertainty is held to the errors that it should find."""
+    loop = open_loop(Told(puzzle, np.broadcast_to(np.arange(10) >= 3, (40, 10))), puzzle, SeedTree(0))
     assert loop.count.tolist() == [40] * 10
     assert loop.correct.tolist() == loop.accepted.tolist() == [1.0] * 3 + [0.0] * 7
     assert loop.correct_accepted[:3].tolist() == [1.0] * 3
@@ -107,9 +86,6 @@ def test_scores_by_depth(puzzle: EvalSet) -> None:
     assert loop.reward_mae.tolist() == [0.5] * 10  # it says -0.5, the rules say -1
     assert loop.termination_error.tolist() == [0.0] * 3 + [1.0] * 7
     assert (loop.epistemic[0], loop.aleatoric[0], loop.modal[0]) == pytest.approx((0.1, 0.5, 0.9))
-
-
-def test_uncertainty_is_held_to_the_errors_it_should_find(puzzle: EvalSet) -> None:
     wrong = np.zeros((40, 10), dtype=np.bool_)
     wrong[1::2, 2] = True  # every other rollout, at depth 3
     loop = open_loop(Told(puzzle, wrong), puzzle, SeedTree(0))
@@ -173,25 +149,14 @@ def test_examples_and_samples_begin_an_episode_and_go_as_imagined() -> None:
         assert np.array_equal(each.real_macrostates[:until], each.rollout.macrostates[:until])
 
 
-def imaginer() -> bench_fakes.RulesImaginer:
-    return bench_fakes.RulesImaginer(context())
-
-
-def compared(seed: int, *wishes: tuple[int, ...]) -> ComparedRollout:
-    """Picking the left object, again and again, imagined to lead to each wish in turn."""
-    frame = np.zeros((64, 64, 3), dtype=np.uint8)
-    rng = np.random.default_rng(seed)
-    rollout = imaginer().imagine(frame, actions=np.zeros(len(wishes), dtype=np.int64), depth=9, rng=rng)
-    rollout = dataclasses.replace(rollout, macrostates=np.array(wishes))
-    return Moment(spec=PICK_PLACE, appearance="clean", frame=frame, macrostate=START).beside(rollout, rng)
+IMAGINER = bench_fakes.RulesImaginer(context())
 
 
 def test_examples_stand_beside_the_truth() -> None:
     first, again, tuning = (
-        examples(imaginer(), PUZZLE, appearance="clean", seeds=SeedTree(0), purpose=purpose)
+        examples(IMAGINER, PUZZLE, appearance="clean", seeds=SeedTree(0), purpose=purpose)
         for purpose in ("evaluation", evaluation_split(0), evaluation_split(TUNING_SEEDS))
     )
-    assert len(first) == EXAMPLES
     for one, other in zip(first, again, strict=True):
         assert np.array_equal(one.rollout.frames, other.rollout.frames)
         assert np.array_equal(one.real_frames, other.real_frames)
@@ -199,24 +164,51 @@ def test_examples_stand_beside_the_truth() -> None:
         assert one.real_terminated[-1]  # always turning the left cube ends in two arrows alike
     starts = [[each.start_macrostate.tolist() for each in found] for found in (first, tuning)]
     assert starts[0] != starts[1], "a run that tunes begins elsewhere"
-    few = examples(imaginer(), PICK_PLACE, appearance="clean", seeds=SeedTree(0))
-    assert len(PICK_PLACE.rules.start_states) < EXAMPLES == len(few), "a task with few starts has examples too"
+    few = examples(IMAGINER, PICK_PLACE, appearance="clean", seeds=SeedTree(0))
+    assert len(PICK_PLACE.rules.start_states) < EXAMPLES == len(few) == len(first), "few starts have examples too"
 
 
 def test_reality_goes_as_was_imagined_where_it_may() -> None:
-    """Three wishes are possible: by luck, twenty draws would not all be the imagined one (3e-10)."""
-    for seed in range(10):
-        for wish in (ASKS_MIDDLE, ASKS_RIGHT):
-            assert tuple(compared(seed, wish).real_macrostates[0]) == wish
-    reached = {tuple(compared(seed, IMPOSSIBLE).real_macrostates[0]) for seed in range(30)}
-    assert reached == {outcome.macrostate for outcome in PICK_PLACE.rules.outcomes(START, 0)}
+    """Picking the left object. By luck, twenty draws would not all be the imagined one (3e-10)."""
+    frame = np.zeros((64, 64, 3), dtype=np.uint8)
+    moment = Moment(spec=PICK_PLACE, appearance="clean", frame=frame, macrostate=START)
+
+    def reached(wish: State, draws: int) -> set[State]:
+        found = set()
+        for rng in map(np.random.default_rng, range(draws)):
+            rollout = IMAGINER.imagine(frame, actions=np.zeros(1, dtype=np.int64), depth=9, rng=rng)
+            real = moment.beside(dataclasses.replace(rollout, macrostates=np.array([wish])), rng)
+            found.add(tuple(real.real_macrostates[0]))
+        return found
+
+    for wish in (ASKS_MIDDLE, ASKS_RIGHT):
+        assert reached(wish, 10) == {wish}
+    assert reached(IMPOSSIBLE, 30) == {outcome.macrostate for outcome in PICK_PLACE.rules.outcomes(START, 0)}
 
 
 def test_only_a_task_with_chance_has_sampled_rollouts() -> None:
-    assert is_random(PICK_PLACE.rules) and not is_random(PUZZLE.rules)
-    assert imagine_sampled_rollouts(imaginer(), PUZZLE, appearance="clean", seeds=SeedTree(0)) == ()
-    sampled = imagine_sampled_rollouts(imaginer(), PICK_PLACE, appearance="clean", seeds=SeedTree(0))
-    assert len(sampled) == SAMPLED_ROLLOUTS
-    for one in sampled:
-        assert np.array_equal(one.start_frame, sampled[0].start_frame)
-        assert np.array_equal(one.start_macrostate, sampled[0].start_macrostate)
+    none, sampled = (
+        imagine_sampled_rollouts(IMAGINER, spec, appearance="clean", seeds=SeedTree(0)) for spec in (PUZZLE, PICK_PLACE)
+    )
+    assert (len(none), len(sampled)) == (0, SAMPLED_ROLLOUTS)
+    assert len({each.start_frame.tobytes() for each in sampled}) == 1
+    assert len({tuple(each.start_macrostate.tolist()) for each in sampled}) == 1
+
+
+class _Coin:
+    """Two safe states and a pit; action 1 always falls, action 0 falls from state 1 half the time."""
+
+    states = ((0,), (1,), (2,))
+    start_states = ((0,), (1,))
+
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
+        falls = 1.0 if action else 0.5 * macrostate[0]
+        possible = (Outcome(falls, (2,), -5.0, True, False), Outcome(1.0 - falls, (0,), -1.0, False, False))
+        return tuple(outcome for outcome in possible if outcome.probability)
+
+
+def test_random_rules_give_only_starts_that_surely_stay_alive() -> None:
+    coin = dataclasses.replace(PUZZLE, rules=_Coin(), action_names=("stay", "jump"))  # type: ignore[arg-type]
+    found = asked(coin, 8, 3)
+    assert found.states == ((0,),) * 8 and (found.asked == 0).all()
+    assert surviving_actions(coin, starts=0, depth=3, appearance="clean") is None

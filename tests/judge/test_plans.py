@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -11,10 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bench_fakes import RulesImaginer
 from numpy.typing import NDArray
 from recordings import contents
 from rerun.chunk import RrdReader
-from small_runs import Inline, small
+from small_runs import Inline, context, small
 from whole_outputs import Expected, rounded
 
 from imagine_bench import registry
@@ -33,12 +36,13 @@ from imagine_bench.tools.audits import plan_report, summarise, write_plans
 TASK = registry.task("arrow_puzzle")
 
 
-class Dreamer:
+class Dreamer(RulesImaginer):
     """Plans by the rules from the true start, which a test lets it peep at, and imagines that all goes well."""
 
     env: Any = None
 
     def __init__(self, choose: Callable[[State], int], uncertainty: float = 0.1, accepts: bool = True) -> None:
+        super().__init__(context())
         self.choose = choose
         self.uncertainty = uncertainty
         self.accepts = accepts
@@ -51,26 +55,18 @@ class Dreamer:
         self.looks += 1
         state: State = self.env.unwrapped.world.read().macrostate
         chosen: list[int] = []
-        states = []
+        states = list[State]()
         success = False
         while len(chosen) < depth and not success:
             chosen.append(self.choose(state))
             (outcome,) = TASK.rules.outcomes(state, chosen[-1])
-            state = outcome.macrostate
-            success = outcome.success
+            state, success = outcome.macrostate, outcome.success
             states.append(state)
-        nothing = np.zeros(len(chosen), dtype=np.float32)
-        return ImaginedRollout(
-            actions=np.array(chosen),
-            frames=np.full((len(chosen), 64, 64), 0.5, dtype=np.float32),
-            start_frame=np.zeros((64, 64), dtype=np.float32),
-            rewards=nothing,
-            p_terminated=nothing,
-            q_values=np.zeros((len(chosen), 6), dtype=np.float32),
-            epistemic=np.linspace(0.0, self.uncertainty, len(chosen), dtype=np.float32),
-            aleatoric=nothing,
-            modal=nothing,
-            accepted=np.full(len(chosen), self.accepts),
+        count = len(chosen)
+        return dataclasses.replace(
+            super().imagine(frame, actions=np.array(chosen), depth=count, rng=rng),
+            epistemic=np.linspace(0.0, self.uncertainty, count, dtype=np.float32),
+            accepted=np.full(count, self.accepts),
             macrostates=np.array(states),
         )
 
@@ -108,23 +104,74 @@ def right() -> list[PlanResult]:
     return carried_out(optimal(), 12)
 
 
-def solved_as_imagined(plans: list[PlanResult]) -> bool:
-    return all(plan.optimal and plan.as_imagined.all() and plan.done == plan.length for plan in plans)
-
-
 def test_optimal_plans_are_solved_without_a_second_look(right: list[PlanResult]) -> None:
-    assert solved_as_imagined(right) and len({plan.shortest for plan in right}) >= 2
+    assert all(plan.optimal and plan.as_imagined.all() and plan.done == plan.length for plan in right)
+    assert len({plan.shortest for plan in right}) >= 2
     assert [plan.done for plan in right] == [fewest_actions(TASK.rules, plan.start) for plan in right]
     dreamer = optimal()
     carried_out(dreamer, 3)
     assert dreamer.looks == 3
 
 
-def test_a_wrong_plan_stops_where_the_episode_does(wrong: list[PlanResult]) -> None:
-    assert summarise(wrong)["solved"] < 6
+def test_what_is_written_holds_every_plan_and_a_wrong_one_stops_where_the_episode_does(
+    wrong: list[PlanResult], right: list[PlanResult], tmp_path: Path, expected: Expected
+) -> None:
     failed = next(plan for plan in wrong if not plan.solved)
     assert failed.done < failed.length and failed.compared.real_terminated[-1]
-    assert failed.outcome == f"failed at macro-action {failed.done}"
+    write_plans(tmp_path, wrong, TASK, {"commit": "abc"})
+    outcomes = [plan.outcome for plan in (*wrong, *right)]
+    written = [(tmp_path / name).read_text() for name in ("plans.csv", "summary.json")]
+    expected("plans", "\n".join([*written, *outcomes, rounded(summarise(right))]))
+    solved = [row["solved"] for row in csv.DictReader(written[0].splitlines())]
+    assert len(solved) == 12 and summarise(wrong)["solved"] == solved.count("1") < 6
+    (tmp_path / "recording.rrd").write_text("old")
+    write_plans(tmp_path, right[:1], TASK, {})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["plans.csv", "plans.png", "summary.json"]
+    with_faults = summarise([dataclasses.replace(plan, faults=3) for plan in right])
+    assert (with_faults["faults"], with_faults["steps"]) == (36, sum(plan.done for plan in right))
+
+
+def test_the_recording_shows_the_same_plans_and_the_arm_moves(
+    right: list[PlanResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dreamer = optimal()
+
+    def env_for(*arguments: Any) -> Any:
+        dreamer.env = make_env(*arguments)
+        return dreamer.env
+
+    monkeypatch.setattr("imagine_bench.recording.plans.make_env", env_for)
+    path = tmp_path / "recording.rrd"
+    record_plans(trained(dreamer), count=2, execution="physics", max_epistemic=None, path=path)
+    timelines = contents(path)
+    rows = Counter[str]()
+    done = list[int]()
+    for chunk in RrdReader(path).stream():
+        rows[chunk.entity_path] += chunk.num_rows
+        if chunk.entity_path == "/real/text":
+            texts = chunk.to_record_batch().column("TextDocument:text").to_pylist()
+            done += [sum(line.endswith(" done") for line in str(text).splitlines()) for (text,) in texts]
+    for entity in ("/real/frame", "/imagined/frame", "/imagined/filmstrip", "/real/text", "/scene/right_l3"):
+        assert timelines[entity] >= {"sim_time", "env_step", "plan"}
+    steps = sum(plan.done for plan in right[:2])
+    assert rows["/real/frame"] == steps + 2, "the physical arm solves the same plans"
+    assert rows["/scene/right_l3"] > 20 * steps, "the arm must be seen moving"
+    assert sorted(done) == sorted(number for plan in right[:2] for number in range(plan.done + 1))
+
+
+@pytest.mark.parametrize(
+    ("dreams", "bound", "words"),
+    [
+        ({"uncertainty": 0.9}, 0.3, "is above 0.3"),
+        ({"accepts": False}, None, "the agent's filter discards macro-action 1"),
+        ({"accepts": False, "uncertainty": 0.9}, 1.0, ""),  # the bound replaces the agent's own filter
+    ],
+)
+def test_an_uncertain_plan_is_refused_and_says_so(dreams: dict[str, Any], bound: float | None, words: str) -> None:
+    plan = next(plan for plan in carried_out(optimal(**dreams), 8, max_epistemic=bound) if plan.length > 1)
+    assert words in plan.refused and bool(words) == bool(plan.refused) != plan.solved
+    assert plan.done == (0 if words else plan.length) and summarise([plan])["refused"] == bool(words)
+    assert plan.outcome.startswith("refused: " if words else "solved")
 
 
 def test_a_detour_is_solved_but_not_optimal() -> None:
@@ -141,21 +188,6 @@ def test_a_detour_is_solved_but_not_optimal() -> None:
     (plan,) = carried_out(Dreamer(wander), 1)
     assert plan.solved and not plan.optimal
     assert plan.outcome == "solved, 2 longer than needed"
-
-
-@pytest.mark.parametrize(
-    ("dreams", "bound", "words"),
-    [
-        ({"uncertainty": 0.9}, 0.3, "is above 0.3"),
-        ({"accepts": False}, None, "the agent's filter discards macro-action 1"),
-        ({"accepts": False, "uncertainty": 0.9}, 1.0, ""),  # the bound replaces the agent's own filter
-    ],
-)
-def test_an_uncertain_plan_is_refused_and_says_so(dreams: dict[str, Any], bound: float | None, words: str) -> None:
-    plan = next(plan for plan in carried_out(optimal(**dreams), 8, max_epistemic=bound) if plan.length > 1)
-    assert words in plan.refused and bool(words) == bool(plan.refused) != plan.solved
-    assert plan.done == (0 if words else plan.length) and summarise([plan])["refused"] == bool(words)
-    assert plan.outcome.startswith("refused: " if words else "solved")
 
 
 def test_all_agents_have_the_same_starts_and_tuning_has_others() -> None:
@@ -178,60 +210,6 @@ def test_no_agent_without_imagination_and_no_empty_series() -> None:
     for count, words in ((1, "does not imagine; give the run of one that does"), (0, "0 plans show nothing")):
         with pytest.raises(InvalidValueError, match=words):
             next(make_plans(trained(object()), count=count, execution="kinematic"))
-
-
-def test_faults_and_macro_actions_are_counted_one_by_one(right: list[PlanResult]) -> None:
-    plans = [dataclasses.replace(right[number], faults=number) for number in range(4)]
-    found = summarise(plans)
-    assert (found["faults"], found["steps"], found["attempted"]) == (6, sum(plan.done for plan in plans), 4)
-
-
-def test_what_is_written_holds_every_plan(
-    wrong: list[PlanResult], right: list[PlanResult], tmp_path: Path, expected: Expected
-) -> None:
-    write_plans(tmp_path, wrong, TASK, {"commit": "abc"})
-    summary = summarise(wrong)
-    outcomes = [plan.outcome for plan in (*wrong, *right)]
-    written = [(tmp_path / name).read_text() for name in ("plans.csv", "summary.json")]
-    expected("plans", "\n".join([*written, *outcomes, rounded(summarise(right))]))
-    rows = (tmp_path / "plans.csv").read_text().splitlines()
-    assert len(rows) == 13 and rows[0].startswith("plan,start,shortest,planned,done,solved,optimal,refused")
-    kept = json.loads((tmp_path / "summary.json").read_text())
-    assert kept["commit"] == "abc" and kept["solved"] == summary["solved"] == sum(
-        row.split(",")[5] == "1" for row in rows
-    )
-    assert (tmp_path / "failed.png").is_file() and summary["solved"] < len(wrong)
-    (tmp_path / "recording.rrd").write_text("old")
-    write_plans(tmp_path, right[:1], TASK, {})
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["plans.csv", "plans.png", "summary.json"]
-
-
-def test_the_recording_shows_the_same_plans_and_the_arm_moves(
-    right: list[PlanResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    dreamer = optimal()
-
-    def env_for(*arguments: Any) -> Any:
-        dreamer.env = make_env(*arguments)
-        return dreamer.env
-
-    monkeypatch.setattr("imagine_bench.recording.plans.make_env", env_for)
-    path = tmp_path / "recording.rrd"
-    record_plans(trained(dreamer), count=2, execution="physics", max_epistemic=None, path=path)
-    timelines = contents(path)
-    for entity in ("/real/frame", "/imagined/frame", "/imagined/filmstrip", "/real/text", "/scene/right_l3"):
-        assert timelines[entity] >= {"sim_time", "env_step", "plan"}
-
-    def rows(entity: str) -> int:
-        return sum(chunk.num_rows for chunk in RrdReader(path).stream() if chunk.entity_path == entity)
-
-    steps = sum(plan.done for plan in right[:2])
-    assert rows("/real/frame") == steps + 2, "the physical arm solves the same plans"
-    assert rows("/scene/right_l3") > 20 * steps, "the arm must be seen moving"
-    said = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == "/real/text"]
-    texts = [str(text) for batch in said for (text,) in batch.column("TextDocument:text").to_pylist()]
-    done = [sum(line.endswith(" done") for line in text.splitlines()) for text in texts]
-    assert sorted(done) == sorted(number for plan in right[:2] for number in range(plan.done + 1))
 
 
 def test_plans_with_another_bound_or_number_lie_in_folders_of_their_own(tmp_path: Path) -> None:

@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
 import pytest
-from fake_reader import BlindReader
-from imagine_bench.agents.world_models.limits import Exact
-from judged import STILL, JudgedWorld, judged_world
-from numpy.typing import NDArray
+from judged import STILL, Altered, JudgedWorld, asked_pairs, judged_world
 
+from imagine_bench.arrays import Ints
 from imagine_bench.interfaces import Frame, Rules, State
 from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge import questions
-from imagine_bench.judge.predictions import evaluate
 from imagine_bench.judge.questions import FRAMES
-from imagine_bench.judge.scores import (
-    after_the_end_scores,
-    by_depth,
-    filter_scores,
-    one_step_scores,
-    ranking_scores,
-)
+from imagine_bench.judge.scores import after_the_end_scores, by_depth, filter_scores, one_step_scores, ranking_scores
 
 ERRORS = (
     *("total_variation", "missed", "invented", "nothing", "outcome_ece", "outcome_brier", "reward_error", "reward_ece"),
@@ -119,109 +109,6 @@ def test_copy_loses_what_always_doing_the_same_loses() -> None:
     assert math.isnan(ranked["regret"]) and ranked["regret_ruled"] > 0.0
 
 
-class Changed(Exact):
-    """Exact, but for the fields that are changed."""
-
-    def __init__(self, world: JudgedWorld, **changes: float | None) -> None:
-        super().__init__(world.spec, world.index)
-        self.changes = changes
-
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        found = super().imagine(frames, actions, samples, rng)
-        shape = found.pictures.shape[:3]
-        given = {name: None if value is None else np.full(shape, value) for name, value in self.changes.items()}
-        return dataclasses.replace(found, **given)
-
-
-def test_a_model_that_expects_the_end_everywhere_is_charged_for_its_haste() -> None:
-    """Its own probability of an end decides its plans: it takes the largest reward at once."""
-    world = judged_world(ARROWS)
-    rules = world.spec.rules
-
-    def hasty(state: State) -> list[int]:
-        rewards = [sum(o.probability * o.reward for o in rules.outcomes(state, a)) for a in range(rules.n_actions)]
-        return [int(np.argmax(rewards))]
-
-    found = short(world, Changed(world, p_ended=1.0))
-    assert found["value_loss_by_start"] == pytest.approx(losses(world, hasty))
-    assert found["worst_value_loss"] == pytest.approx(max(losses(world, hasty)))
-    assert found["value_loss"] == pytest.approx(np.mean(losses(world, hasty))) and found["value_loss"] > 1.0
-    assert found["value_loss_ruled"] == 0.0, "it imagines the right macrostates"
-
-
-@pytest.mark.parametrize("left_out", ["rewards", "p_ended"])
-def test_what_is_left_out_is_a_dash_and_the_rules_stand_in_beside_it(left_out: str) -> None:
-    world = judged_world(ARROWS)
-    scores = world.scores(Changed(world, **{left_out: None}))
-    assert math.isnan(scores["value_loss"]) and scores["value_loss_by_start"] == []
-    assert math.isnan(scores["worth_of_refusing"])
-    assert math.isnan(scores["regret"]) == (left_out == "rewards")
-    assert scores["value_loss_ruled"] == scores["regret_ruled"] == 0.0
-
-
-class Drawing(Exact):
-    """Draws futures: with probability ``mistaken`` that nothing happens, else one of those that the rules allow."""
-
-    def __init__(self, world: JudgedWorld, mistaken: float = 0.0, seed: int = 0) -> None:
-        super().__init__(world.spec, world.index)
-        self.mistaken = mistaken
-        self.rng = np.random.default_rng(seed)
-
-    def probabilities(self, frames: Frame, actions: NDArray[np.int64]) -> Imagined:
-        """The same as probabilities, the last future being that nothing happens."""
-        found = super().imagine(frames, actions, 1, np.random.default_rng(0))
-        weights = np.asarray(found.probabilities) * (1.0 - self.mistaken)
-        still = np.broadcast_to(frames[:, None, -1:], (len(frames), 1, *found.pictures.shape[2:]))
-        mistakes = np.full((len(frames), 1, weights.shape[2]), self.mistaken)
-        images = np.concatenate([found.pictures, still], axis=1)
-        return Imagined(pictures=images, probabilities=np.concatenate([weights, mistakes], axis=1))
-
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        held = self.probabilities(frames, actions)
-        upto = np.asarray(held.probabilities).cumsum(axis=1)[:, None]  # [N, 1, F, D]
-        del rng
-        draws = self.rng.random((len(frames), samples, 1, upto.shape[3])) * upto[:, :, -1:]
-        chosen = (draws >= upto).sum(axis=2)  # [N, S, D]
-        rows, _, steps = np.ix_(*map(np.arange, chosen.shape))
-        return Imagined(pictures=held.pictures[rows, chosen, steps])
-
-
-class Giving(Drawing):
-    """The same probabilities, given."""
-
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        return self.probabilities(frames, actions)
-
-
-@pytest.mark.parametrize("mistaken", [0.0, 0.3])
-def test_a_model_that_draws_is_comparable_with_one_that_gives_probabilities(mistaken: float) -> None:
-    """Without bias: total variation tells them apart, the unbiased score does not."""
-    world = judged_world("arrows:cubes=2,slip=0.2")
-    asked = world.rollouts
-    shown = asked.frames.shape[1]
-    asked = dataclasses.replace(
-        asked, actions=asked.actions[:, : shown + 2], truth=tuple(steps[:3] for steps in asked.truth)
-    )
-    drawing = [by_depth(asked, world.predictions(Drawing(world, mistaken, seed), asked, 8)) for seed in range(8)]
-    given = by_depth(asked, world.predictions(Giving(world, mistaken), asked))
-    mean = {name: np.mean([each[name] for each in drawing], axis=0) for name in given}
-    assert mean["unbiased_by_depth"] == pytest.approx(given["unbiased_by_depth"], abs=0.01)
-    assert min(mean["tv_by_depth"] - given["tv_by_depth"]) > 0.01
-    assert given["perfect_by_depth"] == [0.0] * 3
-    if not mistaken:
-        assert mean["tv_by_depth"] == pytest.approx(mean["perfect_by_depth"], abs=0.01)
-        assert given["tv_by_depth"] == pytest.approx([0.0] * 3, abs=1e-12)
-        assert mean["perfect_by_depth"][0] == pytest.approx(0.117, abs=0.001)
-
-
-def test_a_brier_score_is_a_mean_over_questions_however_many_guesses_each_has() -> None:
-    """Half of the probability on the truth, half on an impossible outcome: 1/4 + 1/4 a question."""
-    world = judged_world(ARROWS)
-    scores = world.scores(Giving(world, 0.5))
-    assert scores["outcome_brier"] == scores["unbiased"] == pytest.approx(0.5)
-    assert scores["total_variation"] == pytest.approx(0.5)
-
-
 def test_after_the_end_is_what_no_training_contains() -> None:
     world = judged_world(ARROWS)
     rules = world.spec.rules
@@ -240,37 +127,138 @@ def test_after_the_end_is_what_no_training_contains() -> None:
     assert all(map(math.isnan, after_the_end_scores(None, None, world.predictions(STILL, world.one_step)).values()))
 
 
-class Mistaken(Exact):
-    """Exact, but for some transitions, of which it says that nothing comes; it is unsure of those alone."""
+def test_skill_is_what_is_discarded_rightly_less_what_wrongly() -> None:
+    away = np.array([1.0, 1.0, 0.0, 0.0, 0.0])
+    epistemic = np.array([0.9, 0.3, 0.5, 0.1, 0.1])
+    found = filter_scores(epistemic, epistemic <= 0.4, away)
+    assert found["filter_keeps"] == pytest.approx(3 / 5) and found["filter_error"] == pytest.approx(1 / 3)
+    assert found["filter_skill"] == pytest.approx(1 / 2 - 1 / 3)
+    assert found["best_skill"] == pytest.approx(1 - 1 / 3)  # between 0.1 and 0.3
+    assert filter_scores(-epistemic, None, away)["best_skill"] == 0.0  # to discard nothing
+    assert math.isnan(filter_scores(epistemic, None, np.zeros(5))["best_skill"])
 
-    def __init__(self, world: JudgedWorld, wrong: set[tuple[State, int]]) -> None:
-        super().__init__(world.spec, world.index)
-        self.wrong = wrong
 
-    def imagine(self, frames: Frame, actions: NDArray[np.int64], samples: int, rng: np.random.Generator) -> Imagined:
-        right = super().imagine(frames, actions, samples, rng)
-        pairs = zip([self.renderer.shows(frame) for frame in frames[:, -1]], actions[:, 0].tolist(), strict=True)
-        wrong = np.array([pair in self.wrong for pair in pairs])
-        images = right.pictures.copy()
-        images[wrong] = frames[wrong, -1][:, None, None]
-        unsure = np.broadcast_to(wrong[:, None], (len(frames), images.shape[2]))
-        assert right.rewards is not None and right.p_ended is not None
-        known = ~wrong[:, None, None]
+# Models with planted mistakes --------------------------------------------------------------------------------------
+
+
+def changed(world: JudgedWorld, **changes: float | None) -> Altered:
+    """Exact, but for the fields that are changed."""
+
+    def alter(found: Imagined, *_: object) -> Imagined:
+        shape = found.pictures.shape[:3]
         return dataclasses.replace(
-            right,
-            pictures=images,
-            rewards=right.rewards * known,
-            p_ended=right.p_ended * known,
-            epistemic=unsure.astype(np.float64),
-            accepted=~unsure,
+            found, **{name: None if value is None else np.full(shape, value) for name, value in changes.items()}
         )
+
+    return Altered(world, alter)
+
+
+def test_a_model_that_expects_the_end_everywhere_is_charged_for_its_haste() -> None:
+    """Its own probability of an end decides its plans: it takes the largest reward at once."""
+    world = judged_world(ARROWS)
+    rules = world.spec.rules
+
+    def hasty(state: State) -> list[int]:
+        rewards = [sum(o.probability * o.reward for o in rules.outcomes(state, a)) for a in range(rules.n_actions)]
+        return [int(np.argmax(rewards))]
+
+    found = short(world, changed(world, p_ended=1.0))
+    lost = losses(world, hasty)
+    assert found["value_loss_by_start"] == pytest.approx(lost)
+    assert found["worst_value_loss"] == pytest.approx(max(lost))
+    assert found["value_loss"] == pytest.approx(np.mean(lost)) and found["value_loss"] > 1.0
+    assert found["value_loss_ruled"] == 0.0, "it imagines the right macrostates"
+
+
+@pytest.mark.parametrize("left_out", ["rewards", "p_ended"])
+def test_what_is_left_out_is_a_dash_and_the_rules_stand_in_beside_it(left_out: str) -> None:
+    world = judged_world(ARROWS)
+    scores = world.scores(changed(world, **{left_out: None}))
+    assert math.isnan(scores["value_loss"]) and scores["value_loss_by_start"] == []
+    assert math.isnan(scores["worth_of_refusing"])
+    assert math.isnan(scores["regret"]) == (left_out == "rewards")
+    assert scores["value_loss_ruled"] == scores["regret_ruled"] == 0.0
+
+
+def giving(world: JudgedWorld, mistaken: float) -> Altered:
+    """Says with probability ``mistaken`` that nothing happens, else what the rules allow."""
+
+    def alter(found: Imagined, frames: Frame, _: Ints) -> Imagined:
+        assert found.probabilities is not None
+        still = np.broadcast_to(frames[:, None, -1:], (len(frames), 1, *found.pictures.shape[2:]))
+        weights = np.insert(found.probabilities * (1.0 - mistaken), found.pictures.shape[1], mistaken, axis=1)
+        return Imagined(pictures=np.concatenate([found.pictures, still], axis=1), probabilities=weights)
+
+    return Altered(world, alter)
+
+
+class Drawing:
+    """Draws its futures from those that another model gives with their probabilities."""
+
+    def __init__(self, given: WorldModel, seed: int) -> None:
+        self.given = given
+        self.rng = np.random.default_rng(seed)
+
+    def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
+        held = self.given.imagine(frames, actions, 1, rng)
+        upto = np.asarray(held.probabilities).cumsum(axis=1)[:, None]  # [N, 1, F, D]
+        draws = self.rng.random((len(frames), samples, 1, upto.shape[3])) * upto[:, :, -1:]
+        chosen = (draws >= upto).sum(axis=2)  # [N, S, D]
+        rows, _, steps = np.ix_(*map(np.arange, chosen.shape))
+        return Imagined(pictures=held.pictures[rows, chosen, steps])
+
+
+@pytest.mark.parametrize("mistaken", [0.0, 0.3])
+def test_a_model_that_draws_is_comparable_with_one_that_gives_probabilities(mistaken: float) -> None:
+    """Without bias: total variation tells them apart, the unbiased score does not."""
+    world = judged_world("arrows:cubes=2,slip=0.2")
+    whole = world.rollouts
+    upto = whole.frames.shape[1] + 2
+    asked = dataclasses.replace(whole, actions=whole.actions[:, :upto], truth=tuple(each[:3] for each in whole.truth))
+    model = giving(world, mistaken)
+    given = by_depth(asked, world.predictions(model, asked))
+    drawing: Any = [by_depth(asked, world.predictions(Drawing(model, seed), asked, 8)) for seed in range(8)]
+    mean = {name: np.mean([each[name] for each in drawing], axis=0) for name in given}
+    assert mean["unbiased_by_depth"] == pytest.approx(given["unbiased_by_depth"], abs=0.01)
+    assert min(mean["tv_by_depth"] - given["tv_by_depth"]) > 0.01
+    assert given["perfect_by_depth"] == [0.0] * 3
+    if not mistaken:
+        assert mean["tv_by_depth"] == pytest.approx(mean["perfect_by_depth"], abs=0.01)
+        assert given["tv_by_depth"] == pytest.approx([0.0] * 3, abs=1e-12)
+        assert mean["perfect_by_depth"][0] == pytest.approx(0.117, abs=0.001)
+
+
+def test_a_brier_score_is_a_mean_over_questions_however_many_guesses_each_has() -> None:
+    """Half of the probability on the truth, half on an impossible outcome: 1/4 + 1/4 a question."""
+    world = judged_world(ARROWS)
+    scores = world.scores(giving(world, 0.5))
+    assert scores["outcome_brier"] == scores["unbiased"] == pytest.approx(0.5)
+    assert scores["total_variation"] == pytest.approx(0.5)
+
+
+def mistaken(world: JudgedWorld, wrong: Collection[tuple[State, int]]) -> Altered:
+    """Says of some transitions that nothing comes; it is unsure of those alone."""
+
+    def alter(right: Imagined, frames: Frame, actions: Ints) -> Imagined:
+        missed = np.array([pair in wrong for pair in asked_pairs(world, frames, actions)])
+        images = right.pictures.copy()
+        images[missed] = frames[missed, -1][:, None, None]
+        unsure = np.broadcast_to(missed[:, None], (len(frames), images.shape[2]))
+        assert right.rewards is not None and right.p_ended is not None
+        known = ~missed[:, None, None]
+        return dataclasses.replace(
+            right, pictures=images, rewards=right.rewards * known, p_ended=right.p_ended * known,
+            epistemic=unsure.astype(np.float64), accepted=~unsure,
+        )  # fmt: skip
+
+    return Altered(world, alter)
 
 
 def test_known_mistakes_are_charged_exactly() -> None:
     world = judged_world(ARROWS)
     pairs = list(dict.fromkeys(world.one_step.pairs))
     wrong = {pairs[index] for index in (3, 11, 20)}
-    scores = world.scores(Mistaken(world, wrong))
+    scores = world.scores(mistaken(world, wrong))
     share = len(wrong) / len(pairs)
     for name in ("total_variation", "missed", "invented", "outcome_ece"):
         assert scores[name] == pytest.approx(share)
@@ -284,84 +272,53 @@ def test_a_filter_is_worth_what_its_mistakes_cost() -> None:
     """A model that expects nothing bad of breaking a rule; its filter discards just that."""
     world = judged_world(ARROWS)
     ends = {
-        (state, action)
-        for state, action in world.one_step.pairs
-        if any(o.terminated and not o.success for o in world.spec.rules.outcomes(state, action))
+        pair
+        for pair in world.one_step.pairs
+        if any(o.terminated and not o.success for o in world.spec.rules.outcomes(*pair))
     }
-    scores = world.scores(Mistaken(world, ends))
+    scores = world.scores(mistaken(world, ends))
     assert scores["worth_of_filter"] == pytest.approx(scores["value_loss"]) and scores["value_loss"] > 1.0
     assert 0.0 < scores["worth_of_refusing"] <= scores["worth_of_filter"] + 1e-9
 
 
-def test_skill_is_what_is_discarded_rightly_less_what_wrongly() -> None:
-    away = np.array([1.0, 1.0, 0.0, 0.0, 0.0])
-    epistemic = np.array([0.9, 0.3, 0.5, 0.1, 0.1])
-    found = filter_scores(epistemic, epistemic <= 0.4, away)
-    assert found["filter_keeps"] == pytest.approx(3 / 5) and found["filter_error"] == pytest.approx(1 / 3)
-    assert found["filter_skill"] == pytest.approx(1 / 2 - 1 / 3)
-    assert found["best_skill"] == pytest.approx(1 - 1 / 3)  # between 0.1 and 0.3
-    assert filter_scores(-epistemic, None, away)["best_skill"] == 0.0  # to discard nothing
-    assert math.isnan(filter_scores(epistemic, None, np.zeros(5))["best_skill"])
-
-
 def test_rewards_are_judged_as_outcomes() -> None:
     world = judged_world("pick_place")
-
-    class Greedy(Exact):
-        def imagine(self, *given: Any) -> Imagined:
-            found = super().imagine(*given)
-            return dataclasses.replace(found, rewards=np.full(found.pictures.shape[:3], 4.9))
-
-    scores = world.scores(Greedy(world.spec, world.index))
+    scores = world.scores(changed(world, rewards=4.9))
     wrong = [not any(reward == 5.0 for _, reward in steps[0].values()) for steps in world.one_step.truth]
     assert scores["reward_ece"] == pytest.approx(np.mean(wrong))
     assert scores["reward_brier"] == pytest.approx(2.0 * np.mean(wrong))
 
 
-def test_the_cost_of_imagining_is_that_of_all_batches() -> None:
-    """By a clock that ticks once whenever it is read."""
-    world, ticks = judged_world(ARROWS), itertools.count()
-    reader = BlindReader(len(world.spec.macrostate_names))
-    how = {"samples": 2, "reader": reader, "index": world.index, "rng": np.random.default_rng(0)}
-    found = evaluate(STILL, "it", world.one_step, **how, cpu_clock=lambda: float(next(ticks)))
-    assert found.cpu_s == next(ticks) / 2 > 1.0
-
-
 def test_rewards_of_a_later_step_are_judged_from_where_it_began() -> None:
     """Of a model that imagines one possible future: the rules' rewards for its macrostates are its own."""
     world = judged_world("pick_place")
-    rules = world.spec.rules
 
-    class OneFuture(Exact):
-        def imagine(self, frames: Frame, actions: NDArray[np.int64], *given: Any) -> Imagined:
-            shape = (len(frames), 1, actions.shape[1])
-            images, rewards = np.zeros((*shape, *frames.shape[2:]), dtype=np.uint8), np.zeros(shape)
-            for row, step in np.ndindex(actions.shape):
-                if step == 0:
-                    state, goes_on = self.renderer.shows(frames[row, -1]), 1.0
-                outcome = rules.outcomes(state, int(actions[row, step]))[-1]
-                images[row, 0, step] = self.renderer.frame(outcome.macrostate)
-                rewards[row, 0, step] = goes_on * outcome.reward
-                state, goes_on = outcome.macrostate, goes_on * (not outcome.terminated)
-            return Imagined(pictures=images, probabilities=np.ones(shape), rewards=rewards)
+    def one_future(found: Imagined, frames: Frame, actions: Ints) -> Imagined:
+        shape = (len(frames), 1, actions.shape[1])
+        images, rewards = np.zeros((*shape, *frames.shape[2:]), dtype=np.uint8), np.zeros(shape)
+        for row, (start, _) in enumerate(asked_pairs(world, frames, actions)):
+            state, over = start, False
+            for step, action in enumerate(actions[row].tolist()):
+                outcome = world.spec.rules.outcomes(state, action)[-1]
+                state = outcome.macrostate
+                images[row, 0, step] = world.index.frame(state)
+                rewards[row, 0, step] = 0.0 if over else outcome.reward
+                over = over or outcome.terminated
+        return Imagined(pictures=images, probabilities=np.ones(shape), rewards=rewards)
 
-    predictions = world.predictions(OneFuture(world.spec, world.index), world.ranked)
-    found = ranking_scores(world.spec, world.ranked, predictions)
+    found = ranking_scores(world.spec, world.ranked, world.predictions(Altered(world, one_future), world.ranked))
     assert found["regret"] == found["regret_ruled"] > 0.0
 
 
 def test_noise_is_told_apart_where_most_of_the_world_is_certain() -> None:
     """By an uncertainty that is 1 where several macrostates may follow, and 0 elsewhere."""
     world = judged_world("pick_place")
-    rules = world.spec.rules
 
-    class Knowing(Exact):
-        def imagine(self, frames: Frame, actions: NDArray[np.int64], *given: Any) -> Imagined:
-            found = super().imagine(frames, actions, *given)
-            pairs = zip([self.renderer.shows(frame) for frame in frames[:, -1]], actions[:, 0].tolist(), strict=True)
-            noisy = np.array([len(rules.outcomes(*pair)) > 1 for pair in pairs], dtype=np.float64)
-            return dataclasses.replace(found, aleatoric=np.repeat(noisy[:, None], found.pictures.shape[2], axis=1))
+    def knowing(found: Imagined, frames: Frame, actions: Ints) -> Imagined:
+        pairs = asked_pairs(world, frames, actions)
+        noisy = np.array([len(world.spec.rules.outcomes(*pair)) > 1 for pair in pairs], dtype=np.float64)
+        return dataclasses.replace(found, aleatoric=np.repeat(noisy[:, None], found.pictures.shape[2], axis=1))
 
     random = [len(steps[0]) > 1 for steps in world.one_step.truth]
     assert 0.0 < np.mean(random) < 0.5
-    assert world.scores(Knowing(world.spec, world.index))["auroc_noisy"] == 1.0
+    assert world.scores(Altered(world, knowing))["auroc_noisy"] == 1.0
