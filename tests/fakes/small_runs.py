@@ -30,9 +30,9 @@ from imagine_bench.store.run_folder import load_newest
 QUICK: dict[str, Any] = {"execution": "kinematic", "open_loop_starts": 0, "recorded_episodes": 0}
 
 
-def small(**changes: Any) -> Protocol:
+def small(task: str = "arrow_puzzle", **changes: Any) -> Protocol:
     few = {"agents": ("table",), "seeds": (0,), "budgets": (4, 9), "evaluation_episodes": 5, **QUICK}
-    return protocol("arrow_puzzle", "smoke", **{**few, **changes})
+    return protocol(task, "smoke", **{**few, **changes})
 
 
 def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress) -> RunResult | None:

@@ -122,6 +122,18 @@ def tests_by(hand: Any, episodes: Sequence[int] = range(TESTS)) -> EvaluationCou
     return played
 
 
+def mixed(sources: Sequence[EvaluationCounts]) -> EvaluationCounts:
+    """Test episodes, each as another source has it."""
+    merged = EvaluationCounts()
+    for test, source in enumerate(sources):
+        start = sum(source.lengths[:test])
+        merged.actions += source.actions[start : start + source.lengths[test]]
+        for name in ("starts", "lengths", "returns", "faults", "fingerprints", "sim_times_s"):
+            getattr(merged, name).append(getattr(source, name)[test])
+        merged.solved += source.solved[test]
+    return merged
+
+
 def training_by(hand: Any, seed: int, episodes: int) -> Counters:
     """Training episodes as ``hand`` plays them, with all that a run counts of them."""
     counters = Counters()

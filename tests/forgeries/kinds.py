@@ -20,12 +20,12 @@ from forging import (
     Remembering,
     Repeats,
     honest_bench,
+    mixed,
     tests_by,
     training_by,
 )
 
 from imagine_bench.running.bench import plan
-from imagine_bench.running.evaluation import EvaluationCounts
 
 
 class Donors:
@@ -380,15 +380,8 @@ def fail_otherwise(f: Forger, run: OpenRun, row: int) -> None:
     """Play failed tests anew by a random hand, and keep those that fail again."""
     old = run.tests(row)
     new = tests_by(Hand(0.0, f.rng))
-    merged = EvaluationCounts()
-    for test in range(TESTS):
-        source = new if (old.solved[test], new.solved[test]) == ("0", "0") else old
-        start = sum(source.lengths[:test])
-        merged.actions += source.actions[start : start + source.lengths[test]]
-        for name in ("starts", "lengths", "returns", "faults", "fingerprints", "sim_times_s"):
-            getattr(merged, name).append(getattr(source, name)[test])
-        merged.solved += source.solved[test]
-    run.set_tests(row, merged)
+    failed = [pair == ("0", "0") for pair in zip(old.solved, new.solved, strict=True)]
+    run.set_tests(row, mixed([new if each else old for each in failed]))
 
 
 def cheaper(row: dict[str, Any], how: str, factor: float) -> None:
