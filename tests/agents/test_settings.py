@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from typing import Any
 
 import pytest
@@ -93,12 +91,6 @@ def test_every_override_is_applied_allowed_and_has_a_reason(agent: str, group: s
     assert {setting for setting in flat if flat[setting] != published[setting]} == set(chosen.sets[name])
     own = {setting: value for setting, value in flat.items() if setting not in chosen.unused}
     assert hyperparameters.resolve("published", own, group) == hyperparameters.resolve(name, {}, group)
-
-
-def test_settings_load_no_torch() -> None:
-    named = {entry.settings.partition(":")[0] for entry in registry.agents().values()} - {""}
-    modules = ", ".join({*named, "imagine_bench_regression.settings"})
-    subprocess.run([sys.executable, "-c", f"import {modules}, sys; assert 'torch' not in sys.modules"], check=True)
 
 
 def test_sizes_that_no_network_has_are_refused() -> None:

@@ -15,7 +15,7 @@ import forging
 import numpy as np
 import pytest
 from forger import forged, rewrite_protocol, share_weights
-from forging import Hand, OpenRun, mixed
+from forging import OpenRun, mixed
 from small_runs import Inline, small
 
 from imagine_bench.cli import exit_code as main
@@ -65,7 +65,7 @@ def by_oracle(tests: int) -> Forge:
     """The first tests of every run are played by the oracle."""
 
     def change(run: OpenRun) -> None:
-        oracle = forging.tests_by(Hand(1.0, np.random.default_rng(0)))
+        oracle = forging.tests_by(forging.oracle())
         for row in (0, 1):
             run.set_tests(row, mixed([oracle] * tests + [run.tests(row)] * (8 - tests)))
 

@@ -9,11 +9,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import forging
 import numpy as np
 import pytest
 from forger import FORGERIES, IN_TRAINING, forged, mend, rewrite_protocol, share_weights
-from forging import Hand, OpenRun
+from forging import OpenRun, oracle
 from kinds import take_row
 from small_runs import Inline, small, written
 
@@ -25,7 +24,7 @@ from imagine_bench.report import bench_page
 from imagine_bench.report.page import texts
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.running.control import plan_control
-from imagine_bench.running.evaluation import EvaluationCounts, replay
+from imagine_bench.running.evaluation import EvaluationCounts, play_test_episode, replay
 from imagine_bench.running.retraining import Retraining
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import episode_seed
@@ -298,18 +297,19 @@ def test_two_seeds_may_learn_the_same_from_a_dataset_alone(tmp_path: Path, episo
     wanted, paths = plan_control("arrow_puzzle", "smoke", **few, **how, dataset=written(tmp_path / "set").folder)
     folder = bench(wanted, paths, root=tmp_path, launcher=Inline()).folder
     counts = EvaluationCounts()
-    solving = forging.tests_by(Hand(1.0, np.random.default_rng(0)), [0]).actions
+    first, *others = (episode_seed("evaluation", 0, test) for test in range(4))
     with environments(wanted, observation="state") as (_, env):
-        for test, actions in enumerate([solving, *[[1, 0, 3, 2, 5, 4] * 2] * 3]):
-            counts.add(replay(env, episode_seed("evaluation", 0, test), actions)[0])
+        counts.add(play_test_episode(env, oracle(), seed=first, privileged=True))
+        for seed in others:
+            counts.add(replay(env, seed, [1, 0, 3, 2, 5, 4] * 2)[0])
     for seed in (0, 1):
         run = OpenRun.read(folder / "table" / f"seed_{seed}")
         run.set_tests(0, counts)
         run.write()
     assert has_own_failures(counts.kept(), wanted)
-    first, second, *_ = verify(folder)
-    assert first.episodes == episodes - 6 + 4
-    assert not first.complaint and complaint in second.complaint and bool(complaint) == bool(second.complaint)
+    one, second, *_ = verify(folder)
+    assert one.episodes == episodes - 6 + 4
+    assert not one.complaint and complaint in second.complaint and bool(complaint) == bool(second.complaint)
 
 
 def test_an_episode_cut_off_before_its_end_is_found(pair: Path, replays: Replays, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, Observation
 from imagine_bench.interfaces.environments import Env
 from imagine_bench.protocols.control import Protocol, context_of
-from imagine_bench.protocols.data import Failure, Job, OnProgress, RunSpec
+from imagine_bench.protocols.data import Failure, Job, Launcher, OnProgress, RunSpec
 from imagine_bench.report import bench_page
 from imagine_bench.report.page import write_page
 from imagine_bench.running.bench import bench, plan
@@ -65,7 +65,7 @@ class Remembering:
         return tuple(failures)
 
 
-def honest_bench(root: Path, launcher: Remembering, **changes: Any) -> Path:
+def honest_bench(root: Path, launcher: Launcher, **changes: Any) -> Path:
     """A bench that ran as it says, two learners and the two that do not learn."""
     few: dict[str, Any] = {
         "agents": (*LEARNERS, "oracle", "random"),

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -16,10 +16,8 @@ import pytest
 from fake_reader import NO_ERRORS
 
 from imagine_bench import registry
-from imagine_bench.errors import BusyError
-from imagine_bench.judge import judgement
-from imagine_bench.judge.judgement import Judgement, judge
-from imagine_bench.store.files import lock, make_folder
+from imagine_bench.judge.judgement import Judgement
+from imagine_bench.store.files import make_folder
 
 pytestmark = pytest.mark.slow
 _MODEL = """
@@ -61,8 +59,8 @@ def _put_reader(root: Path) -> None:
     (folder / "reader.safetensors").write_bytes(reader.content())
 
 
-class Judge:
-    """The command in a process of its own, with a model that waits in its second fit."""
+class Command:
+    """``judge`` in processes of its own, with a model that waits in its second fit."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -73,25 +71,15 @@ class Judge:
         (facts / "entry_points.txt").write_text("[imagine_bench.world_models]\nwaits = waits:ENTRY\n")
         (folder / "waits.py").write_text(_MODEL)
 
-    def start(
-        self, out: str, *, waits_s: float, workers: int, seeds: Sequence[str] = ("0", "1")
-    ) -> subprocess.Popen[str]:
-        words = ["judge", "pick_place", "--models", "waits", "copy", "--sizes", "20", "40", "--seeds", *seeds]
-        words += ["--samples", "2", "--workers", str(workers), "--out", str(self.folder / out)]
+    def start(self, out: str, *, waits_s: float = 0.0, workers: int = 1) -> subprocess.Popen[str]:
+        words = "judge pick_place --models waits copy --sizes 20 40 --seeds 0 1 --samples 2".split()
+        words += ["--workers", str(workers), "--out", str(self.folder / out)]
         _put_reader(self.folder / out)
+        own = {"PYTHONPATH": str(self.folder), "BEGUN": str(self.begun), "WAITS_S": str(waits_s)}
         return subprocess.Popen(
-            [sys.executable, "-m", "imagine_bench", *words],
-            env={
-                **os.environ,
-                "PYTHONPATH": str(self.folder),
-                "BEGUN": str(self.begun),
-                "WAITS_S": str(waits_s),
-            },
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
+            [sys.executable, "-m", "imagine_bench", *words], env={**os.environ, **own}, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
 
     def waiting(self, judge: subprocess.Popen[str]) -> list[psutil.Process]:
         """All processes below it, once a model waits."""
@@ -101,25 +89,29 @@ class Judge:
             time.sleep(0.1)
         return psutil.Process(judge.pid).children(recursive=True)
 
-    def scores(self, out: str) -> dict[str, object]:
-        timed = ("fit_s", "imagine_s_per_1000", "seal")
-        found = {}
-        for file in (self.folder / out).glob("*/*-seed*.json"):
-            cell = json.loads(file.read_text())
-            found[file.name] = {name: value for name, value in cell.items() if name not in timed}
-        return found
+    def scores(self, out: str, *judges: subprocess.Popen[str]) -> dict[str, object]:
+        """All figures but times, once judgements have ended well."""
+        for judge in judges:
+            output, errors = judge.communicate(timeout=300)
+            assert judge.returncode == 0 and "copy the last frame" in output, errors
+            assert "Traceback" not in errors and "damaged" not in errors
+        cells = {file.name: json.loads(file.read_text()) for file in (self.folder / out).glob("*/*-seed*.json")}
+        for cell in cells.values():
+            for name in ("fit_s", "imagine_s_per_1000", "seal"):
+                del cell[name]
+        return cells
 
 
 @pytest.fixture
-def command(tmp_path: Path) -> Iterator[Judge]:
+def command(tmp_path: Path) -> Iterator[Command]:
     heed = signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background may ignore Ctrl-C
-    yield Judge(tmp_path)
+    yield Command(tmp_path)
     signal.signal(signal.SIGINT, heed)
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_it_ends_at_once_with_all_its_processes(command: Judge, workers: int, number: signal.Signals) -> None:
+def test_it_ends_at_once_with_all_its_processes(command: Command, workers: int, number: signal.Signals) -> None:
     judge = command.start("cut", waits_s=600.0, workers=workers)
     family = command.waiting(judge)
     assert len(family) > workers
@@ -131,56 +123,11 @@ def test_it_ends_at_once_with_all_its_processes(command: Judge, workers: int, nu
     assert judge.returncode == (130 if number == signal.SIGINT else -number) and "Traceback" not in errors
     if workers == 2 and number == signal.SIGKILL:
         assert len(command.scores("cut")) < 8
-        for out in ("cut", "whole"):
-            output = command.start(out, waits_s=0.0, workers=1).communicate(timeout=300)
-            assert "waits" in output[0], output
-        assert len(command.scores("whole")) == 8
-        assert command.scores("cut") == command.scores("whole"), "to the bit"
+        cut, whole = (command.scores(out, command.start(out)) for out in ("cut", "whole"))
+        assert len(whole) == 8 and cut == whole, "to the bit"
 
 
-def test_a_worker_that_is_killed_costs_one_cell(command: Judge) -> None:
-    judge = command.start("killed", waits_s=600.0, workers=2, seeds=("0",))
-    command.waiting(judge)
-    deadline_s = time.monotonic() + 200
-    while len(command.scores("killed")) < 3:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.1)
-    (worker,) = (each for each in psutil.Process(judge.pid).children() if each.children())
-    guests = worker.children(recursive=True)
-    worker.kill()
-    assert psutil.wait_procs([*guests, worker], timeout=30)[1] == []
-    output, errors = judge.communicate(timeout=300)
-    assert judge.returncode == 1 and "copy the last frame" in output
-    assert "World model waits: its process ended early with exit code -9 (-9: it was killed" in errors
-    assert len(command.scores("killed")) == 3
-
-
-def test_two_at_once_in_one_folder_share_its_cells_and_keep_the_figures_of_one(command: Judge) -> None:
-    for out in ("shared", "alone"):
-        judges = [command.start(out, waits_s=0.0, workers=1) for _ in range(2 if out == "shared" else 1)]
-        for process in judges:
-            output, errors = process.communicate(timeout=300)
-            assert process.returncode == 0 and "copy the last frame" in output, errors
-            assert "Traceback" not in errors and "damaged" not in errors
-    assert len(command.scores("alone")) == 8
-    assert command.scores("shared") == command.scores("alone"), "to the bit"
-
-
-def test_who_waits_too_long_for_another_judgement_is_told_which_process_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one = Judgement(task="arrows:cubes=1", models=("copy",), sizes=(5,), seeds=(0,), samples=1)
-    folder = make_folder(tmp_path / one.folder_name)
-    hold = "import sys, time; from pathlib import Path; from imagine_bench.store.files import lock\n"
-    hold += "with lock(Path(sys.argv[1]), 'it'):\n    print('held', flush=True)\n    time.sleep(600)"
-    holder = subprocess.Popen([sys.executable, "-c", hold, folder / ".lock"], stdout=subprocess.PIPE, text=True)
-    assert holder.stdout is not None and holder.stdout.readline() == "held\n"
-    monkeypatch.setattr(judgement, "_PATIENCE_S", 0.1)
-    try:
-        with pytest.raises(BusyError, match=rf"^The folder .* is in use by process {holder.pid} on .*; wait for it,"):
-            judge(one, tmp_path, workers=1)
-    finally:
-        holder.kill()
-        holder.communicate()
-    with lock(folder / ".lock", "it"):
-        pass  # the system let go of it
+def test_two_at_once_in_one_folder_share_its_cells_and_keep_the_figures_of_one(command: Command) -> None:
+    shared = command.scores("shared", *[command.start("shared") for _ in range(2)])
+    alone = command.scores("alone", command.start("alone"))
+    assert len(alone) == 8 and shared == alone, "to the bit"

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
 from judged import STILL, judged_world, labelled
 
+from imagine_bench.arrays import Ints
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.exact.changed_rules import slipping
 from imagine_bench.interfaces import State
@@ -38,7 +39,7 @@ from imagine_bench.rules import Dynamics, Rules, states_of_play
 
 SLIPS = "arrows:cubes=2,slip=0.2"
 TASKS = pytest.mark.parametrize("task", [SLIPS, "pick_place"])
-Law = dict[State, float]
+Law = Mapping[State, float]
 
 
 @functools.cache
@@ -55,60 +56,58 @@ class ByHand:
         self.asked = asked_of(task)
         self.names = self.asked.states
         self.alive = set(states_of_play(self.rules))
+        self.slips = slipping(self.rules)
 
     def law(self, state: State, action: int, dynamics: Dynamics | None = None) -> Law:
-        found: Law = {}
+        found = Counter[State]()
         for each in (dynamics or self.rules.outcomes)(state, action):
-            found[each.macrostate] = found.get(each.macrostate, 0.0) + each.probability
+            found[each.macrostate] += each.probability  # type: ignore[assignment]
         return found
 
     def masked_frame(self, of: MaskedFrames, row: int) -> list[float]:
-        start, action = self.names[of.first.states[row]], int(of.first.actions[row])
+        first = self.law(self.names[of.first.states[row]], int(of.first.actions[row]))
         then, last = int(of.actions[row]), self.names[of.reached[row]]
         middles = [self.names[each] for each in of.options[row]]
-        return [self.law(start, action).get(m, 0.0) * self.law(m, then).get(last, 0.0) for m in middles]
+        return [first[middle] * self.law(middle, then)[last] for middle in middles]
 
     def best_chance(self, state: State, goal: State, left: int) -> float:
         if left == 0 or state not in self.alive:
             return 0.0
-        ways = [
+        return max(
             sum(p * (1.0 if s == goal else self.best_chance(s, goal, left - 1)) for s, p in self.law(state, a).items())
             for a in range(self.rules.n_actions)
-        ]
-        return max(ways)
+        )
 
     def shortest_plan(self, of: ShortestPlans, row: int) -> list[float]:
         pair = self.names[of.starts[row]], self.names[of.goals[row]]
-        enough = [
-            n for n in itertools.takewhile(lambda n: n < 4, itertools.count(1)) if self.best_chance(*pair, n) >= 0.5
-        ]
+        enough = next((n for n in (1, 2, 3) if self.best_chance(*pair, n) >= 0.5), None)
         assert enough or of.options[row].max() > 3
-        return [float(bool(enough) and option == enough[0]) for option in of.options[row]] if enough else []
+        return [float(option == enough) for option in of.options[row]] if enough else []
+
+    def yes(self, chance: float, options: Ints) -> list[float]:
+        return [chance if option == YES else 1.0 - chance for option in options]
 
     def reachability(self, of: Reachability, row: int) -> list[float]:
         if of.within[row] > 3:
             return []
-        yes = self.best_chance(self.names[of.starts[row]], self.names[of.goals[row]], int(of.within[row]))
-        return [yes if option == YES else 1.0 - yes for option in of.options[row]]
+        chance = self.best_chance(self.names[of.starts[row]], self.names[of.goals[row]], int(of.within[row]))
+        return self.yes(chance, of.options[row])
 
     def steps(self, of: TwoWorlds | ChangedRule | LuckAlone, row: int) -> list[tuple[State, int, State]]:
-        shown = of.shown
-        found = zip(shown.states[row], shown.actions[row], shown.reached[row], strict=True)
+        found = zip(of.shown.states[row], of.shown.actions[row], of.shown.reached[row], strict=True)
         return [(self.names[s], int(a), self.names[r]) for s, a, r in found]
 
     def which_of_two_worlds(self, of: TwoWorlds, row: int) -> list[float]:
-        slips = slipping(self.rules)
         worlds = [
-            math.prod(self.law(s, a, world).get(r, 0.0) for s, a, r in self.steps(of, row))
-            for world in (self.rules.outcomes, slips)
+            math.prod(self.law(s, a, world)[r] for s, a, r in self.steps(of, row)) for world in (None, self.slips)
         ]
         return [worlds[option] for option in of.options[row]]
 
     def luck_alone(self, of: LuckAlone, row: int) -> list[float]:
         steps = self.steps(of, row)
-        luck = [self.law(s, a, slipping(self.rules)).get(r, 0.0) for s, a, r in steps]
+        luck = [self.law(s, a, self.slips)[r] for s, a, r in steps]
         others = range(self.rules.n_actions)
-        meddled = [np.mean([self.law(s, b).get(r, 0.0) for b in others if b != a]) for s, a, r in steps]
+        meddled = [np.mean([self.law(s, b)[r] for b in others if b != a]) for s, a, r in steps]
         once = [meddled[i] * math.prod(luck[:i] + luck[i + 1 :]) for i in range(len(steps))]
         return [math.prod(luck) if option == YES else float(np.mean(once)) for option in of.options[row]]
 
@@ -117,26 +116,22 @@ class ByHand:
         before, after = [], []
         for state, action, reached in self.steps(of, row):
             usual = self.law(state, action)
-            before.append(usual.get(reached, 0.0))
-            both = [
-                p * (self.law(s, other) if s in self.alive else {s: 1.0}).get(reached, 0.0) for s, p in usual.items()
-            ]
+            both = [p * (self.law(s, other)[reached] if s in self.alive else s == reached) for s, p in usual.items()]
+            before.append(usual[reached])
             after.append(sum(both) if action == one else before[-1])
         return [math.prod(before[:n] + after[n:]) for n in of.options[row]]
 
     def single_cause_pairs(self, of: SingleCausePairs, row: int) -> list[float]:
         law = self.law(self.names[of.shown.states[row, 1]], int(of.shown.actions[row, 1]))
-        return [law.get(self.names[option], 0.0) for option in of.options[row, 1]]
+        return [law[self.names[option]] for option in of.options[row, 1]]
 
     def must_it_change(self, of: FactorsChanged, row: int) -> list[float]:
-        values: list[dict[int, float]] = [{}, {}]
-        shown = of.pairs.shown
+        shown, values = of.pairs.shown, (Counter[int](), Counter[int]())
         for member, start in zip(values, shown.states[of.rows[row]], strict=True):
             for state, p in self.law(self.names[start], int(shown.actions[of.rows[row], 0])).items():
-                value = state[of.factors[row]]
-                member[value] = member.get(value, 0.0) + p
-        apart = 0.5 * sum(abs(values[0].get(v, 0.0) - values[1].get(v, 0.0)) for v in {*values[0], *values[1]})
-        return [apart if option == YES else 1.0 - apart for option in of.options[row]]
+                member[state[of.factors[row]]] += p  # type: ignore[assignment]
+        one, other = values
+        return self.yes(0.5 * sum(abs(one[value] - other[value]) for value in {*one, *other}), of.options[row])
 
 
 @pytest.mark.parametrize("task", [SLIPS, "pick_place", "arrows:cubes=3"])

@@ -1,4 +1,4 @@
-"""Encoders: the VAE's mathematics, the artefact, training."""
+"""Encoders: the VAE's mathematics, the artefact, training, and the command that trains one anew."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import pytest
 import torch
 from encoder_frames import CHAPTER_5, QUICK, TINY, TINY_CONV, arrow_spec, draw
 from imagine_bench.agents.encoders import perception, training
+from imagine_bench.agents.encoders.cli import retrain
 from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard
-from imagine_bench.agents.encoders.probe import Latents, Probe, accuracy, train_probe
 from imagine_bench.agents.encoders.recipes import Recipe, recipe_named
 from imagine_bench.agents.encoders.training import (
     beta_at,
@@ -27,6 +27,7 @@ from imagine_bench.agents.encoders.training import (
 )
 from imagine_bench.agents.encoders.vae import Vae, build_vae, kl_from_standard_normal, standardise
 from imagine_bench.agents.networks.mlp import initialise
+from PIL import Image
 from safetensors.torch import load_file, save
 from torch import Tensor
 
@@ -166,27 +167,11 @@ def test_beta_warms_up_and_the_thesis_has_no_schedule() -> None:
     assert {learning_rate_at(CHAPTER_5["thesis"], step) for step in (0, 49_999)} == {5e-4}
 
 
-# --- the probe -------------------------------------------------------------------------------------------------------
-
-
 def test_every_frame_has_a_draw_of_its_own() -> None:
     latents = Latents(torch.tensor([[1.0, -2.0]]).expand(4000, 2), torch.tensor([[0.5, 3.0]]).expand(4000, 2))
     drawn = latents.sample(torch.Generator().manual_seed(0))
     assert torch.allclose(drawn.mean(dim=0), latents.mu[0], atol=0.2)
     assert torch.allclose(drawn.std(dim=0), latents.sigma[0], rtol=0.05)
-
-
-@pytest.mark.parametrize("clear", [True, False])
-def test_probe_reads_separable_latents_and_not_noise(clear: bool) -> None:
-    rng = np.random.default_rng(0)
-    labels = rng.integers([4, 3], size=(600, 2))
-    angle = labels[:, 0] * np.pi / 2
-    told = np.stack([np.cos(angle), np.sin(angle), labels[:, 1]], axis=1) * 3
-    mu = torch.from_numpy(told if clear else rng.normal(size=told.shape)).float()
-    probe, train = Probe(3, (4, 3), hidden=16), Latents(mu[:400], torch.full((400, 3), 0.2))
-    train_probe(probe, train, labels[:400], steps=300, generator=torch.Generator().manual_seed(0))
-    score = accuracy(probe, mu[400:], labels[400:])
-    assert score == 1.0 if clear else score < 0.25  # chance is 1 / 12
 
 
 # --- training --------------------------------------------------------------------------------------------------------
@@ -336,3 +321,44 @@ def test_a_full_memory_of_frames_forgets_the_oldest(tiny: Encoder, monkeypatch: 
     for frame in shown:
         assert torch.equal(sees.posterior(frame)[0], tiny.encode(frame[None])[0][0])
     assert [frame.tobytes() for frame in shown[2:]] == list(sees._recent)
+
+
+def made(out: Path, recipe: Any = QUICK, appearance: str = "mild", **how: Any) -> str:
+    return retrain(arrow_spec(), recipe=recipe, appearance=appearance, seed=1, out=out, **how)
+
+
+def test_retrain_leaves_three_files_and_never_overwrites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "SAVE_EVERY_S", 0.0)
+    monkeypatch.setitem(CHAPTER_5, "quick", QUICK)
+    text = made(tmp_path, "quick", batch=9, latents=11)
+    path = tmp_path / "drawn_arrows-mild.safetensors"
+    card = Encoder.load(path).card
+    assert f"Wrote {path}" in text
+    assert f"mlp {card.probe['mlp']:.2%}" in text
+    assert (card.recipe.steps, card.recipe.batch, card.recipe.latents) == (QUICK.steps, 9, 11)
+    command = "imagine-bench encoder --task drawn_arrows --appearance mild --recipe quick --seed 1"
+    assert card.command == f"{command} --batch 9 --latents 11"
+    with Image.open(path.with_suffix(".png")) as sheet:
+        assert np.asarray(sheet).std() > 20
+        assert sheet.width > 1000
+    written = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    assert len(written) == 3
+    with pytest.raises(ArtefactError, match="exists already and is never overwritten"):
+        made(tmp_path)
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == written
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"recipe": "defualt"}, r"No encoder recipe 'defualt'. Did you mean 'default'"),
+        ({"appearance": "x"}, "Known: clean, mild, strong"),
+        ({"latents": 0}, "needs latents, frames"),
+        ({"recipe": "codes", "steps": 1, "latents": 11}, r"gradient steps; leave out --steps 1 --latents 11\."),
+        ({"recipe": "codes", "device": "cuda"}, "leave out --device cuda"),
+    ],
+)
+def test_wrong_choices_are_named_before_anything_is_made(tmp_path: Path, how: dict[str, Any], message: str) -> None:
+    with pytest.raises((InvalidValueError, UnknownNameError), match=message):
+        made(tmp_path / "new", **how)
+    assert not (tmp_path / "new").exists()

@@ -131,19 +131,3 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make) -> None:  #
     first, second = (live(each, range(5), np.random.default_rng(1)) for each in (learner, resumed))
     assert first == second and same(learner.state(), resumed.state())
     assert not any(np.array_equal(before[name], learner.state().arrays[name]) for name in kept), "it goes on learning"
-
-
-@pytest.mark.parametrize(
-    ("model", "settings", "steps", "predicted"),
-    [({"end_at": 2}, {}, 2, 2), ({"uncertain_at": 4}, {"threshold_quantile": 1.0, "threshold": 99.0}, 3, 4)],
-)
-def test_an_imagined_episode_goes_on_until_its_end_or_what_is_uncertain(
-    model: dict[str, int], settings: dict[str, Any], steps: int, predicted: int
-) -> None:
-    agent = practising(CountingModel(**model), filtered=True, **settings)
-    for episode in (1, 2):
-        agent.train_in_model()
-        assert agent.imagined_steps == agent.imagined.added == steps * episode
-    ends = [0.0] * (steps - 1) + [float("end_at" in model)]
-    assert agent.imagined.arrays()["terminated"].tolist() == ends * 2
-    assert agent.diagnostics()["imagination/acceptance_rate"] == pytest.approx(steps / predicted)

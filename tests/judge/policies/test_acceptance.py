@@ -12,6 +12,7 @@ from judged import STILL, judged_world
 
 from imagine_bench.arrays import Floats
 from imagine_bench.interfaces import State
+from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.policies.acceptance import ALPHA, acceptance_scores, conformal_threshold, occupancies
 from imagine_bench.judge.policies.agreement import DenseModel, dense
@@ -125,79 +126,71 @@ def test_the_risk_coverage_area_is_that_by_hand() -> None:
 
 
 def test_the_exact_model_keeps_all_and_a_copy_what_one_macro_action_again_and_again_earns() -> None:
-    world = world_of(ARROWS)
-    judged = judged_world(ARROWS)
+    world, judged = world_of(ARROWS), judged_world(ARROWS)
     rules = judged.spec.rules
-    held = imagined_models(judged.one_step, judged.predictions(judged.exact, judged.one_step), rules)
-    assert fidelity(world, dense(held["ruled"])) == pytest.approx(1.0)
-    still = imagined_models(judged.one_step, judged.predictions(STILL, judged.one_step), rules)["ruled"]
-    names = dict(zip(world.policies.names, world.policies.tables, strict=True))
-    chosen = names["optimal"].argmax(axis=1)
+
+    def kept(model: WorldModel) -> float:
+        held = imagined_models(judged.one_step, judged.predictions(model, judged.one_step), rules)
+        return fidelity(world, dense(held["ruled"]))
 
     def again(state: State, action: int, left: int) -> float:
-        found = 0.0
-        for o in rules.outcomes(state, action):
-            onward = 0.0 if o.terminated or left == 1 else again(o.macrostate, action, left - 1)
-            found += o.probability * (o.reward + onward)
-        return found
+        return sum(
+            o.probability * (o.reward + (0.0 if o.terminated or left == 1 else again(o.macrostate, action, left - 1)))
+            for o in rules.outcomes(state, action)
+        )
 
-    earned = [again(s, int(chosen[world.states.index(s)]), world.horizon) for s in rules.start_states]
-    real = dict(zip(world.policies.names, world.real, strict=True))
-    part = (np.mean(earned) - real["uniform"]) / (real["optimal"] - real["uniform"])
-    assert fidelity(world, dense(still)) == pytest.approx(part)
-    assert part < 1.0
+    best = world.policies.names.index("optimal")
+    chosen = dict(zip(world.states, world.policies.tables[best].argmax(axis=1).tolist(), strict=True))
+    earned = np.mean([again(start, chosen[start], world.horizon) for start in rules.start_states])
+    uniform = world.real[world.policies.names.index("uniform")]
+    part = (earned - uniform) / (world.real[best] - uniform)
+    assert kept(judged.exact) == pytest.approx(1.0) and kept(STILL) == pytest.approx(part) and part < 1.0
 
 
 def test_returns_in_imagined_frames_are_those_of_every_pair_of_courses() -> None:
+    """Macrostate 2 of the model is the end, of which no frame tells what to do."""
     rng = np.random.default_rng(0)
     truth, model = (DenseModel(rng.dirichlet(np.ones(3), size=(2, 2))[..., :2], rng.normal(size=(2, 2))) for _ in "ab")
     policy = rng.dirichlet(np.ones(2), size=2)
+    chosen = np.vstack([policy, [0.5, 0.5]])
+    ends = np.concatenate([model.onward, 1.0 - model.onward.sum(axis=2, keepdims=True)], axis=2)
+    imagined = np.concatenate([ends, np.tile([0.0, 0.0, 1.0], (1, 2, 1))])
 
     def of(state: int, seen: int, left: int) -> float:
         if left == 0:
             return 0.0
-        found = 0.0
-        for action in range(2):
-            share = policy[seen, action] if seen < 2 else 0.5
-            imagined = [0.0, 0.0, 1.0]
-            if seen < 2:
-                imagined = [*model.onward[seen, action], 1.0 - model.onward[seen, action].sum()]
-            found += share * float(truth.reward[state, action])
-            for after, then in itertools.product(range(2), range(3)):
-                both = truth.onward[state, action, after] * imagined[then]
-                found += share * both * of(after, then, left - 1)
-        return found
+        return sum(
+            chosen[seen, action]
+            * (
+                truth.reward[state, action]
+                + sum(
+                    truth.onward[state, action, after] * imagined[seen, action, then] * of(after, then, left - 1)
+                    for after, then in itertools.product(range(2), range(3))
+                )
+            )
+            for action in range(2)
+        )
 
-    found = value_in_its_frames(truth, model, policy, 4)
-    assert found == pytest.approx([of(state, state, 4) for state in range(2)])
+    assert value_in_its_frames(truth, model, policy, 4) == pytest.approx([of(state, state, 4) for state in range(2)])
 
 
 # Light -------------------------------------------------------------------------------------------------------------
 
 
-def test_pairs_in_another_light_show_one_macrostate_and_are_all_right_in_the_rules() -> None:
+def test_pairs_in_another_light_show_one_macrostate_and_must_both_be_right() -> None:
     judged = judged_world(ARROWS)
     asked = questions.light_alone(judged.spec, judged.index.render)
     assert asked is not None
     assert asked.states[::2] == asked.states[1::2]
     assert (asked.actions[::2] == asked.actions[1::2]).all()
+    exact, copied = (judged.predictions(model, asked) for model in (judged.exact, STILL))
+    states = exact.states.copy()
+    states[1::2] = np.array(asked.states[1::2])[:, None, None]  # in the second light nothing changes
+    blind = dataclasses.replace(exact, states=states)
     pairs = questions.about_light(judged.spec, asked)
-    exact = light_scores(asked, judged.predictions(judged.exact, asked), pairs)["only the light"]
-    assert exact["right"] == exact["exact"] == 1.0
-    copied = light_scores(asked, judged.predictions(STILL, asked), pairs)["only the light"]
-    assert copied["right"] == pytest.approx(copied["copy"])
-    assert copied["right"] < 0.3
+    scores = [light_scores(asked, each, pairs)["only the light"] for each in (exact, copied, blind)]
+    assert scores[0]["right"] == scores[0]["exact"] == 1.0
+    assert scores[1]["right"] == pytest.approx(scores[1]["copy"]) and scores[1]["right"] < 0.3
+    assert scores[2]["right"] < 0.5
     dark = dataclasses.replace(judged.spec, render_macrostates=lambda states, *_: np.zeros((len(states), 64, 64, 3)))
     assert questions.light_alone(dark, RenderedFrameIndex(dark, "clean").render) is None
-
-
-def test_a_model_that_is_right_in_one_light_only_is_right_in_no_pair() -> None:
-    judged = judged_world(ARROWS)
-    asked = questions.light_alone(judged.spec, judged.index.render)
-    assert asked is not None
-    right = judged.predictions(judged.exact, asked)
-    states = right.states.copy()
-    states[1::2] = np.array(asked.states[1::2])[:, None, None]  # in the second light nothing changes
-    blind = dataclasses.replace(right, states=states)
-    found = light_scores(asked, blind, questions.about_light(judged.spec, asked))["only the light"]
-    assert found["right"] < 0.5
