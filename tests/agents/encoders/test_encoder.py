@@ -16,6 +16,7 @@ from encoder_frames import CHAPTER_5, QUICK, TINY, TINY_CONV, arrow_spec, draw
 from imagine_bench.agents.encoders import perception, training
 from imagine_bench.agents.encoders.cli import retrain
 from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard
+from imagine_bench.agents.encoders.probe import Latents
 from imagine_bench.agents.encoders.recipes import Recipe, recipe_named
 from imagine_bench.agents.encoders.training import (
     beta_at,
