@@ -33,6 +33,12 @@ def test_the_bundled_clone_sees_no_macrostate_and_is_small() -> None:
     assert clone.parameters <= 2_000_000
 
 
+def test_a_clone_sees_images_of_its_own_size() -> None:
+    clone = Clone.load(BUNDLED)
+    clone.about["size_px"] = 96
+    assert CloneExecutedEnv(clone=clone).motion.observation_space["front"].shape == (96, 96, 3)
+
+
 def test_the_clone_turns_the_cube_that_it_is_asked_to_and_the_rules_judge_it() -> None:
     """And its arm ends where it began."""
     env = environment()

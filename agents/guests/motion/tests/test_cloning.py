@@ -69,8 +69,11 @@ def test_demonstrations_depend_on_the_seed_alone_and_come_back_from_their_file(t
     np.testing.assert_array_equal(again.numbers, data.numbers)
     np.testing.assert_array_equal(again.commands, data.commands)
     assert not np.array_equal(collect(1, seed=6, observation=VECTORS).numbers[0], data.numbers[0])
-    data.save(tmp_path / "some.npz")
-    kept = Demonstrations.load(tmp_path / "some.npz")
+    data.save(tmp_path / "some")
+    kept = Demonstrations.load(tmp_path / "some")
+    assert kept.observation == kept.first(2).observation == VECTORS
+    with pytest.raises(InvalidValueError, match="The demonstrations show proprio,objects, not front,proprio; give"):
+        train(kept, seed=0, observation="front,proprio", settings=Training(updates=1))
     np.testing.assert_array_equal(kept.commands, data.commands)
     assert kept.instructions.tolist() == data.instructions.tolist()
     assert kept.first(2).count == 2

@@ -50,6 +50,66 @@ def test_the_planner_solves_what_the_rules_say_and_robot_time_adds_up() -> None:
     assert point.robot_s == pytest.approx(point.macro_actions * macro_action_s, rel=0.2)
 
 
+class _Rememberer:
+    """Says what it is told, and trains in its model three times."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+        self.left = 3
+
+    def begin_episode(self) -> None:
+        self.told.append("begin")
+
+    def act(self, observation: Any, *, explore: bool) -> int:
+        self.told.append("explore" if explore else "test")
+        return 0
+
+    def observe(self, transition: Any, *, episode: int) -> None:
+        self.told.append("learn")
+
+    def train_in_model(self) -> bool:
+        self.left -= 1
+        self.told += ["model"] * (self.left >= 0)
+        return self.left >= 0
+
+
+def test_an_agent_is_told_of_each_episode_and_trained_in_its_model_before_tests() -> None:
+    info = {"macrostate": np.zeros(1), "sim_time_s": 1.0, "fault": False, "is_success": False}
+    frame = np.zeros((64, 64, 3), dtype=np.uint8)
+    env: Any = SimpleNamespace(reset=lambda seed: (frame, info), step=lambda action: (frame, 0.0, True, False, info))
+    agent: Any = _Rememberer()
+    learn(env, env, agent, budgets=[1], tests=2, horizon=5, seed=0, told=lambda point: None)
+    assert agent.told == ["begin", "explore", "learn", "model", "model", "model", "begin", "test", "begin", "test"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("level out --agent random --execution planner --budgets 0", "tests is 50 and budgets [0]; give at least 1"),
+        ("level out --agent oracle --execution planner --tests 0", "tests is 0; give an integer from 1 on."),
+        ("level out --agent elimination --execution planner", "elimination is shown macrostates; give an"),
+        ("level out --agent sb3_dqn --execution planner", "sb3_dqn has a training loop of its own; give an"),
+        ("level FILE/out --agent random --execution planner", "Cannot write"),
+        ("clone FILE FILE/clone.pt", "Cannot write"),
+        ("clone FILE clone.pt", "FILE is not a file of demonstrations"),
+        ("demonstrate FILE/demo", "Cannot write"),
+        ("demonstrate demo --count 0", "count is 0; give an integer from 1 on."),
+        ("try CLONE --count 0", "count is 0; give an integer from 1 on."),
+    ],
+)
+def test_a_wrong_command_ends_at_once_in_one_sentence(
+    words: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("FILE").write_text("nothing")
+    monkeypatch.setattr(sys, "argv", ["motion", *words.replace("CLONE", str(BUNDLED)).split()])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith(sentence)
+    assert [path.name for path in tmp_path.iterdir()] == ["FILE"]
+
+
 def test_an_agents_own_settings_reach_it() -> None:
     spec = environment("planner", cubes=3, slip=0.0).spec
     usual: Any = make_agent("dqn", spec, 0)

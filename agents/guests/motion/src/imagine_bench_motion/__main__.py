@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import sys
 import time
 from dataclasses import asdict
@@ -13,6 +12,7 @@ from typing import Any
 
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.registry.machine import describe_environment
+from imagine_bench.store.files import require_writable, write_json
 
 from .cloning import Clone, Training, train
 from .demonstrations import Demonstrations, collect
@@ -58,6 +58,7 @@ def _add_demonstrate(parser: argparse.ArgumentParser) -> None:
 
 
 def _demonstrate(given: argparse.Namespace) -> None:
+    require_writable(given.file.parent)
     began_s = time.process_time()
     data = collect(
         given.count,
@@ -75,7 +76,9 @@ def _demonstrate(given: argparse.Namespace) -> None:
 def _add_clone(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("demonstrations", type=Path, help="a file of 'demonstrate'")
     parser.add_argument("file", type=Path, help="the file of the policy to write")
-    parser.add_argument("--observation", default=OBSERVATION, help="the parts that the demonstrations show")
+    parser.add_argument(
+        "--observation", help="the parts that the demonstrations show; needed for files of old versions"
+    )
     parser.add_argument("--first", type=int, help="take only so many demonstrations")
     parser.add_argument("--updates", type=int, default=Training.updates, help="gradient steps")
     parser.add_argument("--eye-updates", type=int, default=Training.eye_updates, help="those of the heat maps, before")
@@ -87,13 +90,14 @@ def _add_clone(parser: argparse.ArgumentParser) -> None:
 
 
 def _clone(given: argparse.Namespace) -> None:
+    require_writable(given.file.parent)
     data = Demonstrations.load(given.demonstrations)
     if given.first is not None:
         data = data.first(given.first)
     clone = train(
         data,
         seed=given.seed,
-        observation=given.observation,
+        observation=given.observation or data.observation or OBSERVATION,
         settings=Training(updates=given.updates, eye_updates=given.eye_updates, shift_px=given.shift),
         layout={"chunk": given.chunk, "heat_maps": given.heat_maps},
         told=lambda update, loss: print(f"{update} updates, loss {loss:.4f}", flush=True),
@@ -118,6 +122,8 @@ def _add_try(parser: argparse.ArgumentParser) -> None:
 
 def _try(given: argparse.Namespace) -> None:
     clone = Clone.load(given.file)
+    if given.out is not None:
+        require_writable(given.out.parent)
     began_s = time.process_time()
     found = tries(
         clone,
@@ -137,7 +143,7 @@ def _try(given: argparse.Namespace) -> None:
     if given.out is not None:
         commit = describe_environment()["commit"]
         kept = {"about": clone.about, **_asked(given), "clone": kept_name(given.file), "commit": commit, **counted}
-        given.out.write_text(json.dumps(kept, indent=1) + "\n")
+        write_json(given.out, kept)
 
 
 def _add_record(parser: argparse.ArgumentParser) -> None:
@@ -197,8 +203,9 @@ def _flat(given: argparse.Namespace) -> None:
         print(point, flush=True)
         curve.append(asdict(point))
         kept = {**_asked(given), "commit": commit, "curve": curve}
-        given.out.write_text(json.dumps(kept, indent=1) + "\n")
+        write_json(given.out, kept)
 
+    require_writable(given.out.parent)
     commit = describe_environment()["commit"]
     curve: list[dict[str, float]] = []
     chosen = {"settings": given.settings, "reward": given.reward}
@@ -225,8 +232,9 @@ def _level(given: argparse.Namespace) -> None:
     def told(point: Level) -> None:
         print(point, flush=True)
         kept["curve"].append(asdict(point))
-        given.out.write_text(json.dumps(kept, indent=1) + "\n")
+        write_json(given.out, kept)
 
+    require_writable(given.out.parent)
     world = {"cubes": given.cubes, "slip": given.slip, "clone": given.clone}
     env, test_env = (environment(given.execution, **world) for _ in range(2))
     kept: dict[str, Any] = {**_asked(given), "commit": describe_environment()["commit"], "curve": []}
@@ -236,7 +244,7 @@ def _level(given: argparse.Namespace) -> None:
     if given.agent == "oracle":
         successes, mean_s = oracle_success(test_env.env, rules, tests=given.tests, horizon=horizon)
         kept |= {"successes": successes, "macro_action_s": round(mean_s, 3)}
-        given.out.write_text(json.dumps(kept, indent=1) + "\n")
+        write_json(given.out, kept)
         print(f"{successes} of {given.tests}, {mean_s:.2f} s a macro-action")
         return
     agent = make_agent(given.agent, env.spec, given.seed)

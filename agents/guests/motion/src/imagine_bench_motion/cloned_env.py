@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 from imagine_bench.tasks.rendering.cameras import agent_camera_view
+from imagine_bench.tasks.scenes.constants import FRAME_PX
 
 from imagine_bench.arrays import Observed
 from imagine_bench.errors import InvalidValueError, brief
@@ -132,7 +133,8 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
         if execution != "physics":
             raise InvalidValueError(f"A clone executes macro-actions in physics; execution={brief(execution)} is none.")
         self.clone = clone if isinstance(clone, Clone) else Clone.load(Path(clone or BUNDLED))
-        self.motion = skill_env(self.clone.observation, appearance, time_limit_s=1e9, **options)
+        size = self.clone.about.get("size_px", FRAME_PX)
+        self.motion = skill_env(self.clone.observation, appearance, **{"time_limit_s": 1e9, "size": size, **options})
         self.action_names = self.motion.task.action_names
         self.action_space = gymnasium.spaces.Discrete(len(self.action_names))
         view = agent_camera_view()

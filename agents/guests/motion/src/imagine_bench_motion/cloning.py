@@ -14,7 +14,7 @@ from imagine_bench.agents.encoders.perception import prepare_torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.errors import ArtefactError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 
 from .demonstrations import Demonstrations
 from .instruction import GO_BACK, words_vector
@@ -164,7 +164,12 @@ def train(
         settings: Of training.
         layout: Fields of :class:`.network.Layout` that differ from their defaults.
         told: Called every 100 gradient steps with their number and the mean loss since.
+
+    Raises:
+        InvalidValueError: The demonstrations show other parts.
     """
+    if data.observation and {*data.observation.split(",")} != {*observation.split(",")}:
+        raise InvalidValueError(f"The demonstrations show {data.observation}, not {observation}; give their own parts.")
     prepare_torch("cpu")
     settings = settings or Training()
     generator = torch.Generator().manual_seed(seed)

@@ -11,7 +11,8 @@ import numpy as np
 from imagine_bench.tasks.continuous.expert import Expert
 from numpy.typing import NDArray
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, require_integer, writing
+from imagine_bench.store.files import read_arrays, reading
 
 from .instruction import GO_BACK
 from .skills import HOME_COMMAND, begin, images_of, numbers_of, skill_env
@@ -24,6 +25,8 @@ NOISE_KEPT = 0.8
 _CLOSED = 0.06
 """Fingers that are told to be nearly as close as in the whole demonstration grip: 1.4 mm of each finger."""
 
+_NAMES = ("numbers", "instructions", "commands", "hand_m", "episode")
+"""The arrays of a file, beside its images."""
 MOST_TRIES = 5
 """Tries of the expert for each demonstration that is kept."""
 
@@ -38,6 +41,7 @@ class Demonstrations:
     commands: NDArray[np.float32]  #: the expert's, without noise: (T, C)
     hand_m: NDArray[np.float32]  #: where the hand is by these commands, in the world: (T, 3)
     episode: NDArray[np.int64]  #: which demonstration: (T,)
+    observation: str = ""  #: the parts that are shown, as the environment takes them; empty of an old file
 
     @property
     def count(self) -> int:
@@ -45,7 +49,8 @@ class Demonstrations:
         return int(self.episode.max()) + 1
 
     def first(self, count: int) -> Demonstrations:
-        """The first demonstrations alone."""
+        """The first demonstrations alone, at least one. Raises InvalidValueError: fewer are asked for."""
+        require_integer("first", count, 1)
         kept = self.episode < count
         return Demonstrations(
             images={camera: image[kept] for camera, image in self.images.items()},
@@ -54,6 +59,7 @@ class Demonstrations:
             commands=self.commands[kept],
             hand_m=self.hand_m[kept],
             episode=self.episode[kept],
+            observation=self.observation,
         )
 
     def chunks(self, length: int) -> NDArray[np.int64]:
@@ -80,16 +86,19 @@ class Demonstrations:
     def save(self, path: Path) -> None:
         """Write one ``.npz`` file."""
         arrays: dict[str, Any] = {f"image.{camera}": image for camera, image in self.images.items()}
-        named = {name: getattr(self, name) for name in ("numbers", "instructions", "commands", "hand_m", "episode")}
-        np.savez(path, **arrays, **named)
+        named = {name: getattr(self, name) for name in _NAMES}
+        with writing(path), path.open("wb") as stream:
+            np.savez(stream, **arrays, **named, observation=np.array(self.observation))
 
     @classmethod
     def load(cls, path: Path) -> Demonstrations:
-        """Read a file that :meth:`save` has written."""
-        with np.load(path) as file:
-            images = {name.removeprefix("image."): file[name] for name in file.files if name.startswith("image.")}
-            named = {name: file[name] for name in ("numbers", "instructions", "commands", "hand_m", "episode")}
-        return cls(images=images, **named)
+        """Read a file that :meth:`save` has written. Raises ArtefactError: there is none, or it is another file."""
+        what = "a file of demonstrations"
+        with reading(path, what):
+            found = read_arrays(path, what)
+            images = {name.removeprefix("image."): each for name, each in found.items() if name.startswith("image.")}
+            named = {name: found[name] for name in _NAMES}
+            return cls(images=images, **named, observation=str(found.get("observation", "")))
 
 
 def collect(
@@ -109,8 +118,10 @@ def collect(
         **options: Of the world, and its ``family``.
 
     Raises:
-        InvalidValueError: The expert fails too often in this world.
+        InvalidValueError: The expert fails too often in this world, or none is to be kept.
     """
+    require_integer("count", count, 1)
+    require_integer("seed", seed, 0)
     rng = np.random.default_rng(seed)
     stages = [_Stage(observation, appearance, options) for appearance in appearances]
     kept: list[_Episode] = []
@@ -133,6 +144,7 @@ def collect(
         commands=np.stack([row for each in kept for row in each.commands]),
         hand_m=np.stack([row for each in kept for row in each.hand_m]),
         episode=np.repeat(np.arange(len(kept)), [len(each.commands) for each in kept]),
+        observation=observation,
     )
 
 

@@ -15,8 +15,9 @@ import gymnasium
 import numpy as np
 
 from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError, brief, require_integer
 from imagine_bench.interfaces import Agent, AgentContext, Observation, TaskSpec, Transition
-from imagine_bench.interfaces.capabilities import FrameReader, OutcomePredictor
+from imagine_bench.interfaces.capabilities import FrameReader, ModelOnlyTrainer, OutcomePredictor, begin_episode
 from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.rules import Rules
 from imagine_bench.seeding import SeedTree
@@ -80,8 +81,12 @@ def make_agent(name: str, spec: TaskSpec, seed: int, appearance: str = "clean") 
     Raises:
         UnknownNameError: No such agent or setting.
         SetupError: It is in a package that is not installed or cannot be used.
+        InvalidValueError: It sees macrostates, or has a training loop of its own.
     """
     entry = registry.agent_entry(name)
+    if entry.privileged or entry.external_training_loop:
+        why = "is shown macrostates" if entry.privileged else "has a training loop of its own"
+        raise InvalidValueError(f"{name} {why}; give an agent that learns from frames in the loop of this command.")
     context = AgentContext(
         n_actions=spec.n_actions,
         preprocessing=spec.preprocessing,
@@ -116,13 +121,20 @@ def learn(
         horizon: Macro-actions before truncation.
         seed: Of the training episodes.
         told: Called with each point of the curve.
+
+    Raises:
+        InvalidValueError: No test, or a budget below 1.
     """
+    if tests < 1 or not budgets or min(budgets) < 1:
+        raise InvalidValueError(f"tests is {tests} and budgets {brief(list(budgets))}; give at least 1 for each.")
     began_s = time.process_time()
     count = _Count()
     curve = []
     for episode in range(1, max(budgets) + 1):
         _train_episode(env, agent, episode, horizon, seed * 10**5 + episode, count)
         if episode in budgets:
+            while isinstance(agent, ModelOnlyTrainer) and agent.train_in_model():
+                pass
             successes = sum(test_episode(test_env, agent, horizon, _TEST_SEED + each) for each in range(tests))
             point = Level(
                 episodes=episode,
@@ -150,6 +162,7 @@ class _Count:
 
 def _train_episode(env: Env, agent: Agent, episode: int, horizon: int, seed: int, count: _Count) -> None:
     frame, info = env.reset(seed=seed)
+    begin_episode(agent)
     seen = Observation(frame=frame)
     for step in range(1, horizon + 1):
         action = agent.act(seen, explore=True)
@@ -178,6 +191,7 @@ def _train_episode(env: Env, agent: Agent, episode: int, horizon: int, seed: int
 def test_episode(env: Env, agent: Agent, horizon: int, seed: int) -> bool:
     """Whether a test episode without exploration succeeds."""
     frame, _ = env.reset(seed=seed)
+    begin_episode(agent)
     for _ in range(horizon):
         frame, _, terminated, blew_up, info = env.step(agent.act(Observation(frame=frame), explore=False))
         if terminated or blew_up:
@@ -193,6 +207,7 @@ def expects_nothing(env: Env, agent: Any, starts: int) -> float | None:
     """
     if not isinstance(agent, OutcomePredictor) or not isinstance(agent, FrameReader):
         return None
+    begin_episode(agent)
     frames = np.stack([env.reset(seed=_TEST_SEED + each)[0] for each in range(starts)])
     expected = agent.predict_outcomes(frames, np.random.default_rng(0))
     same = (expected.macrostates == agent.read_frames(frames)[:, None, None, :]).all(axis=-1)  # [N, A, B]
@@ -200,7 +215,11 @@ def expects_nothing(env: Env, agent: Any, starts: int) -> float | None:
 
 
 def oracle_success(env: Env, rules: Rules, *, tests: int, horizon: int) -> tuple[int, float]:
-    """Successes of the rules' optimal policy, and mean seconds of its macro-actions."""
+    """Successes of the rules' optimal policy, and mean seconds of its macro-actions.
+
+    Raises InvalidValueError: no test.
+    """
+    require_integer("tests", tests, 1)
     successes = 0
     times_s = []
     for episode in range(tests):

@@ -10,7 +10,7 @@ import numpy as np
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.scenes.constants import CONTROL_CAMERAS, FRAME_PX
 
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import InvalidValueError, require_integer
 
 from .cloning import Clone
 from .skills import begin, images_of, skill_env
@@ -76,8 +76,10 @@ def tries(
         **options: Of :func:`.skills.skill_env`, the size of images too.
 
     Raises:
-        InvalidValueError: A policy without images, and ``swapped``.
+        InvalidValueError: A policy without images, and ``swapped``; or no try.
     """
+    require_integer("count", count, 1)
+    require_integer("seed", seed, 0)
     if swapped and not set(CONTROL_CAMERAS) & set(clone.observation.split(",")):
         raise InvalidValueError(f"The policy sees {clone.observation}, so there are no images to swap; leave it out.")
     rng = np.random.default_rng(seed)
