@@ -377,10 +377,12 @@ def test_the_agents_expectations_are_those_of_its_laws() -> None:
 def test_kept_programs_are_exact_in_at_least_nine_of_the_twelve_experiments(own: bool) -> None:
     every = json.loads(KEPT.read_text())["rows"]
     assert all(each["macro_actions"] <= 2 * each["learner"] for each in every)
-    rows = [each for each in every if each["codes"].startswith("own") == own and (own or not each["codes"])]
     exact = []
     for experiment in LADDER.experiments:
-        tasks = {level.task for level in experiment.levels}
-        of_levels = [each["total_variation"] for each in rows if each["task"] in tasks]
+        worlds = {
+            (level.task, f"own {level.protocol.get('appearance', 'clean')}" if own else "")
+            for level in experiment.levels
+        }
+        of_levels = [each["total_variation"] for each in every if (each["task"], each["codes"]) in worlds]
         exact.append(bool(of_levels) and np.mean(of_levels) < 0.005)
     assert sum(exact) >= 9
