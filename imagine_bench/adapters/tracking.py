@@ -48,6 +48,7 @@ def track(folder: Path, tool: str) -> Path:
         SetupError: The tool is not installed.
     """
     make_writer = TOOLS[require_known("tracking tool", tool, TOOLS)]
+    require_modules(tool)
     for run in sorted(folder.glob("*/seed_*")):
         if run_folder.is_done(run):
             run_folder.require_done(run)

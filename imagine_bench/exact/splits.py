@@ -75,6 +75,8 @@ def split_of(rules: Rules, text: str) -> Split:
         numbers = [int(each) for each in rest.split(":")]
         is_test = _KINDS[kind](rules, *numbers)
         sides = {state: is_test(state) for state in rules.start_states}
+    except InvalidValueError:  # which says more
+        raise
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise InvalidValueError(
             f"{brief(text)} names no split of {len(rules.start_states)} starts; give plan_length=LONGEST, "

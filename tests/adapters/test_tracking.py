@@ -140,9 +140,13 @@ def test_weights_and_biases_gets_two_runs_at_once(tmp_path):
 
 
 def test_what_cannot_be_is_one_clear_error(tmp_path, bench, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "tensorboard.summary", None)
-    assert main(["report", str(bench), "--track", "tensorboard"]) == 2
+    earlier = bench / "tensorboard/earlier"
+    earlier.mkdir(parents=True)
+    with monkeypatch.context() as context:
+        context.setitem(sys.modules, "tensorboard", None)
+        assert main(["report", str(bench), "--track", "tensorboard"]) == 2
     assert "pip install 'imagine-bench[tracking]'" in capsys.readouterr().err
+    assert earlier.exists(), "what no tool can write anew stays"
     with pytest.raises(UnknownNameError, match="Known: tensorboard, wandb"):
         track(bench, "mlflow")
     with pytest.raises(InvalidValueError, match="has been tested yet"):

@@ -43,6 +43,8 @@ def test_a_text_names_a_split():
         assert split_of(RULES, text.replace("=", "=+")).identity == found.identity  # however a number is written
     with pytest.raises(InvalidValueError, match=r"is .{12} here, not 000000000000"):
         split_of(RULES, "plan_length=2@000000000000")
-    for wrong in ("", "plan_length", "plan_length=long", "length=2", "values=99:1", "pairs=0:3", "pairs=0:3:99"):
+    for wrong in ("", "plan_length", "plan_length=long", "length=2", "values=99:1", "pairs=0:3"):
         with pytest.raises(InvalidValueError, match="names no split of"):
             split_of(RULES, wrong)
+    with pytest.raises(InvalidValueError, match=r"^Only \d+ pairs can be held out, not 99\.$"):
+        split_of(RULES, "pairs=0:3:99")
