@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.arrows.rules import COUPLINGS, FORBIDS, GOALS, Arrows, Turn
+from imagine_bench.tasks.arrows.rules import COUPLINGS, FORBIDS, GOALS, Arrows
 from imagine_bench.tasks.parameters.parameters import GESTURES
+from whole_outputs import KEPT
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError
@@ -52,29 +55,23 @@ def test_a_canonical_name_says_its_world_and_only_it():
     assert len({file_name(str(world)) for world in worlds}) == len(set(worlds))
 
 
-@pytest.mark.parametrize(
-    ("said", "name"),
-    [
-        ("arrows:slip=1e-1,cubes=5", "arrows:cubes=5,slip=0.1"),
-        ("arrows:cubes=3,coupling=none,fickle=1", "arrows:fickle=1.0"),
-        ("arrows:shuffle=4294967295", "arrows:shuffle=4294967295"),
-        ("arrows:goal_change=0.5", "arrows:fickle=0.5"),
-        ("arrows:horizon=10", "arrow_puzzle"),
-        ("arrows:horizon=1000,slip=0.99,gesture=1,lag=10", "arrows:horizon=1000,slip=0.99,gesture=1.0,lag=10"),
-        ("arrows:forbid=equal+agent,horizon=10", "arrow_puzzle_hard"),
-        ("arrow_puzzle:cubes=1,horizon=2", "arrow_puzzle_easy"),
-        ("arrow_puzzle:horizon=null", "arrows"),
-        ("pick_place:fickle=0.5,slip=0.1", "pick_place:slip=0.1,fickle=0.5"),
-        ("pick_place:slip=0", "pick_place"),
-    ],
-)
-def test_one_world_has_one_name(said, name):
-    spec = registry.task(said)
-    assert registry.task_name(said) == spec.id == registry.task(spec.id).id == name
-    assert registry.task_entry(said).env_id == spec.env_id
-    assert gymnasium.spec(spec.env_id).kwargs == dict(registry.task_entry(spec.id).options) or said != name
-    assert protocol(said, "smoke", agents=("random",)).task == name
-    assert protocol(said, "smoke", agents=("random",)).hash == protocol(name, "smoke", agents=("random",)).hash
+def test_one_world_has_one_name(expected):
+    """Its name, encoder, horizon, options of its environment, and macro-actions with the turns of cubes, + clockwise."""
+    said = re.findall(r"^\$ (.*)$", (KEPT / "worlds_by_name.txt").read_text(), re.MULTILINE)
+    answers = []
+    for each in said:
+        spec, entry = registry.task(each), registry.task_entry(each)
+        assert registry.task_name(each) == spec.id == registry.task(spec.id).id
+        one, other = (protocol(name, "smoke", agents=("random",)) for name in (each, spec.id))
+        assert (one.hash, one.task) == (other.hash, spec.id)
+        assert each != spec.id or gymnasium.spec(spec.env_id).kwargs == dict(entry.options)
+        options = dict(registry.task_entry(spec.id).options)
+        answers += [f"$ {each}", f"{spec.id}  {spec.encoder}  {spec.horizon}  {entry.env_id}  {options}"]
+        turns = spec.rules.world.turns if spec.id.startswith("arrow") else [()] * spec.n_actions
+        for name, cubes in zip(spec.action_names, turns, strict=True):
+            signs = [f"{turn.cube}{'+' if turn.clockwise else '-'}" for turn in cubes]
+            answers.append(f"  {name} {' '.join(signs)}")
+    expected("worlds_by_name", "\n".join(answers))
 
 
 def test_a_world_may_lie_in_a_file(tmp_path):
@@ -87,24 +84,8 @@ def test_a_world_may_lie_in_a_file(tmp_path):
             registry.task(f"arrows:@{file}")
 
 
-def test_turns_are_coupled_to_the_right_and_shuffled():
-    plain, coupled, shuffled = Arrows(), Arrows(coupling="neighbour"), Arrows(coupling="neighbour", shuffle=4)
-    assert plain.turns[:2] == ((Turn(0, clockwise=True),), (Turn(0, clockwise=False),))
-    assert coupled.turns[3] == (Turn(1, clockwise=False), Turn(2, clockwise=False))
-    assert coupled.turns[4] == (Turn(2, clockwise=True),)
-    assert set(shuffled.turns) == set(coupled.turns) and shuffled.turns != coupled.turns
-    assert Arrows(shuffle=4).turns != Arrows(shuffle=5).turns
-    named, spec = registry.task("arrows").action_names, registry.task("arrows:shuffle=4")
-    assert set(spec.action_names) == set(named) and spec.action_names != named
-
-
 def test_a_world_ends_at_its_own_horizon():
     for options, horizon in (({"horizon": 3}, 3), ({"cubes": 1}, registry.task("arrows:cubes=1").horizon)):
         env = gymnasium.make("imagine_bench/Arrows-v0", goal="toward_agent", execution="kinematic", **options)
         assert env.get_wrapper_attr("_max_episode_steps") == horizon
         env.close()
-
-
-def test_a_seed_of_the_order_shuffles_also_if_it_is_zero():
-    orders = [Arrows(shuffle=seed).turns for seed in (None, 0, 1)]
-    assert len(set(orders)) == 3 and len({frozenset(order) for order in orders}) == 1

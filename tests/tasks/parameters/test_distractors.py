@@ -83,11 +83,6 @@ def test_neither_rules_nor_physics_notice(id_):
             np.testing.assert_array_equal(*(getattr(env.data, name) for env in scenes))
 
 
-def test_encoders_of_distracted_worlds_are_others():
-    names = [registry.task(f"arrows{said}").encoder for said in ("", ":distractors=1", ":distractors=2,gesture=first")]
-    assert names == ["arrow_puzzle", "arrow_puzzle_distractors1", "arrow_puzzle_hidden_distractors2"]
-
-
 def test_balls_are_anywhere_on_the_screen_equally_often():
     """Also at its edge, from which they roll back."""
     spec = mujoco.MjSpec()

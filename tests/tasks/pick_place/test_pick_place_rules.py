@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from imagine_bench.tasks.pick_place.rules import (
-    HAND_OVER,
-    HANDED_OVER,
-    OPEN_PALM,
-    PICKED,
-    WITHDRAWN,
-    PickPlaceRules,
-)
+from imagine_bench.tasks.pick_place.rules import WITHDRAWN, PickPlaceRules
 from imagine_bench.tasks.pick_place.spec import HORIZON
+from whole_outputs import tabulated
 
+from imagine_bench import registry
 from imagine_bench.rules import facts, is_random, optimal_values, tabulate
 
 RULES = PickPlaceRules()
@@ -32,26 +27,29 @@ def test_play_is_table_3_1_in_its_order():
     assert is_random(RULES)
 
 
-def test_one_action_is_asked_for_in_play_and_none_after_an_end():
-    for state in RULES.states:
-        right = [action for action in range(4) if RULES.is_asked_for(state, action)]
-        assert len(right) == (0 if RULES.is_terminal(state) else 1)
-        for action in set(range(4)) - set(right):
-            (outcome,) = RULES.outcomes(state, action)
-            assert (outcome.reward, outcome.terminated, outcome.success) == (-5.0, True, False)
+@pytest.mark.parametrize("world", ["pick_place", "pick_place:slip=0.2,fickle=0.4"])
+def test_outcomes_of_all_macrostates(world, expected):
+    """Each with its probability, reward and end, * for success; and where the objects are if no grip slips.
 
-
-def test_the_human_keeps_pointing_while_an_object_is_put_back():
-    (outcome,) = RULES.outcomes((1, 0, 0, 2), 0)
-    assert (outcome.macrostate, outcome.reward, outcome.terminated) == ((0, 0, 0, 2), 0.0, False)
-
-
-def test_a_handover_ends_well_only_into_an_open_palm():
-    (good,) = RULES.outcomes((0, 0, 1, OPEN_PALM), HAND_OVER)
-    assert (good.macrostate, good.reward, good.success) == ((0, 0, HANDED_OVER, OPEN_PALM), 5.0, True)
-    (early,) = RULES.outcomes((0, 0, 1, 0), HAND_OVER)
-    assert (early.macrostate, early.reward, early.success) == ((0, 0, PICKED, WITHDRAWN), -5.0, False)
-    assert RULES.objects_after((0, 0, PICKED, WITHDRAWN), HAND_OVER) == (0, 0, PICKED), "into no hand that is gone"
+    One macro-action is asked for in play, and none after an end. A slip keeps the objects, and 0.4 of all humans then
+    point elsewhere: 0.2 x 0.4 / 2 = 0.04 at each of two others.
+    """
+    rules = registry.task(world).rules
+    rows = []
+    for state in rules.states:
+        asked = [rules.is_asked_for(state, action) for action in range(4)]
+        assert sum(asked) == (not rules.is_terminal(state))
+        for action in range(4):
+            outcomes = rules.outcomes(state, action)
+            assert sum(each.probability for each in outcomes) == pytest.approx(1.0)
+            assert len({each.macrostate for each in outcomes} & set(rules.states)) == len(outcomes)
+            assert all(rules.judge(state, action, each.macrostate) == each for each in outcomes)
+            told = [
+                (each.probability, each.macrostate, each.reward, "end" * each.terminated + "*" * each.success)
+                for each in outcomes
+            ]
+            rows.append([state, action, "asked" * asked[action], rules.objects_after(state, action), *told])
+    expected("outcomes_of_pick_place", tabulated(rows), section=world)
 
 
 def test_a_fault_counts_as_a_wrong_action():
