@@ -19,7 +19,7 @@ import cloudpickle
 import numpy as np
 import pytest
 from imagine_bench.agents.baselines import RandomAgent
-from kept import ROOT
+from kept import RESULTS, table
 
 import imagine_bench
 from imagine_bench import api, cli, registry
@@ -263,13 +263,11 @@ def test_a_folder_gives_the_same_results_again(results: api.Comparison) -> None:
     "kept", ["arrow_puzzle-quick", "arrow_puzzle-study", "suite", "arrow_puzzle-judge", "robot_ik-quick"]
 )
 def test_kept_results_are_loaded_as_they_were_written(kept: str) -> None:
-    folder = ROOT / "docs/results" / kept
-    results = imagine_bench.load(folder)
+    results = imagine_bench.load(RESULTS / kept)
     frame = results.frame()
     main = next(iter(results.tables))
     assert main in ("results", "scores")
-    with (folder / f"{main}.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = table(f"{kept}/{main}.csv")
     assert set(frame) == set(rows[0]) and len(rows) > 5
     for column in set(frame) - {"agent"}:  # labels that were renamed are today's
         for value, row in zip(frame[column], rows, strict=True):

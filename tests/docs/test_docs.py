@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import shlex
@@ -16,7 +15,7 @@ import pytest
 import repository
 import thesis_elements
 from doc_tables import PAGES
-from kept import ROOT
+from kept import ROOT, table
 from matplotlib import pyplot
 from small_runs import do
 
@@ -168,8 +167,7 @@ def test_the_elements_of_the_thesis_are_where_they_are_said_to_be() -> None:
 
 
 def test_planted_bugs_are_noticed_or_have_a_reason() -> None:
-    with (ROOT / "docs" / "results" / "mutants" / "mutants.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = table("mutants/mutants.csv")
     reasons = [row["why"] for row in rows if row["result"] == "passed"]
     assert all(reasons) and len(reasons) <= 0.08 * len(rows)
     said = f"plants {len(rows)} small bugs.*: {len(rows) - len(reasons)}, and each of the other {len(reasons)} has"

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 import pytest
 from imagine_bench.agents.encoders.encoder import Encoder
-from kept import ROOT
+from kept import ROOT, facts
 from small_runs import Inline, benched
 
 from imagine_bench import registry
@@ -140,7 +140,7 @@ def test_the_agent_that_learns_to_see_solves_what_nobody_here_wrote(example: Mod
 
 def test_what_the_page_says_of_elsewhere_was_kept() -> None:
     page = (ROOT / "docs" / "explanation" / "from_nothing.md").read_text()
-    kept = json.loads((ROOT / "docs" / "results" / "elsewhere" / "elsewhere.json").read_text())["environments"]
+    kept = facts("elsewhere/elsewhere.json")["environments"]
     said = re.findall(r"(frozen lake|[\w-]+-5x5): (\d+) % (?:solved )?\((?:random actions: )?(\d+) %\)", page)
     found = []
     for name, each in kept.items():

@@ -6,7 +6,6 @@ command gives another value, separated by spaces.
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 
 import pytest
 from doc_cells import KEPT
-from kept import RESULTS, table
+from kept import RESULTS, facts, table
 
 from imagine_bench.cli import exit_code as main
 from imagine_bench.cli import parsed
@@ -66,7 +65,7 @@ def differing(folder: Path, today: ProtocolData) -> list[str]:
     if isinstance(today, Protocol):
         settings = resolved_settings(today)
         now["settings_digest"] = digest({written.written_name(agent): settings[agent] for agent in settings})
-    fields = json.loads((folder / "bench.json").read_text())["protocol"].keys() - {"encoder", "codes"}
+    fields = facts(f"{name(folder)}/bench.json")["protocol"].keys() - {"encoder", "codes"}
     return sorted(field for field in fields if kept[field] != now.get(field))
 
 
