@@ -56,7 +56,7 @@ def test_a_canonical_name_says_its_world_and_only_it():
 
 
 def test_one_world_has_one_name(expected):
-    """Its name, encoder, horizon, options of its environment, and macro-actions with the turns of cubes, + clockwise."""
+    """Its name, encoder, horizon, options of its environment, and macro-actions with the turns of cubes."""
     said = re.findall(r"^\$ (.*)$", (KEPT / "worlds_by_name.txt").read_text(), re.MULTILINE)
     answers = []
     for each in said:
