@@ -118,9 +118,9 @@ def test_a_set_of_others_is_read_without_a_card(tmp_path: Path, monkeypatch: pyt
 def test_the_layout_is_lerobots(tmp_path: Path) -> None:
     """The needs of LeRobot's own reader; those of 0.4.4 and 0.6.1 were run on such a set, but install only apart.
 
-    ``tests/whole`` shows all columns.
+    ``tests/whole`` shows all columns. Here episodes are cut off after a macro-action, but for those that end.
     """
-    written(tmp_path / "set", "lerobot")
+    written(tmp_path / "set", "lerobot", policy="uniform")
     folder = tmp_path / "set"
     info = json.loads((folder / "meta/info.json").read_text())
     table = pq.read_table(folder / info["data_path"].format(chunk_index=0, file_index=0))

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from fake_results import WIDE, bench_result, rewritten
 from report_pages import check_page
+from whole_outputs import Expected
 
 from imagine_bench import statistics
 from imagine_bench.errors import ArtefactError
@@ -83,81 +84,65 @@ def shifted(result: BenchResult, **shares: list[int]) -> BenchResult:
     return rewritten(result, change)
 
 
-@pytest.mark.parametrize(
-    ("successes", "sentence"),
-    [
-        ([150, 152, 152, 152, 152, 152, 154], "imagination: better than dqn at 250, 2,000 and 6,000 (p < .001)."),
-        ([50, 52, 52, 52, 52, 52, 54], "imagination: worse than dqn at 250, 2,000 and 6,000 (p < .001)."),
-        ([80, 90, 100, 105, 105, 110, 140], "imagination: +0.0 points against dqn at 6,000, undecided with 7 seeds."),
-    ],
-)
-def test_the_verdict_says_which_way_it_went(many: BenchResult, successes: list[int], sentence: str) -> None:
-    changed = shifted(many, dqn=[100, 102, 102, 102, 102, 102, 104], imagination=successes)
-    assert sentence in verdict(collect(changed))
+BASE = [100, 102, 102, 102, 102, 102, 104]
+LEARNERS = ("dqn", "dqn_more_updates", "imagination")
+PAIRS = (("imagination", "dqn"), ("imagination", "dqn_more_updates"))
 
 
-def test_a_verdict_s_p_is_of_the_budgets_that_it_names(many: BenchResult) -> None:
-    solved = {"dqn": [100, 102, 102, 102, 102, 102, 104], "imagination": [150, 152, 152, 152, 152, 152, 154]}
-    later = shifted(many, **solved)
-    first = shifted(many, dqn=solved["dqn"], imagination=solved["dqn"])
+def above(least: int) -> list[int]:
+    return [least + each for each in BASE]
 
-    def change(run: RunResult, row: Checkpoint) -> Checkpoint:
-        return first.of(run.agent)[many.protocol.seeds.index(run.seed)].checkpoints[0] if row.episodes == 250 else row
 
-    assert "imagination: better than dqn at 2,000 and 6,000 (p < .001)." in verdict(collect(rewritten(later, change)))
+@pytest.fixture
+def headed(tmp_path: Path) -> BenchResult:
+    """Whose headlines are imagination against both DQNs."""
+    protocol = dataclasses.replace(WIDE, agents=LEARNERS, seeds=tuple(range(7)), headlines=PAIRS)
+    return shifted(
+        bench_result(tmp_path, protocol=protocol), dqn=above(-40), dqn_more_updates=BASE, imagination=above(49)
+    )
+
+
+def test_verdicts(many: BenchResult, result: BenchResult, headed: BenchResult, expected: Expected) -> None:
+    """Which way it went by made-up successes, and what would decide it."""
+    better = shifted(many, dqn=BASE, imagination=above(50))
+    equal = shifted(many, dqn=BASE, imagination=BASE)
+    later = zip(better.runs, equal.runs, strict=True)
+    runs = [dataclasses.replace(one, checkpoints=other.checkpoints[:1] + one.checkpoints[1:]) for one, other in later]
+    three = shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200])
+    typed = {**three.environment, "command": "imagine-bench bench x --seeds 0-1 7 --workers 1"}
+    few = dataclasses.replace(headed.protocol, headlines=PAIRS[1:], few_seeds=(("imagination", 4),))
+    levels = [100, 140, 100, 120, 130, 110, 120]
+    undecided = bench_result(headed.folder, protocol=few)
+    scenes = {
+        "better": better,
+        "worse": shifted(many, dqn=BASE, imagination=above(-50)),
+        "undecided": shifted(many, dqn=BASE, imagination=[80, 90, 100, 105, 105, 110, 140]),
+        "better from the second budget on": dataclasses.replace(better, runs=tuple(runs)),
+        "too few seeds": three,
+        "too few seeds, and options behind them": dataclasses.replace(three, environment=typed),
+        "a gain over equal updates": headed,
+        "no gain over equal updates": shifted(headed, dqn_more_updates=above(48)),
+        "an undecided headline": shifted(undecided, dqn=levels, dqn_more_updates=levels, imagination=[130] * 7),
+    }
+    text = [line for name, scene in scenes.items() for line in (f"== {name}", *verdict(collect(scene)))]
+    expected("verdicts", "\n".join(text), exactly=False)
 
 
 def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult) -> None:
-    changed = shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200])
-    (line,) = (line for line in verdict(collect(changed)) if line.startswith("imagination: "))
-    assert line.startswith("imagination: +48.5 points against dqn at 6,000, undecided with 3 seeds; about 2 more would")
-    environment = {**changed.environment, "command": "imagine-bench bench x --seeds 0-1 7 --workers 1"}
-    (other,) = verdict(collect(dataclasses.replace(changed, environment=environment)))[-1:]
-    assert "imagine-bench bench x --workers 1 " in other, "the options behind the seeds stay"
-    page = bench_page(changed)
+    page = bench_page(shifted(result, dqn=[100, 102, 104], imagination=[198, 199, 200]))
     assert table(page, "gains").caption.startswith("Too few seeds to say")
     rows = list(csv.DictReader(io.StringIO(page.files["summary.csv"])))
     assert {row["interval_over"] for row in rows} == {"too few seeds"}
     assert all(row[name] in ("", "nan") for row in rows for name in (*SCORE[1:], *DIFFERENCE[1:], "p_holm"))
 
 
-LEARNERS = ("dqn", "dqn_more_updates", "imagination")
-
-
-@pytest.mark.parametrize(
-    ("equal", "sentence"),
-    [
-        (100, "better than dqn_more_updates (as many gradient updates), +24.5 ["),
-        (148, "no gain over dqn_more_updates (as many gradient updates) is shown, +0.5 ["),
-    ],
-)
-def test_the_first_line_says_what_equal_updates_leave_of_a_gain(tmp_path: Path, equal: int, sentence: str) -> None:
-    pairs = (("imagination", "dqn"), ("imagination", "dqn_more_updates"))
-    protocol = dataclasses.replace(WIDE, agents=LEARNERS, seeds=tuple(range(7)), headlines=pairs)
-    levels = zip(LEARNERS, (60, equal, 149), strict=True)
-    shares = {agent: [level + each for each in (-2, -1, 0, 0, 0, 1, 2)] for agent, level in levels}
-    data = collect(shifted(bench_result(tmp_path, protocol=protocol), **shares))
-    first = verdict(data)[0]
-    assert first.startswith("imagination: better than dqn, +44.5 [") and sentence in first
-    raw = [
-        statistics.difference(*(data.result.success_rates(agent)[:, -1] for agent in pair), trials=200).p
-        for pair in pairs
-    ]
-    assert [each.found.p for each in data.headlines] == statistics.holm(raw).tolist(), "for one another alone"
+def test_headlines_are_corrected_for_one_another_alone(headed: BenchResult) -> None:
+    data = collect(headed)
+    shares = {agent: headed.success_rates(agent)[:, -1] for agent in LEARNERS}
+    raw = [statistics.difference(shares[one], shares[base], trials=200).p for one, base in PAIRS]
+    assert [each.found.p for each in data.headlines] == statistics.holm(raw).tolist()
     assert data.of("imagination")[-1]["p_holm"] == data.headlines[0].found.p
-    others = sum("p" in record for record in data.records) - sum(each.base == "dqn" for each in data.headlines)
-    assert data.cells == others, "all other comparisons with DQN, each once"
-
-
-def test_an_undecided_headline_names_a_command_that_adds_seeds_itself(tmp_path: Path) -> None:
-    pairs = (("imagination", "dqn_more_updates"),)
-    few = (("imagination", 4),)
-    wanted = dataclasses.replace(WIDE, agents=LEARNERS, seeds=tuple(range(7)), headlines=pairs, few_seeds=few)
-    levels = [100, 140, 100, 120, 130, 110, 120]
-    result = bench_result(tmp_path, protocol=wanted)
-    first = verdict(collect(shifted(result, dqn=levels, dqn_more_updates=levels, imagination=[130] * 7)))[0]
-    assert "undecided with 5 seeds of imagination and 7 of dqn_more_updates; about " in first
-    assert " more would decide: imagine-bench bench --task arrow_puzzle --until-decided;" in first
+    assert data.cells == sum("p" in record for record in data.records) - 1, "all other comparisons with DQN, each once"
 
 
 def test_a_difference_is_shown_only_after_holms_correction(many: BenchResult) -> None:
