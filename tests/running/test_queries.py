@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import small_runs
 from bench_fakes import Pupil
 from imagine_bench.tasks.arrows.rules import ArrowRules
 from small_runs import final_arrays, measured, run_observed, small
@@ -15,7 +16,6 @@ from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.interfaces.capabilities import Label
-from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running import run_state, runner
@@ -31,11 +31,9 @@ def pupils() -> list[Pupil]:
     return Pupil.made
 
 
-def do(folder: Path, agent: str = "pupil", task: str = "arrow_puzzle", **changes: Any) -> RunResult:
-    wanted = {**small().as_dict(), "agents": (agent,), "budgets": (6,), "evaluation_episodes": 1, **changes}
-    wanted = {name: value for name, value in wanted.items() if name not in ("task", "preset")}
-    spec = RunSpec(protocol=protocol(task, "smoke", **wanted), agent=agent, seed=0)
-    return run_observed(spec, folder, lambda progress: None)
+def do(folder: Path, **changes: Any) -> RunResult:
+    few = {"agents": ("pupil",), "budgets": (6,), "evaluation_episodes": 1}
+    return small_runs.do(folder, "pupil", **{**few, **changes})
 
 
 # --- demonstrations ----------------------------------------------------------------------------------------------

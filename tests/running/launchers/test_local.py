@@ -126,49 +126,37 @@ def test_a_worker_that_dies_costs_one_item_and_others_go_on_in_one_process() -> 
 
 
 _OLD_CPU = "cpu,cpuacct/x/cpu.cfs"
+_OLD_MEMORY = "memory/x/memory.limit_in_bytes"
 
 
 @pytest.mark.parametrize(
-    ("groups", "files", "cores"),
+    ("groups", "files", "cores", "memory"),
     [
-        ("0::/a/b", {"a/cpu.max": "100000 100000", "a/b/cpu.max": "max 100000"}, 1),
-        ("0::/", {"cpu.max": "50000 100000"}, 1),
-        ("0::/gone", {"cpu.max": "150000 100000"}, 2),
-        ("3:cpu,cpuacct:/x", {f"{_OLD_CPU}_quota_us": "100000", f"{_OLD_CPU}_period_us": "100000"}, 1),
-        ("3:cpu:/of/the/host", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, None),
-        ("3:cpuset:/\n\nnonsense", {"cpuset/cpu.max": "1 100000", "cpu.max": "nothing"}, None),
-        ("0::/", {"cpu.max": "1 0"}, None),
+        ("0::/a/b", {"a/cpu.max": "100000 100000", "a/b/cpu.max": "max 100000"}, 1, None),
+        ("0::/", {"cpu.max": "50000 100000", "memory.max": "max"}, 1, None),
+        ("0::/gone", {"cpu.max": "150000 100000"}, 2, None),
+        ("3:cpu,cpuacct:/x", {f"{_OLD_CPU}_quota_us": "100000", f"{_OLD_CPU}_period_us": "100000"}, 1, None),
+        ("3:cpu:/of/the/host", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, None, None),
+        ("3:cpuset:/\n\nnonsense", {"cpuset/cpu.max": "1 100000", "cpu.max": "nothing"}, None, None),
+        ("0::/", {"cpu.max": "1 0"}, None, None),
+        ("0::/a/b", {"a/memory.max": "1048576", "a/b/memory.max": "max"}, None, 1048576),
+        ("2:memory:/x", {_OLD_MEMORY: "4096"}, None, 4096),
+        ("2:memory:/x", {_OLD_MEMORY: "9223372036854771712"}, None, None),
     ],
 )
-def test_a_quota_bounds_the_cores_counted(
-    tmp_path: Path, groups: str, files: dict[str, str], cores: int | None
+def test_a_containers_limits_bound_the_cores_and_the_memory_counted(
+    tmp_path: Path, groups: str, files: dict[str, str], cores: int | None, memory: int | None
 ) -> None:
-    write_groups(tmp_path, groups, files)
-    unbounded = usable_cores(tmp_path / "none")
-    assert usable_cores(tmp_path) == min(unbounded, cores or unbounded)
-
-
-@pytest.mark.parametrize(
-    ("groups", "files", "limit"),
-    [
-        ("0::/a/b", {"a/memory.max": "1048576", "a/b/memory.max": "max"}, 1048576),
-        ("0::/", {"memory.max": "max", "cpu.max": "1 1"}, None),
-        ("2:memory:/x", {"memory/x/memory.limit_in_bytes": "4096"}, 4096),
-        ("2:memory:/x", {"memory/x/memory.limit_in_bytes": "9223372036854771712"}, None),
-    ],
-)
-def test_a_containers_limit_bounds_the_memory_of_a_judged_model(
-    tmp_path: Path, groups: str, files: dict[str, str], limit: int | None
-) -> None:
-    write_groups(tmp_path, groups, files)
-    assert usable_memory(tmp_path) == (limit or usable_memory(tmp_path / "none"))
-    assert Limits().memory == usable_memory() * 3 // 4
-
-
-def write_groups(tmp_path: Path, groups: str, files: dict[str, str]) -> None:
     for name, text in {"proc/self/cgroup": groups, **{f"sys/fs/cgroup/{n}": t for n, t in files.items()}}.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(f"{text}\n")
+    unbounded = usable_cores(tmp_path / "none")
+    assert usable_cores(tmp_path) == min(unbounded, cores or unbounded)
+    assert usable_memory(tmp_path) == (memory or usable_memory(tmp_path / "none"))
+
+
+def test_a_judged_model_has_three_quarters_of_the_memory() -> None:
+    assert Limits().memory == usable_memory() * 3 // 4
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system knows no affinity")
