@@ -5,8 +5,9 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -139,8 +140,8 @@ _WORDS = {
     "beforehand are those on which the model's encoder had been trained before.",
 }
 SHORT = (
-    *("total_variation", "perfect_sampler", "unbiased", "unbiased_10", "nothing", "value_loss", "value_loss_ruled"),
-    *("policy_tau", "lift", "exploit", "auroc_wrong", "notice_slip", "counterfactual", "fit_s"),
+    *("total_variation", "perfect_sampler", "unbiased", "nothing", "value_loss"),
+    *("policy_tau", "lift", "exploit", "auroc_wrong", "counterfactual", "fit_s"),
 )
 _SHARES = {
     *("total_variation", "tv_3", "tv_5", "tv_10", "perfect_sampler", "perfect_10", "after_the_end", "nothing"),
@@ -149,6 +150,8 @@ _SHARES = {
     *(name for name in COLUMNS if name.startswith(("auroc", "conformal"))),
     "risk_coverage",
 }
+_MOST_SCORES = 8
+"""Scores in one table: more do not fit a page of 1,200 pixels."""
 _WHY_DASH = "not offered by the model, nothing to tell apart, or judged before this score existed"
 _BY_DEPTH = {"tv": "tv_by_depth", "perfect": "perfect_by_depth", "unbiased": "unbiased_by_depth"}
 Scores = Mapping[str, Any]
@@ -250,22 +253,35 @@ def _scores(found: Judged, table: str, names: Collection[str]) -> Table:
     return Table(table, header, rows, f"{caption}regret are in units of reward.", _WHY_DASH)
 
 
+def _tables(found: Judged, name: str, scores: Sequence[str]) -> list[Table]:
+    """Tables of all scores, as many as fit the page beside each other in each."""
+    parts = math.ceil(len(scores) / _MOST_SCORES)
+    size = math.ceil(len(scores) / parts)
+    return [
+        _scores(found, f"{name}_{part + 1}" if part else name, scores[part * size : (part + 1) * size])
+        for part in range(parts)
+    ]
+
+
 def in_short(found: Judged) -> Section:
-    """The main scores, and the reader's own errors."""
+    """The main scores of each model at the most transitions, and the reader's own errors."""
+    most = {model: size for model, size in sorted(found.cells, key=itemgetter(1))}
+    newest = replace(found, cells={key: each for key, each in found.cells.items() if most[key[0]] == key[1]})
     errors = {name: f"{share:.2%}" for name, share in read_json(found.folder / "reader.json", "errors").items()}
     words = (
         "Imagined images are read as macrostates by a network, the reader, that was trained apart from all models. Its "
         "own errors are in the second table: the shares of real frames that it takes for another macrostate or does "
-        "not recognize, and the shares of fog, noise and blends of two frames that it wrongly takes for a real frame."
+        "not recognize, and the shares of fog, noise and blends of two frames that it wrongly takes for a real frame. "
+        "Each model is shown after the most transitions that it learned from; the tables below have all."
     )
     reader = Table.of("reader", [errors], "The errors of the reader of images itself.")
-    return Section("In short", [words], tables=[_scores(found, "short", SHORT), reader])
+    return Section("In short", [words], tables=[_scores(newest, "short", SHORT), reader])
 
 
 def question(found: Judged, title: str) -> Section:
     """The scores that answer one question, after every number of transitions."""
     name = title.lower().strip("?").replace(" ", "_").replace(",", "")
-    return Section(title, [_WORDS[title]], tables=[_scores(found, name, QUESTIONS[title])])
+    return Section(title, [_WORDS[title]], tables=_tables(found, name, tuple(QUESTIONS[title])))
 
 
 def levels(found: Judged) -> Section:
@@ -280,10 +296,12 @@ def levels(found: Judged) -> Section:
     for model, arrays in shown(found.folder, found.judgement).items():
         if arrays.get("film"):
             films.append(film_image(model, _title(model), found.spec, arrays["film"], arrays))
-    scores = _scores(found, "levels", level_of)
-    header = [*scores.header[:2], *(f"{level} {COLUMNS[name]}" for name, level in level_of.items())]
-    tables = [replace(scores, header=header), claims_table()]
-    return Section("From looks to exploits: L0 to L7", [reader], tables=tables, images=films)
+    titles = {COLUMNS[name]: f"{level} {COLUMNS[name]}" for name, level in level_of.items()}
+    tables = [
+        replace(table, header=[titles.get(title, title) for title in table.header])
+        for table in _tables(found, "levels", tuple(level_of))
+    ]
+    return Section("From looks to exploits: L0 to L7", [reader], tables=[*tables, claims_table()], images=films)
 
 
 def compared(found: Judged) -> Section:

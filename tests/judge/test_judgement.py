@@ -23,8 +23,10 @@ from fake_reader import read_nothing
 from guest_packages import Guests
 from kept import ROOT
 from recordings import contents, times, view_names
+from report_pages import page_in_words
 from same_values import assert_same
 from small_runs import Inline, small
+from whole_outputs import Expected, short
 
 import imagine_bench
 from imagine_bench import registry
@@ -313,6 +315,16 @@ def test_scores_that_an_older_judgement_lacks_are_dashes(said: Said) -> None:
     lacking = {COLUMNS[name] for name in COLUMNS if _SINCE.match(name)} & columns.keys()
     assert lacking and all(set(columns[name]) == {DASH} for name in lacking)
     assert DASH not in columns[COLUMNS["total_variation"]]
+
+
+def test_the_page_of_a_judgement(said: Said, expected: Expected) -> None:
+    found = judged(said.folder, _of("nearest", "cheat", "copy", "exact"))
+    for cell in itertools.chain(*found.cells.values()):
+        cell.update(fit_s=cell["fit_s"] and 1.5, imagine_s_per_1000=2.5)
+    page = judgement_page(found)
+    words = page_in_words(dataclasses.replace(page, facts={}))
+    text = f"{words}\n== terminal\n{page.summary}".replace(str(said.folder), "HERE")
+    expected("judgement", short(text), exactly=False)
 
 
 def test_lost_cells_and_images_are_made_anew_by_the_same_judgement_and_nothing_else_is(copied: Path) -> None:
