@@ -125,9 +125,10 @@ def test_a_failing_seed_fails_the_command_and_names_its_log(
 
 
 def test_a_bench_ends_with_a_table_a_report_and_recordings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = bench_words(tmp_path, "--agents", "random", "oracle", "--evaluation-episodes", "10")
+    monkeypatch.setitem(PRESETS["smoke"], "recorded_seeds", 1)
+    words = bench_words(tmp_path, *"--agents random oracle --seeds 0 1 --evaluation-episodes 10".split())
     assert main(words) == 0
     said = capsys.readouterr().out
     folder = newest_bench(tmp_path)
@@ -135,8 +136,9 @@ def test_a_bench_ends_with_a_table_a_report_and_recordings(
     assert f"Report:     {folder}/report/index.html" in said
     assert (folder / "report" / "index.html").stat().st_size > 10_000
     assert len(list(folder.glob("*/seed_0/recording.rrd"))) == 2
+    assert "Recordings: 2, such as" in said, "those of the first seed"
     assert main(words) == 0
-    assert len(inline.order) == 2, "a finished bench is not run again"
+    assert len(inline.order) == 4, "a finished bench is not run again"
     assert capsys.readouterr().out.splitlines()[-4:] == said.splitlines()[-4:]
 
 

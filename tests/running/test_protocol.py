@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import shutil
 
 import pytest
 
@@ -10,6 +11,7 @@ from imagine_bench.interfaces import APPEARANCES
 from imagine_bench.protocols.control import PRESETS, Protocol, protocol
 from imagine_bench.registry import TASKS, task
 from imagine_bench.running.control import plan_control
+from imagine_bench.store import encoders
 
 BUNDLED = [name for name in TASKS if name != "arrow_puzzle_easy"]
 """Tasks whose encoders are bundled."""
@@ -34,6 +36,16 @@ def test_photo_has_latents_and_says_that_it_has_no_codes(name):
 def test_quick_finds_encoders_at_every_appearance(name, appearance):
     wanted, paths = plan_control(name, "quick", appearance=appearance)
     assert set(paths) == {"latents", "codes"} and wanted.codes is not None
+
+
+@pytest.mark.parametrize("kind", ["latents", "codes"])
+def test_latents_that_are_given_are_for_agents_that_read_them_and_codes_for_all(kind, tmp_path):
+    spec = task("arrow_puzzle")
+    own = {each: encoders.own(spec, "clean", each) for each in ("latents", "codes")}
+    given = tmp_path / "given.safetensors"
+    shutil.copy(own[kind], given)
+    _, paths = plan_control("arrow_puzzle", "quick", agents=("dqn", "factored:given"), encoder=str(given))
+    assert paths == ({"latents": given, "codes": given} if kind == "codes" else {**own, "latents": given})
 
 
 def test_any_change_changes_the_hash():
