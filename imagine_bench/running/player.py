@@ -92,6 +92,7 @@ def protocol_of_player(
         found,
         execution=registry.task(found.task).execution(execution or found.execution),
         appearance=appearance or found.appearance,
+        test_appearance=None if appearance else found.test_appearance,
         agents=(player,),
         seeds=(seed,),
         few_seeds=(),

@@ -16,6 +16,7 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import BusyError, ImagineBenchError, InvalidValueError
 from imagine_bench.judge.verify import verify_runs
 from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.running import player
 from imagine_bench.running.bench import bench
 from imagine_bench.running.player import FinishedError, PlayedRun, played_run, protocol_of_player
 from imagine_bench.store import run_folder
@@ -162,6 +163,14 @@ def test_one_process_at_a_time_and_no_episode_more(tmp_path: Path) -> None:
             play_one(run)
         with pytest.raises(FinishedError, match="person:anna: all 4 episodes are played; give another name"):
             run.reset()
+
+
+def test_an_appearance_that_is_asked_for_is_that_of_the_tests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = protocol("arrow_puzzle", "smoke", agents=("random",), test_appearance="strong")
+    monkeypatch.setattr(player, "read_control", lambda folder: there)
+    for asked, found in ((None, "strong"), ("mild", "mild")):
+        wanted = protocol_of_player(None, "person", "anna", like=tmp_path, appearance=asked)
+        assert wanted.appearance_in_tests == found
 
 
 def test_a_person_stands_in_the_table_of_a_bench(tmp_path: Path) -> None:

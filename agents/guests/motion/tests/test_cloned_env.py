@@ -102,8 +102,11 @@ def test_gymnasiums_checker_passes() -> None:
 def test_another_execution_or_macro_action_is_refused() -> None:
     with pytest.raises(InvalidValueError, match="in physics"):
         CloneExecutedEnv(execution="kinematic")
-    with pytest.raises(InvalidValueError, match="from 0 to 5"):
-        environment().step(6)
+    for action in (6, 1.5, None):
+        with pytest.raises(InvalidValueError, match="from 0 to 5"):
+            environment().step(action)
+    with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):
+        CloneExecutedEnv(clone=environment().clone).step(0)
 
 
 def test_the_bench_knows_the_task_with_the_rules_of_the_arrow_puzzle() -> None:

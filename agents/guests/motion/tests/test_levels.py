@@ -92,6 +92,7 @@ def test_an_agent_is_told_of_each_episode_and_trained_in_its_model_before_tests(
         ("level FILE/out --agent random --execution planner", "Cannot write"),
         ("clone FILE FILE/clone.pt", "Cannot write"),
         ("clone FILE clone.pt", "FILE is not a file of demonstrations"),
+        ("flat out --steps 100 --every 2500", "steps is 100 and every 2500; give a multiple of every"),
         ("demonstrate FILE/demo", "Cannot write"),
         ("demonstrate demo --count 0", "count is 0; give an integer from 1 on."),
         ("try CLONE --count 0", "count is 0; give an integer from 1 on."),

@@ -59,11 +59,12 @@ HOSTILE = {
     "gives a half": ("def outcomes(s, a): return {s: 0.5}", "the probabilities 0.5; give numbers of at least 0"),
     "gives less than 0": ("def outcomes(s, a): return {s: 1.5, (0, 0, 0, 0): -0.5}", "probabilities 1.5, -0.5"),
     "gives other values": ("def outcomes(s, a): return {(9, 9, 9, 9): 1.0}", "symbols lie below (4, 4, 4, 3)."),
+    "gives half a symbol": ("def outcomes(s, a): return {(0, 1, 2, 0.5): 1.0}", "(0, 1, 2, 0.5); give whole numbers."),
     "gives fewer symbols": ("def outcomes(s, a): return {(0,): 1.0}", "give 4 symbols, or (symbols, reward"),
 }
 
 
-_FAST = {"imports a part that no program needs", "imports a part of one", "gives fewer symbols"}
+_FAST = {"imports a part that no program needs", "imports a part of one", "gives fewer symbols", "gives half a symbol"}
 
 
 @pytest.mark.parametrize(

@@ -155,11 +155,13 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
 
     def step(self, action: np.int64 | int) -> tuple[Frame, float, bool, bool, Info]:
         """Let the clone carry out one macro-action, and bring the arm back."""
-        chosen = int(action)
-        if not self.action_space.contains(chosen):
+        if not self.action_space.contains(action):
             raise InvalidValueError(
                 f"Action {brief(action)} does not exist; give an integer from 0 to {len(self.action_names) - 1}."
             )
+        if self._seen is None:
+            raise InvalidValueError("There is no episode to go on with; call reset() first.")
+        chosen = int(action)
         rules = self.motion.task.rules
         before = self.motion.episode.macrostate
         self._periods = 0

@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from imagine_bench.arrays import Info
+from imagine_bench.errors import InvalidValueError
 
 OBSERVATION = "proprio,objects,state"
 """It sees more than any other agent here: the true poses and the macrostate."""
@@ -78,7 +79,12 @@ def learn(
         tests: Episodes of a test, from seeds that training never sees.
         told: Called with each point of the curve.
         **options: Of the environment.
+
+    Raises:
+        InvalidValueError: No test would follow, or one before the last step.
     """
+    if every < 1 or steps < every or steps % every:
+        raise InvalidValueError(f"steps is {steps} and every {every}; give a multiple of every, which is at least 1.")
     prepare_torch("cpu")
     scales = settings == "tuned"
     env = VecNormalize(DummyVecEnv([partial(flat_env, **options)]), norm_obs=scales, norm_reward=scales, gamma=0.97)

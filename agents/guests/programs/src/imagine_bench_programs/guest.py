@@ -111,6 +111,8 @@ class Served:
             raise InvalidValueError(
                 f"it gives the outcome {brief(given)}; give {factors} symbols, or (symbols, reward, ended, memory)."
             )
+        if any(isinstance(symbol, float) and not symbol.is_integer() for symbol in symbols):
+            raise InvalidValueError(f"it gives the symbols {brief(symbols)}; give whole numbers.")
         reward, ended, memory = (*more, None, None, None)[:3]
         values = tuple(int(symbol) for symbol in symbols)
         return values, math.nan if reward is None else float(reward), bool(ended), self._number(memory)

@@ -184,7 +184,7 @@ class Handler(BaseHTTPRequestHandler):
             return
 
     def _said(self, text: str, player: dict[str, Json]) -> Answer:
-        """The answer to a message; ``player`` is whom the last reset named."""
+        """The answer to a message; ``player`` is whom the last reset named, for messages that name nobody."""
         try:
             message = _mapping(read_json(text.encode()))
             kind = message.get("type")
@@ -192,12 +192,12 @@ class Handler(BaseHTTPRequestHandler):
             if kind == "close":
                 raise ClosedError
             if kind == "state":
-                return {"type": "state", "data": self._players.state(player)}
+                return {"type": "state", "data": self._players.state({**player, **data})}
             if kind == "reset":
                 player.update({"player": data["player"]} if "player" in data else {})
                 return {"type": "observation", "data": self._players.reset({**data, **player})}
             if kind == "step":
-                return {"type": "observation", "data": self._players.step({**data, **player})}
+                return {"type": "observation", "data": self._players.step({**player, **data})}
             raise InvalidValueError("A message has the type reset, step, state or close.")
         except ImagineBenchError as error:
             return {"type": "error", "data": {"message": plain(error), "code": "VALIDATION_ERROR"}}
