@@ -53,6 +53,14 @@ def test_a_step_round_the_circle_is_shorter_than_a_table() -> None:
     assert laws.turned((3,), 0) == (0,), "a value that was never seen turns as the others do"
 
 
+def test_a_permutation_is_shorter_than_a_table_and_completes_itself() -> None:
+    turns = {2: 0, 0: 3, 3: 1}  # no step round the circle; where 1 goes was never seen
+    laws = Laws((4,), 1, [row((value,), (after,)) for value, after in turns.items()] * 2)
+    assert laws.turned((1,), 0) == (2,) and not laws.drifts
+    presses = [row((value,), (max(value, 1),)) for value in range(4) for _ in range(3)]
+    assert [Laws((4,), 1, presses).turned((value,), 0)[0] for value in range(4)] == [1, 1, 2, 3]
+
+
 def test_one_probability_for_all_macro_actions_is_shorter_than_a_certain_one_among_them() -> None:
     counts = [(41, 17), (34, 8), (41, 9), (35, 0), (41, 15), (38, 6)]  # of one exploration at slip=0.2
     rows = [

@@ -35,8 +35,8 @@ from .delay import MOST_DELAY, Row, changes, complete, too_early
 
 _CONTRADICTED = 20.0
 """Nats that a transition costs which no law explains."""
-_FORMS = 3
-"""Forms of a function of a value: a step round the circle of its values, a constant, a table."""
+_FORMS = 4
+"""Forms of a function of a value: a step round the circle of its values, a constant, a permutation, a table."""
 _TESTS = 2
 """Most conditions of a law."""
 
@@ -287,6 +287,20 @@ def _functions(pairs: Counter[tuple[int, int]], size: int) -> Iterator[tuple[flo
     for (before, after), _ in sorted(pairs.items(), key=lambda item: item[1]):  # the most frequent last
         table[before] = after if after != before else table[before]
     yield each * size, tuple(table)
+    permutation = _permutation(pairs, size)
+    if permutation is not None:
+        yield math.lgamma(size + 1), permutation
+
+
+def _permutation(pairs: Counter[tuple[int, int]], size: int) -> State | None:
+    """The permutation of all changes among pairs of values, if there is one; where they leave it open, in order."""
+    changed = {before: after for before, after in pairs if before != after}
+    consistent = sum(before != after for before, after in pairs) == len(changed) == len({*changed.values()})
+    if not consistent:
+        return None
+    unused = [value for value in range(size) if value not in changed.values()]
+    left = [value for value in range(size) if value not in changed]
+    return tuple((changed | dict(zip(left, unused, strict=True)))[value] for value in range(size))
 
 
 def _misfit(pairs: Counter[tuple[int, int]], becomes: State) -> float:
