@@ -23,6 +23,7 @@ from small_runs import Inline
 from imagine_bench import cli, errors, registry
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
+from imagine_bench.protocols.control import PRESETS
 from imagine_bench.registry import AGENTS, TASKS, WORLD_MODELS
 from imagine_bench.registry.entries import AgentConfiguration, parse_configuration
 from imagine_bench.store.bench_folder import newest_bench
