@@ -59,7 +59,7 @@ from imagine_bench.store.results import BenchResult
 
 _EQUAL_UPDATES = "dqn_more_updates"
 _UNTIL = " --until-decided"
-_SEEDS_OPTION = re.compile(r" --seeds(?: \d[\d-]*)+")
+_SEEDS_OPTION = re.compile(r" --seeds[ =]\d[\d-]*(?: \d[\d-]*)*")
 _AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
     "against dqn": lambda record: record["agent"],
     "real episodes": lambda record: f"{record['episodes']:,}",
@@ -229,7 +229,7 @@ def _unfinished(result: BenchResult) -> list[str]:
 def _left_out(result: BenchResult) -> list[str]:
     if not result.left_out:
         return []
-    return [f"Left out, for some agent has not been run with that seed: {', '.join(result.left_out)}."]
+    return [f"Left out, for some agent has not been run with that seed or one before: {', '.join(result.left_out)}."]
 
 
 def _not_installed(data: ReportData) -> list[str]:
@@ -333,9 +333,9 @@ def gain(data: ReportData) -> Section | None:
         "seeds have no interval, nor has a gain over a DQN that may have solved nothing."
     )
     records = [record for record in data.records if record["agent"] in data.compared]
-    sizes = [record["detectable_difference"] for record in records]
-    detectable = f"Too few seeds to say: none of {len(sizes)} cells can show a difference."
-    if not math.isnan(sizes[0]):
+    sizes = [size for record in records if not math.isnan(size := record["detectable_difference"])]
+    detectable = f"Too few seeds to say: none of {len(records)} cells can show a difference."
+    if sizes:
         families = f"{data.cells} cells"
         if data.headlines:
             families += f", those of the {len(data.headlines)} headlines for one another alone"

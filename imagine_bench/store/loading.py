@@ -11,6 +11,7 @@ same. The latter is how a bench is shared out among machines that have no disk i
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -175,14 +176,14 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
     """Several benches, or parts of them, that differ only in agents or in seeds, as one in a new folder below ``root``.
 
     Shown are the seeds that every agent has, and the budgets that all benches have; ``left_out`` names the other runs.
-    A person, or another player that is no agent, needs one run. Where one bench has fewer tests, the first ones of all
-    count: they begin alike.
+    An agent of fewer seeds in one of them needs only its first ones; a person, or another player that is no agent,
+    needs one run. Where one bench has fewer tests, the first ones of all count: they begin alike.
 
     Raises:
         InvalidValueError: They differ in more, an agent's seed is in two of them, or no budget is in all.
         ArtefactError: No seed is in all, two runs of an agent had other settings, or tests are not kept one by one.
     """
-    protocol = _merged(results)
+    protocol = _merged(results, [result.protocol for result in results])
     runs = {(run.agent, run.seed): _of_first(run, protocol) for result in results for run in result.runs}
     if len(runs) < sum(len(result.runs) for result in results):
         raise InvalidValueError(
@@ -192,6 +193,7 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
     part = _largest_table(protocol, _reached(protocol, runs))
     commands = "; ".join(str(result.environment.get("command", "")) for result in results)
     benches = {f"bench {number}": dict(result.environment) for number, result in enumerate(results, start=1)}
+    missing = tuple(sentence for result in results for sentence in result.missing)
     return BenchResult(
         protocol=part,
         runs=_runs_of(part, runs),
@@ -199,8 +201,9 @@ def merge(results: Sequence[BenchResult], root: Path) -> BenchResult:
         folder=root / file_name(part.task) / f"merged-{part.hash}",
         wall_s=sum(result.wall_s for result in results),
         certificate=next((result.certificate for result in results if result.certificate is not None), None),
-        missing=tuple(sentence for result in results for sentence in result.missing),
-        left_out=tuple(f"{agent} seed {seed}" for agent, seed in sorted(runs) if seed not in part.seeds),
+        whole=_merged(results, [result.whole or result.protocol for result in results]) if missing else None,
+        missing=missing,
+        left_out=tuple(f"{agent} seed {seed}" for agent, seed in sorted(runs.keys() - {*part.runs})),
     )
 
 
@@ -211,13 +214,12 @@ def _of_first(run: RunResult, protocol: Protocol) -> RunResult:
     return dataclasses.replace(run, checkpoints=tuple(rows))
 
 
-def _merged(results: Sequence[BenchResult]) -> Protocol:
-    """The protocol of all of their agents and seeds."""
-    encoder = next((result.protocol.encoder for result in results if result.protocol.encoder), None)
-    codes = next((result.protocol.codes for result in results if result.protocol.codes), None)
+def _merged(results: Sequence[BenchResult], protocols: Sequence[Protocol]) -> Protocol:
+    """The protocol of all agents and seeds of these benches, of each its protocol or that of its whole."""
+    encoder = next((protocol.encoder for protocol in protocols if protocol.encoder), None)
+    codes = next((protocol.codes for protocol in protocols if protocol.codes), None)
     protocols = [
-        dataclasses.replace(each, encoder=each.encoder or encoder, codes=each.codes or codes)
-        for each in (result.protocol for result in results)
+        dataclasses.replace(each, encoder=each.encoder or encoder, codes=each.codes or codes) for each in protocols
     ]
     first = protocols[0]
     same_agents = len({frozenset(protocol.agents) for protocol in protocols}) == 1
@@ -248,10 +250,12 @@ def _merged(results: Sequence[BenchResult]) -> Protocol:
 
 
 def _few_seeds(protocols: Sequence[Protocol]) -> tuple[tuple[str, int], ...]:
-    """The agents of which few seeds are run, with their last seed; players are."""
+    """The agents of few seeds, players among them, each with the last of the first seeds that it has without a gap."""
+    seeds = sorted({seed for protocol in protocols for seed in protocol.seeds})
     found: dict[str, int] = {}
-    for protocol in protocols:
-        players = [(agent, protocol.seeds[-1]) for agent in protocol.agents if registry.is_player(agent)]
-        for agent, last in (*protocol.few_seeds, *players):
-            found[agent] = max(last, found.get(agent, last))
-    return tuple(found.items())
+    few = dict.fromkeys(agent for protocol in protocols for agent, _ in protocol.few_seeds)
+    players = (agent for protocol in protocols for agent in protocol.agents if registry.is_player(agent))
+    for agent in dict.fromkeys((*few, *players)):
+        its = {seed for protocol in protocols if agent in protocol.agents for seed in protocol.seeds_of(agent)}
+        found[agent] = max(itertools.takewhile(its.__contains__, seeds), default=max(its))
+    return tuple((agent, last) for agent, last in found.items() if last < seeds[-1])

@@ -126,6 +126,9 @@ def test_verdicts(many: BenchResult, result: BenchResult, headed: BenchResult, e
     }
     text = [line for name, scene in scenes.items() for line in (f"== {name}", *verdict(collect(scene)))]
     expected("verdicts", "\n".join(text), exactly=False)
+    same = {**three.environment, "command": "imagine-bench bench x --seeds=0-1 7 --workers 1"}
+    first, other = (verdict(collect(dataclasses.replace(three, environment=each))) for each in (typed, same))
+    assert first == other, "seeds are typed in two ways"
 
 
 def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult) -> None:
@@ -134,6 +137,14 @@ def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult)
     rows = list(csv.DictReader(io.StringIO(page.files["summary.csv"])))
     assert {row["interval_over"] for row in rows} == {"too few seeds"}
     assert all(row[name] in ("", "nan") for row in rows for name in (*SCORE[1:], *DIFFERENCE[1:], "p_holm"))
+
+
+def test_an_agent_of_one_seed_hides_no_difference_that_others_could_show(many: BenchResult) -> None:
+    first = collect(many).compared[0]
+    protocol = dataclasses.replace(many.protocol, few_seeds=((first, many.protocol.seeds[0]),))
+    runs = tuple(run for run in many.runs if run.agent != first or run.seed == many.protocol.seeds[0])
+    caption = table(bench_page(dataclasses.replace(many, protocol=protocol, runs=runs)), "gains").caption
+    assert "The smallest difference that would be shown with probability 80 % is " in caption and "nan" not in caption
 
 
 def test_headlines_are_corrected_for_one_another_alone(headed: BenchResult) -> None:

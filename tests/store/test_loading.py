@@ -18,7 +18,7 @@ from small_runs import Inline, small
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.protocols.control import Protocol
-from imagine_bench.report import summary_table
+from imagine_bench.report import summary_table, write_report
 from imagine_bench.running.bench import bench, load_bench
 from imagine_bench.store.loading import cut, load_so_far, merge
 from imagine_bench.store.results import BenchResult
@@ -44,9 +44,9 @@ def do(root: Path, *agents: str, **changes: Any) -> Path:
     return folder
 
 
-def kept_from(folder: Path, kept: Path) -> Path:
-    """The part of a bench that is kept for good."""
-    assert main(["report", str(folder)]) == 0
+def kept_from(folder: Path, kept: Path, joined: BenchResult | None = None) -> Path:
+    """The part of a bench, or of joined ones, that is kept for good."""
+    assert write_report(joined).exists() if joined else main(["report", str(folder)]) == 0
     kept.mkdir()
     for name in ("bench.json", "results.csv"):
         (kept / name).write_bytes((folder / "report" / name).read_bytes())
@@ -64,7 +64,9 @@ def test_every_run_of_both_is_there_unchanged(tmp_path: Path) -> None:
     assert joined.environment["bench 2"]["command"] == own.environment["command"]
     assert joined.folder.name.startswith("merged-") and joined.missing == ()
     assert joined.left_out == ("oracle seed 0", "random seed 2")
-    assert "Left out, for some agent has not been run with that seed: oracle seed 0, random" in summary_table(joined)
+    assert "Left out, for some agent has not been run with that seed or one before: oracle seed 0" in summary_table(
+        joined
+    )
 
 
 @pytest.mark.parametrize(
@@ -110,7 +112,36 @@ def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
     joined = load_merged([here, there], tmp_path)
     assert joined.protocol.seeds == (0, 2)
     assert joined.missing == ("oracle seed 1: 0 of 9 real episodes",)
-    assert "This bench is not finished: shown are 2 of 2 seeds up to 9 of 9 real" in summary_table(joined)
+    assert "This bench is not finished: shown are 2 of 3 seeds up to 9 of 9 real" in summary_table(joined)
+    assert load_so_far(kept_from(joined.folder, tmp_path / "kept", joined)).missing == joined.missing
+
+
+@pytest.mark.parametrize(
+    ("seeds", "more", "shown", "left_out"),
+    [
+        ((0, 1), {"agents": ("oracle",), "seeds": (1,)}, {"random": (0, 1), "oracle": (0, 1)}, ()),
+        ((0, 1, 2), {"agents": ("oracle",), "seeds": (2,)}, {"random": (0, 1, 2), "oracle": (0,)}, ("oracle seed 2",)),
+        (
+            (0, 1),
+            {"seeds": (2, 3), "few_seeds": {"oracle": 1}},
+            {"random": (0, 1, 2, 3), "oracle": (0,)},
+            ("oracle seed 2",),
+        ),
+    ],
+    ids=["the others of an agent of few seeds", "a gap in its seeds", "few seeds in both"],
+)
+def test_agents_of_few_seeds_are_joined_with_all_that_follow_each_other(
+    tmp_path: Path,
+    seeds: tuple[int, ...],
+    more: dict[str, Any],
+    shown: dict[str, tuple[int, ...]],
+    left_out: tuple[str, ...],
+) -> None:
+    one = do(tmp_path / "one", "random", "oracle", seeds=seeds, few_seeds={"oracle": 1})
+    other = do(tmp_path / "other", *more.pop("agents", ("random", "oracle")), **more)
+    joined = load_merged([one, other], tmp_path)
+    assert {agent: tuple(run.seed for run in joined.of(agent)) for agent in ("random", "oracle")} == shown
+    assert joined.left_out == left_out
 
 
 def test_seeds_whose_machines_chose_other_settings_are_refused(tmp_path: Path) -> None:
