@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from imagine_bench import statistics
+from imagine_bench import registry, statistics
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.statistics import LEVEL, Estimate
@@ -101,6 +101,8 @@ def until_decided(
         )
     counts = stages(len(first.seeds), most)
     agents = tuple(dict.fromkeys(agent for pair in first.headlines for agent in reversed(pair)))
+    known = frozenset[str]().union(*map(registry.setting_names, agents))
+    overrides = tuple(pair for pair in first.overrides if pair[0] in known)  # of the others no run is left
     few = {agent: len(first.seeds_of(agent)) for agent, _ in first.few_seeds if agent not in agents}
     begun = plan(seeds=first.seeds, most_looks=len(counts), few_seeds=few)
     parts: list[BenchResult] = []
@@ -109,15 +111,15 @@ def until_decided(
         if decided(whole):
             break
         seeds = tuple(first.seeds[-1] + 1 + step for step in range(before - counts[0], count - counts[0]))
-        parts.append(plan(agents=agents, seeds=seeds, headlines=first.headlines, most_looks=len(counts)))
+        changes = {"headlines": first.headlines, "most_looks": len(counts), "overrides": overrides}
+        parts.append(plan(agents=agents, seeds=seeds, **changes))
         whole = merge([_of_agents(begun, parts[0].protocol), *parts], root)
     return begun, whole
 
 
 def _of_agents(result: BenchResult, like: Protocol) -> BenchResult:
     """A bench with the agents of another protocol alone, which have the same settings there."""
-    part = dataclasses.replace(
-        result.protocol, agents=like.agents, settings_digest=like.settings_digest, few_seeds=like.few_seeds
-    )
+    of_agents = {name: getattr(like, name) for name in ("agents", "settings_digest", "few_seeds", "overrides")}
+    part = dataclasses.replace(result.protocol, **of_agents)
     runs = tuple(run for run in result.runs if run.agent in part.agents)
     return dataclasses.replace(result, protocol=part, runs=runs)

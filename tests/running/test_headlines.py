@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,14 @@ def test_stages_end_once_decided_or_at_the_most(staged: Any, tmp_path: Path, gap
     again: list[Protocol] = []
     assert until_decided(staged(gap, again), FIRST, most=13, root=tmp_path)[1].protocol == whole.protocol
     assert again == asked, "the same call asks for the same benches, which are then only read"
+
+
+def test_a_setting_that_no_agent_of_headlines_has_is_of_the_first_stage(staged: Any, tmp_path: Path) -> None:
+    asked: list[Protocol] = []
+    first = dataclasses.replace(FIRST, overrides=(("controller.discount", 0.9), ("dynamics.parents", 2)))
+    _, whole = until_decided(partial(staged(0, asked), overrides=first.overrides), first, most=8, root=tmp_path)
+    assert asked[0].overrides == first.overrides
+    assert whole.protocol.overrides == asked[1].overrides == first.overrides[:1]
 
 
 def test_an_interrupted_search_ends_in_the_same_results(tmp_path: Path) -> None:
