@@ -101,7 +101,6 @@ def protocol_of_player(
         encoder=None,
         codes=None,
         code=(),
-        overrides=(),
         settings_digest=digest({player: {}} if training else {}),
     )
 

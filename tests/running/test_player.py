@@ -176,8 +176,9 @@ def test_an_appearance_that_is_asked_for_is_that_of_the_tests(tmp_path: Path, mo
 def test_a_person_stands_in_the_table_of_a_bench(tmp_path: Path) -> None:
     """Its tests are the bench's first ones, and the bench's row with as many tests is that of its first ones."""
     planned = protocol(
-        "arrow_puzzle", "smoke", agents=("random", "oracle"), seeds=(0, 1), evaluation_episodes=9, execution="kinematic"
-    )
+        "arrow_puzzle", "smoke", agents=("random", "oracle"), seeds=(0, 1), evaluation_episodes=9,
+        execution="kinematic", overrides=(("controller.discount", 0.9),),
+    )  # fmt: skip
     there = bench(planned, {}, root=tmp_path, launcher=Inline())
     played = protocol_of_player(None, "person", "anna", tests=4, like=there.folder)
     mine = load_so_far(play_all(played, tmp_path).parents[1])
