@@ -155,7 +155,8 @@ def transfer(run: Run) -> None:
             while counters.before < (index + 1) * each:
                 with run.training_time():
                     seed = episode_seed("earlier_training", run.spec.seed, counters.before)
-                    for transition, _ in play(env, run.agent, seed=seed, explore=True, privileged=False):
+                    privileged = run.entry.privileged
+                    for transition, _ in play(env, run.agent, seed=seed, explore=True, privileged=privileged):
                         run.agent.observe(transition, episode=counters.before if untold else counters.before % each)
                     counters.before += 1
                     if counters.before % each == 0 and isinstance(run.agent, TransferLearner) and not untold:
@@ -174,11 +175,16 @@ def train(run: Run, budget: int) -> None:
         run.made_progress("training")
 
 
+def _number(run: Run) -> int:
+    """The number of the training episode that goes on, as learners are told it."""
+    return run.counters.episode + (run.protocol.episodes_before if run.protocol.unannounced else 0)
+
+
 def _episode_of_dataset(run: Run, dataset: Episodes) -> None:
     episode = run.counters.episode
     begin_episode(run.agent)
     for transition in dataset.transitions(episode):
-        run.agent.observe(transition, episode=episode)
+        run.agent.observe(transition, episode=_number(run))
     run.counters.add_episode(bool(dataset.success[episode]), int(dataset.lengths[episode]))
 
 
@@ -206,7 +212,7 @@ def _training_episode(run: Run, *, demonstrated: bool) -> None:
     )
     length = 0
     success = False
-    number = counters.episode + (run.protocol.episodes_before if run.protocol.unannounced else 0)
+    number = _number(run)
     for lived, info in episode:
         transition = lived if teacher is None else teacher.told(lived)
         run.agent.observe(transition if run.entry.privileged else as_seen(transition), episode=number)

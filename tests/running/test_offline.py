@@ -83,6 +83,12 @@ def test_a_dataset_is_experience_and_budgets_count_it(tmp_path: Path) -> None:
     assert further.training_success[:6].tolist() == episodes.success.tolist()
 
 
+def test_in_an_unannounced_change_a_datasets_episodes_are_counted_on(tmp_path: Path) -> None:
+    changes = {"budgets": (8,), "after": ("arrow_puzzle_hard",), "after_episodes": 3, "unannounced": True}
+    run(tmp_path / "run", spec_of(written(tmp_path / "set").folder, **changes))
+    assert [*dict.fromkeys(episode for episode, _ in Pupil.made[-1].shown)] == list(range(3 + 8))
+
+
 def test_a_kill_within_a_dataset_changes_no_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_state, "_REPORT_EVERY_S", 0.0)
     told = 0

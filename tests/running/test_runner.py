@@ -103,7 +103,8 @@ def test_a_run_counts_what_happens(tmp_path: Path) -> None:
 def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
     bench_fakes.Pupil.made.clear()
     for name in ("pupil", "pupil_privileged"):
-        do(tmp_path / name, name, agents=(name,), recorded_episodes=1)
+        after = {"after": ("arrow_puzzle_hard",), "after_episodes": 2, "unannounced": True}
+        do(tmp_path / name, name, agents=(name,), recorded_episodes=1, **after)
     plain, privileged = bench_fakes.Pupil.made
     assert len(plain.seen) > 20 and all(observation.macrostate is None for observation in plain.seen)
     assert plain.optimal_policy is None and callable(privileged.optimal_policy)
