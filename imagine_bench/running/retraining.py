@@ -111,13 +111,15 @@ def train_again(folder: Path, retraining: Retraining) -> list[Verdict]:
 
     Raises:
         ArtefactError: The bench is damaged.
-        InvalidValueError: Less than one run of each agent is asked for.
+        InvalidValueError: Less than one run of each agent is asked for, or a dataset is given where no run had one.
         SetupError: Nothing can be written, or there is no GL.
     """
     protocol = read_control(folder)
     kept = BenchStore(folder, protocol)
     differing = _differing(kept)
     wanted = drawn(protocol, retraining.runs, retraining.nonce)
+    if protocol.dataset is None and retraining.dataset is not None:
+        raise InvalidValueError(f"No run of {folder} learned from a dataset; leave --dataset out.")
     found = []
     with TemporaryDirectory(prefix="imagine-bench-verify-") as scratch:
         again = BenchStore(Path(scratch), protocol)

@@ -302,16 +302,14 @@ def what_is_shown(folder: Path, found: Sequence[Verdict], retraining: Retraining
     lines = [*(f"Not shown: {each}." for each in UNSHOWN), f"Made at commit {commits}, as it says."]
     trained = sum(each.of_training for each in found)
     if trained and retraining is not None:
-        count = len(protocol.seeds)
-        each = min(retraining.runs, count)
-        chances = (
-            f"{forged} of {count} forged: {percent(chance_to_find(count, forged, each))} %" for forged in _few(count)
-        )
         lines[0] = f"{lines[0][:-1]}, but in the runs that were trained again."
-        lines.append(
-            f"Trained again: {trained} runs, {each} of an agent's {count}, drawn by --nonce {retraining.nonce}."
-        )
-        lines.append(f"Chance that a draw finds a forged run of an agent: {'; '.join(chances)}.")
+        each = {count: min(retraining.runs, count) for count in {len(protocol.seeds_of(a)) for a in protocol.agents}}
+        words = " or ".join(f"{drawn} of an agent's {count}" for count, drawn in sorted(each.items()))
+        lines.append(f"Trained again: {trained} runs, {words}, drawn by --nonce {retraining.nonce}.")
+        for count, drawn in sorted(each.items()):
+            chances = ((forged, chance_to_find(count, forged, drawn)) for forged in _few(count))
+            said = "; ".join(f"{forged} of {count} forged: {percent(chance)} %" for forged, chance in chances)
+            lines.append(f"Chance that a draw finds a forged run of an agent: {said}.")
     elif retraining is not None:
         lines.append("Training again: no run was.")
     elif not is_archive(folder):

@@ -4,6 +4,7 @@ with exit code 3.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
@@ -16,10 +17,12 @@ import numpy as np
 import pytest
 from forger import forged, rewrite_protocol, share_weights
 from forging import OpenRun, mixed
-from small_runs import Inline, small
+from small_runs import Inline, small, written
 
 from imagine_bench.cli import exit_code as main
-from imagine_bench.running.retraining import Retraining, chance_to_find, drawn
+from imagine_bench.errors import InvalidValueError
+from imagine_bench.running.bench import bench
+from imagine_bench.running.retraining import Retraining, Verdict, chance_to_find, drawn
 from imagine_bench.store.files import read_sealed, sealed
 from imagine_bench.tools.audits import conclusion, verify, what_is_shown
 
@@ -86,6 +89,21 @@ def test_an_honest_run_repeats_to_the_bit_and_each_nonce_draws_its_own(pair: Pat
     found = verify(pair, again("a"))
     assert not found[-1].complaint and "repeats to the bit" in str(found[-1])
     assert "--nonce a" in what_is_shown(pair, found, again("a"))
+
+
+def test_the_chance_to_find_a_forged_run_is_that_of_the_runs_an_agent_has(tmp_path: Path) -> None:
+    wanted = dataclasses.replace(small(agents=("table", "random")), seeds=(0, 1, 2, 3), few_seeds=(("random", 0),))
+    folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
+    said = what_is_shown(folder, [Verdict(what="one", of_training=True)], again("a")).splitlines()
+    assert "Trained again: 1 runs, 1 of an agent's 1 or 1 of an agent's 4, drawn by --nonce a." in said
+    assert said[-2] == "Chance that a draw finds a forged run of an agent: 1 of 1 forged: 100.0 %."
+    assert said[-1].startswith("Chance that a draw finds a forged run of an agent: 1 of 4 forged: 25.0 %; 2 of 4")
+
+
+def test_a_dataset_from_which_no_run_learned_is_refused(pair: Path, tmp_path: Path) -> None:
+    superfluous = dataclasses.replace(again(), dataset=written(tmp_path / "set").folder)
+    with pytest.raises(InvalidValueError, match=r"No run of .* learned from a dataset; leave --dataset out"):
+        verify(pair, superfluous)
 
 
 def test_runs_that_do_not_hold_are_not_said_to_be_trained_again(
