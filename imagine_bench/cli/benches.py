@@ -246,6 +246,8 @@ class Report(OfBench):
     def __call__(self) -> None:
         """Load and write."""
         given, task = self.meant()
+        if self.track is not None and self.merge:
+            raise InvalidValueError("--track writes the metrics of one bench; leave it or --merge out.")
         folder = given or newest_bench(self.out, task)
         if self.track is not None:
             print(f"Metrics: {track(folder, self.track)}")

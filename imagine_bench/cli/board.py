@@ -88,9 +88,11 @@ class Daily:
 
     def __call__(self) -> None:
         """Draw, describe, run."""
-        task = registry.load(registry.command("daily"))(date=self.date, secret=self.secret)
         if self.agents is None:
             require_with("--agents", self, "seeds", "budgets")
+            require_with("--agents", self.launch, "workers", "launcher", "out")
+        task = registry.load(registry.command("daily"))(date=self.date, secret=self.secret)
+        if self.agents is None:
             return
         Bench(
             task=task,

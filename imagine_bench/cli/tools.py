@@ -32,7 +32,7 @@ from imagine_bench.errors import CheckFailedError, InvalidValueError
 from imagine_bench.interfaces import APPEARANCES, DEVICES
 from imagine_bench.interfaces.episodes import FRAME_SHAPE
 from imagine_bench.registry.entries import file_name
-from imagine_bench.running.collect import collect, policy_of
+from imagine_bench.running.collect import POLICIES, collect, policy_of
 from imagine_bench.running.collect import describe as describe_episodes
 from imagine_bench.running.player import protocol_of_player
 from imagine_bench.store.bench_folder import newest_recording
@@ -84,6 +84,9 @@ class DatasetCommand:
         """Collect, or describe."""
         if [self.task is None, self.describe is None, not self.standard].count(False) != 1:
             raise InvalidValueError("Give exactly one of a task to collect episodes of, --describe and --standard.")
+        if self.task is None:
+            how = ("policy", "seed", "execution", "appearance", "motion_hz", "size", "workers", "encoder")
+            require_with("a task", self, *how, *(() if self.standard else ("episodes", "format", "out")))
         if self.describe is not None:
             if "control" in (read_card(self.describe) or {}):
                 print(demonstrations().describe(read_demonstrations(self.describe)))
@@ -100,6 +103,8 @@ class DatasetCommand:
             for folder in standard_sets(self.out or Path("datasets"), self.format, self.episodes):
                 print(f"{folder}\n{describe_episodes(read_dataset(folder))}\n")
             return
+        if self.policy in POLICIES:
+            require_with("--policy FOLDER", self, "encoder")
         spec = registry.task(self.task)
         policy = policy_of(self.policy, spec, self.seed, self.encoder)
         folder = self.out or Path("datasets") / f"{file_name(spec.id)}-{policy.name}"
@@ -296,7 +301,8 @@ class Play:
     def _quiz(self) -> None:
         from imagine_bench.tools.quiz import quiz  # noqa: PLC0415 - as above
 
-        require_with("a game", self, "model", "execution", "encoder", "film", "out", "keep")
+        require_with("a game", self, "model", "execution", "encoder", "camera", "film", "out", "keep")
+        require_with("--keep", self, "tests", "training", "like")
         if self.task is None:
             raise InvalidValueError("There is nothing to ask about; give a task, such as play arrow_puzzle --quiz 16.")
         print(quiz(self.task, self.quiz, seed=self.seed, appearance=self.appearance or APPEARANCES[0]))
@@ -378,6 +384,7 @@ class CheckCommand:
             numbers = {"turns": self.turns, "trials": self.trials, "random_episodes": self.random}
             failed = not physics.check_motion(self.task, self.out, **numbers, appearances=self.appearances)
         else:
+            require_with("a task of continuous control", self, "random")
             failed = not physics.check_physics(
                 self.task, self.out, turns=self.turns, trials=self.trials, appearances=self.appearances
             )

@@ -20,7 +20,7 @@ from imagine_bench.arrays import Floats
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Rules
 from imagine_bench.judge.causes import expected_rightly
-from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData
+from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData, require_different
 from imagine_bench.running.bench import carry_out, plan, require_done, task_type
 from imagine_bench.running.trained import require_control
 from imagine_bench.statistics import Estimate, difference
@@ -178,6 +178,7 @@ def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Laun
     """Carry out the missing runs of a suite. A run that fails costs the others nothing. Raises as
     :func:`plan_level`.
     """
+    require_different("agents", tuple(agents))
     plans = {
         (each.name, agent): [plan_level(suite, level, agent) for level in each.levels]
         for each, agent in itertools.product(suite.experiments, agents)

@@ -50,7 +50,8 @@ def new_package(kind: str, name: str, out: Path) -> str:
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,60}", name) or keyword.iskeyword(name):
         raise InvalidValueError(f"{name!r} cannot be a module; give small letters, digits and _, such as my_{kind}.")
     taken = {
-        **registry.TASKS, **registry.REGRESSIONS, **registry.AGENTS, **registry.REGRESSORS, **registry.WORLD_MODELS
+        **registry.TASKS, **registry.REGRESSIONS, **registry.AGENTS, **registry.PLAYERS, **registry.REGRESSORS,
+        **registry.WORLD_MODELS,
     }  # fmt: skip
     if name in taken or registry.guest_with(group, name) is not None:
         raise InvalidValueError(f"{name!r} is a name of imagine_bench already; give another name.")

@@ -112,10 +112,10 @@ class _Board:
     """Where tasks on any node leave how far they are, for the process that shows it."""
 
     def __init__(self) -> None:
-        self._news: dict[tuple[str, int], Progress] = {}
+        self._news: dict[tuple[str, str, int], Progress] = {}
 
     def put(self, progress: Progress) -> None:
-        self._news[progress.agent, progress.seed] = progress
+        self._news[progress.bench, progress.agent, progress.seed] = progress
 
     def take(self) -> list[Progress]:
         news = list(self._news.values())

@@ -135,6 +135,17 @@ def test_a_node_and_a_worker_killed_in_the_middle_cost_no_result(
 
 
 @needs_ray
+def test_the_news_of_two_benches_do_not_hide_each_other() -> None:
+    from imagine_bench.running.launchers.ray import _Board
+
+    board = _Board()
+    news = [Progress(agent="dqn", seed=0, bench=each, phase="done", done=1, work=1) for each in ("one", "other")]
+    for each in news:
+        board.put(each)
+    assert board.take() == news and board.take() == []
+
+
+@needs_ray
 @pytest.mark.slow
 def test_a_cluster_without_a_gpu_does_not_wait_for_one_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
