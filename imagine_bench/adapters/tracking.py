@@ -119,11 +119,13 @@ class Tracked:
 
     def note(self, result: Result) -> None:
         """Print a sentence if some runs of a bench were finished before, so that they were not tracked."""
-        before = sum(run.folder not in self._launched for run in result.runs)
+        before = [run.folder.parents[1] for run in result.runs if run.folder not in self._launched]
         if before:
+            folders = dict.fromkeys(before)  # of merged benches each has its own
+            commands = (f"'imagine-bench report {shlex.quote(str(each))} --track {self._tool}'" for each in folders)
             print(
-                f"Note: {before} of {len(result.runs)} runs were finished before and are not tracked: 'imagine-bench "
-                f"report {shlex.quote(str(result.folder))} --track {self._tool}' writes the tests of all runs."
+                f"Note: {len(before)} of {len(result.runs)} runs were finished before and are not tracked: "
+                f"{' and '.join(commands)} writes the tests of all runs."
             )
 
     def writer(self, run: Path) -> RunWriter:

@@ -217,7 +217,7 @@ def play(
     imaginer = None
     if model is not None:
         trained = load_trained(model, encoder=encoder)
-        if task not in (None, trained.task.id):
+        if task is not None and registry.task_name(task) != trained.task.id:
             raise InvalidValueError(f"{model} was trained on {trained.task.id!r}, not on {task!r}; leave the task out.")
         task = trained.task.id
         imaginer = trained.imaginer

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import sys
+from types import SimpleNamespace
 
 import pytest
 from small_runs import small
@@ -90,6 +91,16 @@ def test_tensorboard_sees_training_and_tests_while_the_runs_go_on(tmp_path):
     (failure,) = tracked(tmp_path, "tensorboard", look)
     assert failure.reason == "it broke"
     assert seen == [(1, None), (1, None), (2, None), (2, None), (3, [(2, 0.25)]), (3, None)]
+
+
+def test_the_command_for_runs_of_merged_benches_names_each_bench(tmp_path, capsys):
+    """As with --until-decided: the merged folder itself has no runs."""
+    tracked = Tracked(Told(None), "tensorboard", "arrow_puzzle")
+    runs = [SimpleNamespace(folder=tmp_path / bench / "dqn/seed_0") for bench in ("one", "two", "two")]
+    tracked.note(SimpleNamespace(runs=runs, folder=tmp_path / "merged"))
+    said = capsys.readouterr().out
+    assert all(f"'imagine-bench report {tmp_path / bench} --track tensorboard'" in said for bench in ("one", "two"))
+    assert "Note: 3 of 3 runs" in said and "merged" not in said
 
 
 def test_a_tool_that_fails_costs_no_run(tmp_path, capsys, monkeypatch):

@@ -190,6 +190,10 @@ def test_a_model_brings_its_task_and_its_looks_and_what_cannot_be_played_is_refu
     play(None, model=tmp_path, execution="physics", appearance="strong")
     made = [[call.kwargs[name] for name in ("execution", "appearance")] for call in make.call_args_list]
     assert made == [["kinematic", "mild"], ["physics", "strong"]], "options are above the model's"
+    monkeypatch.setattr(trained, "task", registry.task("arrows:cubes=1,slip=0.1"))
+    keyboard("1")
+    assert "1 macrostates" in play("arrows:slip=0.10,cubes=1", model=tmp_path), "written in another way"
+    monkeypatch.setattr(trained, "task", registry.task("arrow_puzzle"))
     with pytest.raises(InvalidValueError, match="trained on 'arrow_puzzle', not on 'pick_place'; leave the task out"):
         play("pick_place", model=tmp_path)
     monkeypatch.setitem(sys.modules, "pygame", None)
