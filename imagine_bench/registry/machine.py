@@ -68,9 +68,14 @@ def commit() -> str | None:
 
 
 def _changes(top: Path) -> str:
-    """Beginning of a digest of all files of code that differ from the commit or are new; empty if none do."""
+    """Beginning of a digest of all files of code that differ from the commit or are new; empty if none do.
+
+    ``unknown`` where git does not say, as on a machine that is too busy.
+    """
     options = ("--porcelain", "-z", "--no-renames", "--untracked-files=all")
-    found = _output("git", "-C", str(top), "status", *options, "--", *_CODE) or ""
+    found = _output("git", "-C", str(top), "status", *options, "--", *_CODE)
+    if found is None:
+        return "unknown"
     names = sorted(entry.split(maxsplit=1)[1] for entry in found.split("\0") if entry)
     digest = hashlib.sha256()
     for name in names:

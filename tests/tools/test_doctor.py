@@ -60,6 +60,8 @@ def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.
     assert len(set(seen)) == 4 and all(str(each).startswith(f"{head}+changes.") for each in seen)
     (tmp_path / "agents/new.py").unlink()
     assert commit_with("agents/a.py", "1") == head
+    (tmp_path / ".git/index").write_bytes(b"damaged")  # git still knows the commit, and not what differs
+    assert environment.commit() == f"{head}+changes.unknown"
 
 
 @pytest.mark.parametrize(
