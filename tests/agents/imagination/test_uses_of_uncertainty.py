@@ -59,6 +59,19 @@ def test_gathered_uncertainty_ends_rollouts_and_weighs_transitions(
         np.testing.assert_allclose(rows["weight"], confidence(depth, accumulates), rtol=1e-4)
 
 
+def test_what_a_rollout_has_gathered_is_its_own() -> None:
+    """Of rollouts that begin in (i, 5) and are i times as unsure of a step, the unsure end early."""
+
+    def graded(sound: Mixture, z: torch.Tensor) -> Mixture:
+        more = (unsure(sound, z).means - sound.means) * z[:, 0, None, None].sqrt()
+        return dataclasses.replace(sound, means=sound.means + more)
+
+    gathering = {"threshold": 0.35, "accumulates": True, "start_states": "replayed", "breadth": 60}
+    imagination, _ = imagined(CountingModel(change=graded), filtered=True, states=4, **gathering)
+    z = imagination.memory.arrays()["z"].round()
+    assert [z[z[:, 0] == index, 1].max() - 4 for index in range(4)] == [10, 3, 1, 1]
+
+
 def test_model_only_training_gathers_and_weighs_uncertainty() -> None:
     uses = {"threshold": 0.35, "accumulates": True, "confidence_scale": 0.2}
     agent = practising(CountingModel(change=unsure), filtered=True, **uses)
