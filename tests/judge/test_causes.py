@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.exact.values import true_model
-from imagine_bench.interfaces import State, TaskSpec
+from imagine_bench.interfaces import Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
-from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, memory_suffices
+from imagine_bench.judge.causes import CAUSES, Attribution, FailedEpisode, drawn_by, memory_suffices, place
 from imagine_bench.rules import fewest_actions, states_of
 from imagine_bench.store.results import PolicyTable
 
@@ -118,6 +118,18 @@ def test_every_failure_has_exactly_one_cause() -> None:
                 assert found.cause(happened) != "misread"
     assert all(counted[name] for name in ("misread", "unexperienced", "model", "planning", "values"))
     assert counted["execution"] == counted["unlucky"] == 0, "the rules leave nothing to chance, and always a way"
+
+
+def test_a_number_finds_the_outcome_that_it_stands_for() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        shares = rng.dirichlet(np.ones(4))
+        outcomes = [Outcome(float(p), (i,), 0.0, terminated=False, success=False) for i, p in enumerate(shares)]
+        for outcome in outcomes:
+            before, probability = place(outcomes, outcome.macrostate)
+            assert drawn_by(before + probability * rng.random(), outcomes) is outcome
+        drawn = np.random.default_rng(9).choice(4, p=shares)
+        assert drawn_by(np.random.default_rng(9).random(), outcomes) is outcomes[drawn], "as an environment draws"
 
 
 MEMORY = registry.task("arrows:horizon=5,gesture=first")

@@ -204,6 +204,15 @@ def tried(values: dict[str, Any], arrays: Arrays, rng: np.random.Generator) -> N
     values["tried"][str(rng.choice(list(values["tried"])))] += 1
 
 
+def exchanged_lengths(values: dict[str, Any], arrays: Arrays, rng: np.random.Generator) -> None:
+    """Two training episodes before the first test exchange their lengths, so that every sum of them stays."""
+    del arrays, rng
+    length = values["length"]
+    early = range(values["rows"][0]["episodes"])
+    other = next(each for each in early if length[each] != length[0])
+    length[0], length[other] = length[other], length[0]
+
+
 def without(beginning: str) -> Forge:
     """The arrays of a learner's checkpoint whose names begin so are deleted, though its format says they are kept."""
 
@@ -286,6 +295,7 @@ IN_TRAINING: dict[str, Forge] = {
     "training success": in_training("success"), "training kept success": in_training("training/success"),
     "training length": in_training("length"), "training faults": in_training("training/faults"),
     "training return": in_training("training/returns"), "simulated time": in_training("training/sim_times_s"),
+    "exchanged lengths": in_checkpoint(exchanged_lengths),
     "nothing": without("training/"), "no simulated time": without("training/sim_times_s"),
     "no simulated time of tests": without("rows/0/kept/sim_times_s"), "tried": in_checkpoint(tried),
 }  # fmt: skip
