@@ -119,6 +119,7 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make) -> None:  #
     live(learner, range(8), np.random.default_rng(0))
     before = learner.state().arrays
     resumed.restore(learner.state())
+    assert resumed.imagination.filter.threshold == learner.imagination.filter.threshold != 99.0
     for each in (learner, resumed):
         each.reset_for_new_task()
     after = learner.state().arrays
