@@ -14,7 +14,7 @@ _WORLDS = (
 )
 _FACTORED = tuple(
     f"agents/guests/factored/tests/test_{name}.py"
-    for name in ("factored_formulas", "factored", "learned", "transfer", "memory", "slips", "rewards", "worlds")
+    for name in ("factored_formulas", "factored", "learned", "transfer", "memory", "rewards", "worlds")
 )
 _CHECKPOINTS = ("tests/store/test_checkpoints.py", "tests/running/test_runner.py")
 _PLAYED = (*_CHECKPOINTS[::-1], "tests/running/test_queries.py", "tests/running/test_observations.py")
