@@ -99,3 +99,13 @@ def test_balls_are_anywhere_on_the_screen_equally_often():
     for share in (np.array(middles_m) - low_m).T / wide_m[:, None]:
         assert stats.kstest(share, "uniform").statistic < 0.02
         assert (np.minimum(share, 1.0 - share) < 0.01).mean() == pytest.approx(0.02, rel=0.25)
+
+
+@pytest.mark.parametrize("appearance", ["clean", "mild", "patched", "harsh"])
+def test_balls_roll_between_the_frames_of_every_appearance(appearance):
+    env = make(ARROWS, distractors=2, appearance=appearance)
+    env.reset(seed=0)
+    for action in (0, 1):
+        before_m = env.data.mocap_pos.copy()
+        env.step(action)
+        assert (env.data.mocap_pos[-1] != before_m[-1]).any()
