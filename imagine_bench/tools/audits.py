@@ -303,10 +303,11 @@ def what_is_shown(folder: Path, found: Sequence[Verdict], retraining: Retraining
     trained = sum(each.of_training for each in found)
     if trained and retraining is not None:
         lines[0] = f"{lines[0][:-1]}, but in the runs that were trained again."
-        each = {count: min(retraining.runs, count) for count in {len(protocol.seeds_of(a)) for a in protocol.agents}}
-        words = " or ".join(f"{drawn} of an agent's {count}" for count, drawn in sorted(each.items()))
+        counts = {len(protocol.seeds_of(agent)) for agent in protocol.agents}
+        drawn_of = {count: min(retraining.runs, count) for count in sorted(counts)}
+        words = " or ".join(f"{drawn} of an agent's {count}" for count, drawn in drawn_of.items())
         lines.append(f"Trained again: {trained} runs, {words}, drawn by --nonce {retraining.nonce}.")
-        for count, drawn in sorted(each.items()):
+        for count, drawn in drawn_of.items():
             chances = ((forged, chance_to_find(count, forged, drawn)) for forged in _few(count))
             said = "; ".join(f"{forged} of {count} forged: {percent(chance)} %" for forged, chance in chances)
             lines.append(f"Chance that a draw finds a forged run of an agent: {said}.")
