@@ -23,7 +23,7 @@ from imagine_bench_programs.sight import Hidden, SeeingWriter, SeenCodes, hidden
 from imagine_bench_programs.symbol_rules import SymbolRules
 from imagine_bench_programs.symbols import Symbols
 from imagine_bench_programs.writing.delay import Row
-from imagine_bench_programs.writing.laws import Laws, _cover, ends_of, simplest
+from imagine_bench_programs.writing.laws import Laws, _completed, _cover, ends_of, simplest
 from imagine_bench_programs.writing.writer import Writer
 from numpy.typing import NDArray
 
@@ -61,6 +61,29 @@ def test_a_permutation_is_shorter_than_a_table_and_completes_itself() -> None:
     assert [Laws((4,), 1, presses).turned((value,), 0)[0] for value in range(4)] == [1, 1, 2, 3]
 
 
+def test_macro_actions_that_undo_each_other_share_what_was_seen() -> None:
+    turns = {0: 2, 2: 3, 3: 1, 1: 0}
+    there = [row((0,), (2,), 0)]
+    back = [row((turns[value],), (value,), 1) for value in (0, 2)]
+    laws = Laws((4,), 2, [*there, *back] * 3)
+    for value, after in turns.items():
+        assert (laws.turned((value,), 0), laws.turned((after,), 1)) == ((after,), (value,))
+    other = [row((0,), (1,), 1), row((1,), (3,), 1)]  # undoes nothing that was seen
+    assert Laws((4,), 2, [*there, *other] * 3).turned((3,), 1) == (2,)
+    ends = [row((value,), (min(value + 1, 2),), 0) for value in range(3)]
+    ends += [row((value,), (max(value - 1, 0),), 1) for value in range(3)]
+    laws = Laws((3,), 2, ends * 3)
+    assert (laws.turned((2,), 0), laws.turned((0,), 1)) == ((2,), (0,)), "values that were seen to stay"
+
+
+def test_a_permutation_makes_one_cycle_of_values_that_were_never_seen() -> None:
+    assert [_completed(changed, 4) for changed in ({2: 0}, {0: 2, 3: 1}, {0: 1, 1: 0})] == [
+        (3, 2, 0, 1),
+        (2, 0, 3, 1),
+        (1, 0, 3, 2),
+    ]
+
+
 def test_one_probability_for_all_macro_actions_is_shorter_than_a_certain_one_among_them() -> None:
     counts = [(41, 17), (34, 8), (41, 9), (35, 0), (41, 15), (38, 6)]  # of one exploration at slip=0.2
     rows = [
@@ -92,6 +115,7 @@ def test_a_factor_that_changes_whatever_is_done_drifts() -> None:
         rows.append(row((now,), (then,), action=int(rng.integers(4))))
     laws = Laws((3,), 4, rows)
     assert laws.drifts == {0: pytest.approx(0.2)} and not any(laws.effects)
+    assert laws.superfluous == {0}
     assert sum(each.probability for each in laws.outcomes((0,), 1)) == pytest.approx(1.0)
 
 
@@ -205,7 +229,7 @@ def shown(values: Sequence[int | None], hidden: int, episodes: int = 20) -> list
 
 def test_a_value_that_hides_a_factor_is_found_by_its_contradictions() -> None:
     hidden = hidden_value(shown((1, None, 1, None), hidden=3), (4, 1))
-    assert hidden is not None and hidden == (0, 3)
+    assert hidden is not None and hidden[:2] == (0, 3)
     filled = hidden.filled(shown((1, None, None), hidden=3))
     assert all(each.now == each.then and min(each.now) >= 0 for each in filled)
     assert hidden_value(shown((1, 1, 1), hidden=3), (4, 1)) is None, "nothing is hidden, and nothing contradicts"
@@ -230,7 +254,7 @@ def dials(then: Sequence[int], later: Sequence[int]) -> list[Row]:
 def test_a_value_that_hides_a_factor_is_found_without_contradictions() -> None:
     rows = dials((3, 3, 3), (3, 3, 3))
     assert hidden_value(rows, (4, 8)) is None, "no code comes twice"
-    assert still_value(rows, (4, 8), 1) == (0, 3)
+    assert still_value(rows, (4, 8), 1) == (0, 3, -1)
     assert still_value(dials((0, 1, 2), (0, 1, 2)), (4, 8), 1) is None, "nothing changes"
     assert still_value(dials((1, 2, 0), (2, 0, 1)), (4, 8), 1) is None, "a dial that turns is not hidden"
 
@@ -244,6 +268,20 @@ def test_a_light_that_flips_by_chance_is_not_hidden() -> None:
     ]
     assert not any(each.now[0] != each.then[0] for each in Hidden(0, 1).filled(rows)), "it would never change"
     assert still_value(rows, (2, 3), 1) is None, "to say which images hide it takes longer"
+
+
+def test_a_factor_of_one_value_that_images_hide_says_nothing() -> None:
+    rng = np.random.default_rng(0)
+    hides = (rng.random(121) < 0.1).astype(int).tolist()
+    rows = [
+        Row((before, step % 3), 0, (after, (step + 1) % 3), float(step == 1), False, step % 3)
+        for step, (before, after) in enumerate(itertools.pairwise(hides))
+    ]
+    hidden = hidden_value(rows, (2, 3)) or still_value(rows, (2, 3), 1)
+    assert hidden is not None and hidden.only == 1 - hidden.value
+    starts = [each for each in hidden.filled(rows) if not each.step]
+    assert {each.now[0] for each in starts} == {hidden.only}, "also in an image that is the first of an episode"
+    assert any(each.now[0] == hidden.value for each in rows if not each.step), "some of them hide it"
 
 
 def test_codes_are_read_by_most_images() -> None:
@@ -297,6 +335,46 @@ def test_former_factors_are_kept_where_the_new_ones_contradict(step: int, keeps:
     assert (perception.sight is perception.fine) == keeps
     values = (3, 0) if keeps else (1, 0)
     assert writer.writer.laws.turned(values[:1], 0) == values[1:]
+
+
+class PixelPerception(LearnedPerception):
+    """Sees of a frame the pixels that its factors name by the widths of their joint values."""
+
+    full = True
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        factors = [SeenFactor((), np.zeros((size, place), dtype=np.int64)) for place, size in enumerate(sizes)]
+        self._factored = True
+        self.take(Sight(factors, Standard()), 0)
+
+    def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_]]:
+        places = [factor.joint.shape[1] for factor in self.found]
+        codes = [tuple(row) for row in frames[:, 0, places, 0].tolist()]
+        return codes, np.ones((len(frames), len(places)), dtype=bool)
+
+    def code(self, frame: Frame) -> State:
+        return self.codes(frame[None])[0][0]
+
+
+@pytest.mark.parametrize("matters", [False, True])
+def test_a_factor_that_drifts_is_left_out_if_nothing_depends_on_it(matters: bool) -> None:
+    rng = np.random.default_rng(0)
+    writer = SeeingWriter(registry.task("arrows:cubes=2"), "clean", rng, rng)
+    writer.perception = PixelPerception((3, 4))
+    writer.writer.take_up(writer.perception.sizes, [])
+    lights = rng.integers(3, size=81)
+    for number in range(81):  # a light that flips by chance, and a dial that turns
+        image = np.zeros((64, 64, 3), dtype=np.uint8)
+        image[0, :2, 0] = lights[number], number % 4
+        writer._images.append(image)
+    for number in range(80):
+        pays = number % 4 == 3 and (not matters or lights[number + 1] == 1)
+        writer.learn(Row((number,), 0, (number + 1,), float(pays), False, number % 4))
+    assert writer.writer.laws.drifts.keys() == {0}
+    writer.write()
+    assert writer.writer.sizes == ((3, 4) if matters else (4,))
+    assert writer.writer.laws.turned((1, 3) if matters else (3,), 0)[-1] == 0
+    assert [len(row.now) for row in writer.writer.rows] == [len(writer.writer.sizes)] * 80
 
 
 @pytest.mark.slow  # half a minute: a perception learns to see

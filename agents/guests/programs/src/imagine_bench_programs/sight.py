@@ -6,14 +6,16 @@ finds others, all transitions so far get their new codes, and the writer begins 
 A value of a factor may say that the image hides the factor, as where the human points only once. There are two ways to
 find it. It has contradictions: the same codes and macro-action have different outcomes, and hardly any do once the
 value last seen stands in its place. Or the factor never changes once that stands there, and the laws become shorter by
-more than it takes to say which images hide it.
+more than it takes to say which images hide it. A factor of one value, and one that hides it, says nothing: the
+one value stands in all of its codes. In the end a factor is left out that drifts and on which no law depends: such as
+a shadow that the perception took for a thing.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -98,13 +100,14 @@ class SeeingWriter:
         if not self.perception.full:
             self.perception.look(len(self.perception.frames))
         self._begin_again(sight)
+        self._leave_out(self.writer.laws.superfluous)
 
     def codes(self) -> SeenCodes:
         """The codes that macrostates have by the present perception, each in new images."""
         found = {}
         for state in states_of(self._spec.rules):
             codes, _ = self.perception.codes(self._drawn([state] * _IMAGES))
-            found[state] = Counter(codes)
+            found[state] = Counter(codes if self._hidden is None else (self._hidden.fill(code, None) for code in codes))
         return SeenCodes(found)
 
     def _drawn(self, macrostates: Sequence[State]) -> Frame:
@@ -133,6 +136,18 @@ class SeeingWriter:
         self._hidden, rows = found
         self.writer.take_up(self.perception.sizes, rows)
 
+    def _leave_out(self, superfluous: Collection[int]) -> None:
+        """See these factors no more, and write anew; all of them are seen if no other one would be left."""
+        sight = self.perception.sight
+        left = [place for place in range(len(sight.factors)) if place not in superfluous]
+        if not left or len(left) == len(sight.factors):
+            return
+        factors = [sight.factors[place] for place in left]
+        self.perception.take(sight._replace(factors=factors), self.perception.found_in)
+        self._codes = {number: tuple(code[place] for place in left) for number, code in self._codes.items()}
+        self._hidden, rows = self._explained(self.perception.sizes)
+        self.writer.take_up(self.perception.sizes, rows)
+
     def _explained(self, sizes: Sequence[int]) -> tuple[Hidden | None, list[Row]]:
         """The value of all codes that hides a factor, and the transitions in which the value last seen stands there."""
         self._hidden = None
@@ -157,12 +172,14 @@ class Hidden(NamedTuple):
 
     factor: int
     value: int
+    #: the only other value, if there is but one, -1 else: such a factor says nothing in any image
+    only: int = -1
 
     def fill(self, code: State, before: State | None) -> State:
-        """A code with the value that the factor had in the code before; -1 if there was none."""
+        """A code with the value that the factor had in the code before; without one, the only other value, or -1."""
         if code[self.factor] != self.value:
             return code
-        last = -1 if before is None else before[self.factor]
+        last = self.only if before is None else before[self.factor]
         return (*code[: self.factor], last, *code[self.factor + 1 :])
 
     def filled(self, rows: Sequence[Row]) -> list[Row]:
@@ -186,14 +203,19 @@ def hidden_value(rows: Sequence[Row], sizes: Sequence[int]) -> Hidden | None:
     The first transition begins an episode.
     """
     without = _contradicting(rows)
-    values = [Hidden(factor, value) for factor, size in enumerate(sizes) if size > 1 for value in range(size)]
     left: dict[Hidden, float] = {}
-    for each in values if without else ():
+    for each in _hiding(range(len(sizes)), sizes) if without else ():
         filled = each.filled(rows)
         if 2 * len(complete(filled)) > len(rows):  # else too much is left out to tell
             left[each] = _contradicting(filled)
     best = min(left, key=left.__getitem__, default=None)
     return best if best is not None and left[best] < _CLEARER * without else None
+
+
+def _hiding(factors: Iterable[int], sizes: Sequence[int]) -> list[Hidden]:
+    """The values of some factors that may say that an image hides the factor."""
+    pairs = [(factor, value) for factor in factors for value in range(sizes[factor]) if sizes[factor] > 1]
+    return [Hidden(factor, value, only=1 - value if sizes[factor] == 2 else -1) for factor, value in pairs]
 
 
 def still_value(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> Hidden | None:
@@ -204,7 +226,7 @@ def still_value(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> Hi
     changed = [factor for factor in range(len(sizes)) if any(row.now[factor] != row.then[factor] for row in rows)]
     best = None
     nats = Laws(sizes, n_actions, rows).nats if changed else 0.0
-    for each in (Hidden(factor, value) for factor in changed for value in range(sizes[factor])):
+    for each in _hiding(changed, sizes):
         filled = complete(each.filled(rows))
         if 2 * len(filled) <= len(rows) or any(row.now[each.factor] != row.then[each.factor] for row in filled):
             continue

@@ -4,7 +4,8 @@ A program of laws has three parts, each the shortest that explains the data. Sym
 (:mod:`.delay`); laws are about those that are not.
 
 - *Effects*: "if at most two conditions hold, the macro-action makes a factor f(its value)". All effects of a
-  macro-action come about together, with one probability; otherwise it changes nothing.
+  macro-action come about together, with one probability; otherwise it changes nothing. Two macro-actions that undo
+  each other on a factor, wherever both were seen, are taken to do so everywhere.
 - *Drifts*: whatever is done, a factor turns into another of its values with one probability, while the episode goes on.
 - *Ends*: a list of "if at most two conditions hold, this reward, and whether the episode ends", read from the top.
   Laws of a class have one of four forms, and a form with fewer possible conditions makes each law shorter. The first
@@ -22,7 +23,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -106,6 +107,17 @@ class Laws(SymbolRules):
     def count(self) -> int:
         """How many laws there are."""
         return sum(map(len, self.effects)) + len(self.drifts) + len(self.ends)
+
+    @property
+    def superfluous(self) -> set[int]:
+        """Factors that drift, and on which no law depends."""
+        tests = [test for laws in self.effects for law in laws for test in law.tests]
+        count = len(self.sizes)
+        used = {test.place for test in tests}
+        for test in itertools.chain(*(law.tests for law in self.ends)):
+            places = (test.place, test.value) if test.alike else (test.place,)
+            used |= {place % (count + 1) for place in places}  # after, the action, before
+        return self.drifts.keys() - used
 
     def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
         """The outcomes that the laws expect; none is called a success. Dynamics hold after an end, too."""
@@ -214,8 +226,24 @@ class _Dynamics:
         if changed and nats < of_effects:
             self.drifts[factor] = chance
             return
-        for laws, (more, _) in zip(self.effects, found, strict=True):
+        for laws, more in zip(self.effects, self._pooled(factor, [more for more, _ in found]), strict=True):
             laws.extend(more)
+
+    def _pooled(self, factor: int, found: Sequence[list[Effect]]) -> list[list[Effect]]:
+        """The effects of each macro-action on a factor; two that undo each other share the changes that were seen."""
+        seen = {}
+        for action, laws in enumerate(found):
+            pairs = Counter((row.now[factor], row.then[factor]) for row in self._of_action[action])
+            if len(laws) == 1 and not laws[0].tests and (changed := _injective(pairs)):
+                seen[action] = changed
+        pooled = list(found)
+        for action, changed in seen.items():
+            known = _with_others(changed, [other for each, other in seen.items() if each != action])
+            stays = {row.now[factor] for row in self._of_action[action]} - changed.keys()
+            becomes = _completed(known or changed, self.sizes[factor])
+            if known is not None and all(becomes[value] == value for value in stays):
+                pooled[action] = [Effect(factor, (), becomes)]
+        return pooled
 
     def _effects(self, rows: Sequence[Row], factor: int) -> tuple[list[Effect], float]:
         """The effects of one macro-action on one factor, and their nats: one after another, each saves the most."""
@@ -293,14 +321,43 @@ def _functions(pairs: Counter[tuple[int, int]], size: int) -> Iterator[tuple[flo
 
 
 def _permutation(pairs: Counter[tuple[int, int]], size: int) -> State | None:
-    """The permutation of all changes among pairs of values, if there is one; where they leave it open, in order."""
-    changed = {before: after for before, after in pairs if before != after}
-    consistent = sum(before != after for before, after in pairs) == len(changed) == len({*changed.values()})
-    if not consistent:
-        return None
-    unused = [value for value in range(size) if value not in changed.values()]
-    left = [value for value in range(size) if value not in changed]
-    return tuple((changed | dict(zip(left, unused, strict=True)))[value] for value in range(size))
+    """The permutation of all changes among pairs of values, if there is one; see :func:`_completed`."""
+    changed = _injective(pairs)
+    return None if changed is None else _completed(changed, size)
+
+
+def _injective(pairs: Iterable[tuple[int, int]]) -> dict[int, int] | None:
+    """The value after each value that changed, None if these are no part of a permutation."""
+    different = {(before, after) for before, after in pairs if before != after}
+    changed = dict(different)
+    return changed if len(different) == len(changed) == len({*changed.values()}) else None
+
+
+def _with_others(changed: dict[int, int], others: Iterable[dict[int, int]]) -> dict[int, int] | None:
+    """The changes of a macro-action and of those that undo it, or do the same, wherever both were seen; None alone."""
+    known = None
+    for other in others:
+        back = {after: before for before, after in other.items()}
+        for each in (other, back):
+            own = known or changed
+            joint = _injective([*own.items(), *each.items()])
+            if joint is not None and own.items() & each.items():
+                known = joint
+    return known
+
+
+def _completed(changed: dict[int, int], size: int) -> State:
+    """The permutation with these changes that makes one cycle of all values whose own cycle is not seen whole."""
+    becomes = dict(changed)
+    first = [value for value in range(size) if value not in changed.values()]
+    last = []
+    for begin in first:
+        end = begin
+        while end in changed:
+            end = changed[end]
+        last.append(end)
+    becomes.update(zip(last, [*first[1:], *first[:1]], strict=True))
+    return tuple(becomes[value] for value in range(size))
 
 
 def _misfit(pairs: Counter[tuple[int, int]], becomes: State) -> float:
