@@ -12,7 +12,7 @@ from judged import labelled, shown
 from numpy.typing import NDArray
 from small_runs import context
 
-from imagine_bench.interfaces import Frame, Observation, Outcome, State, TaskSpec
+from imagine_bench.interfaces import Frame, Outcome, State, TaskSpec
 from imagine_bench.interfaces.capabilities import ImaginedRollout
 from imagine_bench.judge.open_loop import (
     EXAMPLES,
@@ -98,23 +98,13 @@ def test_scores_by_depth(puzzle: EvalSet) -> None:
 class Perfect(bench_fakes.RulesImaginer):
     """Imagines the environment's own frames, from a start that its first frame cannot tell from the real one."""
 
-    fresh = False
-
     def __init__(self, spec: TaskSpec) -> None:
         super().__init__(context())
         self.spec, self.env = spec, gymnasium.make(spec.env_id, execution="kinematic", disable_env_checker=True)
 
-    def begin_episode(self) -> None:
-        self.fresh = True
-
-    def act(self, observation: Observation, *, explore: bool) -> int:
-        self.fresh = False
-        return 0
-
     def imagine(
         self, frame: Frame, *, actions: NDArray[np.int64] | None, depth: int, rng: np.random.Generator
     ) -> ImaginedRollout:
-        assert self.fresh, "it is asked in the middle of an episode"
         actions, seen = np.zeros(depth, dtype=np.int64) if actions is None else actions, shown(frame, self.spec)
         alike = [state for state in self.spec.rules.start_states if ((seen == state) | (seen < 0)).all()]
         start = alike[int(rng.integers(len(alike)))]
@@ -133,15 +123,13 @@ class Perfect(bench_fakes.RulesImaginer):
 def test_who_imagines_what_frames_will_show_is_right(task: str, depth: int) -> None:
     spec = labelled(task)
     agent, found = Perfect(spec), asked(spec, 6, 4)
-    agent.act(Observation(frame=found.frames[0, 0]), explore=False)  # the last frame of a test episode
     assert open_loop(agent, found, SeedTree(0)).correct.tolist() == [1.0] * depth
 
 
-def test_examples_and_samples_begin_an_episode_and_go_as_imagined() -> None:
+def test_examples_and_samples_go_as_imagined() -> None:
     spec = labelled("pick_place:gesture=first")
     agent = Perfect(spec)
     found = examples(agent, spec, appearance="clean", seeds=SeedTree(0))
-    agent.fresh = False
     found += imagine_sampled_rollouts(agent, spec, appearance="clean", seeds=SeedTree(0))
     assert len(found) == EXAMPLES + SAMPLED_ROLLOUTS
     for each in found:  # chance goes as was imagined, as far as frames tell

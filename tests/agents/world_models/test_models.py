@@ -60,6 +60,10 @@ def test_each_keeps_the_contract(name: str) -> None:
     if first.p_ended is not None:
         assert (np.diff(first.p_ended, axis=2) >= -1e-6).all(), "an ended episode begins again"
     assert isinstance(model.parameters(), int)
+    real = data().frames[[0, 2, 4, 6, 8]].mean(axis=-1)
+    drawn = first.pictures[:, 0, 0].reshape(*real.shape, -1).mean(axis=-1)
+    mirrored = [real, real.swapaxes(1, 2), real[:, ::-1], real[:, :, ::-1]]
+    assert np.argmin([np.abs(drawn - each).mean() for each in mirrored]) == 0, "a picture stands upright"
 
 
 @pytest.mark.usefixtures("quick")

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 import torch
 from agent_states import same
-from fake_latents import ACTIONS, LATENTS, FakeEncoder, built, frame, transition, with_own_settings
-from imagine_bench_controls.memory import drqn, imagination, readout
+from fake_latents import ACTIONS, CODES, LATENTS, FakeEncoder, built, frame, transition, with_own_settings
+from imagine_bench.agents.encoders.perception import Perception
+from imagine_bench.agents.replay import Batch
+from imagine_bench.agents.world_models import latent
+from imagine_bench_controls.memory import drqn, imagination, readout, world_model
 from imagine_bench_controls.memory.agent import RememberingAgent
 from imagine_bench_controls.memory.sequences import START, Recurrence, SequenceMemory
 
-from imagine_bench.interfaces import Observation
+from imagine_bench.interfaces import Frame, Observation
+from imagine_bench.interfaces.episodes import joined
 
 UNITS = 16
 RECURRENT: dict[str, Any] = {
@@ -173,6 +178,60 @@ def test_rollouts_carry_what_they_imagine() -> None:
     with torch.no_grad():
         whole = own.model.recurrence(torch.stack(latents, dim=1), previous, torch.zeros(1, UNITS))
     assert torch.allclose(state[:, LATENTS:], whole[:, -1], atol=1e-6)
+
+
+def test_the_world_model_remembers_every_frame_and_the_macro_actions_between(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In its training, where each reward names a transition, and before it imagines."""
+    monkeypatch.setattr(
+        FakeEncoder,
+        "encode",
+        lambda self, frames: (CODES[frames[:, 0, 0, 0].astype(int)], torch.zeros(len(frames), LATENTS)),
+    )
+    monkeypatch.setattr(latent, "UPDATES", 5)
+    with mock.patch(
+        "imagine_bench_controls.memory.world_model.load_perception", lambda context: Perception(FakeEncoder())
+    ):
+        model = built(world_model.make, hyperparameters="minimal")
+    rng = np.random.default_rng(0)
+    lived = []
+    for number, length in enumerate((4, 1, 3)):
+        actions = rng.integers(ACTIONS, size=length)
+        lived.append(
+            {
+                "frames": np.stack([frame(int(each)) for each in rng.integers(6, size=length + 1)]),
+                "actions": actions, "rewards": 10.0 * number + np.arange(length),
+                "terminated": np.arange(length) == length - 1, "truncated": np.zeros(length, dtype=bool),
+                "success": True, "action_masks": np.ones((length + 1, ACTIONS), dtype=np.int8),
+            }
+        )  # fmt: skip
+    recurrence = model.imagination.model.recurrence
+
+    def states(frames: Frame, actions: list[int]) -> torch.Tensor:
+        z = CODES[frames[:, 0, 0, 0].astype(int)].unsqueeze(0)
+        with torch.no_grad():
+            memory = recurrence(z, torch.tensor([[START, *actions]]), recurrence.blank(1))
+        return torch.cat([z, memory], dim=-1)[0]
+
+    dataset = joined(lived)
+    batches: list[Batch] = []
+    monkeypatch.setattr(model.imagination.model, "update", lambda batch, generator: batches.append(batch))
+    model.fit(dataset, np.random.default_rng(1))
+    assert len(batches) == 5
+    met = set()
+    for batch in batches:
+        for z, next_z, reward in zip(batch.z.detach(), batch.next_z.detach(), batch.reward.tolist(), strict=True):
+            number, step = divmod(int(reward), 10)
+            own = states(lived[number]["frames"], lived[number]["actions"].tolist())
+            assert torch.allclose(torch.stack([z, next_z]), own[step : step + 2], atol=1e-6)
+            met.add((number, step))
+    assert len(met) == 8
+    first = lived[0]
+    asked = np.array([[*first["actions"][:2], other] for other in range(ACTIONS)])
+    found = model.states(np.repeat(first["frames"][None, :3], ACTIONS, axis=0), asked)
+    own = states(first["frames"][:3], first["actions"][:2].tolist())[-1]
+    assert torch.allclose(found, own.expand(ACTIONS, -1), atol=1e-6), (
+        "a macro-action that is asked about is none before it"
+    )
 
 
 def test_a_new_task_keeps_dynamics_and_recurrence_which_the_model_s_updates_train() -> None:

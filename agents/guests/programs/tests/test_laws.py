@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate
-from imagine_bench.interfaces import AgentContext, Frame, Outcome, State, TaskSpec
+from imagine_bench.interfaces import AgentContext, Frame, Observation, Outcome, State, TaskSpec, Transition
 from imagine_bench.seeding import SeedTree
 from imagine_bench.sweep.grid import LADDER
 
@@ -184,8 +184,6 @@ def test_a_plan_begins_after_the_macro_actions_that_are_not_seen_yet() -> None:
     (now,) = writer.laws.after((3,), [first])
     again = writer.choose((3,), explore=False)  # the frame still shows the start
     assert writer.laws.turned((now,), again) == (0,), "it knows where the first macro-action led"
-    writer.begin_episode()
-    assert writer.choose((3,), explore=False) == first
 
 
 def test_more_macro_actions_are_another_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -431,11 +429,11 @@ def test_a_program_of_codes_has_every_fact(seed: int) -> None:
 class ByteSymbols(Symbols):
     """The code of a frame is its first two bytes; a probe adds 10."""
 
-    def __init__(self) -> None:
-        self.sizes = (3, 2)
+    def __init__(self, sizes: tuple[int, ...] = (3, 2)) -> None:
+        self.sizes = sizes
 
     def read(self, frames: Frame) -> list[State]:
-        return [tuple(each) for each in frames[:, 0, 0, :2].tolist()]
+        return [tuple(each) for each in frames[:, 0, 0, : len(self.sizes)].tolist()]
 
     def macrostates(self, states: Sequence[State]) -> NDArray[np.int64]:
         return np.array(states) + 10
@@ -457,6 +455,32 @@ def test_the_agents_expectations_are_those_of_its_laws() -> None:
     expected = [{tuple(place): share for place, share in zip(*each, strict=True) if share} for each in branches]
     assert expected == [{(11, 10): 1.0}, {(10, 11): 0.5, (10, 10): 0.5}, {}, {(12, 10): 0.5, (12, 11): 0.5}]
     np.testing.assert_array_equal(found.reward, [[0.0, 0.5], [5.0, 0.5]])
+
+
+def test_an_agent_plans_from_its_macro_actions_of_this_episode_alone() -> None:
+    """Frames are a macro-action late. The second macro-action ends the episode from 2, the first one from 4."""
+    context = AgentContext(n_actions=2, preprocessing="none", encoder=None, seeds=SeedTree(0))
+    agent = LawsAgent(ByteSymbols((5,)), context)
+    frames = [np.full((64, 64, 3), value, dtype=np.uint8) for value in range(5)]
+    for number, each in enumerate(late(1, episodes=40)):
+        if each.step == 0:
+            agent.begin_episode()
+        seen, then = (Observation(frame=frames[value]) for (value,) in (each.now, each.then))
+        transition = Transition(
+            observation=seen,
+            action=each.action,
+            reward=each.reward,
+            next_observation=then,
+            terminated=each.ended,
+            truncated=each.step == 7 and not each.ended,
+        )
+        agent.observe(transition, episode=number)
+    assert agent.writer.rows == late(1, episodes=40) and agent.writer.laws.delay == 1
+    for _ in range(2):
+        agent.begin_episode()
+        assert [agent.act(Observation(frame=frames[3]), explore=False) for _ in range(2)] == [0, 0]
+        agent.begin_episode()
+        assert agent.act(Observation(frame=frames[2]), explore=False) == 1, "nothing is on its way yet"
 
 
 @pytest.mark.parametrize(("own", "experiments"), [(False, 10), (True, 8)])
