@@ -20,7 +20,7 @@ from .motion.executor import MacroExecutor, MacroResult, at_rest
 from .motion.orientation import Sensing
 from .parameters.distractors import Distraction
 from .parameters.parameters import HIDDEN
-from .scenes.appearance import Appearance, AppearanceSampler, looks_of
+from .scenes.appearance import Appearance, AppearanceSampler, appearance_arrays
 from .scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from .scenes.constants import Point
 from .scenes.control_views import varied_by_appearance
@@ -149,7 +149,7 @@ class World(abc.ABC):
 
     def get_state(self) -> WorldState:
         """Everything in the scene that may change, copied."""
-        looks = tuple(np.array(each) for each in looks_of(self.model))
+        looks = tuple(np.array(each) for each in appearance_arrays(self.model))
         return WorldState(
             physics=self.physics(),
             looks=looks,
@@ -164,7 +164,7 @@ class World(abc.ABC):
         """Put the scene as it was, to the bit. Raises InvalidValueError: it has values that are not finite."""
         if not all(np.isfinite(each).all() for each in (state.physics, *state.looks)):
             raise InvalidValueError("the scene has values that are not finite")
-        for mine, then in zip(looks_of(self.model), state.looks, strict=True):
+        for mine, then in zip(appearance_arrays(self.model), state.looks, strict=True):
             mine[:] = then
         self._composite = state.composite
         self._nuisance = state.nuisance

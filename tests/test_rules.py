@@ -82,10 +82,12 @@ def _plainly(rules, horizon):
     return [best(state, horizon) for state in rules.start_states]
 
 
-@pytest.mark.parametrize("dials", [{}, {"slip": 0.3}, {"fickle": 0.4}, {"slip": 0.2, "fickle": 0.1, "n": 2}], ids=str)
+@pytest.mark.parametrize(
+    "parameters", [{}, {"slip": 0.3}, {"goal_change": 0.4}, {"slip": 0.2, "goal_change": 0.1, "n": 2}], ids=str
+)
 @pytest.mark.parametrize("horizon", [1, 2, 6])
-def test_the_horizon_optimum_is_that_of_plain_recursion(dials, horizon):
-    rules = Wheels(**dials)
+def test_the_horizon_optimum_is_that_of_plain_recursion(parameters, horizon):
+    rules = Wheels(**parameters)
     tables = tabulate(rules)
     found = horizon_optimum(tables, horizon)
     np.testing.assert_allclose(found.success[tables.starts], _plainly(rules, horizon), atol=1e-12)
@@ -94,7 +96,7 @@ def test_the_horizon_optimum_is_that_of_plain_recursion(dials, horizon):
 
 
 def test_shortest_plans_are_those_of_a_search():
-    for rules in (Wheels(), Wheels(slip=0.5), Wheels(n=2, fickle=0.5), registry.task("arrow_puzzle_hard").rules):
+    for rules in (Wheels(), Wheels(slip=0.5), Wheels(n=2, goal_change=0.5), registry.task("arrow_puzzle_hard").rules):
         tables = tabulate(rules)
         lengths = shortest_plans(tables)[tables.starts]
         assert lengths.tolist() == [fewest_actions(rules, start) for start in rules.start_states]

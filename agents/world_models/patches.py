@@ -1,8 +1,8 @@
 """A plain world model without a network, between *copy* and the networks: an engineer's work of one afternoon.
 
-Pixels that change under the same macro-actions are a patch. The looks of each patch are grouped. A table counts which
-look follows which under each macro-action, another which rewards and ends came with the looks. Frames are drawn by
-pasting an example of the new look into the latest frame.
+Pixels that change under the same macro-actions are a patch. The appearances of each patch are grouped. A table counts
+which appearance follows which under each macro-action, another which rewards and ends came with the appearances. Frames
+are drawn by pasting an example of the new appearance into the latest frame.
 """
 
 from __future__ import annotations
@@ -26,61 +26,64 @@ from imagine_bench.interfaces.model import Imagined, until_the_end
 _CHANGED = 40  # a pixel has changed if one of its colors differs by more, of 255
 _OFTEN = 0.1  # share of the transitions of a macro-action in which it changes the pixels of a patch
 _LEAST_PIXELS = 40  # of a patch
-_MOST_LOOKS = 32  # of a patch
-_COMPARED = 300  # frames whose looks are grouped
+_MOST_APPEARANCES = 32  # of a patch
+_COMPARED = 300  # frames whose appearances are grouped
 _BLUR = 3  # pixels
-_SHIFT = 2  # pixels by which two frames with the same look may be shifted
+_SHIFT = 2  # pixels by which two frames with the same appearance may be shifted
 _LEVEL = 0.02  # of the largest distance: differences below it count as none
-Looks = tuple[int, ...]
-"""The look of each patch, by its number."""
+Appearances = tuple[int, ...]
+"""The appearance of each patch, by its number."""
 Memory = defaultdict[Hashable, list[int]]
-"""A table of one patch: the looks before and a macro-action, and a list of all looks that followed them."""
+"""A table of one patch: the appearances before and a macro-action, and a list of all appearances that followed them."""
 
 
 class Patch(NamedTuple):
-    """Pixels that change together, P of a flattened frame, and an example of each of their L looks."""
+    """Pixels that change together, P of a flattened frame, and an example of each of their L appearances."""
 
     pixels: Ints  # shape (P,)
     gray: Floats  # shape (L, P)
     colors: Pixels  # shape (L, P, 3)
 
-    def looks(self, gray: Floats) -> Ints:
-        """The look of each of N gray frames (N, 4096). Shape (N,)."""
+    def appearances(self, gray: Floats) -> Ints:
+        """The appearance of each of N gray frames (N, 4096). Shape (N,)."""
         return _distances(gray, self.pixels, self.gray).argmin(axis=1)
 
 
 class Patches:
-    """Patches, looks and tables as a world model."""
+    """Patches, appearances and tables as a world model."""
 
     def __init__(self, context: AgentContext) -> None:
         self.n_actions = context.n_actions
         self.patches: list[Patch] = []
         self.tables: list[Memory] = []
         self.outcomes: defaultdict[Hashable, list[tuple[float, bool]]] = defaultdict(list)
-        """Rewards and ends that were seen: with the looks before and after a macro-action, and with those after."""
+        """Rewards and ends that were seen: with the appearances before and after a macro-action, and with those
+        after.
+        """
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
-        """Find patches and looks, and count."""
+        """Find patches and appearances, and count."""
         frames = dataset.frames
         before = dataset.rows[0]
         gray = _gray(frames)
         some = np.sort(rng.choice(len(frames), min(_COMPARED, len(frames)), replace=False))
         groups = _pixels_of_patches(frames, before, dataset.actions, self.n_actions)
         self.patches = [_patch(frames[some], gray[some], pixels) for pixels in groups]
-        looks = self._looks(gray)
+        appearances = self._appearances(gray)
         actions = dataset.actions.tolist()
-        steps = [(looks[row], action, looks[row + 1]) for row, action in zip(before.tolist(), actions, strict=True)]
+        rows = zip(before.tolist(), actions, strict=True)
+        steps = [(appearances[row], action, appearances[row + 1]) for row, action in rows]
         self.tables = [_table(steps, index) for index in range(len(self.patches))]
         ends = zip(dataset.rewards.tolist(), dataset.terminated.tolist(), strict=True)
         for step, outcome in zip(steps, ends, strict=True):
             for key in (step, step[2], None):
                 self.outcomes[key].append(outcome)
 
-    def _looks(self, gray: Floats) -> list[Looks]:
-        """The looks of N gray frames."""
+    def _appearances(self, gray: Floats) -> list[Appearances]:
+        """The appearances of N gray frames."""
         found = np.zeros((len(gray), len(self.patches)), dtype=np.int64)
         for index, patch in enumerate(self.patches):
-            found[:, index] = patch.looks(gray)
+            found[:, index] = patch.appearances(gray)
         return list(map(tuple, found.tolist()))
 
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
@@ -92,36 +95,36 @@ class Patches:
         shape = (len(frames), samples, asked.shape[1])
         images = np.empty((*shape, *frames.shape[2:]), dtype=np.uint8)
         rewards, ends, unknown = np.zeros((3, *shape))
-        starts = self._looks(_gray(frames[:, -1]))
+        starts = self._appearances(_gray(frames[:, -1]))
         for row, sample in np.ndindex(shape[:2]):
-            looks = starts[row]
+            appearances = starts[row]
             image = frames[row, -1].reshape(-1, 3).copy()
             for step, action in enumerate(asked[row].tolist()):
-                after, seen = self._drawn(looks, action, rng)
+                after, seen = self._drawn(appearances, action, rng)
                 place = (row, sample, step)
-                rewards[place], ends[place] = self._outcome((looks, action, after))
+                rewards[place], ends[place] = self._outcome((appearances, action, after))
                 unknown[place] = 1.0 / (1.0 + seen)
-                for patch, old, new in zip(self.patches, looks, after, strict=True):
+                for patch, old, new in zip(self.patches, appearances, after, strict=True):
                     if new != old:
                         image[patch.pixels] = patch.colors[new]
                 images[place] = image.reshape(frames.shape[2:])
-                looks = after
+                appearances = after
         counted, p_ended = until_the_end(rewards, ends)
         return Imagined(pictures=images, rewards=counted, p_ended=p_ended, epistemic=unknown.mean(axis=1))
 
-    def _drawn(self, looks: Looks, action: int, rng: np.random.Generator) -> tuple[Looks, int]:
-        """The next looks, and how often that patch was seen of which least is known; unseen looks stay."""
-        after = list(looks)
+    def _drawn(self, appearances: Appearances, action: int, rng: np.random.Generator) -> tuple[Appearances, int]:
+        """The next appearances, and how often that patch was seen of which least is known; unseen appearances stay."""
+        after = list(appearances)
         least = len(self.outcomes[None])
         for index, table in enumerate(self.tables):
-            seen = table.get((looks, action)) or table.get((looks[index], action), [])
+            seen = table.get((appearances, action)) or table.get((appearances[index], action), [])
             least = min(least, len(seen))
             if seen:
                 after[index] = seen[int(rng.integers(len(seen)))]
         return tuple(after), least
 
-    def _outcome(self, step: tuple[Looks, int, Looks]) -> tuple[float, float]:
-        """Mean reward and share of ends of the step, else of its looks after, else of everything."""
+    def _outcome(self, step: tuple[Appearances, int, Appearances]) -> tuple[float, float]:
+        """Mean reward and share of ends of the step, else of its appearances after, else of everything."""
         seen = self.outcomes.get(step) or self.outcomes.get(step[2]) or self.outcomes[None]
         return math.fsum(reward for reward, _ in seen) / len(seen), sum(end for _, end in seen) / len(seen)
 
@@ -171,13 +174,13 @@ def _change_rates(frames: Frame, rows: Ints) -> Floats:
 
 
 def _patch(frames: Frame, gray: Floats, pixels: Ints) -> Patch:
-    """A patch, whose looks are groups by average distance; their number is where distances rise most steeply."""
+    """A patch, whose appearances are groups by average distance; their number is where distances rise most steeply."""
     seen = gray[:, pixels]
     squared = _distances(gray, pixels, seen)
     away = np.sqrt(np.maximum(squared, squared.T))
     np.fill_diagonal(away, 0.0)
     tree = hierarchy.linkage(squareform(away, checks=False), "average")
-    heights = tree[::-1, 2][:_MOST_LOOKS]  # at which 2, 3, ... groups become one fewer
+    heights = tree[::-1, 2][:_MOST_APPEARANCES]  # at which 2, 3, ... groups become one fewer
     rises = heights[:-1] / (heights[1:] + _LEVEL * max(heights[0], 1.0))
     count = 2 + int(rises.argmax()) if len(rises) else 2
     group = hierarchy.fcluster(tree, count, "maxclust")
@@ -186,8 +189,8 @@ def _patch(frames: Frame, gray: Floats, pixels: Ints) -> Patch:
     return Patch(pixels, seen[middle], frames[middle].reshape(len(middle), -1, 3)[:, pixels])
 
 
-def _table(steps: Sequence[tuple[Looks, int, Looks]], index: int) -> Memory:
-    """The looks that followed a patch's own look and, if these predict it better, the looks of all patches."""
+def _table(steps: Sequence[tuple[Appearances, int, Appearances]], index: int) -> Memory:
+    """The appearances that followed a patch's own and, if these predict it better, those of all patches."""
     own: Memory = defaultdict(list)
     whole: Memory = defaultdict(list)
     for before, action, after in steps:
@@ -199,7 +202,7 @@ def _table(steps: Sequence[tuple[Looks, int, Looks]], index: int) -> Memory:
 
 
 def _foretold(table: Memory) -> float:
-    """Log-likelihood of the looks that followed, each predicted from all others in its list."""
+    """Log-likelihood of the appearances that followed, each predicted from all others in its list."""
     found = 0.0
     for seen in table.values():
         for count in Counter(seen).values():

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench_board.motions import MotionTests
-from imagine_bench_motion.cloned_env import BUNDLED, Period, carry_out
+from imagine_bench_motion.cloned_env import BUNDLED, ControlPeriod, carry_out
 from imagine_bench_motion.cloning import Clone
 from imagine_bench_motion.skills import CONTROL, PLACEMENT_M, Command
 
@@ -25,13 +25,13 @@ def clone_tests(tests: int, seed: int) -> MotionTests:
     motion = env.unwrapped
     assert isinstance(motion, MotionEnv)
 
-    def period(command: Command) -> Period:
+    def period(command: Command) -> ControlPeriod:
         seen, _, terminated, truncated, info = env.step(command)
-        return Period(seen, event=bool(info["event"]), over=terminated or truncated)
+        return ControlPeriod(seen, event=bool(info["event"]), over=terminated or truncated)
 
     for _ in range(tests):
         seen, _ = env.reset()
-        latest = Period(seen, event=False, over=False)
+        latest = ControlPeriod(seen, event=False, over=False)
         while not latest.over:
             action = motion.task.rules.optimal_action(motion.episode.macrostate)
             latest = carry_out(clone, motion.task.action_names[action], latest.seen, period)

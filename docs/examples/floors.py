@@ -1,4 +1,4 @@
-"""Transitions until an agent solves 95 % of the solvable episodes, over the information floor: the ladder's worlds.
+"""Transitions until an agent solves 95 % of the solvable episodes, over the cautious learner's, in the suite's worlds.
 
 python floors.py --agent factored --cubes 4 --out floors.json
 """
@@ -45,7 +45,7 @@ def transitions(run: RunResult, optimum: float) -> float:
 
 
 def measure(task: str, appearance: str, agent: str, options: argparse.Namespace) -> dict[str, Any]:
-    """One world: of each seed the transitions, and the world's floor and optimum."""
+    """One world: of each seed the transitions, and the world's cautious learner and optimum."""
     protocol, encoders = plan(
         task, "sample_efficiency", agents=(agent,), seeds=tuple(options.seeds), budgets=BUDGETS, execution="kinematic",
         evaluation_episodes=options.tests, appearance=appearance,
@@ -56,15 +56,15 @@ def measure(task: str, appearance: str, agent: str, options: argparse.Namespace)
     needed = [transitions(run, certificate.optimum) for run in result.of(agent)]
     return {
         "task": task, "appearance": appearance, "optimum": certificate.optimum,
-        "floor": certificate.floor and certificate.floor.transitions,
+        "floor": certificate.learning_cost and certificate.learning_cost.transitions,
         "transitions": [each if math.isfinite(each) else None for each in needed],
         "train_cpu_s": float(np.mean([run.checkpoints[-1].train_cpu_s for run in result.of(agent)])),
         "environment": dict(result.environment),
     }  # fmt: skip
 
 
-def over_floor(row: dict[str, Any]) -> float:
-    """Median of the seeds, over the floor; infinite where that is no number."""
+def over_cautious(row: dict[str, Any]) -> float:
+    """Median of the seeds, over the cautious learner; infinite where that is no number."""
     needed = [math.inf if each is None else each for each in row["transitions"]]
     return float(np.median(needed)) / (row["floor"] or math.nan)
 
@@ -82,8 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = []
     for task, appearance in worlds(options.cubes):
         rows.append(measure(task, appearance, options.agent, options))
-        print(f"{over_floor(rows[-1]):8.2f} {task} {appearance}", flush=True)
-    print(f"{np.median([over_floor(row) for row in rows]):8.2f} median of {len(rows)} worlds")
+        print(f"{over_cautious(rows[-1]):8.2f} {task} {appearance}", flush=True)
+    print(f"{np.median([over_cautious(row) for row in rows]):8.2f} median of {len(rows)} worlds")
     if options.out:
         options.out.write_text(json.dumps(rows, indent=1))
 

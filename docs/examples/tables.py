@@ -1,5 +1,5 @@
-"""The distance of the actions' effects, as `factored:given` learned them, from the exact rules, after the floor's
-number of transitions.
+"""How far the actions' effects that `factored:given` learned are from the rules, after the cautious learner's
+transitions.
 
 python tables.py slip=0.1 slip=0.2 fickle=0.2 --out tables.json
 """
@@ -27,7 +27,7 @@ from imagine_bench.rules import states_of
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 
-FLOORS = (0.5, 1.0, 2.0, 4.0)
+MULTIPLES = (0.5, 1.0, 2.0, 4.0)
 
 
 def away(agent: FactoredAgent, spec: TaskSpec, frames: Frame) -> float:
@@ -52,7 +52,7 @@ def away(agent: FactoredAgent, spec: TaskSpec, frames: Frame) -> float:
     return float(np.mean(found))
 
 
-def learn(dials: dict[str, float], spec: TaskSpec, seed: int, budgets: Sequence[int]) -> list[float]:
+def learn(parameters: dict[str, float], spec: TaskSpec, seed: int, budgets: Sequence[int]) -> list[float]:
     """Train in frames of the world, without physics; how far it is away after each number of transitions."""
     seeds = SeedTree(seed)
     agent = make(
@@ -64,7 +64,7 @@ def learn(dials: dict[str, float], spec: TaskSpec, seed: int, budgets: Sequence[
     every = np.array(states_of(spec.rules))
     frames = spec.render_macrostates(every, "clean", seeds.child("asked").generator())
     found = []
-    with closing(gymnasium.make("imagine_bench/Arrows-v0", execution="kinematic", **dials)) as env:
+    with closing(gymnasium.make("imagine_bench/Arrows-v0", execution="kinematic", **parameters)) as env:
         frame, _ = env.reset(seed=seed)
         for count in range(1, max(budgets) + 1):
             seen = Observation(frame=frame)
@@ -87,18 +87,18 @@ def learn(dials: dict[str, float], spec: TaskSpec, seed: int, budgets: Sequence[
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("dials", nargs="+", help="of arrows:, such as slip=0.1")
+    parser.add_argument("parameters", nargs="+", help="of arrows:, such as slip=0.1")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--out", type=Path)
     options = parser.parse_args(arguments)
     result: dict[str, Any] = {**describe_environment(), "worlds": {}}
-    for given in options.dials:
+    for given in options.parameters:
         spec = registry.task(f"arrows:{given}")
-        dials = {name: float(value) for name, value in (each.split("=") for each in given.split(","))}
-        known = certificate(spec).floor
+        parameters = {name: float(value) for name, value in (each.split("=") for each in given.split(","))}
+        known = certificate(spec).learning_cost
         assert known is not None
-        budgets = [round(share * known.transitions) for share in FLOORS]
-        found = [learn(dials, spec, seed, budgets) for seed in options.seeds]
+        budgets = [round(share * known.transitions) for share in MULTIPLES]
+        found = [learn(parameters, spec, seed, budgets) for seed in options.seeds]
         result["worlds"][given] = {"transitions": budgets, "total_variation": found}
         print(given, *(f"{n}: {mean:.3f}" for n, mean in zip(budgets, np.mean(found, axis=0), strict=True)), flush=True)
     if options.out:

@@ -187,13 +187,13 @@ LADDER = {
 
 
 def ladder() -> None:
-    """Episodes to 95 % of each agent, down to the information floor."""
+    """Episodes to 95 % of each agent, and that of the cautious learner."""
     tested = {agent: rates(folder, agent) for folder, agents in LADDER.items() for agent in agents}
     reached: dict[str, list[int | None]] = {}
     for agent, table in tested.items():
         by_seed = np.stack(list(table.values()), axis=1)
         reached[agent] = [statistics.first_lasting(list(table), seed, 0.95) for seed in by_seed]
-    floor = certificate(registry.task("arrow_puzzle")).floor
+    cost = certificate(registry.task("arrow_puzzle")).learning_cost
     beyond = 1.6 * max(max(table) for table in tested.values())
     found = {agent: [beyond if each is None else each for each in seeds] for agent, seeds in reached.items()}
     order = sorted(found, key=lambda agent: (np.median(found[agent]), np.mean(found[agent])))
@@ -204,9 +204,9 @@ def ladder() -> None:
         axes.plot([middle], [place], "|", color=color, markersize=24, markeredgewidth=1.5, alpha=0.5)
         for point, shift in zip(found[agent], np.linspace(-0.28, 0.28, len(found[agent])), strict=True):
             axes.plot([point], [place + shift], ">" if point == beyond else marker, color=color, markersize=4.5)
-    if floor:
-        axes.axvline(floor.episodes, **figures.REFERENCE)
-        said = f"each marker is a seed, a line is their median; dashed: cautious learner, {floor.episodes:.0f} episodes"
+    if cost:
+        axes.axvline(cost.episodes, **figures.REFERENCE)
+        said = f"each marker is a seed, a line is their median; dashed: cautious learner, {cost.episodes:.0f} episodes"
         axes.set_title(said, fontsize=9, loc="left")
     axes.set_yticks(range(len(order)), order)
     axes.set_xscale("log")

@@ -73,7 +73,7 @@ _INDEX = "__index_level_0__"
 """Where pandas keeps the index of a table."""
 
 
-class _Part(NamedTuple):
+class _EpisodeRows(NamedTuple):
     """The rows of one episode."""
 
     columns: Arrays
@@ -92,7 +92,9 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
     text = [str(card["description"])]
     table = {**columns, _MASK: masks[before]}
     spans = [slice(*span) for span in zip(firsts.tolist(), (firsts + episodes.lengths).tolist(), strict=True)]
-    parts = (_Part({name: each[span] for name, each in table.items()}, {_IMAGE: frames[span]}, text) for span in spans)
+    parts = (
+        _EpisodeRows({name: each[span] for name, each in table.items()}, {_IMAGE: frames[span]}, text) for span in spans
+    )
     _write_rows(folder, parts)
     pq.write_table(_tasks(text), folder / "meta/tasks.parquet")
     ends = _table({_EPISODE: np.arange(len(last)), _MASK: masks[last]}, {_IMAGE: episodes.frames[last]})
@@ -101,7 +103,7 @@ def write(folder: Path, episodes: Episodes, card: Mapping[str, Json]) -> None:
     write_json(folder / _INFO, _info(_features(episodes), counts, fps=1))
 
 
-def _write_rows(folder: Path, parts: Iterable[_Part]) -> None:
+def _write_rows(folder: Path, parts: Iterable[_EpisodeRows]) -> None:
     """Write the rows of episodes, one after another, the list of these, and the statistics of all."""
     rows: list[dict[str, Json]] = []
     columns = []
@@ -129,7 +131,7 @@ def _write_rows(folder: Path, parts: Iterable[_Part]) -> None:
     write_json(folder / "meta/stats.json", _statistics(whole, levels))
 
 
-def _placed(parts: Iterable[_Part]) -> Iterator[tuple[tuple[int, int], int, _Part]]:
+def _placed(parts: Iterable[_EpisodeRows]) -> Iterator[tuple[tuple[int, int], int, _EpisodeRows]]:
     """Each part with its chunk and file, and with the number of rows before it."""
     begin = 0
     for part in parts:
@@ -144,7 +146,7 @@ def write_motion(folder: Path, episodes: Iterator[Arrays], card: Mapping[str, An
     fps = round(card["rate_hz"])
     size = card["size"]
 
-    def parts() -> Iterator[_Part]:
+    def parts() -> Iterator[_EpisodeRows]:
         for episode in episodes:
             yield _motion_part(episode, counts, tasks, fps)
             counts.update(total_episodes=1, total_frames=len(episode["rewards"]))
@@ -161,7 +163,7 @@ def write_motion(folder: Path, episodes: Iterator[Arrays], card: Mapping[str, An
     write_json(folder / _INFO, _info(features, {**counts, "total_tasks": len(tasks)}, fps=fps))
 
 
-def _motion_part(episode: Arrays, before: Mapping[str, int], tasks: dict[str, int], fps: float) -> _Part:
+def _motion_part(episode: Arrays, before: Mapping[str, int], tasks: dict[str, int], fps: float) -> _EpisodeRows:
     """The rows of a demonstration; ``before`` counts those before it, ``tasks`` numbers the instructions so far."""
     said = episode["instruction"].tolist()
     for text in said:
@@ -178,7 +180,9 @@ def _motion_part(episode: Arrays, before: Mapping[str, int], tasks: dict[str, in
     }
     given = {theirs: episode[ours][:n_steps] for theirs, ours in _MOTION_NAMES.items()}
     columns = {name: {**given, **made}[name].astype(dtype) for name, dtype in _MOTION_TYPES.items()}
-    return _Part(columns, {_CAMERA + name: episode[name][:n_steps] for name in CAMERAS}, list(dict.fromkeys(said)))
+    return _EpisodeRows(
+        columns, {_CAMERA + name: episode[name][:n_steps] for name in CAMERAS}, list(dict.fromkeys(said))
+    )
 
 
 def read_motion(folder: Path) -> Iterator[Arrays]:

@@ -59,7 +59,8 @@ class Certificate:
     outcomes: tuple[tuple[str, str], ...]  #: (reward and end, coordinates of the conditions that force it), in order
     width: int  #: the most coordinates that decide one factor or condition
     facts: int  #: local entries and conditions that there are to know
-    floor: LearningCost | None  #: None where no start can be solved, or a learner is not done after learner.MOST
+    #: of a cautious learner; None where no start can be solved, or a learner is not done after learner.MOST
+    learning_cost: LearningCost | None
     lower_bound: int | None = None  #: transitions that any learner needs (:mod:`.bound`); None in older certificates
 
 
@@ -104,16 +105,20 @@ def certificate(spec: TaskSpec) -> Certificate:
         outcomes=_outcomes(spec, full, graph),
         width=graph.width,
         facts=graph.facts,
-        floor=_floor(full, graph, spec.horizon) if seen_optimum > 0.0 else None,
+        learning_cost=_learning_cost(full, graph, spec.horizon) if seen_optimum > 0.0 else None,
         lower_bound=lower_bound(full, graph, spec.horizon) if seen_optimum > 0.0 else None,
     )
 
 
 def from_json(values: Mapping[str, Any]) -> Certificate:
-    """Undo ``dataclasses.asdict`` and JSON. Raises TypeError or KeyError: fields are missing or unknown."""
-    lists = {name: tuple(map(tuple, values[name])) for name in ("plan_lengths", "dynamics", "outcomes")}
-    floor = values["floor"] and LearningCost(**values["floor"])
-    return Certificate(**{**values, **lists, "floor": floor})
+    """Undo ``dataclasses.asdict`` and JSON; older files say ``floor`` for ``learning_cost``.
+
+    Raises TypeError or KeyError: fields are missing or unknown.
+    """
+    today = {"learning_cost" if name == "floor" else name: value for name, value in values.items()}
+    lists = {name: tuple(map(tuple, today[name])) for name in ("plan_lengths", "dynamics", "outcomes")}
+    cost = today["learning_cost"]
+    return Certificate(**{**today, **lists, "learning_cost": cost and LearningCost(**cost)})
 
 
 def optimum(spec: TaskSpec) -> float:
@@ -149,11 +154,11 @@ def certificate_rows(found: Certificate) -> dict[str, str]:
             f"{found.lower_bound} transitions, before which no learner solves {100 * SHARE:.0f} % of the tests "
             "that the best policy solves, on average over the worlds that differ by the names of their actions"
         )
-    if found.floor is not None:
-        floor = found.floor
+    if found.learning_cost is not None:
+        cost = found.learning_cost
         part = " (of the certain part alone)" if found.random else ""
         rows["cautious"] = (
-            f"{floor.transitions:.0f} ± {floor.standard_error:.0f} transitions, {floor.episodes:.0f} episodes, until a "
+            f"{cost.transitions:.0f} ± {cost.standard_error:.0f} transitions, {cost.episodes:.0f} episodes, until a "
             f"learner with ideal codes and this graph knows an optimal policy{part}"
         )
     return rows
@@ -195,7 +200,7 @@ def _class(full: Machine, index: int) -> str:
     return f"{reward:+g}{', success' if success else ', end' if ended else ''}"
 
 
-def _floor(full: Machine, graph: FactorGraph, horizon: int) -> LearningCost | None:
+def _learning_cost(full: Machine, graph: FactorGraph, horizon: int) -> LearningCost | None:
     learners = min(_LEARNERS, max(_FEWEST, _PAIRS // (full.n_play * full.n_actions)))
     runs = list[LearnerRun]()
     for seed in range(learners):

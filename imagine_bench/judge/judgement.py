@@ -36,6 +36,7 @@ from imagine_bench.judge.scores import (
     one_step_scores,
     policy_scores,
     ranking_scores,
+    today,
     whole_world_scores,
 )
 from imagine_bench.judge.truth import Distribution, shares
@@ -351,7 +352,7 @@ def _fit(
 def _named(spec: TaskSpec, outcomes: Distribution) -> dict[str, float]:
     """Probabilities by the names of macrostates."""
     return {
-        "no picture" if state[0] < 0 else ", ".join(spec.value_names(state)): share for state, share in outcomes.items()
+        "unreadable" if state[0] < 0 else ", ".join(spec.value_names(state)): share for state, share in outcomes.items()
     }
 
 
@@ -435,7 +436,7 @@ def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], r
 def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
     """Every cell of a judgement that is kept. Raises ArtefactError: one is damaged."""
     cells = sorted(judgement.cells, key=lambda cell: judgement.models.index(cell.model))
-    found = [read_sealed(folder / cell.file, "a judged cell") for cell in cells if (folder / cell.file).exists()]
+    found = [today(read_sealed(folder / cell.file, "a judged cell")) for cell in cells if (folder / cell.file).exists()]
     made_by = {
         "read by different readers": {cell.get("reader", "") for cell in found},
         "judged by different policies": {cell["policies"] for cell in found if "policies" in cell},

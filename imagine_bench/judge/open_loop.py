@@ -73,52 +73,52 @@ def surviving_actions(
                 found.append(action)
         return found
 
-    looks = {state: _clearest_look(spec.sight, state) for state in spec.rules.start_states}
-    alike = {look: [state for state in looks if looks[state] == look] for look in looks.values()}
+    observed = {state: _clearest(spec.sight, state) for state in spec.rules.start_states}
+    alike = {first: [state for state in observed if observed[state] == first] for first in observed.values()}
     candidates: list[State] = []
     while depth and not candidates:
-        candidates = [state for state in looks if safe(frozenset(alike[looks[state]]), depth)]
+        candidates = [state for state in observed if safe(frozenset(alike[observed[state]]), depth)]
         depth -= not candidates
     if not candidates or not starts:
         return None
     chosen = [candidates[index] for index in rng.integers(len(candidates), size=starts)]
-    frames = spec.render_macrostates(np.array([looks[state] for state in chosen], dtype=np.int64), appearance, rng)
+    frames = spec.render_macrostates(np.array([observed[state] for state in chosen], dtype=np.int64), appearance, rng)
     actions = np.zeros((starts, depth), dtype=np.int64)
     truth = []
     for row, state in enumerate(chosen):
-        same_look = alike[looks[state]]
-        reached: list[Outcomes] = [{(each, False): (1.0 / len(same_look), 0.0) for each in same_look}]
+        same = alike[observed[state]]
+        reached: list[Outcomes] = [{(each, False): (1.0 / len(same), 0.0) for each in same}]
         for step in range(depth):
             actions[row, step] = rng.choice(safe(frozenset(shares(reached[-1])), depth - step))
             reached.append(advance(spec.rules, reached[-1], int(actions[row, step])))
-        truth.append(tuple(_observed(spec, reached, looks[state], step) for step in range(1, depth + 1)))
+        truth.append(tuple(_observed(spec, reached, observed[state], step) for step in range(1, depth + 1)))
     return EvalSet(states=tuple(chosen), frames=frames[:, None], actions=actions, truth=tuple(truth))
 
 
-def _clearest_look(sight: ObservationModel | None, state: State) -> State:
+def _clearest(sight: ObservationModel | None, state: State) -> State:
     """The content of an episode's first frame where it hides as little as it can; -1 for the hidden."""
     if sight is None:
         return state
     return min((what for _, what in sight.seen(state, 0)), key=lambda what: sum(value < 0 for value in what))
 
 
-def _observed(spec: TaskSpec, reached: Sequence[Outcomes], look: State, step: int) -> Outcomes:
+def _observed(spec: TaskSpec, reached: Sequence[Outcomes], first: State, step: int) -> Outcomes:
     """The truth of a frame after ``step`` actions, and of the reward of the latest.
 
-    ``reached`` are the outcomes after each number of actions, and ``look`` is the content of the first frame.
+    ``reached`` are the outcomes after each number of actions, and ``first`` is the content of the first frame.
     """
     if spec.sight is None:
         return reached[step]
     taken = step - spec.sight.lag
-    looks = {spec.as_observed(look): 1.0}
+    observed = {spec.as_observed(first): 1.0}
     if taken > 0:
-        looks = added_up(
+        observed = added_up(
             (spec.as_observed(shown), share * probability)
             for state, share in shares(reached[taken]).items()
             for probability, shown in spec.sight.seen(state, taken)
         )
     reward = expected_reward(reached[step])
-    return {(read, False): (share, reward) for read, share in looks.items()}
+    return {(read, False): (share, reward) for read, share in observed.items()}
 
 
 def open_loop(agent: Imaginer, questions: EvalSet, seeds: SeedTree) -> OpenLoop:
@@ -211,12 +211,12 @@ class Moment:
         late.
         """
         sight = self.spec.sight
-        looks = {state}
+        observed = {state}
         if sight is not None:
             taken = len(self.before) + step + 1
-            looks = {self.spec.as_observed(what) for _, what in sight.seen(state, taken)}
+            observed = {self.spec.as_observed(what) for _, what in sight.seen(state, taken)}
             step += sight.lag
-        return step < len(rollout.macrostates) and tuple(rollout.macrostates[step].tolist()) in looks
+        return step < len(rollout.macrostates) and tuple(rollout.macrostates[step].tolist()) in observed
 
     def sampled(self, agent: Imaginer, seeds: SeedTree) -> tuple[ComparedRollout, ...]:
         """Imagine this moment several times. The agent has seen the episode so far, and is not changed."""
@@ -227,8 +227,8 @@ class Moment:
 
 def _first_moments(spec: TaskSpec, starts: Sequence[State], appearance: str, rng: np.random.Generator) -> list[Moment]:
     """How episodes begin in some macrostates."""
-    looks = [_clearest_look(spec.sight, start) for start in starts]
-    frames = spec.render_macrostates(np.array(looks, dtype=np.int64), appearance, rng)
+    observed = [_clearest(spec.sight, start) for start in starts]
+    frames = spec.render_macrostates(np.array(observed, dtype=np.int64), appearance, rng)
     pairs = zip(frames, starts, strict=True)
     return [Moment(spec=spec, appearance=appearance, frame=frame, macrostate=start) for frame, start in pairs]
 
@@ -264,8 +264,8 @@ def _in_frames(sight: ObservationModel | None, states: Sequence[State], rng: np.
     """The content of the agent's frame in each macrostate of an episode; -1 for a hidden coordinate."""
     if sight is None:
         return states
-    looks = [sight.seen(state, step) for step, state in enumerate(states)]
-    shown = [look[0][1] if len(look) == 1 else _drawn(look, rng) for look in looks]
+    possible = [sight.seen(state, step) for step, state in enumerate(states)]
+    shown = [each[0][1] if len(each) == 1 else _drawn(each, rng) for each in possible]
     return [shown[max(0, step - sight.lag)] for step in range(len(states))]
 
 

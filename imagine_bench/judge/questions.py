@@ -122,8 +122,8 @@ def counterfactuals(spec: TaskSpec, render: Render) -> tuple[EvalSet, ...]:
 def about_whole_world(spec: TaskSpec, single: EvalSet) -> WorldQuestions:
     """Questions about the whole world, of which ``single`` has every macro-action as :func:`one_step` has it."""
     of_one = single.frames.reshape(-1, FRAMES, *single.frames.shape[1:])
-    looks = bool((of_one[:, 0] != of_one[:, -1]).any())
-    return whole_world(spec, single.macrostates, FRAMES, looks=looks)
+    frames_vary = bool((of_one[:, 0] != of_one[:, -1]).any())
+    return whole_world(spec, single.macrostates, FRAMES, frames_vary=frames_vary)
 
 
 def light_alone(spec: TaskSpec, render: Render) -> EvalSet | None:

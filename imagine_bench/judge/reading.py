@@ -139,9 +139,9 @@ def reader_in(spec: TaskSpec, appearance: str, folder: Path) -> ImageReader:
 def _reader_of_world(spec: TaskSpec, appearance: str, code: ModuleType) -> tuple[bytes, dict[str, float]]:
     """The reader of a world as a file, and its errors; trained and measured where the cache has none."""
     states = states_of(spec.rules)
-    looks = spec.render_macrostates(np.array(states[:8]), appearance, np.random.default_rng(0)).tobytes()
+    frames = spec.render_macrostates(np.array(states[:8]), appearance, np.random.default_rng(0)).tobytes()
     made_of = (spec.id, appearance, states, inspect.getsource(code))
-    name = hashlib.sha256(repr(made_of).encode() + looks).hexdigest()[:12]
+    name = hashlib.sha256(repr(made_of).encode() + frames).hexdigest()[:12]
     path = make_folder(encoders.cache_folder() / "readers" / name) / READER_FILE
     card = path.with_name("reader.json")
     with making(path.parent):

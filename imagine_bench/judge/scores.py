@@ -1,7 +1,7 @@
 """Scores of a model's predictions against the exact truth; 0 is best in every error.
 
-The names of scores are columns of kept files and stay as they are there. NaN stands where a model does not offer a
-prediction, and where there is nothing to tell apart.
+The names of scores are columns of kept files; :data:`FORMER` has those of older files. NaN stands where a model does
+not offer a prediction, and where there is nothing to tell apart.
 
 A model that draws futures is charged for their number by every score of probabilities: by total variation, calibration
 errors and Brier scores. Two columns make it comparable with a model that gives probabilities: the total variation that
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -51,9 +51,22 @@ _BINS = 10
 _MOST = 0.5  # share of a transition's frames in which a filter keeps it; probability from which an episode goes on
 _AVOIDED = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)  # shares of the transitions, those that a model knows least of
 _WRONG = 0.5  # total variation from which a transition counts as imagined wrongly
+FORMER = {
+    "invented": "hallucinated",
+    "nothing": "unreadable",
+    "worth_of_refusing": "value_of_abstaining",
+    "worth_of_filter": "value_of_filter",
+}
+"""Today's name of each score that files kept before 2026-11-30 name otherwise."""
 Scores = dict[str, float]
+T = TypeVar("T")
 Pairs = Sequence[tuple[Mapping[Value, float], Mapping[Value, float]]]
 """Exact and imagined probabilities of each question."""
+
+
+def today(scores: Mapping[str, T]) -> dict[str, T]:
+    """Kept scores by today's names."""
+    return {FORMER.get(name, name): value for name, value in scores.items()}
 
 
 def by_depth(questions: EvalSet, predictions: Predictions) -> dict[str, list[float]]:
@@ -89,8 +102,8 @@ def one_step_scores(
         "perfect_sampler": distances["perfect_by_depth"][0],
         "unbiased": distances["unbiased_by_depth"][0],
         "missed": float(np.mean([missed_modes(*pair) for pair in pairs])),
-        "invented": float(np.mean([hallucinated_modes(*pair) for pair in pairs])),
-        "nothing": float(np.mean([sum(p for state, p in each.items() if state[0] < 0) for _, each in pairs])),
+        "hallucinated": float(np.mean([hallucinated_modes(*pair) for pair in pairs])),
+        "unreadable": float(np.mean([sum(p for state, p in each.items() if state[0] < 0) for _, each in pairs])),
         **_calibration("outcome", pairs),
         **_reward_scores(questions, predictions),
         **_end_scores(questions, predictions),
@@ -203,13 +216,13 @@ def _costs(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dict
     out. ``value_loss_ruled`` is the mean loss with the rules' rewards and ends for the imagined macrostates.
 
     The gain of abstaining is the gain in value of a planner that avoids some transitions, except in macrostates where
-    it would avoid all of them. ``worth_of_refusing`` avoids those that the model knows least of; it tries the shares
+    it would avoid all of them. ``value_of_abstaining`` avoids those that the model knows least of; it tries the shares
     of :data:`_AVOIDED` and is the gain of the best one with the truth known, or 0 where none gains.
-    ``worth_of_filter`` avoids those that the model's own filter discards.
+    ``value_of_filter`` avoids those that the model's own filter discards.
     """
     states = questions.macrostates
     starts = spec.rules.start_states
-    names = ("value_loss", "worst_value_loss", "value_loss_ruled", "worth_of_refusing", "worth_of_filter")
+    names = ("value_loss", "worst_value_loss", "value_loss_ruled", "value_of_abstaining", "value_of_filter")
     found: dict[str, float | list[float]] = {**dict.fromkeys(names, math.nan), "value_loss_by_start": []}
     if not set(starts) <= set(states):
         return found
@@ -240,9 +253,9 @@ def _costs(spec: TaskSpec, questions: EvalSet, predictions: Predictions) -> dict
     accepted = predictions.of_one_step("accepted")
     if epistemic is not None:
         unknown = by_pair(epistemic)
-        found["worth_of_refusing"] = max(0.0, *(gain(unknown <= np.quantile(unknown, 1.0 - s)) for s in _AVOIDED))
+        found["value_of_abstaining"] = max(0.0, *(gain(unknown <= np.quantile(unknown, 1.0 - s)) for s in _AVOIDED))
     if accepted is not None:
-        found["worth_of_filter"] = gain(by_pair(accepted) >= _MOST)
+        found["value_of_filter"] = gain(by_pair(accepted) >= _MOST)
     return found
 
 

@@ -254,7 +254,7 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
         return spec_of(self.task, self.split, testing=testing)
 
     @property
-    def looks(self) -> str:
+    def appearance_in_words(self) -> str:
         """The appearance in words: ``clean``, or ``clean, tested at strong``; and the observations of agents beside
         frames.
         """

@@ -86,7 +86,7 @@ def bench_page(result: BenchResult) -> Page:
     if len(protocol.seeds) == 1:
         interval = "95 % interval over test episodes only (Wilson; one seed says nothing about the luck of training)"
     subtitle = (
-        f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.looks}” · "
+        f"Preset {protocol.preset} · {protocol.execution} execution · appearance “{protocol.appearance_in_words}” · "
         f"{len(protocol.seeds)} seed{'s' * (len(protocol.seeds) != 1)}{few}, "
         f"{trials} test episode{'s' * (trials != 1)}{dataset}{split} · "
         f"{interval} · protocol {result.protocol_hash}"

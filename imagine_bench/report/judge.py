@@ -46,7 +46,8 @@ QUESTIONS = {
         "total_variation": "total variation, 1 step", "tv_3": "3 steps", "tv_5": "5 steps", "tv_10": "10 steps",
         "perfect_sampler": "perfect sampler's, 1 step", "perfect_10": "perfect sampler's, 10",
         "unbiased": "unbiased Brier, 1 step", "unbiased_10": "unbiased Brier, 10",
-        "after_the_end": "after the end", "missed": "missed outcomes", "invented": "invented", "nothing": "no picture",
+        "after_the_end": "after the end", "missed": "missed outcomes",
+        "hallucinated": "hallucinated outcomes", "unreadable": "unreadable images",
         "outcome_ece": "calibration error", "outcome_brier": "Brier",
     },
     "Which rewards and ends?": {
@@ -63,7 +64,7 @@ QUESTIONS = {
         "auroc_after_the_end": "after the end", "auroc_noisy": "aleatoric, noisy", "auroc_several": "modal, several",
         "filter_keeps": "its filter keeps",
         "filter_error": "error of that", "filter_skill": "skill of its filter", "best_skill": "of the best threshold",
-        "worth_of_refusing": "worth of refusing", "worth_of_filter": "worth of its filter",
+        "value_of_abstaining": "value of abstaining", "value_of_filter": "value of its filter",
         "risk_coverage": "risk–coverage area",
     },
     "Does a guarantee hold?": {
@@ -97,9 +98,9 @@ _WORDS = {
     "and hold 0 for a model that gives probabilities. The unbiased Brier score is free of that: the sum of squared "
     "differences of probabilities, less the mean share of sampling: 0 is perfect, 2 the worst, and a perfect "
     "sampler may be a little below 0. Compare a model that draws with one that gives probabilities by this score only; "
-    "missed and invented outcomes, calibration error and Brier score hold the sampling, too. “After the end” is the "
-    "total variation of macro-actions after an episode has ended, which no data contains. Missed and invented outcomes "
-    "are counted per transition. “No picture” is the share of images in which the reader recognizes nothing.",
+    "missed and hallucinated outcomes, calibration error and Brier score hold the sampling, too. “After the end” is "
+    "the total variation of macro-actions after an episode has ended, which no data contains. Missed and hallucinated "
+    "outcomes are counted per transition. “Unreadable images” is their share: the reader recognizes nothing in them.",
     "Which rewards and ends?": "Error of the expected reward, in units of reward, and of the probability of the end. "
     "For calibration and Brier score a reward counts as the nearest that the rules give.",
     "What do mistakes cost?": "Value loss is V* - V: the return of the best policy from a start, less that of the "
@@ -112,7 +113,7 @@ _WORDS = {
     "Does it know?": "AUROC of the epistemic uncertainty for transitions imagined wrongly, never seen in the data, or "
     "either, and for those after the end; of the aleatoric for random ones; of the modal for several outcomes. Skill: "
     "the share of wrong ones that a filter discards, less that of right ones; the best threshold of the epistemic "
-    "uncertainty is chosen with the truth, and a filter may read more. Worth: reward a start that planning gains "
+    "uncertainty is chosen with the truth, and a filter may read more. Value: reward a start that planning gains "
     "without the macro-actions it knows least of (the best share, chosen with the truth), and without those that its "
     "own filter discards. Risk–coverage area: the share of wrong ones among the k most certain, the mean over all k.",
     "Does a guarantee hold?": f"A transition is accepted if its epistemic uncertainty is below a threshold that is "
@@ -140,11 +141,11 @@ _WORDS = {
     "beforehand are those on which the model's encoder had been trained before.",
 }
 SHORT = (
-    *("total_variation", "perfect_sampler", "unbiased", "nothing", "value_loss"),
+    *("total_variation", "perfect_sampler", "unbiased", "unreadable", "value_loss"),
     *("policy_tau", "lift", "exploit", "auroc_wrong", "counterfactual", "fit_s"),
 )
 _SHARES = {
-    *("total_variation", "tv_3", "tv_5", "tv_10", "perfect_sampler", "perfect_10", "after_the_end", "nothing"),
+    *("total_variation", "tv_3", "tv_5", "tv_10", "perfect_sampler", "perfect_10", "after_the_end", "unreadable"),
     *("outcome_ece", "reward_ece", "end_error", "end_ece"),
     *("filter_keeps", "filter_error", "best_skill", "counterfactual"),
     *(name for name in COLUMNS if name.startswith(("auroc", "conformal"))),

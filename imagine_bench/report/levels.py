@@ -27,7 +27,7 @@ class EvidenceLevel(NamedTuple):
 
 
 LEVELS = (
-    EvidenceLevel("L0", ("nothing",), "Its images look like images of this world.", "They show the right thing."),
+    EvidenceLevel("L0", ("unreadable",), "Its images look like images of this world.", "They show the right thing."),
     EvidenceLevel(
         "L1",
         ("total_variation", "unbiased"),

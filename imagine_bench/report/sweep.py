@@ -121,7 +121,7 @@ def _scores(result: SuiteResult) -> Table:
     rows = []
     for each in experiments:
         scores = (estimate(result.score(each, agent), decimals) for agent in result.agents)
-        rows.append([f"{each.name}: {each.dial}", *scores])
+        rows.append([f"{each.name}: {each.parameter}", *scores])
     prices = ["training of all levels and seeds (CPU s)"]
     for agent in result.agents:
         trained = (level.train_cpu_s for each in experiments for level in result.levels[each.name, agent])
@@ -133,7 +133,7 @@ def _scores(result: SuiteResult) -> Table:
         "epistemic uncertainty tells wrong imagined transitions from right ones, from 0.5 to 1; an agent that does not "
         "say has 0.5."
     )
-    header = ["experiment: dial", *result.agents]
+    header = ["experiment: parameter", *result.agents]
     return Table("suite", header, [*rows, prices], words, "not run, or no imagined transition was wrong")
 
 

@@ -66,8 +66,8 @@ def _place(made_for: bytes, name: str) -> Path:
 
 def cached(spec: TaskSpec, appearance: str, kind: str) -> Path:
     """Where the trained encoder of a task's looks belongs, be it there or not; other looks are another folder."""
-    looks = f"{spec.preprocessing}/{spec.config_group}/".encode() + _frames(spec, appearance).tobytes()
-    return _place(looks, bundled_name(spec.encoder, appearance, kind))
+    made_for = f"{spec.preprocessing}/{spec.config_group}/".encode() + _frames(spec, appearance).tobytes()
+    return _place(made_for, bundled_name(spec.encoder, appearance, kind))
 
 
 def offered(spec: TaskSpec, appearance: str, name: str) -> Path:

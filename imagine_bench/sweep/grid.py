@@ -108,7 +108,7 @@ class Experiment:
     """One capability, and the world parameter that asks for more and more of it."""
 
     name: str
-    dial: str  #: The world parameter, in words
+    parameter: str  #: The world parameter, in words
     question: str  #: For a reader of the report
     levels: tuple[Level, ...]
     measure: str = "success"  #: One of :data:`MEASURES`
@@ -141,6 +141,8 @@ class Suite:
         """12 hex digits that change when anything in any level does; seeds and tests count, too, but not agents."""
         fields = dataclasses.asdict(self)
         del fields["agents"]
+        for each in fields["experiments"]:
+            each["dial"] = each.pop("parameter")  # the name that it had, so that hashes stay
         return digest(fields)
 
     def only(self, names: Sequence[str]) -> Suite:
@@ -181,6 +183,8 @@ def read_grid(path: Path) -> Study | Suite:
             return Study(**{**data, "variants": tuple(variants)})
         experiments = []
         for each in data["experiments"]:
+            if "dial" in each:  # the name that it had
+                each["parameter"] = each.pop("dial")
             levels = tuple(Level(**level) for level in each["levels"])
             experiments.append(Experiment(**{**each, "levels": levels}))
         return Suite(**{**data, "experiments": tuple(experiments)})

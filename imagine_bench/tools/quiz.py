@@ -66,7 +66,7 @@ def quiz(
             "that nothing is asked about its whole world; take another task, such as arrow_puzzle."
         )
     first = spec.render_macrostates(np.array(states[:1] * 2, dtype=np.int64), look, rng)
-    asked = whole_world(spec, states, FRAMES, looks=bool((first[0] != first[1]).any()))
+    asked = whole_world(spec, states, FRAMES, frames_vary=bool((first[0] != first[1]).any()))
     place = make_folder(folder / spec.id)
     found: dict[str, list[Floats]] = {}
     for number in range(count):

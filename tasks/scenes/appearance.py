@@ -147,7 +147,7 @@ def between(name: str, factors: Mapping[str, float]) -> Appearance:
     return Appearance(name=name, **widths)
 
 
-def looks_of(model: mujoco.MjModel) -> tuple[Floats, ...]:
+def appearance_arrays(model: mujoco.MjModel) -> tuple[Floats, ...]:
     """The values that any appearance writes into a model: views of it."""
     headlight = model.vis.headlight
     return headlight.ambient, headlight.diffuse, model.light_diffuse, model.mat_rgba, model.cam_pos, model.cam_quat
@@ -170,12 +170,12 @@ class AppearanceSampler:
         self._level = level
         self._cameras = [model.camera(name).id for name in cameras]
         self._materials = np.array([model.material(name).id for name in materials])
-        self._nominal = [each.copy() for each in looks_of(model)]
+        self._nominal = [each.copy() for each in appearance_arrays(model)]
 
     def vary(self, rng: np.random.Generator) -> None:
         """Write one new sample; it replaces the one before, nothing adds up."""
         level = self._level
-        *lights, rgba, cam_pos, cam_quat = looks_of(self._model)
+        *lights, rgba, cam_pos, cam_quat = appearance_arrays(self._model)
         *nominal_lights, nominal_rgba, nominal_pos, nominal_quat = self._nominal
         if level.light_fraction:
             brightness = 1.0 + level.light_fraction * rng.uniform(-1.0, 1.0)

@@ -18,6 +18,7 @@ from kept import RESULTS, certificate_of, facts, table
 
 from imagine_bench import reference, registry, rules, statistics
 from imagine_bench.exact import motion
+from imagine_bench.judge.scores import today
 from imagine_bench.registry.entries import agent_label, label_today
 from imagine_bench.report.page import over_seeds
 from imagine_bench.running.bench import read_protocol
@@ -353,11 +354,11 @@ def futures(folder: str, agent: str, measure: str, depth: str) -> str:
 
 def judged(folder: str, model: str, transitions: str, score: str) -> str:
     """A score of the judge: interquartile mean / mean over the seeds in which it is a number, as :func:`iqm`."""
-    rows = picked(f"{folder}/scores.csv", model=model, transitions=transitions)
+    rows = [today(row) for row in picked(f"{folder}/scores.csv", model=model, transitions=transitions)]
     values = [float(row[score]) for row in rows if row[score]]
     if not values:
         return "–"
-    shares = ("auroc", "total", "tv", "after", "counter", "best", "conformal", "risk", "outcome", "nothing")
+    shares = ("auroc", "total", "tv", "after", "counter", "best", "conformal", "risk", "outcome", "unreadable")
     share = score.startswith(shares)
     digits = 2 if share or "skill" in score or "unbiased" in score or score.startswith(("policy", "fidelity")) else 1
     digits = 3 if score.startswith("conformal_wrong") else digits

@@ -21,9 +21,9 @@ def needed_by_any(where: str) -> str:
 
 def needed_by_cautious(where: str, what: str) -> str:
     """The mean transitions or episodes of the cautious learner."""
-    floor = certificate_of(task_of(where)).floor
-    assert floor is not None
-    return f"{getattr(floor, what):.0f}"
+    cost = certificate_of(task_of(where)).learning_cost
+    assert cost is not None
+    return f"{getattr(cost, what):.0f}"
 
 
 def worlds_learned(what: str) -> str:

@@ -160,15 +160,15 @@ def test_what_an_agent_needs_over_the_floor(
     monkeypatch.setattr(example, "BUDGETS", (4, 8))
     monkeypatch.setattr(example, "worlds", lambda cubes: [("arrow_puzzle_easy", "clean")])
     monkeypatch.setattr(example, "launcher", lambda name, workers: Inline())
-    floor = certificate(registry.task("arrow_puzzle_easy")).floor
-    assert floor
+    cost = certificate(registry.task("arrow_puzzle_easy")).learning_cost
+    assert cost
     for agent, needed, ratio in (("oracle", [0], 0.0), ("random", [None], np.inf)):
         words = f"--agent {agent} --cubes 1 --seeds 1000 --tests 20".split()
         example.main([*words, "--runs", str(tmp_path), "--out", str(tmp_path / "floors.json")])
         (row,) = json.loads((tmp_path / "floors.json").read_text())
-        assert (row["transitions"], row["floor"]) == (needed, floor.transitions)
+        assert (row["transitions"], row["floor"]) == (needed, cost.transitions)
         assert f"{ratio:8.2f} arrow_puzzle_easy clean" in capsys.readouterr().out
-    assert example.over_floor({"transitions": [None, 30, 50], "floor": 25.0}) == 2.0
+    assert example.over_cautious({"transitions": [None, 30, 50], "floor": 25.0}) == 2.0
 
 
 @pytest.mark.parametrize("example", ["tables"], indirect=True)
@@ -176,13 +176,13 @@ def test_how_far_learned_tables_are_from_the_rules(
     example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Far after one transition, nearer after a quarter as many as the cautious learner needs."""
-    floor = certificate(registry.task("arrows:slip=0.1")).floor
-    assert floor
-    monkeypatch.setattr(example, "FLOORS", (1 / floor.transitions, 0.25))
+    cost = certificate(registry.task("arrows:slip=0.1")).learning_cost
+    assert cost
+    monkeypatch.setattr(example, "MULTIPLES", (1 / cost.transitions, 0.25))
     example.main(["slip=0.1", "--seeds", "1000", "--out", str(tmp_path / "tables.json")])
     world = json.loads((tmp_path / "tables.json").read_text())["worlds"]["slip=0.1"]
     ((first, learned),) = world["total_variation"]
-    assert world["transitions"] == [1, round(0.25 * floor.transitions)]
+    assert world["transitions"] == [1, round(0.25 * cost.transitions)]
     assert first > 0.4 and first <= 1.0
     assert learned > 0.0 and learned < 0.5 * first
 
@@ -193,7 +193,7 @@ def test_the_study_on_a_page_could_be_run(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(text)
     study = read_grid(tmp_path / "mine.toml")
     found = [plan_variant(study, "arrow_puzzle", variant)[0] for variant in study.variants]
-    assert [(dict(each.overrides), each.looks) for each in found if isinstance(each, Protocol)] == [
+    assert [(dict(each.overrides), each.appearance_in_words) for each in found if isinstance(each, Protocol)] == [
         ({}, "clean"), ({"controller.discount": 0.9}, "clean"), ({}, "clean, tested at strong"),
     ]  # fmt: skip
 

@@ -53,6 +53,6 @@ def test_a_learner_that_has_seen_all_that_is_unsure_plans_again():
     """Of the clockwise puzzle some conditions are never told apart: all points that they decide are seen instead."""
     started_s = time.process_time()
     found = certificate(registry.task("arrow_puzzle_clockwise"))
-    assert found.floor is not None and found.optimum == 1.0
-    assert 56 < found.floor.transitions < found.macrostates * 6  # facts; all that a table could need
+    assert found.learning_cost is not None and found.optimum == 1.0
+    assert 56 < found.learning_cost.transitions < found.macrostates * 6  # facts; all that a table could need
     assert time.process_time() - started_s < 30.0

@@ -17,17 +17,17 @@ from imagine_bench.exact.learner import learn
 
 
 @pytest.mark.parametrize(
-    ("dials", "facts"),
+    ("parameters", "facts"),
     [
         ({}, 3 * 2 * 4 + 2 * 4 + 3),
         ({"forbid": False}, 3 * 2 * 4 + 3),
-        ({"slip": 0.1, "fickle": 0.2}, 3 * 2 * 4 + 6 * 3 + 2 * 4 + 3),
+        ({"slip": 0.1, "goal_change": 0.2}, 3 * 2 * 4 + 6 * 3 + 2 * 4 + 3),
         ({"n": 6}, 6 * 2 * 4 + 5 * 4 + 6),
     ],
     ids=str,
 )
-def test_facts_are_those_that_the_machine_was_built_of(dials, facts):
-    graph = factor_graph(machine(Wheels(**dials)))
+def test_facts_are_those_that_the_machine_was_built_of(parameters, facts):
+    graph = factor_graph(machine(Wheels(**parameters)))
     assert (graph.facts, graph.width, graph.read) == (facts, 2, "next")
     assert all(factor.children == factor.parents for factor in graph.factors)
 
@@ -56,8 +56,8 @@ class _Reordered(Wheels):
 
 
 def test_no_fact_depends_on_the_order_of_outcomes():
-    dials = {"slip": 0.1, "fickle": 0.2}
-    graph, again = (factor_graph(machine(kind(**dials))) for kind in (Wheels, _Reordered))
+    parameters = {"slip": 0.1, "goal_change": 0.2}
+    graph, again = (factor_graph(machine(kind(**parameters))) for kind in (Wheels, _Reordered))
     assert again.facts == graph.facts
     assert [(f.action, f.children, f.parents) for f in again.factors] == [
         (f.action, f.children, f.parents) for f in graph.factors
@@ -74,10 +74,10 @@ def test_what_is_drawn_together_is_one_factor():
     assert [f.children for f in sure.factors if f.action == 0] == [(0,), (1,)]
 
 
-@pytest.mark.parametrize("dials", [{}, {"slip": 0.3}, {"fickle": 0.3}], ids=str)
-def test_a_learner_that_is_done_has_seen_what_it_needs(dials):
+@pytest.mark.parametrize("parameters", [{}, {"slip": 0.3}, {"goal_change": 0.3}], ids=str)
+def test_a_learner_that_is_done_has_seen_what_it_needs(parameters):
     """A transition shows at most one entry of the dynamics a wheel, so that there is a bound from below."""
-    rules = Wheels(**dials)
+    rules = Wheels(**parameters)
     full = machine(rules)
     graph = factor_graph(full)
     runs = [learn(full, graph, 12, np.random.default_rng(seed)) for seed in range(3)]
@@ -104,7 +104,7 @@ def test_a_learner_looks_no_further_than_its_episode_goes_on(monkeypatch):
 
 def test_the_cost_of_learning_is_the_mean_of_learners_with_its_standard_error():
     rules = Wheels(n=2)
-    cost, full = certificate(spec_of(rules, 8)).floor, machine(rules)
+    cost, full = certificate(spec_of(rules, 8)).learning_cost, machine(rules)
     runs = [learn(full, factor_graph(full), 8, np.random.default_rng(seed)) for seed in range(cost.learners)]
     needed = [run.transitions for run in runs]
     assert cost.transitions == pytest.approx(np.mean(needed))
@@ -118,5 +118,5 @@ def test_a_world_without_a_plan_says_so():
             return dataclasses.replace(super().judge(state, action, reached, share), success=False)
 
     found = certificate(spec_of(Hopeless(n=2), 5))
-    assert found.floor is None and found.optimum == 0.0
+    assert found.learning_cost is None and found.optimum == 0.0
     assert certificate_rows(found)["shortest plans"] == "none; none from 18 starts"

@@ -18,10 +18,10 @@ from imagine_bench.rules import states_of
 
 WORLDS = {
     "seen": (Wheels(n=2, slip=0.2), Glimpse(), 4),
-    "first": (Wheels(n=2, fickle=0.3), Glimpse(finger="first"), 3),
+    "first": (Wheels(n=2, goal_change=0.3), Glimpse(finger="first"), 3),
     "half": (Wheels(n=2, slip=0.1), Glimpse(finger=0.5), 2),
     "lag 2": (Wheels(n=2, slip=0.3), Glimpse(lag=2), 4),
-    "lag 1, half": (Wheels(n=2, fickle=0.2), Glimpse(finger=0.5, lag=1), 3),
+    "lag 1, half": (Wheels(n=2, goal_change=0.2), Glimpse(finger=0.5, lag=1), 3),
 }
 ALL = pytest.mark.parametrize(("rules", "sight", "horizon"), WORLDS.values(), ids=list(WORLDS))
 
@@ -174,5 +174,5 @@ def test_what_needs_no_memory_is_said_of_the_thesis_puzzle():
 
 def test_too_many_beliefs_leave_a_bound_and_say_so(monkeypatch):
     monkeypatch.setattr("imagine_bench.exact.beliefs.MOST", 5)
-    found = certificate(spec_of(Wheels(n=2, fickle=0.3), 3, Glimpse(finger="first")))
+    found = certificate(spec_of(Wheels(n=2, goal_change=0.3), 3, Glimpse(finger="first")))
     assert found.beliefs is None and found.optimum == found.seen_optimum

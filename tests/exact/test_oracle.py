@@ -77,7 +77,7 @@ def test_what_is_shown_is_possible_by_the_sight(name):
 @pytest.mark.parametrize("sight", [Glimpse(finger="first"), Glimpse(finger=0.5, lag=1)], ids=str)
 def test_what_the_oracle_knew_of_an_episode_is_forgotten_in_the_next(sight):
     """It acts as one does that begins with this episode."""
-    rules, horizon, rng = Wheels(n=2, fickle=0.3), 3, np.random.default_rng(0)
+    rules, horizon, rng = Wheels(n=2, goal_change=0.3), 3, np.random.default_rng(0)
     used, longest = OptimalPolicy(rules, sight, horizon), 0
     for _ in range(15):
         fresh = OptimalPolicy(rules, sight, horizon)

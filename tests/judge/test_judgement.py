@@ -38,6 +38,7 @@ from imagine_bench.judge import judgement, questions
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
 from imagine_bench.judge.models import ModelSource, model_entry, opened, source_of
 from imagine_bench.judge.reading import RenderedFrameIndex
+from imagine_bench.judge.scores import FORMER
 from imagine_bench.report.judge import COLUMNS, Judged, judged, judgement_page
 from imagine_bench.report.page import DASH
 from imagine_bench.running import bench as benches
@@ -278,6 +279,16 @@ def test_each_cell_names_reader_and_policies_and_is_not_compared_with_those_of_a
         shown(copied, _of("exact"))
 
 
+def test_former_names_of_scores_are_read(copied: Path) -> None:
+    cell = copied / ModelFit("exact", 1000, 60).file
+    before = kept(copied, _of("exact"))
+    former = {new: old for old, new in FORMER.items()}
+    assert all(former.keys() <= each.keys() for each in before)
+    write_json(cell, sealed({former.get(name, name): value for name, value in read_sealed(cell, "a cell").items()}))
+    assert not former.keys() & read_sealed(cell, "a cell").keys()
+    assert kept(copied, _of("exact")) == before
+
+
 def test_a_model_of_theirs_is_judged(said: Said) -> None:
     assert "nearest frame" in said.out and "exact" in said.out
     recorded = said.folder / "judgement.rrd"
@@ -406,7 +417,7 @@ def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tm
     folder, one = _judged(tmp_path, run, "copy", seeds=(1000, 1001))
     (cell,) = (cell for cell in kept(folder, one) if cell["model"] == run)
     assert (cell["seed"], cell["transitions"]) == (0, 40), "it learns nothing here: once"
-    assert cell["nothing"] == cell["total_variation"] == cell["after_the_end"] == 1.0
+    assert cell["unreadable"] == cell["total_variation"] == cell["after_the_end"] == 1.0
     assert cell["fit_s"] is None
     assert "imaginer, seed 0  " in judgement_page(judged(folder, one)).summary
     folder, other = _judged(tmp_path, "copy", seeds=(1001,))

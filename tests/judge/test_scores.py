@@ -19,8 +19,8 @@ from imagine_bench.judge.questions import FRAMES
 from imagine_bench.judge.scores import after_the_end_scores, by_depth, filter_scores, one_step_scores, ranking_scores
 
 ERRORS = (
-    *("total_variation", "missed", "invented", "nothing", "outcome_ece", "outcome_brier", "reward_error", "reward_ece"),
-    *("reward_brier", "end_error", "end_ece", "end_brier", "value_loss", "worst_value_loss", "unbiased"),
+    *("total_variation", "missed", "hallucinated", "unreadable", "outcome_ece", "outcome_brier", "reward_error"),
+    *("reward_ece", "reward_brier", "end_error", "end_ece", "end_brier", "value_loss", "worst_value_loss", "unbiased"),
 )
 ARROWS, BOTH = "arrows:cubes=2", pytest.mark.parametrize("task", ["arrows:cubes=2", "pick_place"])
 
@@ -30,7 +30,7 @@ def test_exact_is_without_any_error(task: str) -> None:
     world = judged_world(task)
     scores = world.scores(world.exact)
     assert {name: scores[name] for name in ERRORS} == pytest.approx(dict.fromkeys(ERRORS, 0.0), abs=1e-12)
-    assert scores["regret"] == scores["worth_of_refusing"] == 0.0
+    assert scores["regret"] == scores["value_of_abstaining"] == 0.0
     assert math.isnan(scores["auroc_wrong"]) and math.isnan(scores["best_skill"])  # there is no error to find
     assert scores["perfect_sampler"] == scores["value_loss_ruled"] == 0.0
     if task == ARROWS:
@@ -175,7 +175,7 @@ def test_what_is_left_out_is_a_dash_and_the_rules_stand_in_beside_it(left_out: s
     world = judged_world(ARROWS)
     scores = world.scores(changed(world, **{left_out: None}))
     assert math.isnan(scores["value_loss"]) and scores["value_loss_by_start"] == []
-    assert math.isnan(scores["worth_of_refusing"])
+    assert math.isnan(scores["value_of_abstaining"])
     assert math.isnan(scores["regret"]) == (left_out == "rewards")
     assert scores["value_loss_ruled"] == scores["regret_ruled"] == 0.0
 
@@ -260,7 +260,7 @@ def test_known_mistakes_are_charged_exactly() -> None:
     wrong = {pairs[index] for index in (3, 11, 20)}
     scores = world.scores(mistaken(world, wrong))
     share = len(wrong) / len(pairs)
-    for name in ("total_variation", "missed", "invented", "outcome_ece"):
+    for name in ("total_variation", "missed", "hallucinated", "outcome_ece"):
         assert scores[name] == pytest.approx(share)
     assert scores["outcome_brier"] == pytest.approx(2 * share)
     assert wrong == {pairs[row // FRAMES] for row in scores["worst"][: FRAMES * len(wrong)]}
@@ -268,7 +268,7 @@ def test_known_mistakes_are_charged_exactly() -> None:
     assert (scores["filter_keeps"], scores["filter_error"]) == (pytest.approx(1.0 - share), 0.0)
 
 
-def test_a_filter_is_worth_what_its_mistakes_cost() -> None:
+def test_the_value_of_a_filter_is_the_cost_of_mistakes() -> None:
     """A model that expects nothing bad of breaking a rule; its filter discards just that."""
     world = judged_world(ARROWS)
     ends = {
@@ -277,8 +277,8 @@ def test_a_filter_is_worth_what_its_mistakes_cost() -> None:
         if any(o.terminated and not o.success for o in world.spec.rules.outcomes(*pair))
     }
     scores = world.scores(mistaken(world, ends))
-    assert scores["worth_of_filter"] == pytest.approx(scores["value_loss"]) and scores["value_loss"] > 1.0
-    assert 0.0 < scores["worth_of_refusing"] <= scores["worth_of_filter"] + 1e-9
+    assert scores["value_of_filter"] == pytest.approx(scores["value_loss"]) and scores["value_loss"] > 1.0
+    assert 0.0 < scores["value_of_abstaining"] <= scores["value_of_filter"] + 1e-9
 
 
 def test_rewards_are_judged_as_outcomes() -> None:

@@ -45,7 +45,7 @@ Law = Mapping[State, float]
 @functools.cache
 def asked_of(task: str, seed: int = 0) -> WorldQuestions:
     spec = labelled(task)
-    return world_questions(spec, states_of_play(spec.rules), 2, np.random.default_rng(seed), looks=True)
+    return world_questions(spec, states_of_play(spec.rules), 2, np.random.default_rng(seed), frames_vary=True)
 
 
 class ByHand:
@@ -181,7 +181,7 @@ def test_the_position_of_an_answer_tells_nothing(task: str) -> None:
         assert all(len({*options}) == len(options) for options in family.options.reshape(exact.shape).tolist())
         np.testing.assert_allclose(exact.sum(axis=1), 1.0)
     repeated = world_questions(
-        labelled(task), asked.states[: len(asked.truth.mean)], 2, np.random.default_rng(0), looks=True
+        labelled(task), asked.states[: len(asked.truth.mean)], 2, np.random.default_rng(0), frames_vary=True
     )
     for family, again in zip(asked.families, repeated.families, strict=True):
         np.testing.assert_array_equal(family.options, again.options)

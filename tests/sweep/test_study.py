@@ -134,7 +134,7 @@ def test_a_study_from_a_file_changes_the_world_too(tmp_path: Path) -> None:
     study = read_grid(path)
     assert (study.name, study.execution, study.variants[0].factor) == ("mine", "kinematic", BASE)
     run_study(study, "arrow_puzzle", root=tmp_path, launcher=launcher)
-    worlds = [(job.spec.protocol.looks, job.spec.protocol.world) for job in launcher.jobs]
+    worlds = [(job.spec.protocol.appearance_in_words, job.spec.protocol.world) for job in launcher.jobs]
     assert worlds == [
         ("clean", {"execution": "kinematic"}), ("clean, tested at strong", {"execution": "kinematic"}),
         ("clean", {"execution": "physics", "physics": {"pad_friction": 0.1}}),

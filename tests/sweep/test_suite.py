@@ -18,6 +18,7 @@ from imagine_bench import registry
 from imagine_bench.exact.splits import split_of
 from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
+from imagine_bench.sweep import grid
 from imagine_bench.sweep.grid import LADDER, SEPARATING, Experiment, Level, Suite
 from imagine_bench.sweep.run import plan_level, run_suite
 
@@ -26,12 +27,12 @@ TINY = Suite(
     name="tiny",
     experiments=(
         Experiment(
-            name="stochasticity", dial="slip", question="?",
+            name="stochasticity", parameter="slip", question="?",
             levels=(Level(name="0", task="arrows", episodes=5), Level(name="0.3", task="arrows:slip=0.3", episodes=5)),
         ),
-        Experiment(name="size", dial="cubes", question="?", levels=(Level(name="3", task="arrows", episodes=5),)),
+        Experiment(name="size", parameter="cubes", question="?", levels=(Level(name="3", task="arrows", episodes=5),)),
         Experiment(
-            name="transfer", dial="goal", question="?",
+            name="transfer", parameter="goal", question="?",
             levels=(
                 Level(
                     name="hard", task="arrow_puzzle_hard", episodes=5,
@@ -40,7 +41,7 @@ TINY = Suite(
             ),
         ),
         Experiment(
-            name="uncertainty", dial="real episodes", question="?", measure="auroc",
+            name="uncertainty", parameter="real episodes", question="?", measure="auroc",
             levels=(Level(name="5", task="arrows", episodes=5, protocol={"open_loop_starts": 4}),),
         ),
     ),
@@ -125,6 +126,13 @@ def test_the_page_shows_every_score_and_the_hash(result, expected):
 def test_the_suite_is_that_of_all_kept_scores():
     kept = json.loads((RESULTS / "suite" / "suite.json").read_text())
     assert LADDER.hash == kept["hash"] == "95bb5d4a0450" and len(LADDER.experiments) == 12
+
+
+def test_a_suite_may_call_its_parameter_a_dial_as_before(tmp_path):
+    today = (Path(grid.__file__).parent / "grids/suite.toml").read_text()
+    (tmp_path / "suite.toml").write_text(today.replace("\nparameter = ", "\ndial = "))
+    assert "\nparameter" not in (tmp_path / "suite.toml").read_text()
+    assert grid.read_grid(tmp_path / "suite.toml") == LADDER
 
 
 def test_any_change_of_any_level_changes_the_hash():

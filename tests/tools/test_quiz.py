@@ -27,7 +27,7 @@ def typed(*words: str) -> Callable[[str], str]:
 @pytest.mark.parametrize("task", ["arrow_puzzle", "pick_place"])
 def test_every_family_has_words_and_an_answer_for_each_option(task: str) -> None:
     spec = registry.task(task)
-    asked = whole_world(spec, states_of_play(spec.rules), 2, looks=True)
+    asked = whole_world(spec, states_of_play(spec.rules), 2, frames_vary=True)
     for family in asked.families:
         options = np.atleast_2d(family.options[0])
         found = family.words(asked.named, 0)

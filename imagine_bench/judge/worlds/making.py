@@ -62,14 +62,14 @@ class WorldQuestions:
     named: Named  #: the world's names, for a person
 
 
-def whole_world(spec: TaskSpec, states: Sequence[State], frames: int, *, looks: bool) -> WorldQuestions:
+def whole_world(spec: TaskSpec, states: Sequence[State], frames: int, *, frames_vary: bool) -> WorldQuestions:
     """The questions that every model and every person is asked about a task; as :func:`world_questions`."""
     rng = SeedTree(0).child("evaluation", "judge", "worlds", spec.id).generator()
-    return world_questions(spec, states, frames, rng, looks=looks)
+    return world_questions(spec, states, frames, rng, frames_vary=frames_vary)
 
 
 def world_questions(
-    spec: TaskSpec, states: Sequence[State], frames: int, rng: np.random.Generator, *, looks: bool
+    spec: TaskSpec, states: Sequence[State], frames: int, rng: np.random.Generator, *, frames_vary: bool
 ) -> WorldQuestions:
     """Draw the questions about a world; families that the world leaves nothing to ask of are left out.
 
@@ -78,12 +78,12 @@ def world_questions(
         states: Every macrostate in which an episode goes on. Length S.
         frames: Frames of each macrostate, F.
         rng: Draws the questions and the order of their answers.
-        looks: Whether the frames of one macrostate look different.
+        frames_vary: Whether the frames of one macrostate differ.
     """
     every, truth = exact_table(spec.rules, tuple(states), frames)
     world = _World(np.array(every, dtype=np.int64), truth, rng)
     families = [*_masked_frames(world), *_plans(world, min(spec.horizon, LONGEST)), *_streams(world)]
-    families += _single_causes(world, spec.macrostate_names, looks=looks)
+    families += _single_causes(world, spec.macrostate_names, frames_vary=frames_vary)
     named = Named(every, spec.action_names, spec.macrostate_names)
     edges = edges_of_rules(spec.rules)
     return WorldQuestions(states=every, truth=truth, families=tuple(families), edges=edges, named=named)
@@ -222,19 +222,19 @@ def _where(chosen: Bools, one: Transitions, other: Transitions) -> Transitions:
 # Single causes -----------------------------------------------------------------------------------------------------
 
 
-def _single_causes(world: _World, names: Sequence[str], *, looks: bool) -> list[Family]:
+def _single_causes(world: _World, names: Sequence[str], *, frames_vary: bool) -> list[Family]:
     """Pairs of starts that differ in one coordinate, or only in how they look; and the effects of each cause."""
     play = world.coordinates[: world.n_states]
     differ = play[:, None] != play[None]  # [S, S, M]
     alone = {name: differ[..., i] & (differ.sum(axis=2) == 1) for i, name in enumerate(names)}
-    alone[LOOK] = np.eye(len(play), dtype=bool) & looks
+    alone[LOOK] = np.eye(len(play), dtype=bool) & frames_vary
     causes = [name for name, where in alone.items() if where.any()]
     if not causes:
         return []
     states = np.concatenate([world.some(alone[cause], PAIRS) for cause in causes])  # [pairs, 2]
     asked = world.transitions(*states.shape)
     asked = replace(asked, states=states, actions=asked.actions[:, :1].repeat(2, axis=1))
-    if looks:
+    if frames_vary:
         asked.frames[-PAIRS:] = (0, 1)
     options = np.array([_outcomes(world, of_pair) for of_pair in usual(world.truth, asked)])
     pairs = SingleCausePairs(shown=asked, causes=tuple(np.repeat(causes, PAIRS).tolist()), options=options)

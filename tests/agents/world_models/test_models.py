@@ -125,10 +125,10 @@ def test_a_look_is_recognised_where_it_is_shifted_by_up_to_two_pixels() -> None:
     """Shifted by more, a pattern is as far from itself as from any other, and gray is nearer."""
     pattern = np.random.default_rng(0).normal(size=(64, 64))
     pixels = np.arange(64 * 64).reshape(64, 64)[20:40, 20:40].ravel()
-    looks = np.stack([np.zeros(len(pixels)), pattern.ravel()[pixels]])
-    patch = Patch(pixels, looks, np.zeros((2, len(pixels), 3), dtype=np.uint8))
+    appearances = np.stack([np.zeros(len(pixels)), pattern.ravel()[pixels]])
+    patch = Patch(pixels, appearances, np.zeros((2, len(pixels), 3), dtype=np.uint8))
     for shift in itertools.product(range(-3, 4), repeat=2):
-        (found,) = patch.looks(np.roll(pattern, shift, axis=(0, 1)).reshape(1, -1))
+        (found,) = patch.appearances(np.roll(pattern, shift, axis=(0, 1)).reshape(1, -1))
         assert found == (max(map(abs, shift)) <= 2), shift
 
 

@@ -20,7 +20,7 @@ class Wheels:
     n: int = 3
     forbid: bool = True
     slip: float = 0.0  #: nothing turns
-    fickle: float = 0.0  #: the finger then points at the next wheel
+    goal_change: float = 0.0  #: the finger then points at the next wheel
 
     @property
     def n_actions(self):
@@ -42,7 +42,7 @@ class Wheels:
         turned = tuple((v + (3 if back else 1)) % 4 if i == wheel else v for i, v in enumerate(state[:-1]))
         shares = {}
         for p, wheels in ((self.slip, state[:-1]), (1 - self.slip, turned)):
-            for q, finger in ((self.fickle, (state[-1] + 1) % self.n), (1 - self.fickle, state[-1])):
+            for q, finger in ((self.goal_change, (state[-1] + 1) % self.n), (1 - self.goal_change, state[-1])):
                 after = (*wheels, finger)
                 shares[after] = shares.get(after, 0.0) + p * q
         return tuple(self.judge(state, action, after, share) for after, share in shares.items() if share)

@@ -7,7 +7,7 @@ import dataclasses
 import gymnasium
 import numpy as np
 import pytest
-from imagine_bench.tasks.scenes.appearance import LEVELS, appearance, between, looks_of
+from imagine_bench.tasks.scenes.appearance import LEVELS, appearance, appearance_arrays, between
 from whole_outputs import tabulated
 
 from imagine_bench.appearance import FACTORS, NUISANCES, POINTS, appearance_name
@@ -81,7 +81,7 @@ def least_and_most(values):
 
 def drawn(task, given, size):
     """All that 200 starts vary, and by how much; the frame is gray with a white spot at row and column 30."""
-    env, usual = make(task, appearance=given, size=size), looks_of(make(task).model)
+    env, usual = make(task, appearance=given, size=size), appearance_arrays(make(task).model)
     world, rng, width_m = env.world, np.random.default_rng(0), appearance(given).object_offset_m
     frame = np.full((size, size, 3), 128, np.uint8)
     frame[30, 30] = 255
@@ -91,7 +91,7 @@ def drawn(task, given, size):
         world.vary(rng)
         poses.append(world.object_poses())
         hands.append(env.data.mocap_pos.copy())
-        looks.append([now - then for now, then in zip(looks_of(env.model), usual, strict=True)])
+        looks.append([now - then for now, then in zip(appearance_arrays(env.model), usual, strict=True)])
         frames.append(world.composite(frame))
         assert np.array_equal(world.composite(frame), frames[-1]), "a moment that is seen twice is the same"
         world.vary(rng, move_objects=False)

@@ -12,7 +12,7 @@ from imagine_bench.tasks.pick_place.world import PickWorld
 from imagine_bench.tasks.rendering import Renderer, View
 from imagine_bench.tasks.rendering.cameras import DRAWN_GROUPS, agent_camera_view, control_view
 from imagine_bench.tasks.scenes import constants as c
-from imagine_bench.tasks.scenes.appearance import AppearanceSampler, appearance, looks_of
+from imagine_bench.tasks.scenes.appearance import AppearanceSampler, appearance, appearance_arrays
 from imagine_bench.tasks.scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from imagine_bench.tasks.scenes.control_views import varied_by_appearance
 
@@ -161,11 +161,11 @@ def test_an_arrow_can_be_read_from_the_11_by_11_pixels_around_it(scenes, cubes, 
 @pytest.mark.parametrize(("control", "cameras", "materials"), [(False, 1, 1), (True, 3, 4)])
 def test_strong_appearance_varies_each_camera_and_the_coarse_arm(control, cameras, materials):
     model = world_of(3, control=control).model
-    before = [each.copy() for each in looks_of(model)]
+    before = [each.copy() for each in appearance_arrays(model)]
     names, varied = varied_by_appearance(model, ["cube"])
     sampler = AppearanceSampler(model, appearance("strong"), cameras=names, materials=varied)
     sampler.vary(np.random.default_rng(0))
-    *_, colors, places, turns = (now - then for now, then in zip(looks_of(model), before, strict=True))
+    *_, colors, places, turns = (now - then for now, then in zip(appearance_arrays(model), before, strict=True))
     for change in (places, turns):
         moved = change[np.abs(change).sum(axis=1) > 0]
         assert len(moved) == len(np.unique(moved, axis=0)) == cameras

@@ -18,7 +18,7 @@ from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench_board import motions
 from imagine_bench_board.check import NOT_VOUCHED, Checked, check
 from imagine_bench_board.commands import board
-from imagine_bench_board.motion_rows import Motion, MotionRow, read_motions
+from imagine_bench_board.motion_rows import MotionRow, PlayedMotion, read_motions
 from imagine_bench_board.motions import SLACK_PERIODS, MotionTests
 from imagine_bench_board.page import write_board
 from imagine_bench_board.rows import LONGEST
@@ -298,7 +298,7 @@ def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(
 ) -> None:
     replayed = motions._played
 
-    def worse(env: MotionEnv, seed: int, commands: Floats32) -> Motion | None:
+    def worse(env: MotionEnv, seed: int, commands: Floats32) -> PlayedMotion | None:
         found = replayed(env, seed, commands)
         return found and dataclasses.replace(found, total_reward=found.total_reward - 40.0)
 

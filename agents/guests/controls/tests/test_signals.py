@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from imagine_bench.agents.imagination.mixture import Mixture
-from imagine_bench_controls.signals import Limits, lost_information, moments, round_trip
+from imagine_bench_controls.signals import InfopropLimits, lost_information, moments, round_trip
 
 
 def bits(variance: float) -> float:
@@ -52,7 +52,7 @@ def test_mixtures_count_with_their_mean_and_whole_variance() -> None:
 
 def test_limits_are_quantiles_of_what_real_transitions_lose() -> None:
     entropies = torch.arange(101.0)[:, None].double()
-    limits = Limits.of_real(entropies)
+    limits = InfopropLimits.of_real(entropies)
     assert limits.nothing.item() == pytest.approx(0.0)  # the first hundredth, and 1 bit below it
     assert limits.of_step.item() == pytest.approx(95.0)
     assert limits.of_rollout.item() == pytest.approx(1_000.0)  # 1 bit of each of 1,000 steps

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from imagine_bench.tasks.scenes.constants import TABLE_HEIGHT_M
-from imagine_bench_motion.cloning import Clone, Scale, Training, _varied, train
-from imagine_bench_motion.demonstrations import Demonstrations, collect, turn_of
+from imagine_bench_motion.cloning import Clone, Standardisation, Training, _varied, train
+from imagine_bench_motion.demonstrations import DemonstrationData, collect, turn_of
 from imagine_bench_motion.instruction import GO_BACK, words_vector
-from imagine_bench_motion.network import ChunkPolicy, Layout, PointEye, new_network
+from imagine_bench_motion.network import ChunkPolicy, PointEncoder, PolicyLayout, new_network
 from imagine_bench_motion.trials import MOST_PERIODS, share_done, tries
 from numpy.typing import NDArray
 from scripted_clone import ScriptedClone
@@ -26,7 +26,7 @@ VECTORS = "proprio,objects"
 
 
 @functools.cache
-def demonstrations() -> Demonstrations:
+def demonstrations() -> DemonstrationData:
     return collect(4, seed=5, observation=VECTORS)
 
 
@@ -42,7 +42,7 @@ def test_each_macro_action_has_words_of_its_own_in_any_order_and_case() -> None:
     np.testing.assert_array_equal(words_vector("Turn the left cube."), words_vector("cube left the turn"))
 
 
-def first_rows(data: Demonstrations) -> NDArray[np.int64]:
+def first_rows(data: DemonstrationData) -> NDArray[np.int64]:
     return np.unique(data.episode, return_index=True)[1]
 
 
@@ -70,7 +70,7 @@ def test_demonstrations_depend_on_the_seed_alone_and_come_back_from_their_file(t
     np.testing.assert_array_equal(again.commands, data.commands)
     assert not np.array_equal(collect(1, seed=6, observation=VECTORS).numbers[0], data.numbers[0])
     data.save(tmp_path / "some")
-    kept = Demonstrations.load(tmp_path / "some")
+    kept = DemonstrationData.load(tmp_path / "some")
     assert kept.observation == kept.first(2).observation == VECTORS
     with pytest.raises(InvalidValueError, match="The demonstrations show proprio,objects, not front,proprio; give"):
         train(kept, seed=0, observation="front,proprio", settings=Training(updates=1))
@@ -129,16 +129,16 @@ def test_images_are_moved_as_far_as_is_said() -> None:
 def test_a_point_moves_with_the_thing_that_it_marks() -> None:
     """By one cell of the heat map for four pixels, whatever the weights; the instruction alone says where to look."""
     generator = torch.Generator().manual_seed(0)
-    layout = Layout(cameras=("front",), numbers=1, commands=1, heat_maps=2)
-    eye = cast(PointEye, new_network(layout, 64, generator).eyes["front"])
+    layout = PolicyLayout(cameras=("front",), numbers=1, commands=1, heat_maps=2)
+    encoder = cast(PointEncoder, new_network(layout, 64, generator).encoders["front"])
     images = torch.full((1, 3, 64, 64), 0.4)
     moved = images.clone()
     images[:, :, 20:30, 20:30] = 1.0
     moved[:, :, 20:30, 24:34] = 1.0
     with torch.inference_mode():
-        torch.testing.assert_close(eye.what(images)[..., 3:12, 3:11], eye.what(moved)[..., 3:12, 4:12])
+        torch.testing.assert_close(encoder.what(images)[..., 3:12, 3:11], encoder.what(moved)[..., 3:12, 4:12])
         words = torch.from_numpy(np.stack([words_vector("left"), words_vector("right")]))
-        left, right = eye(images.expand(2, -1, -1, -1), words)
+        left, right = encoder(images.expand(2, -1, -1, -1), words)
     assert not torch.equal(left, right)
     assert left.abs().max() <= 1.0
 
@@ -161,7 +161,7 @@ class Counting(ChunkPolicy):
     """Predicts 10 n, 10 n + 1, ... at its n-th call."""
 
     def __init__(self) -> None:
-        super().__init__(Layout(cameras=(), numbers=1, commands=1, chunk=3))
+        super().__init__(PolicyLayout(cameras=(), numbers=1, commands=1, chunk=3))
         self.calls = 0
 
     def forward(self, images: object, numbers: object, words: object) -> torch.Tensor:
@@ -170,7 +170,7 @@ class Counting(ChunkPolicy):
 
 
 def test_a_command_is_the_mean_of_all_predictions_for_its_period_the_oldest_first() -> None:
-    unit = Scale(mean=np.zeros(1, dtype=np.float32), deviation=np.ones(1, dtype=np.float32))
+    unit = Standardisation(mean=np.zeros(1, dtype=np.float32), deviation=np.ones(1, dtype=np.float32))
     policy = Clone(Counting(), unit, unit, {})
     policy.begin(GO_BACK)
     seen = {"proprio": np.zeros(1, dtype=np.float32)}

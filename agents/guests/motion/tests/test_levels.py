@@ -14,8 +14,8 @@ import pytest
 from imagine_bench_motion import flat
 from imagine_bench_motion.__main__ import main
 from imagine_bench_motion.cloned_env import BUNDLED
-from imagine_bench_motion.flat import SETTINGS, Counts, Point
-from imagine_bench_motion.levels import Level, environment, expects_nothing, learn, make_agent, oracle_success
+from imagine_bench_motion.flat import SETTINGS, EndCounts, Point
+from imagine_bench_motion.levels import CurvePoint, environment, expects_nothing, learn, make_agent, oracle_success
 
 from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 
@@ -42,7 +42,7 @@ def test_the_planner_solves_what_the_rules_say_and_robot_time_adds_up() -> None:
     successes, macro_action_s = oracle_success(stage.env, stage.rules, tests=5, horizon=stage.horizon)
     assert successes == 5
     assert 1.5 < macro_action_s < 3.0
-    told: list[Level] = []
+    told: list[CurvePoint] = []
     agent = make_agent("random", stage.spec, 0)
     (point,) = learn(stage.env, stage.env, agent, budgets=[4], tests=2, horizon=stage.horizon, seed=0, told=told.append)
     assert told == [point]
@@ -138,7 +138,7 @@ def test_sac_is_tested_on_whole_episodes_and_its_training_faults_are_counted(set
     assert told == curve and [point.steps for point in curve] == [25, 50]
     assert [point.robot_s for point in curve] == pytest.approx([1.0, 2.0])
     assert curve[-1].train_faults == curve[-1].train_successes == 0, "no hand reaches a cube in 0.4 s"
-    counts = Counts()
+    counts = EndCounts()
     ends = [(True, False), (False, True), (False, True), (False, False)]
     counts.add([{"fault": fault, "is_success": success} for fault, success in ends])
     assert (counts.faults, counts.successes) == (1, 2)

@@ -19,7 +19,7 @@ with warnings.catch_warnings():
     import torch
     from imagine_bench.agents.encoders.encoder import Encoder, bundled_encoder
     from imagine_bench_peers import dreamer
-    from imagine_bench_peers.dreamer import Dreamer, Sequences, make
+    from imagine_bench_peers.dreamer import Dreamer, SequenceReplay, make
 
 
 def learner(seed: int = 0, encoder: Path | None = None, **overrides: Any) -> Dreamer:
@@ -61,7 +61,7 @@ def test_rows_are_what_the_library_expects() -> None:
 
 
 def test_sequences_are_whole_and_begin_anywhere() -> None:
-    memory = Sequences(capacity=5)
+    memory = SequenceReplay(capacity=5)
     for value in range(8):
         memory.add({"n": np.array([value])})
     drawn = memory.sample(200, 3, np.random.default_rng(0))["n"][..., 0]

@@ -12,17 +12,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from imagine_bench_factored.perception import LearnedPerception, Sight
+from imagine_bench_factored.perception import FrameFactors, LearnedPerception
 from imagine_bench_factored.seeing.appearance import SeenFactor
 from imagine_bench_factored.seeing.standard import Standard
 from imagine_bench_programs import __main__ as commands
 from imagine_bench_programs.__main__ import _explore, written
 from imagine_bench_programs.agent import LawsAgent
 from imagine_bench_programs.scores import Codes, ReadRules, score
-from imagine_bench_programs.sight import Hidden, SeeingWriter, SeenCodes, hidden_value, still_value
+from imagine_bench_programs.seeing import Hidden, SeeingWriter, SeenCodes, hidden_value, still_value
 from imagine_bench_programs.symbol_rules import SymbolRules
 from imagine_bench_programs.symbols import Symbols
-from imagine_bench_programs.writing.delay import Row
+from imagine_bench_programs.writing.delay import CodedRow
 from imagine_bench_programs.writing.laws import Laws, _completed, _cover, ends_of, simplest
 from imagine_bench_programs.writing.writer import Writer
 from numpy.typing import NDArray
@@ -44,8 +44,10 @@ def test_a_probability_has_as_few_decimals_as_counts_allow(came: int, failed: in
     assert simplest(came, failed)[0] == pytest.approx(chance)
 
 
-def row(now: tuple[int, ...], then: tuple[int, ...], action: int = 0, reward: float = 0.0, ended: bool = False) -> Row:
-    return Row(now, action, then, reward, ended)
+def row(
+    now: tuple[int, ...], then: tuple[int, ...], action: int = 0, reward: float = 0.0, ended: bool = False
+) -> CodedRow:
+    return CodedRow(now, action, then, reward, ended)
 
 
 def test_a_step_round_the_circle_is_shorter_than_a_table() -> None:
@@ -131,7 +133,7 @@ def test_a_law_that_later_ones_make_superfluous_is_left_out() -> None:
     assert _cover(holds, np.ones(6, dtype=bool)) == [(1,), (2,)]
 
 
-def late(delay: int, episodes: int = 30) -> list[Row]:
+def late(delay: int, episodes: int = 30) -> list[CodedRow]:
     """Of two macro-actions, which turn a dial of five values, with symbols that are late; turning to 0 ends it."""
     rng = np.random.default_rng(3)
     rows = []
@@ -142,7 +144,7 @@ def late(delay: int, episodes: int = 30) -> list[Row]:
             states.append((states[-1] + (1, 3)[action]) % 5)
             shown = [states[max(0, each - delay)] for each in (step, step + 1)]
             done = states[-1] == 0
-            rows.append(Row((shown[0],), action, (shown[1],), float(done), done, step))
+            rows.append(CodedRow((shown[0],), action, (shown[1],), float(done), done, step))
             if done:
                 break
     return rows
@@ -202,7 +204,7 @@ _HARDER = ("arrows:slip=0.2", "arrows:horizon=5,gesture=first", "arrows:horizon=
 @pytest.mark.parametrize("name", ["arrow_puzzle", *(pytest.param(name, marks=pytest.mark.slow) for name in _HARDER)])
 def test_the_writer_is_exact_after_twice_the_cautious_learners_experience(name: str) -> None:
     spec = registry.task(name)
-    cost = certificate(spec).floor
+    cost = certificate(spec).learning_cost
     assert cost is not None
     assert written(spec, int(2 * cost.transitions), seed=7)["total_variation"] < 0.005
 
@@ -213,7 +215,7 @@ def test_the_writer_is_exact_from_codes_too() -> None:
     assert found["total_variation"] < 0.005 and found["ranking"] == found["fidelity"] == 1.0
 
 
-def shown(values: Sequence[int | None], hidden: int, episodes: int = 20) -> list[Row]:
+def shown(values: Sequence[int | None], hidden: int, episodes: int = 20) -> list[CodedRow]:
     """A dial of three values, which the image hides where ``values`` says so, and a button that pays where it is 1."""
     rng = np.random.default_rng(5)
     rows = []
@@ -221,7 +223,7 @@ def shown(values: Sequence[int | None], hidden: int, episodes: int = 20) -> list
         dial = int(rng.integers(3))
         for step, (before, after) in enumerate(itertools.pairwise(values)):
             now, then = (hidden if each is None else dial for each in (before, after))
-            rows.append(Row((now, 0), 0, (then, 0), float(dial == 1), False, step))
+            rows.append(CodedRow((now, 0), 0, (then, 0), float(dial == 1), False, step))
     return rows
 
 
@@ -235,7 +237,7 @@ def test_a_value_that_hides_a_factor_is_found_by_its_contradictions() -> None:
     assert first.now == (-1, 0), "nothing was seen before"
 
 
-def dials(then: Sequence[int], later: Sequence[int]) -> list[Row]:
+def dials(then: Sequence[int], later: Sequence[int]) -> list[CodedRow]:
     """Three episodes of two steps along a counter, none of which meets the counter's values of another one.
 
     Each episode has a dial, whose value after both steps is in ``then`` and ``later``; a counter of 8 pays where it is
@@ -244,8 +246,8 @@ def dials(then: Sequence[int], later: Sequence[int]) -> list[Row]:
     rows = []
     for dial, (middle, last) in enumerate(zip(then, later, strict=True)):
         count = 3 * dial
-        rows.append(Row((dial, count), 0, (middle, count + 1), 0.0, False, 0))
-        rows.append(Row((middle, count + 1), 0, (last, (count + 2) % 8), float(dial == 2), False, 1))
+        rows.append(CodedRow((dial, count), 0, (middle, count + 1), 0.0, False, 0))
+        rows.append(CodedRow((middle, count + 1), 0, (last, (count + 2) % 8), float(dial == 2), False, 1))
     return rows
 
 
@@ -261,7 +263,7 @@ def test_a_light_that_flips_by_chance_is_not_hidden() -> None:
     rng = np.random.default_rng(0)
     lights = np.cumsum(rng.random(201) < 0.2) % 2
     rows = [
-        Row((int(now), step % 3), 0, (int(then), (step + 1) % 3), 0.0, False, step)
+        CodedRow((int(now), step % 3), 0, (int(then), (step + 1) % 3), 0.0, False, step)
         for step, (now, then) in enumerate(itertools.pairwise(lights))
     ]
     assert not any(each.now[0] != each.then[0] for each in Hidden(0, 1).filled(rows)), "it would never change"
@@ -272,7 +274,7 @@ def test_a_factor_of_one_value_that_images_hide_says_nothing() -> None:
     rng = np.random.default_rng(0)
     hides = (rng.random(121) < 0.1).astype(int).tolist()
     rows = [
-        Row((before, step % 3), 0, (after, (step + 1) % 3), float(step == 1), False, step % 3)
+        CodedRow((before, step % 3), 0, (after, (step + 1) % 3), float(step == 1), False, step % 3)
         for step, (before, after) in enumerate(itertools.pairwise(hides))
     ]
     hidden = hidden_value(rows, (2, 3)) or still_value(rows, (2, 3), 1)
@@ -296,12 +298,12 @@ class BytePerception(LearnedPerception):
     sizes = (4,)
 
     def __init__(self, renews_at: int) -> None:
-        self.sight = Sight([SeenFactor((), np.zeros((1, 0), dtype=np.int64))], Standard())
-        self.fine = self.sight
+        self.frame_factors = FrameFactors([SeenFactor((), np.zeros((1, 0), dtype=np.int64))], Standard())
+        self.fine = self.frame_factors
         self.left = renews_at
 
     def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_]]:
-        values = frames[:, 0, 0, 0] // (1 if self.sight is self.fine else 2)
+        values = frames[:, 0, 0, 0] // (1 if self.frame_factors is self.fine else 2)
         return [(int(value),) for value in values], np.ones((len(frames), 1), dtype=bool)
 
     def code(self, frame: Frame) -> State:
@@ -312,11 +314,11 @@ class BytePerception(LearnedPerception):
 
     def renew(self) -> bool:
         if self.left == 0:
-            self.sight = self.sight._replace(standard=Standard())
+            self.frame_factors = self.frame_factors._replace(standard=Standard())
         return self.left == 0
 
-    def take(self, sight: Sight, found_in: int) -> None:
-        self.sight = sight
+    def take(self, frame_factors: FrameFactors, found_in: int) -> None:
+        self.frame_factors = frame_factors
 
 
 @pytest.mark.parametrize(("step", "keeps"), [(1, True), (2, False)])
@@ -329,8 +331,8 @@ def test_former_factors_are_kept_where_the_new_ones_contradict(step: int, keeps:
     for number in range(12):  # a dial of four values that turns by one or two
         for value in (number, number + step):
             writer._images.append(np.full((64, 64, 3), value % 4, dtype=np.uint8))
-        writer.learn(Row((2 * number,), 0, (2 * number + 1,), 0.0, False))
-    assert (perception.sight is perception.fine) == keeps
+        writer.learn(CodedRow((2 * number,), 0, (2 * number + 1,), 0.0, False))
+    assert (perception.frame_factors is perception.fine) == keeps
     values = (3, 0) if keeps else (1, 0)
     assert writer.writer.laws.turned(values[:1], 0) == values[1:]
 
@@ -343,7 +345,7 @@ class PixelPerception(LearnedPerception):
     def __init__(self, sizes: Sequence[int]) -> None:
         factors = [SeenFactor((), np.zeros((size, place), dtype=np.int64)) for place, size in enumerate(sizes)]
         self._factored = True
-        self.take(Sight(factors, Standard()), 0)
+        self.take(FrameFactors(factors, Standard()), 0)
 
     def codes(self, frames: Frame) -> tuple[list[State], NDArray[np.bool_]]:
         places = [factor.joint.shape[1] for factor in self.found]
@@ -367,7 +369,7 @@ def test_a_factor_that_drifts_is_left_out_if_nothing_depends_on_it(matters: bool
         writer._images.append(image)
     for number in range(80):
         pays = number % 4 == 3 and (not matters or lights[number + 1] == 1)
-        writer.learn(Row((number,), 0, (number + 1,), float(pays), False, number % 4))
+        writer.learn(CodedRow((number,), 0, (number + 1,), float(pays), False, number % 4))
     assert writer.writer.laws.drifts.keys() == {0}
     writer.write()
     assert writer.writer.sizes == ((3, 4) if matters else (4,))

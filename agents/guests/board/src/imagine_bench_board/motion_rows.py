@@ -76,7 +76,7 @@ class MotionProtocol:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion:
+class PlayedMotion:
     """A test episode."""
 
     commands: Floats32 = field(repr=False)  #: shape (N, 8)
@@ -111,7 +111,7 @@ class MotionFigures:
         require_types(self)
 
     @classmethod
-    def of(cls, motions: Sequence[Motion]) -> MotionFigures:
+    def of(cls, motions: Sequence[PlayedMotion]) -> MotionFigures:
         """Those of some tests."""
         sure = [each for each in motions if each.reproducible]
         failed = [min(each.total_reward, FAILED_RETURN) for each in motions if not each.reproducible]
@@ -134,7 +134,7 @@ class MotionRow:
     mujoco: str  #: The version of MuJoCo that played, as its author says it
     vouched: MotionFigures
     claimed: Claims
-    motions: tuple[Motion, ...] = field(repr=False)
+    motions: tuple[PlayedMotion, ...] = field(repr=False)
 
     @property
     def round(self) -> str:
@@ -157,18 +157,18 @@ class MotionRow:
         return self.protocol.world
 
 
-def columns_of(motion: Motion) -> dict[str, Any]:
+def columns_of(motion: PlayedMotion) -> dict[str, Any]:
     """An episode as the file has it."""
     commands = motion.commands.astype(COMMAND).tobytes()
     return {**vars(motion), "commands": base64.b64encode(commands).decode()}
 
 
-def _motion_of(columns: dict[str, Any]) -> Motion:
+def _motion_of(columns: dict[str, Any]) -> PlayedMotion:
     """The inverse of :func:`columns_of`. Raises ArtefactError: it has no commands, or some that are no numbers."""
     content = base64.b64decode(columns["commands"], validate=True)
     commands = np.frombuffer(content, COMMAND).reshape(-1, _WIDTH).astype(np.float32)
     require(len(commands) > 0 and bool(np.isfinite(commands).all()), "a test has commands that are no finite numbers.")
-    motion = Motion(**{**columns, "commands": commands})
+    motion = PlayedMotion(**{**columns, "commands": commands})
     kinds = {"total_reward": float, "solved": bool, "fault": bool, "fingerprint": int, "reproducible": bool}
     for name, kind in kinds.items():
         require(type(getattr(motion, name)) is kind, f"a test's {name} is no {kind.__name__}.")

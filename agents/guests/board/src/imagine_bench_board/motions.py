@@ -29,7 +29,7 @@ from imagine_bench.registry.machine import describe_environment
 from imagine_bench.store.files import make_folder, sha256, write_bytes, write_json
 from imagine_bench.values import Json
 
-from .motion_rows import COMMAND, FORMAT, RATE_HZ, Motion, MotionFigures, MotionProtocol, MotionRow, columns_of
+from .motion_rows import COMMAND, FORMAT, RATE_HZ, MotionFigures, MotionProtocol, MotionRow, PlayedMotion, columns_of
 from .rounds import POLICY, policy_row, read_round, revealed_seed
 from .rows import CARD, EPISODES, LARGEST, NAME, Claims, named, one_line
 
@@ -57,7 +57,7 @@ class ReplayError(ArtefactError):
     """A test does not play again."""
 
 
-class _Tally:
+class _EpisodeFacts:
     """The facts of an episode while it is played."""
 
     def __init__(self, start: Sequence[int]) -> None:
@@ -79,9 +79,9 @@ class _Tally:
         signed = json.dumps([list(map(int, macrostate)), reward]).encode()
         self.fingerprint = zlib.crc32(signed, self.fingerprint)
 
-    def motion(self, commands: Floats32) -> Motion:
+    def motion(self, commands: Floats32) -> PlayedMotion:
         """The episode so far."""
-        return Motion(
+        return PlayedMotion(
             commands=commands,
             total_reward=self.total_reward,
             solved=self.solved,
@@ -156,8 +156,8 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._control = HandControl(control, ArmModel(), self._motion.period_s)
         self.action_space = self._control.space
         self._commands: list[Floats32] = []
-        self._tally: _Tally | None = None
-        self.motions: list[Motion] = []
+        self._tally: _EpisodeFacts | None = None
+        self.motions: list[PlayedMotion] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observed, Info]:
         """Begin the next test. Raises InvalidValueError: the one before was left before its end."""
@@ -165,7 +165,7 @@ class MotionTests(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._tally is not None and self._commands:
             raise InvalidValueError(f"Test {len(self.motions)} was left before its end. Make a new MotionTests.")
         observation, info = self.env.reset(seed=self.protocol.start(len(self.motions) % self.protocol.tests))
-        self._tally = _Tally(info["macrostate"]) if len(self.motions) < self.protocol.tests else None
+        self._tally = _EpisodeFacts(info["macrostate"]) if len(self.motions) < self.protocol.tests else None
         self._commands = []
         return observation, info
 
@@ -273,7 +273,7 @@ def check_motions(row: MotionRow, env: gymnasium.Env[Any, Any], *, other_mujoco:
     return dataclasses.replace(row, motions=tuple(motions), vouched=MotionFigures.of(motions))
 
 
-def _difference(kept: Motion, played: Motion | None) -> str:
+def _difference(kept: PlayedMotion, played: PlayedMotion | None) -> str:
     """The first result in which an episode is not as it was kept, in words; empty if there is none."""
     if played is None:
         return "it does not end where its commands do."
@@ -284,12 +284,12 @@ def _difference(kept: Motion, played: Motion | None) -> str:
     return ""
 
 
-def _is_reproducible(env: MotionEnv, seed: int, kept: Motion) -> bool:
+def _is_reproducible(env: MotionEnv, seed: int, kept: PlayedMotion) -> bool:
     """Whether all disturbed replays of a test have the results that were kept."""
     return all(not _difference(kept, _played(env, seed, kept.commands, disturbance=k)) for k in range(DISTURBED))
 
 
-def _same_when_disturbed(env: MotionEnv, seed: int, commands: Floats32, played: Motion | None) -> bool:
+def _same_when_disturbed(env: MotionEnv, seed: int, commands: Floats32, played: PlayedMotion | None) -> bool:
     """Whether all disturbed replays of some commands have the results of an undisturbed one."""
     wanted = None if played is None else played.facts
     for number in range(DISTURBED):
@@ -299,13 +299,13 @@ def _same_when_disturbed(env: MotionEnv, seed: int, commands: Floats32, played: 
     return True
 
 
-def _played(env: MotionEnv, seed: int, commands: Floats32, *, disturbance: int | None = None) -> Motion | None:
+def _played(env: MotionEnv, seed: int, commands: Floats32, *, disturbance: int | None = None) -> PlayedMotion | None:
     """The episode of some commands, None where it does not end with the last of them, give or take the slack.
 
     With the number of a disturbance, each joint of arm and objects moves a little, once a second.
     """
     env.restart(seed=seed)
-    tally = _Tally(env.episode.macrostate)
+    tally = _EpisodeFacts(env.episode.macrostate)
     after_last = np.repeat(commands[-1:], SLACK_PERIODS, axis=0)
     length = 0
     for each in _periods(env, np.concatenate([commands, after_last]), disturbance):

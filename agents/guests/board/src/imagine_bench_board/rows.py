@@ -172,7 +172,7 @@ def one_line(text: object) -> str:
 
 def world_words(protocol: Protocol) -> str:
     """All that decides how hard the tests of a protocol are: task, execution, physics, looks and starts."""
-    words = [protocol.task, protocol.execution, protocol.looks]
+    words = [protocol.task, protocol.execution, protocol.appearance_in_words]
     words += [f"{name}={value}" for name, value in protocol.physics]
     if protocol.split is not None:
         words.append(f"starts split by {protocol.split}")

@@ -26,7 +26,7 @@ from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import AgentContext, AgentState, ExactWorld, Outcome, Rules, State, Transition
 from imagine_bench.seeding import SeedTree
 
-LOOKS = 8
+FRAMES_OF_EACH = 8
 """Frames that are rendered of a macrostate."""
 _REWARD = 1.0
 _RELATIVE = 0.1
@@ -43,17 +43,18 @@ class LatentCache:
         self._seen: dict[State, tuple[Tensor, Tensor]] = {}
 
     def latents(self, states: Sequence[State], generator: torch.Generator) -> Tensor:
-        """Of each of N macrostates one look, and latents drawn from its posterior. Shape (N, Z)."""
+        """Of each of N macrostates one frame, and latents drawn from its posterior. Shape (N, Z)."""
         device = generator.device
-        looks = torch.randint(LOOKS, (len(states),), generator=generator, device=device).tolist()
-        seen = [(mu[look], sigma[look]) for (mu, sigma), look in zip(map(self._posteriors, states), looks, strict=True)]
+        chosen = torch.randint(FRAMES_OF_EACH, (len(states),), generator=generator, device=device).tolist()
+        posteriors = zip(map(self._posteriors, states), chosen, strict=True)
+        seen = [(mu[frame], sigma[frame]) for (mu, sigma), frame in posteriors]
         mu, sigma = (torch.stack(part) for part in zip(*seen, strict=True))
         return torch.addcmul(mu, sigma, torch.empty_like(mu).normal_(generator=generator))
 
     def _posteriors(self, state: State) -> tuple[Tensor, Tensor]:
         """The same in every run of a seed, whatever was asked for before."""
         if state not in self._seen:
-            frames = self._world.render(np.array([state] * LOOKS), self._seeds.child(*state).generator())
+            frames = self._world.render(np.array([state] * FRAMES_OF_EACH), self._seeds.child(*state).generator())
             self._seen[state] = self._perception.encoder.encode(frames)
         return self._seen[state]
 
@@ -71,7 +72,7 @@ class ExactImaginationAgent(DQN):
         node = seeds.child("imagination")
         self._rules = world.rules
         self._known: dict[tuple[State, int], Sequence[Outcome]] = {}
-        self._gallery = LatentCache(world, perception, node.child("gallery"))
+        self._latents = LatentCache(world, perception, node.child("gallery"))
         self._draws = torch.Generator(device).manual_seed(node.child("rollouts").integer())
         self.visited: deque[State] = deque(maxlen=settings.memory.real)
         self.imagined = ImaginedMemory(settings.memory.imagined, perception.latent_size, device)
@@ -108,7 +109,7 @@ class ExactImaginationAgent(DQN):
         draws = self._draws
         explores = max(epsilon(self.steps, self.settings.controller), settings.exploration)
         states = self._starts()
-        z = self._gallery.latents(states, draws)
+        z = self._latents.latents(states, draws)
         for _ in range(settings.depth):
             action = Imagination.act(self.controller, z, explores, draws)
             chances = torch.rand(len(states), generator=draws, device=draws.device).tolist()
@@ -116,7 +117,7 @@ class ExactImaginationAgent(DQN):
                 _drawn(self._outcomes(state, each), chance)
                 for state, each, chance in zip(states, action.tolist(), chances, strict=True)
             ]
-            next_z = self._gallery.latents([outcome.macrostate for outcome in happened], draws)
+            next_z = self._latents.latents([outcome.macrostate for outcome in happened], draws)
             reward = torch.tensor([outcome.reward for outcome in happened], device=z.device, dtype=z.dtype)
             ended = torch.tensor([outcome.terminated for outcome in happened], device=z.device)
             self.imagined.add(Batch(z, action, reward, next_z, ended.float()))

@@ -75,7 +75,7 @@ def moments(samples: Mixture) -> tuple[Tensor, Tensor]:
     return mean, (weights * around).sum(dim=-2)
 
 
-class Limits(NamedTuple):
+class InfopropLimits(NamedTuple):
     """Infoprop's limits, of real transitions. Each of shape (Z,), in bits."""
 
     nothing: Tensor  # entropy below which nothing counts as lost
@@ -83,7 +83,7 @@ class Limits(NamedTuple):
     of_rollout: Tensor  # most that all steps of a rollout may lose together
 
     @classmethod
-    def of_real(cls, entropies: Tensor) -> Limits:
+    def of_real(cls, entropies: Tensor) -> InfopropLimits:
         """Those of N real transitions (N, Z)."""
         nothing = entropies.quantile(_LOW, dim=0) - 1.0
         lost = (entropies - nothing).clamp(min=0.0)
@@ -93,7 +93,7 @@ class Limits(NamedTuple):
 class InfopropImagination(Imagination):
     """Imagination whose uncertainty is lost information, and whose filter is Infoprop's stopping rule."""
 
-    limits: Limits | None = None
+    limits: InfopropLimits | None = None
 
     def lost(self, step: ImaginedStep) -> Tensor:
         """Bits that each step loses. Shape (N, Z)."""
@@ -139,7 +139,7 @@ class Infoprop(LatentModel):
             lost_information(*moments(self.imagination.model.predict(*each, None)))
             for each in zip(z.split(_SPREAD_OF), actions.split(_SPREAD_OF), strict=True)
         ]
-        self.imagination.limits = Limits.of_real(torch.cat(found))
+        self.imagination.limits = InfopropLimits.of_real(torch.cat(found))
 
 
 class SignalImagination(Imagination):

@@ -22,7 +22,7 @@ from imagine_bench.interfaces.capabilities import Perceived
 from .agent import CodeAgent, completed
 from .factors import CodeTransition, contradictions, remembering
 from .model import choose
-from .perception import LearnedPerception, Sight, find_sight
+from .perception import FrameFactors, LearnedPerception, find_factors
 from .rewards import reward_classes
 from .seeing import appearance
 from .settings import LEARNED, LearnedSettings
@@ -73,16 +73,16 @@ class LearnedPerceptionAgent(CodeAgent):
                 before = transition.observation.frame
                 after = transition.next_observation.frame
                 perception.remember(before, transition.action, after, begins=self._observed == 0)
-                sight = perception.sight
+                frame_factors = perception.frame_factors
                 found_in = perception.found_in
                 if perception.renew():
-                    self._recode(sight, found_in)
+                    self._recode(frame_factors, found_in)
                     if perception.found_in not in perception.history:
                         perception.history.append(perception.found_in)
             self.meters.count("time/perception_s")
         super().observe(transition, episode=episode)
 
-    def _recode(self, sight: Sight, found_in: int) -> None:
+    def _recode(self, frame_factors: FrameFactors, found_in: int) -> None:
         """Give every replayed transition the codes that its frames have now, and learn from all of them once more.
 
         The factors seen before are kept where outcomes contradict the present factors and did not contradict
@@ -93,13 +93,13 @@ class LearnedPerceptionAgent(CodeAgent):
         of_task = slice(self.tasks[-1] if self.tasks else 0, count)  # other tasks have other outcomes
         rows = self._rows()
         few = _CONTRADICTIONS * (count - of_task.start)
-        if sight.factors and _contradictions(rows[of_task]) > few:
-            sight_now = perception.sight
+        if frame_factors.factors and _contradictions(rows[of_task]) > few:
+            factors_now = perception.frame_factors
             found_now_in = perception.found_in
-            perception.take(sight, found_in)
+            perception.take(frame_factors, found_in)
             earlier = self._rows()
             if _contradictions(earlier[of_task]) > few:
-                perception.take(sight_now, found_now_in)
+                perception.take(factors_now, found_now_in)
             else:
                 rows = earlier
         begins = perception.begins
@@ -125,10 +125,10 @@ class LearnedPerceptionAgent(CodeAgent):
         perception = self.perception
         for count in perception.history:
             seen = perception.first(count)
-            sight = find_sight(*seen)
+            frame_factors = find_factors(*seen)
             begun = sum(compress(perception.begins, [after < count for _, after in perception.transitions]))
-            sizes = tuple(len(factor.joint) for factor in sight.factors)
-            yield Perceived(begun, sizes, image(sight.factors, _shown(sight.standard.of(seen[0]))))
+            sizes = tuple(len(factor.joint) for factor in frame_factors.factors)
+            yield Perceived(begun, sizes, image(frame_factors.factors, _shown(frame_factors.standard.of(seen[0]))))
 
     def diagnostics(self) -> dict[str, float]:
         """Also its perception."""

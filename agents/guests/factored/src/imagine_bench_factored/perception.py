@@ -89,17 +89,17 @@ def _rows(codes: Codes, sizes: Sequence[int], *, factored: bool) -> list[Code]:
     return [tuple(row) for row in rows.tolist()]
 
 
-class Sight(NamedTuple):
+class FrameFactors(NamedTuple):
     """Factors, and the normal frame that they are seen in."""
 
     factors: list[appearance.SeenFactor]
     standard: Standard
 
 
-def find_sight(frames: Frame, begins: Mask, actions: Ints) -> Sight:
+def find_factors(frames: Frame, begins: Mask, actions: Ints) -> FrameFactors:
     """The factors of frames (N, 64, 64, 3) without nuisances; see :func:`.appearance.find`."""
     standard = standard_of(frames)
-    return Sight(appearance.find(standard.of(frames), begins, actions), standard)
+    return FrameFactors(appearance.find(standard.of(frames), begins, actions), standard)
 
 
 class LearnedPerception:
@@ -124,7 +124,7 @@ class LearnedPerception:
         self.unknown = False
         """Whether anything seen since has no known value."""
         self._remembered = 0
-        self.take(Sight([], Standard()), 0)
+        self.take(FrameFactors([], Standard()), 0)
 
     @property
     def seen_sizes(self) -> tuple[int, ...]:
@@ -173,7 +173,7 @@ class LearnedPerception:
         """The codes of frames (N, 64, 64, 3), and which values are known, (N, P)."""
         if not self.found:
             return [(0,)] * len(frames), np.zeros((len(frames), 1), dtype=bool)
-        codes, known = appearance.read(self.found, self.sight.standard.of(frames))
+        codes, known = appearance.read(self.found, self.frame_factors.standard.of(frames))
         return _rows(codes, [len(factor.joint) for factor in self.found], factored=self._factored), known
 
     def remember(self, before: Frame, action: int, after: Frame, *, begins: bool = False) -> None:
@@ -195,7 +195,7 @@ class LearnedPerception:
 
     def look(self, count: int) -> None:
         """Find factors in the first ``count`` frames remembered."""
-        self.take(find_sight(*self.first(count)) if count else Sight([], Standard()), count)
+        self.take(find_factors(*self.first(count)) if count else FrameFactors([], Standard()), count)
         self.looked_at = count
         self.unknown = False
 
@@ -208,10 +208,10 @@ class LearnedPerception:
                 actions[before] = action
         return np.stack(self.frames[:count]), begins, actions
 
-    def take(self, sight: Sight, found_in: int) -> None:
+    def take(self, frame_factors: FrameFactors, found_in: int) -> None:
         """See these factors from now on."""
-        self.sight = sight
-        self.found = sight.factors
+        self.frame_factors = frame_factors
+        self.found = frame_factors.factors
         self.found_in = found_in
         self.memory: Memory | None = None
         self._recent: dict[bytes, tuple[Code, bool]] = {}

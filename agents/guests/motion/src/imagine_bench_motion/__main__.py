@@ -15,7 +15,7 @@ from imagine_bench.registry.machine import describe_environment
 from imagine_bench.store.files import require_writable, write_json
 
 from .cloning import Clone, Training, train
-from .demonstrations import Demonstrations, collect
+from .demonstrations import DemonstrationData, collect
 from .judge.command import add_judge
 from .skills import FAMILIES, PLACEMENT_M
 from .trials import summary, tries
@@ -81,7 +81,10 @@ def _add_clone(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--first", type=int, help="take only so many demonstrations")
     parser.add_argument("--updates", type=int, default=Training.updates, help="gradient steps")
-    parser.add_argument("--eye-updates", type=int, default=Training.eye_updates, help="those of the heat maps, before")
+    parser.add_argument(
+        *("--encoder-updates", "--eye-updates"), type=int, default=Training.encoder_updates,
+        help="those of the heat maps, before",
+    )  # fmt: skip
     parser.add_argument("--shift", type=int, default=Training.shift_px, help="pixels that images are moved by at most")
     parser.add_argument("--chunk", type=int, default=16, help="commands that are predicted at once")
     parser.add_argument("--heat-maps", type=int, default=16, help="points that are looked for in each image")
@@ -91,14 +94,14 @@ def _add_clone(parser: argparse.ArgumentParser) -> None:
 
 def _clone(given: argparse.Namespace) -> None:
     require_writable(given.file.parent)
-    data = Demonstrations.load(given.demonstrations)
+    data = DemonstrationData.load(given.demonstrations)
     if given.first is not None:
         data = data.first(given.first)
     clone = train(
         data,
         seed=given.seed,
         observation=given.observation or data.observation or OBSERVATION,
-        settings=Training(updates=given.updates, eye_updates=given.eye_updates, shift_px=given.shift),
+        settings=Training(updates=given.updates, encoder_updates=given.encoder_updates, shift_px=given.shift),
         layout={"chunk": given.chunk, "heat_maps": given.heat_maps},
         told=lambda update, loss: print(f"{update} updates, loss {loss:.4f}", flush=True),
     )
@@ -227,9 +230,9 @@ def _add_level(parser: argparse.ArgumentParser) -> None:
 
 def _level(given: argparse.Namespace) -> None:
     from .cloned_env import BUNDLED  # noqa: PLC0415 - needs MuJoCo
-    from .levels import Level, environment, learn, make_agent, oracle_success  # noqa: PLC0415 - needs MuJoCo
+    from .levels import CurvePoint, environment, learn, make_agent, oracle_success  # noqa: PLC0415 - needs MuJoCo
 
-    def told(point: Level) -> None:
+    def told(point: CurvePoint) -> None:
         print(point, flush=True)
         kept["curve"].append(asdict(point))
         write_json(given.out, kept)

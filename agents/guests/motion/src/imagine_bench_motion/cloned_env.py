@@ -36,7 +36,7 @@ _AT_HOME_RAD = 2e-3
 """An arm nearer to its observation pose, at each joint, is there."""
 
 
-class Period(NamedTuple):
+class ControlPeriod(NamedTuple):
     """What a control period ends with."""
 
     seen: Observed
@@ -44,7 +44,9 @@ class Period(NamedTuple):
     over: bool  #: whether no further period is to follow
 
 
-def carry_out(clone: Clone, instruction: str, seen: Observed, period: Callable[[Command], Period]) -> Period:
+def carry_out(
+    clone: Clone, instruction: str, seen: Observed, period: Callable[[Command], ControlPeriod]
+) -> ControlPeriod:
     """Let a clone follow an instruction, then lift the hand, and bring the arm home along its joints.
 
     Args:
@@ -56,7 +58,7 @@ def carry_out(clone: Clone, instruction: str, seen: Observed, period: Callable[[
     Returns:
         The last period.
     """
-    latest = Period(seen, event=False, over=False)
+    latest = ControlPeriod(seen, event=False, over=False)
     clone.begin(instruction)
     for _ in range(MOST_PERIODS):
         latest = period(clone.act(latest.seen))
@@ -186,7 +188,7 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
 
     # --- details -------------------------------------------------------------------------------------------------
 
-    def _period(self, command: Command) -> Period:
+    def _period(self, command: Command) -> ControlPeriod:
         """One control period; keeps its event unless the episode is over. It is the last if the simulation blew up."""
         self._seen, reward, terminated, blew_up, info = self.motion.step(command)
         self._periods += 1
@@ -197,7 +199,7 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
                 float(reward), terminated, bool(info["is_success"]), int(info["macro_action"]), info["fault_reason"]
             )
             self._events.append(event)
-        return Period(self._seen, bool(info["event"]), blew_up)
+        return ControlPeriod(self._seen, bool(info["event"]), blew_up)
 
     def _frame(self) -> Frame:
         return self.motion.world.composite(self._camera.frame(self.motion.data))

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from imagine_bench.errors import ArtefactError, InvalidValueError
 
-from .demonstrations import Demonstrations
+from .demonstrations import DemonstrationData
 from .instruction import GO_BACK, words_vector
-from .network import POINT_PX, ChunkPolicy, Layout, new_network
+from .network import POINT_PX, ChunkPolicy, PolicyLayout, new_network
 from .skills import Command, Observed, images_of, numbers_of
 
 _SMALLEST_DEVIATION = 1e-2
@@ -32,8 +32,9 @@ class Training:
 
     updates: int = 6_000  #: gradient steps
     batch: int = 48  #: periods a gradient step
-    eye_updates: int = 4_000  #: gradient steps before them by which eyes with heat maps learn where the hand will grip
-    eye_batch: int = 32  #: periods in each of these
+    #: gradient steps before them, by which encoders with heat maps learn where the hand will grip
+    encoder_updates: int = 4_000
+    encoder_batch: int = 32  #: periods in each of these
     learning_rate: float = 2e-3  #: the largest; it rises during the first 30 % of the steps, and falls to 0
     weight_decay: float = 1e-4
     number_noise: float = 0.05  #: standard deviation added to standardised inputs
@@ -42,14 +43,14 @@ class Training:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scale:
+class Standardisation:
     """Means and standard deviations of a vector."""
 
     mean: NDArray[np.float32]
     deviation: NDArray[np.float32]
 
     @classmethod
-    def of(cls, rows: NDArray[np.float32]) -> Scale:
+    def of(cls, rows: NDArray[np.float32]) -> Standardisation:
         """Of the columns of an array (T, P)."""
         return cls(mean=rows.mean(axis=0), deviation=np.maximum(rows.std(axis=0), _SMALLEST_DEVIATION))
 
@@ -75,7 +76,9 @@ class Clone:
         about: How it was made; kept with it.
     """
 
-    def __init__(self, network: ChunkPolicy, inputs: Scale, commands: Scale, about: Mapping[str, Any]) -> None:
+    def __init__(
+        self, network: ChunkPolicy, inputs: Standardisation, commands: Standardisation, about: Mapping[str, Any]
+    ) -> None:
         prepare_torch("cpu")
         self.network = network.eval()
         self._inputs = inputs
@@ -138,16 +141,21 @@ class Clone:
                 raise KeyError(content["version"])
         except Exception as error:
             raise ArtefactError(f"{path} is no saved clone ({error}); train one first.") from error
-        layout = Layout(**{**content["layout"], "cameras": tuple(content["layout"]["cameras"])})
+        layout = PolicyLayout(**{**content["layout"], "cameras": tuple(content["layout"]["cameras"])})
         with torch.device("meta"):
             network = ChunkPolicy(layout, content["about"]["size_px"])
-        network.load_state_dict(content["weights"], assign=True)
-        scales = {name: Scale(**{k: v.numpy() for k, v in of.items()}) for name, of in content["scales"].items()}
+        weights = {  # files before 2026-11-30 say eyes
+            name.replace("eyes.", "encoders.", 1): weight for name, weight in content["weights"].items()
+        }
+        network.load_state_dict(weights, assign=True)
+        scales = {
+            name: Standardisation(**{k: v.numpy() for k, v in of.items()}) for name, of in content["scales"].items()
+        }
         return cls(network, scales["inputs"], scales["commands"], content["about"])
 
 
 def train(
-    data: Demonstrations,
+    data: DemonstrationData,
     *,
     seed: int,
     observation: str,
@@ -173,8 +181,8 @@ def train(
     prepare_torch("cpu")
     settings = settings or Training()
     generator = torch.Generator().manual_seed(seed)
-    inputs, commands = Scale.of(data.numbers), Scale.of(data.commands)
-    shape = Layout(
+    inputs, commands = Standardisation.of(data.numbers), Standardisation.of(data.commands)
+    shape = PolicyLayout(
         cameras=tuple(sorted(data.images)),
         numbers=data.numbers.shape[1],
         commands=data.commands.shape[1],
@@ -198,9 +206,9 @@ def train(
 
 def _fit(
     network: ChunkPolicy,
-    data: Demonstrations,
-    inputs: Scale,
-    commands: Scale,
+    data: DemonstrationData,
+    inputs: Standardisation,
+    commands: Standardisation,
     settings: Training,
     generator: torch.Generator,
     told: Callable[[int, float], None] | None,
@@ -209,7 +217,7 @@ def _fit(
     words = torch.from_numpy(np.stack([words_vector(str(each)) for each in known]))[torch.from_numpy(which)]
     seen = None
     if network.place is not None:
-        _fit_eyes(network, data, words, settings, generator, told)
+        _fit_encoders(network, data, words, settings, generator, told)
         seen = _looked(network, data, words)
     numbers = torch.from_numpy(inputs.standardised(data.numbers))
     targets = torch.from_numpy(commands.standardised(data.commands))
@@ -226,12 +234,12 @@ def _fit(
             looked = seen[rows]
         return (network.act(looked, numbers[rows] + noise, words[rows]) - targets[chunks[rows]]).abs().mean()
 
-    _descend(learning, loss, settings.updates, settings, told)
+    _optimise(learning, loss, settings.updates, settings, told)
 
 
-def _fit_eyes(
+def _fit_encoders(
     network: ChunkPolicy,
-    data: Demonstrations,
+    data: DemonstrationData,
     words: Tensor,
     settings: Training,
     generator: torch.Generator,
@@ -240,17 +248,17 @@ def _fit_eyes(
     """Learn to see where the hand grips: the place that the expert brings it to, in each period before the event."""
     grips = data.grips()
     rows = torch.from_numpy(np.flatnonzero(data.instructions != GO_BACK))
-    places = torch.from_numpy(Scale.of(data.hand_m[grips[rows]]).standardised(data.hand_m[grips]))
+    places = torch.from_numpy(Standardisation.of(data.hand_m[grips[rows]]).standardised(data.hand_m[grips]))
 
     def loss() -> Tensor:
-        some = rows[torch.randint(len(rows), (settings.eye_batch,), generator=generator)]
+        some = rows[torch.randint(len(rows), (settings.encoder_batch,), generator=generator)]
         images, moved = _varied(data.images, some, settings, generator)
         return (network.look(images, words[some], moved) - places[some]).abs().mean()
 
-    _descend(network, loss, settings.eye_updates, settings, told)
+    _optimise(network, loss, settings.encoder_updates, settings, told)
 
 
-def _descend(
+def _optimise(
     learning: torch.nn.Module,
     loss_of: Callable[[], Tensor],
     updates: int,
@@ -274,7 +282,7 @@ def _descend(
             losses = []
 
 
-def _looked(network: ChunkPolicy, data: Demonstrations, words: Tensor) -> Tensor:
+def _looked(network: ChunkPolicy, data: DemonstrationData, words: Tensor) -> Tensor:
     """All that a network sees in each period. Shape (T, P)."""
     with torch.no_grad():
         parts = [

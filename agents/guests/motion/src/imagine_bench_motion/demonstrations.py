@@ -32,7 +32,7 @@ MOST_TRIES = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demonstrations:
+class DemonstrationData:
     """Control periods of N demonstrations, one after the other; T of them."""
 
     images: dict[str, NDArray[np.uint8]]  #: by camera: (T, S, S, 3)
@@ -48,11 +48,11 @@ class Demonstrations:
         """How many demonstrations."""
         return int(self.episode.max()) + 1
 
-    def first(self, count: int) -> Demonstrations:
+    def first(self, count: int) -> DemonstrationData:
         """The first demonstrations alone, at least one. Raises InvalidValueError: fewer are asked for."""
         require_integer("first", count, 1)
         kept = self.episode < count
-        return Demonstrations(
+        return DemonstrationData(
             images={camera: image[kept] for camera, image in self.images.items()},
             numbers=self.numbers[kept],
             instructions=self.instructions[kept],
@@ -91,7 +91,7 @@ class Demonstrations:
             np.savez(stream, **arrays, **named, observation=np.array(self.observation))
 
     @classmethod
-    def load(cls, path: Path) -> Demonstrations:
+    def load(cls, path: Path) -> DemonstrationData:
         """Read a file that :meth:`save` has written. Raises ArtefactError: there is none, or it is another file."""
         what = "a file of demonstrations"
         with reading(path, what):
@@ -103,7 +103,7 @@ class Demonstrations:
 
 def collect(
     count: int, *, seed: int, observation: str, appearances: Sequence[str] = ("clean", "mild"), **options: Any
-) -> Demonstrations:
+) -> DemonstrationData:
     """Let the expert demonstrate each macro-action in turn, the same number of times.
 
     Arms start off their observation pose. In every second demonstration of each macro-action, at each appearance, the
@@ -137,7 +137,7 @@ def collect(
             f"Of {MOST_TRIES * count} tries of the expert only {len(kept)} succeeded; give another world."
         )
     cameras = kept[0].images[0]
-    return Demonstrations(
+    return DemonstrationData(
         images={camera: np.stack([image[camera] for each in kept for image in each.images]) for camera in cameras},
         numbers=np.stack([row for each in kept for row in each.numbers]),
         instructions=np.array([words for each in kept for words in each.instructions]),
@@ -148,7 +148,7 @@ def collect(
     )
 
 
-class Turn(NamedTuple):
+class NextTurn(NamedTuple):
     """The next demonstration."""
 
     appearance: int  #: its place among the appearances
@@ -156,7 +156,7 @@ class Turn(NamedTuple):
     disturbed: bool
 
 
-def turn_of(index: int, appearances: int, n_actions: int) -> Turn:
+def turn_of(index: int, appearances: int, n_actions: int) -> NextTurn:
     """The turn of a demonstration, by its place among those that are kept.
 
     Each macro-action at each appearance is disturbed every second time. Neighbouring appearances begin differently, so
@@ -164,7 +164,7 @@ def turn_of(index: int, appearances: int, n_actions: int) -> Turn:
     """
     place, appearance = divmod(index, appearances)
     before, macro_action = divmod(place, n_actions)
-    return Turn(appearance, macro_action, (before + appearance) % 2 == 1)
+    return NextTurn(appearance, macro_action, (before + appearance) % 2 == 1)
 
 
 class _Episode:

@@ -90,7 +90,7 @@ def learn(
     env = VecNormalize(DummyVecEnv([partial(flat_env, **options)]), norm_obs=scales, norm_reward=scales, gamma=0.97)
     test_env = flat_env(**options)
     model = SETTINGS[settings]("MlpPolicy", env, seed=seed % _SEEDS, device="cpu")
-    counts = Counts()
+    counts = EndCounts()
     began_s = time.process_time()
     curve = []
     for done in range(every, steps + 1, every):
@@ -101,7 +101,7 @@ def learn(
     return curve
 
 
-class Counts(BaseCallback):
+class EndCounts(BaseCallback):
     """Counts ends of training episodes."""
 
     def __init__(self) -> None:
@@ -126,7 +126,7 @@ def _tested(
     env: gymnasium.Env[Any, Any],
     steps: int,
     tests: int,
-    counts: Counts,
+    counts: EndCounts,
     cpu_s: float,
 ) -> Point:
     successes = touched = 0

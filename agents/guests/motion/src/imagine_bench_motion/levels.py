@@ -31,7 +31,7 @@ _TEST_SEED = 10**9
 
 
 @dataclass(frozen=True, kw_only=True)
-class Level:
+class CurvePoint:
     """One point of a learning curve of an agent of macro-actions."""
 
     episodes: int  #: real training episodes so far
@@ -108,8 +108,8 @@ def learn(
     tests: int,
     horizon: int,
     seed: int,
-    told: Callable[[Level], None],
-) -> list[Level]:
+    told: Callable[[CurvePoint], None],
+) -> list[CurvePoint]:
     """Train an agent, and test it after so many episodes.
 
     Args:
@@ -136,7 +136,7 @@ def learn(
             while isinstance(agent, ModelOnlyTrainer) and agent.train_in_model():
                 pass
             successes = sum(test_episode(test_env, agent, horizon, _TEST_SEED + each) for each in range(tests))
-            point = Level(
+            point = CurvePoint(
                 episodes=episode,
                 macro_actions=count.macro_actions,
                 robot_s=round(count.robot_s, 2),

@@ -19,7 +19,7 @@ _SHARPNESS = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Layout:
+class PolicyLayout:
     """Sizes of inputs and outputs."""
 
     cameras: tuple[str, ...]  #: names of the images
@@ -31,7 +31,7 @@ class Layout:
     heat_maps: int = 0  #: points that are looked for in each camera's image; 0: it becomes ``features`` instead
 
 
-class Eye(nn.Sequential):
+class ImageEncoder(nn.Sequential):
     """Two convolutions and a linear layer for one camera: (B, 3, S, S) in [0, 1] to (B, features)."""
 
     def __init__(self, size_px: int, features: int) -> None:
@@ -47,7 +47,7 @@ class Eye(nn.Sequential):
         )
 
 
-class PointEye(nn.Module):
+class PointEncoder(nn.Module):
     """Heat maps of one camera's image, and the mean point of each (spatial softmax; Finn et al. 2016).
 
     A heat map is the sum of a convolutional network's answer, which is the same wherever a thing lies in the image, and
@@ -95,13 +95,13 @@ class ChunkPolicy(nn.Module):
         size_px: Edge of the images; a multiple of 8.
     """
 
-    def __init__(self, layout: Layout, size_px: int = 64) -> None:
+    def __init__(self, layout: PolicyLayout, size_px: int = 64) -> None:
         super().__init__()
         self.layout = layout
         points = layout.heat_maps
-        self.eyes = nn.ModuleDict(
+        self.encoders = nn.ModuleDict(
             {
-                camera: PointEye(size_px, points) if points else Eye(size_px, layout.features)
+                camera: PointEncoder(size_px, points) if points else ImageEncoder(size_px, layout.features)
                 for camera in layout.cameras
             }
         )
@@ -138,9 +138,9 @@ class ChunkPolicy(nn.Module):
         seen = []
         for camera in self.layout.cameras:
             if self.place is None:
-                seen.append(self.eyes[camera](images[camera]))
+                seen.append(self.encoders[camera](images[camera]))
             else:
-                points = self.eyes[camera](images[camera], words)
+                points = self.encoders[camera](images[camera], words)
                 seen.append(points if moved is None else points - moved.repeat(self.layout.heat_maps))
         if self.place is None:
             return torch.cat(seen, dim=1) if seen else words[:, :0]
@@ -152,7 +152,7 @@ class ChunkPolicy(nn.Module):
         return flat.unflatten(1, (self.layout.chunk, self.layout.commands))
 
 
-def new_network(layout: Layout, size_px: int, generator: torch.Generator) -> ChunkPolicy:
+def new_network(layout: PolicyLayout, size_px: int, generator: torch.Generator) -> ChunkPolicy:
     """A network with the first weights that torch's layers have by default, drawn from ``generator``."""
     with torch.device("meta"):
         network = ChunkPolicy(layout, size_px)

@@ -70,7 +70,7 @@ class Dreamer:
         self._optimisers = self._new_optimisers()
         moments = self._config.algo.actor.moments
         self._moments = Moments(moments.decay, moments.max, moments.percentile.low, moments.percentile.high)
-        self._memory = Sequences(settings.buffer_size)
+        self._memory = SequenceReplay(settings.buffer_size)
         self.meters = Meters()
         self.steps = self.updates = 0
         self._arrived = (0.0, False, False)  # reward and ends of the transition before, of this episode
@@ -248,7 +248,7 @@ class _Losses:
             self._meters.add(_LOSSES[name], float(value))
 
 
-class Sequences:
+class SequenceReplay:
     """The latest rows of experience, one behind the other through the ends of episodes, drawn as sequences.
 
     Args:

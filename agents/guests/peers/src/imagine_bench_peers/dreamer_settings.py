@@ -18,7 +18,7 @@ from imagine_bench.agents.settings import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelSettings:
+class DreamerModelSettings:
     """Sizes of the world model; actor and critic have as many units."""
 
     units: int = setting(256, COUNT)  #: of hidden layers
@@ -33,7 +33,7 @@ class ModelSettings:
 class DreamerSettings:
     """All settings of ``dreamer_v3``; by default the library's own of its smallest model, XS."""
 
-    model: ModelSettings = field(default_factory=ModelSettings)
+    model: DreamerModelSettings = field(default_factory=DreamerModelSettings)
     replay_ratio: float = setting(1.0, between(0.0, 64.0))  #: gradient updates a macro-action
     learning_starts: int = setting(1024, ROWS)  #: macro-actions before the first update, all of them random
     batch_size: int = setting(16, COUNT)  #: sequences

@@ -21,7 +21,7 @@ from imagine_bench.errors import InvalidValueError
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelSettings:
+class LeWMModelSettings:
     """Sizes of the encoder (ViT-tiny in the paper) and of the predictor, a transformer."""
 
     patch: int = setting(8, between(4, 32))  #: pixels of a patch's side; in the paper a 16th of the image's
@@ -46,7 +46,7 @@ class ModelSettings:
 class LeWMSettings:
     """All settings of ``lewm``; by default the paper's, but for those of an agent that acts as it learns."""
 
-    model: ModelSettings = field(default_factory=ModelSettings)
+    model: LeWMModelSettings = field(default_factory=LeWMModelSettings)
     regularisation: float = setting(0.09, NOT_NEGATIVE)  #: weight of SIGReg, lambda
     learning_rate: float = setting(5e-5, POSITIVE)  #: step size of the optimiser
     weight_decay: float = setting(1e-3, NOT_NEGATIVE)  #: weight decay of the optimiser, a gradient update

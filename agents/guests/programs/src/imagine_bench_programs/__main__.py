@@ -22,7 +22,7 @@ from imagine_bench.store.files import read_json, reading, require_writable, writ
 from .experience import See, itself, macro_actions_of, play, write_experience
 from .program import Program
 from .scores import Codes, ReadRules, Scores, efficiency, score
-from .sight import SeeingWriter, SeenCodes
+from .seeing import SeeingWriter, SeenCodes
 from .writing.writer import Writer
 
 _TIMES = 2.0
@@ -87,7 +87,7 @@ def _words(spec: TaskSpec, found: Scores, macro_actions: int | None) -> str:
 
 def _learner(spec: TaskSpec) -> float | None:
     """Mean macro-actions of the cautious learner, where it ends."""
-    cost = certificate(spec).floor
+    cost = certificate(spec).learning_cost
     return None if cost is None else cost.transitions
 
 

@@ -13,7 +13,7 @@ from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 from .program import Program
 from .settings import HYPERPARAMETERS
 from .symbols import Symbols
-from .writing.delay import Row
+from .writing.delay import CodedRow
 from .writing.writer import Writer
 
 _TYPES = {
@@ -89,7 +89,9 @@ class LawsAgent:
         """Learn from the transition."""
         with self.meters.cpu_time("time/model_s"):
             now, then = self.symbols.read(np.stack([transition.observation.frame, transition.next_observation.frame]))
-            self.writer.learn(Row(now, transition.action, then, transition.reward, transition.terminated, self._step))
+            self.writer.learn(
+                CodedRow(now, transition.action, then, transition.reward, transition.terminated, self._step)
+            )
             self._step += 1
         self.meters.count("time/model_s")
 
@@ -148,7 +150,7 @@ class LawsAgent:
         self.writer = Writer(self.symbols.sizes, self.writer.n_actions, self._rng)
         columns = (arrays[name].tolist() for name in _TYPES)
         for now, action, then, reward, ended, step in zip(*columns, strict=True):
-            self.writer.learn(Row(tuple(now), action, tuple(then), reward, ended, step))
+            self.writer.learn(CodedRow(tuple(now), action, tuple(then), reward, ended, step))
         self.meters.restore(state.values["meters"])
         self._rng.bit_generator.state = state.values["exploration"]
 

@@ -14,7 +14,7 @@ from imagine_bench.interfaces import State, TaskSpec
 from imagine_bench.registry import task
 from imagine_bench.store.files import require_writable
 
-from .writing.delay import Row
+from .writing.delay import CodedRow
 
 Choose = Callable[[State], int]
 See = Callable[[State], State]
@@ -26,7 +26,9 @@ def itself(state: State) -> State:
     return state
 
 
-def play(spec: TaskSpec, choose: Choose, rng: np.random.Generator, see: See = itself) -> Iterator[tuple[Row, bool]]:
+def play(
+    spec: TaskSpec, choose: Choose, rng: np.random.Generator, see: See = itself
+) -> Iterator[tuple[CodedRow, bool]]:
     """Macro-actions of one episode after another, without end, and whether each is the last of its episode.
 
     A macro-action comes about as the task's rules say, which is the kinematic execution. ``see`` turns the content of a
@@ -48,7 +50,7 @@ def play(spec: TaskSpec, choose: Choose, rng: np.random.Generator, see: See = it
             shown = taken[max(0, step - lag)]
             then = tuple(old if new < 0 else new for new, old in zip(shown, now, strict=True))
             last = outcome.terminated or step == spec.horizon
-            yield Row(now, action, then, outcome.reward, outcome.terminated, step - 1), last
+            yield CodedRow(now, action, then, outcome.reward, outcome.terminated, step - 1), last
             if last:
                 break
             now = then

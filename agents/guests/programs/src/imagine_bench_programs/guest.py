@@ -47,7 +47,7 @@ class _Text(InspectLoader):
         return self._source
 
 
-class Served:
+class ServedProgram:
     """A program, as :class:`imagine_bench.running.isolation.Isolated` serves it.
 
     ``source`` is the text of the file.

@@ -17,7 +17,7 @@ from .program import Program
 from .settings import HYPERPARAMETERS
 from .symbol_rules import SymbolRules
 from .symbols import Symbols
-from .writing.delay import Row
+from .writing.delay import CodedRow
 from .writing.laws import Laws
 
 
@@ -68,7 +68,7 @@ class WrittenModel(SymbolModel):
         steps = np.concatenate([np.arange(length) for length in dataset.lengths])
         columns = (dataset.rows[0], dataset.actions, dataset.rewards, dataset.terminated, steps)
         rows = zip(*(column.tolist() for column in columns), strict=True)
-        found = [Row(symbols[at], action, symbols[at + 1], *more) for at, action, *more in rows]
+        found = [CodedRow(symbols[at], action, symbols[at + 1], *more) for at, action, *more in rows]
         self.rules = Laws(self.symbols.sizes, self.rules.n_actions, found)
 
     def parameters(self) -> int:

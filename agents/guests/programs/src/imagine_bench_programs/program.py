@@ -71,7 +71,7 @@ class Program(SymbolRules):
         self.name = spelled(argument)[: -len(_DIGITS)]
         self.sizes = tuple(sizes)
         self._known: dict[State, list[tuple[Outcome, ...]]] = {}
-        make = f"{__package__}.guest:Served"
+        make = f"{__package__}.guest:ServedProgram"
         try:
             self._process = Isolated(make, _source(self.name), log=Path(os.devnull), limits=limits)
         except InvalidValueError as error:

@@ -20,7 +20,7 @@ from .symbol_rules import SymbolRules
 from .symbols import Symbols
 
 if TYPE_CHECKING:
-    from .sight import SeenCodes
+    from .seeing import SeenCodes
 
 DISTRACTORS = 5
 """Macrostates among which a real next one is ranked."""

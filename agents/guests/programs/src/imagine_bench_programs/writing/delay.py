@@ -15,7 +15,7 @@ MOST_DELAY = 3
 """Macro-actions that symbols may be late."""
 
 
-class Row(NamedTuple):
+class CodedRow(NamedTuple):
     """A transition between symbols, -1 for a value that was not seen."""
 
     now: State
@@ -26,12 +26,12 @@ class Row(NamedTuple):
     step: int = 0  # macro-actions before it in its episode
 
 
-def complete(rows: Sequence[Row]) -> list[Row]:
+def complete(rows: Sequence[CodedRow]) -> list[CodedRow]:
     """The transitions in which every value was seen."""
     return [row for row in rows if min(*row.now, *row.then) >= 0]
 
 
-def changes(rows: Sequence[Row], delay: int) -> list[Row]:
+def changes(rows: Sequence[CodedRow], delay: int) -> list[CodedRow]:
     """Transitions with the macro-action that was taken ``delay`` steps before, instead of their own.
 
     Each transition of an episode is to follow the one before it. At the beginning of an episode the first symbols are
@@ -44,6 +44,6 @@ def changes(rows: Sequence[Row], delay: int) -> list[Row]:
     return found
 
 
-def too_early(rows: Sequence[Row], delay: int) -> int:
+def too_early(rows: Sequence[CodedRow], delay: int) -> int:
     """How many transitions changed something where symbols that are so late would still repeat the first."""
     return sum(row.step < delay and row.now != row.then for row in complete(rows))

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from imagine_bench.interfaces import Outcome, State
 
 from ..symbol_rules import SymbolRules
-from .delay import MOST_DELAY, Row, changes, complete, too_early
+from .delay import MOST_DELAY, CodedRow, changes, complete, too_early
 
 _CONTRADICTED = 20.0
 """Nats that a transition costs which no law explains."""
@@ -77,7 +77,7 @@ class End(NamedTuple):
 class Laws(SymbolRules):
     """The laws of N transitions between symbols of so many values each, -1 for a value that was not seen."""
 
-    def __init__(self, sizes: Sequence[int], n_actions: int, rows: Sequence[Row] = ()) -> None:
+    def __init__(self, sizes: Sequence[int], n_actions: int, rows: Sequence[CodedRow] = ()) -> None:
         super().__init__(n_actions)
         self.sizes = tuple(sizes)
         self._known: dict[tuple[State, int], tuple[Outcome, ...]] = {}
@@ -145,7 +145,7 @@ class Laws(SymbolRules):
             state = self.turned(state, action) if min(state) >= 0 else state
         return state
 
-    def present(self, rows: Sequence[Row]) -> list[Row]:
+    def present(self, rows: Sequence[CodedRow]) -> list[CodedRow]:
         """Transitions between the symbols that were not seen yet, with the rewards that came at once.
 
         Each transition of an episode is to follow the one before it.
@@ -196,7 +196,7 @@ def _turned(effects: Sequence[Sequence[Effect]], state: State, action: int) -> S
 class _Dynamics:
     """Drifts and effects of N transitions in which every value was seen, and the nats of all of them."""
 
-    def __init__(self, sizes: Sequence[int], n_actions: int, rows: Sequence[Row]) -> None:
+    def __init__(self, sizes: Sequence[int], n_actions: int, rows: Sequence[CodedRow]) -> None:
         self.sizes = tuple(sizes)
         self.n_actions = n_actions
         self._rows = rows
@@ -245,7 +245,7 @@ class _Dynamics:
                 pooled[action] = [Effect(factor, (), becomes)]
         return pooled
 
-    def _effects(self, rows: Sequence[Row], factor: int) -> tuple[list[Effect], float]:
+    def _effects(self, rows: Sequence[CodedRow], factor: int) -> tuple[list[Effect], float]:
         """The effects of one macro-action on one factor, and their nats: one after another, each saves the most."""
         laws: list[Effect] = []
         spent = 0.0
@@ -260,7 +260,7 @@ class _Dynamics:
             spent += nats - _CONTRADICTED * sum(row.now[factor] != row.then[factor] for row in rest)
             left = rest
 
-    def _best(self, rows: Sequence[Row], factor: int) -> tuple[float, Effect | None]:
+    def _best(self, rows: Sequence[CodedRow], factor: int) -> tuple[float, Effect | None]:
         """The law of the fewest nats on all ``rows``, by the number of conditions, as long as more may be shorter."""
         now = np.array([row.now for row in rows], dtype=np.int64).reshape(-1, len(self.sizes))
         then = np.array([row.then[factor] for row in rows], dtype=np.int64)
@@ -397,7 +397,7 @@ def _named(came: int, failed: int) -> tuple[float, float]:
     return chance, nats + math.log(10) * ((came > 0) != (failed > 0))
 
 
-def ends_of(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> list[End]:
+def ends_of(rows: Sequence[CodedRow], sizes: Sequence[int], n_actions: int) -> list[End]:
     """A list of laws for reward and end: first the class that the shortest conditions tell from all others."""
     if not rows:
         return []

@@ -15,7 +15,7 @@ import numpy as np
 
 from imagine_bench.interfaces import Outcome, State
 
-from .delay import Row, changes, complete
+from .delay import CodedRow, changes, complete
 from .laws import Laws
 
 _DEPTH = 20
@@ -36,7 +36,7 @@ class Writer:
         self.sizes = tuple(sizes)
         self.n_actions = n_actions
         self.rng = rng
-        self.rows: list[Row] = []
+        self.rows: list[CodedRow] = []
         self.laws = Laws(self.sizes, n_actions)
         """The newest laws, of the first ``_learned`` transitions."""
         self._learned = 0
@@ -47,7 +47,7 @@ class Writer:
         self._met: set[tuple[tuple[int, int], ...]] = set()
         """Values, with their places, that met in a transition: those of the law that held; if none, all pairs."""
 
-    def learn(self, row: Row) -> None:
+    def learn(self, row: CodedRow) -> None:
         """Take in a transition; one with a value that was not seen teaches nothing."""
         self.rows.append(row)
         if min(*row.now, *row.then) < 0:
@@ -69,7 +69,7 @@ class Writer:
         """Forget the macro-actions so far."""
         self._taken = []
 
-    def _count_try(self, row: Row) -> None:
+    def _count_try(self, row: CodedRow) -> None:
         for factor, value in enumerate(row.now):
             self._tried[row.action, factor, value] += 1 if row.then == row.now else _TRIES
 
@@ -85,13 +85,13 @@ class Writer:
         for row in complete(changes(self.rows, self.laws.delay)):
             self._count_try(row)
 
-    def take_up(self, sizes: Sequence[int], rows: Sequence[Row]) -> None:
+    def take_up(self, sizes: Sequence[int], rows: Sequence[CodedRow]) -> None:
         """Begin again with transitions whose symbols have so many values each."""
         self.sizes = tuple(sizes)
         self.rows = list(rows)
         self.write()
 
-    def _claims(self, row: Row) -> list[tuple[tuple[int, int], ...]]:
+    def _claims(self, row: CodedRow) -> list[tuple[tuple[int, int], ...]]:
         """The values whose meeting decides a transition's reward and end, as far as the laws say; else all pairs."""
         tests = self.laws.end(row.now, row.action, row.then).tests
         if not tests:
@@ -101,7 +101,7 @@ class Writer:
         return [tuple((place, values[place]) for place in sorted(places))]
 
     def _is_unknown(self, now: State, action: int, expected: Outcome) -> bool:
-        row = Row(now, action, expected.macrostate, expected.reward, expected.terminated)
+        row = CodedRow(now, action, expected.macrostate, expected.reward, expected.terminated)
         tried = all(self._tried[action, factor, value] >= _TRIES for factor, value in enumerate(now))
         return not tried or not self._met.issuperset(self._claims(row))
 

@@ -19,14 +19,14 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from imagine_bench_factored.perception import LearnedPerception, Sight
+from imagine_bench_factored.perception import FrameFactors, LearnedPerception
 from imagine_bench_factored.settings import LearnedPerceptionSettings
 from numpy.typing import NDArray
 
 from imagine_bench.interfaces import Frame, State, TaskSpec
 from imagine_bench.rules import states_of
 
-from .writing.delay import Row, complete
+from .writing.delay import CodedRow, complete
 from .writing.laws import Laws, simplest
 from .writing.writer import Writer
 
@@ -61,7 +61,7 @@ class SeeingWriter:
         self._images: list[Frame] = []
         self._codes: dict[int, State] = {}
         """The present codes of images, by their number."""
-        self._rows: list[Row] = []
+        self._rows: list[CodedRow] = []
         """Transitions between numbers of images."""
 
     def see(self, macrostate: State) -> State:
@@ -77,16 +77,16 @@ class SeeingWriter:
             code = self._hidden.fill(code, None if begins else self.writer.rows[-1].then)
         return self.writer.explore(code)
 
-    def learn(self, row: Row) -> None:
+    def learn(self, row: CodedRow) -> None:
         """Take in a transition between images."""
         before, after = (self._images[number] for (number,) in (row.now, row.then))
         self._rows.append(row)
         coded = self._coded(self._rows[-1 - row.step :])[-1]
-        sight = self._sight()
+        frame_factors = self._perceived()
         if not self.perception.full:
             self.perception.remember(before, row.action, after, begins=row.step == 0)
             if self.perception.renew():
-                self._begin_again(sight)
+                self._begin_again(frame_factors)
                 return
         self.writer.learn(coded)
 
@@ -96,10 +96,10 @@ class SeeingWriter:
 
     def write(self) -> None:
         """Look for factors a last time, and find the laws of all transitions."""
-        sight = self._sight()
+        frame_factors = self._perceived()
         if not self.perception.full:
             self.perception.look(len(self.perception.frames))
-        self._begin_again(sight)
+        self._begin_again(frame_factors)
         self._leave_out(self.writer.laws.superfluous)
 
     def codes(self) -> SeenCodes:
@@ -114,23 +114,23 @@ class SeeingWriter:
         """An image of each of N macrostates. Shape (N, 64, 64, 3)."""
         return self._spec.render_macrostates(np.array(macrostates, dtype=np.int64), self._appearance, self._rng)
 
-    def _sight(self) -> tuple[Sight, int, Sequence[int]]:
+    def _perceived(self) -> tuple[FrameFactors, int, Sequence[int]]:
         """The present factors, in how many images they were found, and their numbers of values."""
-        return self.perception.sight, self.perception.found_in, self.perception.sizes
+        return self.perception.frame_factors, self.perception.found_in, self.perception.sizes
 
-    def _begin_again(self, before: tuple[Sight, int, Sequence[int]]) -> None:
+    def _begin_again(self, before: tuple[FrameFactors, int, Sequence[int]]) -> None:
         """Give all transitions their present codes, and write anew.
 
         The factors of before are kept if by them far fewer transitions contradict one another.
         """
-        sight, found_in, sizes = before
+        frame_factors, found_in, sizes = before
         kept = self._codes
         known = self._explained(sizes)
         codes, _ = self.perception.codes(np.stack(self._images))
         self._codes = dict(enumerate(codes))
         found = self._explained(self.perception.sizes)
-        if sight.factors and _contradicting(known[1]) < _CLEARER * _contradicting(found[1]):
-            self.perception.take(sight, found_in)
+        if frame_factors.factors and _contradicting(known[1]) < _CLEARER * _contradicting(found[1]):
+            self.perception.take(frame_factors, found_in)
             self._codes = kept
             found = known
         self._hidden, rows = found
@@ -138,17 +138,17 @@ class SeeingWriter:
 
     def _leave_out(self, superfluous: Collection[int]) -> None:
         """See these factors no more, and write anew; all of them are seen if no other one would be left."""
-        sight = self.perception.sight
-        left = [place for place in range(len(sight.factors)) if place not in superfluous]
-        if not left or len(left) == len(sight.factors):
+        frame_factors = self.perception.frame_factors
+        left = [place for place in range(len(frame_factors.factors)) if place not in superfluous]
+        if not left or len(left) == len(frame_factors.factors):
             return
-        factors = [sight.factors[place] for place in left]
-        self.perception.take(sight._replace(factors=factors), self.perception.found_in)
+        factors = [frame_factors.factors[place] for place in left]
+        self.perception.take(frame_factors._replace(factors=factors), self.perception.found_in)
         self._codes = {number: tuple(code[place] for place in left) for number, code in self._codes.items()}
         self._hidden, rows = self._explained(self.perception.sizes)
         self.writer.take_up(self.perception.sizes, rows)
 
-    def _explained(self, sizes: Sequence[int]) -> tuple[Hidden | None, list[Row]]:
+    def _explained(self, sizes: Sequence[int]) -> tuple[Hidden | None, list[CodedRow]]:
         """The value of all codes that hides a factor, and the transitions in which the value last seen stands there."""
         self._hidden = None
         rows = self._coded(self._rows)
@@ -161,7 +161,7 @@ class SeeingWriter:
             self._codes[number] = self.perception.code(self._images[number])  # which keeps it for `remember`
         return self._codes[number]
 
-    def _coded(self, rows: Sequence[Row]) -> list[Row]:
+    def _coded(self, rows: Sequence[CodedRow]) -> list[CodedRow]:
         """Transitions between images as transitions between codes; the first one begins an episode."""
         coded = [row._replace(now=self._code(row.now[0]), then=self._code(row.then[0])) for row in rows]
         return coded if self._hidden is None else self._hidden.filled(coded)
@@ -182,22 +182,22 @@ class Hidden(NamedTuple):
         last = self.only if before is None else before[self.factor]
         return (*code[: self.factor], last, *code[self.factor + 1 :])
 
-    def filled(self, rows: Sequence[Row]) -> list[Row]:
+    def filled(self, rows: Sequence[CodedRow]) -> list[CodedRow]:
         """Transitions with values filled in; the first one begins an episode."""
-        found: list[Row] = []
+        found: list[CodedRow] = []
         for row in rows:
             now = self.fill(row.now, found[-1].then if row.step else None)
             found.append(row._replace(now=now, then=self.fill(row.then, now)))
         return found
 
-    def nats(self, rows: Sequence[Row]) -> float:
+    def nats(self, rows: Sequence[CodedRow]) -> float:
         """The length of saying in which images it stands, the first ones of episodes and the later ones apart."""
         first = [row.now[self.factor] == self.value for row in rows if not row.step]
         later = [row.then[self.factor] == self.value for row in rows]
         return sum(simplest(sum(stands), len(stands) - sum(stands))[1] for stands in (first, later))
 
 
-def hidden_value(rows: Sequence[Row], sizes: Sequence[int]) -> Hidden | None:
+def hidden_value(rows: Sequence[CodedRow], sizes: Sequence[int]) -> Hidden | None:
     """The value that leaves the fewest contradictions where the value last seen stands in its place, if there is one.
 
     The first transition begins an episode.
@@ -218,7 +218,7 @@ def _hiding(factors: Iterable[int], sizes: Sequence[int]) -> list[Hidden]:
     return [Hidden(factor, value, only=1 - value if sizes[factor] == 2 else -1) for factor, value in pairs]
 
 
-def still_value(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> Hidden | None:
+def still_value(rows: Sequence[CodedRow], sizes: Sequence[int], n_actions: int) -> Hidden | None:
     """The value without which its factor never changes, if laws without these changes are shorter.
 
     The first transition begins an episode.
@@ -236,7 +236,7 @@ def still_value(rows: Sequence[Row], sizes: Sequence[int], n_actions: int) -> Hi
     return best
 
 
-def _contradicting(rows: Sequence[Row]) -> float:
+def _contradicting(rows: Sequence[CodedRow]) -> float:
     """Share of the complete transitions that had another result than the first of the same code and macro-action."""
     known = complete(rows)
     first = {(row.now, row.action): row for row in reversed(known)}
