@@ -126,7 +126,7 @@ def plan_report(
     spec = trained.spec
     whose: dict[str, Json] = {"agent": spec.agent, "seed": spec.seed, "episodes": trained.episodes}
     how: dict[str, Json] = {
-        "appearance": spec.protocol.appearance,
+        "appearance": spec.protocol.appearance_in_tests,
         "execution": execution,
         "max_epistemic": max_epistemic,
     }

@@ -146,6 +146,17 @@ def test_a_model_that_expects_the_gesture_to_be_hidden_is_not_wrong() -> None:
     assert found == ["planning", "planning"]
 
 
+def test_a_frame_that_hides_something_and_is_misread_too_is_not_blamed_on_memory() -> None:
+    start = FAR[0]
+    (outcome,) = RULES.outcomes(start, OPTIMAL[start])
+    lost = episode(start, [OPTIMAL[start], ILLEGAL[outcome.macrostate]], hidden=[False, True])
+    blamed = [
+        cause(does(OPTIMAL, model_of(MEMORY)), ALL, dataclasses.replace(lost, misread=[False, wrong]), MEMORY)
+        for wrong in (False, True)
+    ]
+    assert blamed == ["forgotten", "misread"]
+
+
 def test_memory_suffices_where_the_first_frame_shows_all_that_stays() -> None:
     assert all(map(memory_suffices, map(registry.task, ("arrow_puzzle", "arrows:gesture=first"))))
     for name in ("arrows:gesture=first,goal_change=0.1", "pick_place:gesture=first"):

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -131,32 +132,45 @@ def test_what_is_written_holds_every_plan_and_a_wrong_one_stops_where_the_episod
     assert (with_faults["faults"], with_faults["steps"]) == (36, sum(plan.done for plan in right))
 
 
+def recorded(path: Path) -> tuple[Counter[str], list[str]]:
+    """Rows of each entity of a recording, and its texts."""
+    rows = Counter[str]()
+    texts = list[str]()
+    for chunk in RrdReader(path).stream():
+        rows[chunk.entity_path] += chunk.num_rows
+        if chunk.entity_path == "/real/text":
+            texts += [str(text) for (text,) in chunk.to_record_batch().column("TextDocument:text").to_pylist()]
+    return rows, texts
+
+
 def test_the_recording_shows_the_same_plans_and_the_arm_moves(
     right: list[PlanResult], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dreamer = optimal()
+    executions = []
 
-    def env_for(*arguments: Any) -> Any:
-        dreamer.env = make_env(*arguments)
+    def env_for(whose: Trained, execution: str) -> Any:
+        executions.append(execution)
+        dreamer.env = make_env(whose, execution)
         return dreamer.env
 
     monkeypatch.setattr("imagine_bench.recording.plans.make_env", env_for)
     path = tmp_path / "recording.rrd"
     record_plans(trained(dreamer), count=2, execution="physics", max_epistemic=None, path=path)
     timelines = contents(path)
-    rows = Counter[str]()
-    done = list[int]()
-    for chunk in RrdReader(path).stream():
-        rows[chunk.entity_path] += chunk.num_rows
-        if chunk.entity_path == "/real/text":
-            texts = chunk.to_record_batch().column("TextDocument:text").to_pylist()
-            done += [sum(line.endswith(" done") for line in str(text).splitlines()) for (text,) in texts]
+    rows, texts = recorded(path)
+    done = [sum(line.endswith(" done") for line in text.splitlines()) for text in texts]
     for entity in ("/real/frame", "/imagined/frame", "/imagined/filmstrip", "/real/text", "/scene/right_l3"):
         assert timelines[entity] >= {"sim_time", "env_step", "plan"}
     steps = sum(plan.done for plan in right[:2])
     assert rows["/real/frame"] == steps + 2, "the physical arm solves the same plans"
     assert rows["/scene/right_l3"] > 20 * steps, "the arm must be seen moving"
     assert sorted(done) == sorted(number for plan in right[:2] for number in range(plan.done + 1))
+    record_plans(trained(dreamer), count=2, execution="kinematic", max_epistemic=0.05, path=path)
+    _, texts = recorded(path)
+    long = [plan.number for plan in right[:2] if plan.length > 1]  # the first imagined step is certain
+    refused = {text.split()[2] for text in texts if "**Refused:**" in text}
+    assert refused == {str(number) for number in long} != set() and executions == ["physics", "kinematic"]
 
 
 @pytest.mark.parametrize(
@@ -212,13 +226,18 @@ def test_no_agent_without_imagination_and_no_empty_series() -> None:
             next(make_plans(trained(object()), count=count, execution="kinematic"))
 
 
-def test_plans_with_another_bound_or_number_lie_in_folders_of_their_own(tmp_path: Path) -> None:
-    """So that none overwrites the table and the films of those before."""
-    imaginer = small(agents=("imaginer",), budgets=(2,), evaluation_episodes=1)
+def test_plans_with_another_bound_or_number_lie_in_folders_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that none overwrites the table and the films of those before; each names the world that it was tried in."""
+    imaginer = small(agents=("imaginer",), budgets=(2,), evaluation_episodes=1, test_appearance="mild")
     folder = bench(imaginer, {}, root=tmp_path, launcher=Inline()).folder
+    recording = mock.Mock()
+    monkeypatch.setattr("imagine_bench.recording.plans.record_plans", recording)
     for count, bound in [(1, None), (1, 0.3), (2, None)]:
-        plan_report(
-            folder, root=tmp_path, task=None, count=count, execution="kinematic", max_epistemic=bound, encoder=None
-        )
+        how: dict[str, Any] = {"count": count, "execution": "kinematic", "max_epistemic": bound}
+        plan_report(folder, root=tmp_path, task=None, encoder=None, recorded=1, **how)
+        assert recording.call_args.kwargs == {**how, "count": 1, "path": mock.ANY}
     kept = [json.loads(path.read_text()) for path in folder.glob("imaginer/seed_0/plans/*/summary.json")]
     assert {(each["attempted"], each["max_epistemic"]) for each in kept} == {(1, None), (1, 0.3), (2, None)}
+    assert {(each["appearance"], each["execution"]) for each in kept} == {("mild", "kinematic")}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -18,13 +20,16 @@ import bench_fakes
 import numpy as np
 import pytest
 from imagine_bench.tasks.macro_env import MacroEnv
-from small_runs import do, final_arrays, run_observed, same_but_for_time, small
+from small_runs import do, final_arrays, run_observed, same_but_for_time, small, written
 
-import imagine_bench  # noqa: F401 - registers the environments
+from imagine_bench import registry
 from imagine_bench.cli import observers
 from imagine_bench.errors import DivergedError
+from imagine_bench.exact.splits import split_of
 from imagine_bench.interfaces import Transition
+from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.data import RunSpec
+from imagine_bench.recording import episodes
 from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts, start_from
 from imagine_bench.running.run_state import Counters, make_env
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
@@ -63,27 +68,42 @@ def test_an_episode_begins_where_its_seed_says_unless_a_start_is_asked_for() -> 
         (0, {"test_appearance": "mild"}, ("evaluation", "mild")),
         (0, {"test_appearance": "patched"}, ("evaluation", "photo_held_out")),
         (TUNING_SEEDS, {"appearance": "photo"}, ("tuning", "photo_held_out")),  # shown tuning starts alone
+        (0, {"split": "values=3:0:1"}, ("evaluation", "clean")),
     ],
 )
-def test_tests_have_starts_and_looks_that_training_never_saw_and_observers_ask_about_these(
+def test_tests_and_recordings_have_starts_and_looks_that_training_never_saw_and_observers_ask_about_these(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, looks: dict[str, str], tests: tuple[str, str]
 ) -> None:
     reset, seen, asked = MacroEnv.reset, set(), []
+    held_out = set(split_of(registry.task("arrow_puzzle").rules, looks.get("split", "values=3:0:1")).test)
 
     def noted(env: MacroEnv, *, seed: int, options: Any = None) -> Any:
-        seen.add((seed >> 56, env.world.level.name))
-        return reset(env, seed=seed, options=options)
+        begun = reset(env, seed=seed, options=options)
+        is_held_out = tuple(begun[1]["macrostate"]) in held_out if "split" in looks else None
+        seen.add((seed >> 56, env.world.level.name, is_held_out))
+        return begun
 
     monkeypatch.setattr(MacroEnv, "reset", noted)
     for name in ("surviving_actions", "frames_to_ask_with", "examples", "imagine_sampled_rollouts"):
         asking = mock.Mock(side_effect=getattr(observers, name))
         monkeypatch.setattr(observers, name, asking)
         asked.append(asking)
-    few = {"budgets": (4,), "evaluation_episodes": 1, "open_loop_starts": 2}
+    recorded = mock.Mock(side_effect=episodes.record_run)
+    monkeypatch.setattr(episodes, "record_run", recorded)
+    few = {"budgets": (4,), "evaluation_episodes": 1, "open_loop_starts": 2, "recorded_episodes": 1}
     do(tmp_path, "imaginer", seed, agents=("imaginer",), seeds=(seed,), **few, **looks)
     purpose, appearance = tests
-    training, testing = (episode_seed(each, 0, 0) >> 56 for each in ("training", purpose))
-    assert seen == {(training, looks.get("appearance", "clean")), (testing, appearance)}
+    training, testing, recording = (episode_seed(each, 0, 0) >> 56 for each in ("training", purpose, "recording"))
+    trained, tested = (False, True) if "split" in looks else (None, None)
+    assert seen == {
+        (training, looks.get("appearance", "clean"), trained),
+        (testing, appearance, tested),
+        (recording, appearance, tested),
+    }
+    assert {name: recorded.call_args.kwargs[name] for name in ("seed", "appearance")} == {
+        "seed": seed,
+        "appearance": appearance,
+    }
     for each in asked:
         assert {(call.kwargs["purpose"], call.kwargs["appearance"]) for call in each.call_args_list} == {tests}
 
@@ -111,6 +131,41 @@ def test_only_the_privileged_are_shown_more_than_frames(tmp_path: Path) -> None:
     assert all(np.shape(observation.macrostate) == (4,) for observation in privileged.seen)
 
 
+def noting(log: list[str], word: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def noted(*given: Any, **named: Any) -> Any:
+        log.append(word)
+        return function(*given, **named)
+
+    return noted
+
+
+@pytest.mark.parametrize("first", ["dataset", "demonstrations", "own episodes"])
+def test_an_agent_is_told_of_each_episode_that_it_begins(
+    first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a dataset's, those that it watches, its own on each task, tests and recordings; before it sees any of it."""
+    log: list[str] = []
+    agent = bench_fakes.TableAgent
+    monkeypatch.setattr(agent, "begin_episode", noting(log, "told", lambda agent: None), raising=False)
+    for kind, name, word in (
+        (agent, "act", "sees"), (agent, "observe", "sees"), (MacroEnv, "reset", "new"), (Episodes, "transitions", "new")
+    ):  # fmt: skip
+        monkeypatch.setattr(kind, name, noting(log, word, getattr(kind, name)))
+    changes: dict[str, Any] = {"after": ("arrow_puzzle_hard",), "after_episodes": 2, "unannounced": True}
+    changes |= {"budgets": (8,), "evaluation_episodes": 2, "recorded_episodes": 2}
+    dataset = written(tmp_path / "set") if first == "dataset" else None
+    if dataset is not None:
+        changes |= {"dataset": dataset.identity, "appearance": "mild"}
+    changes |= {"demonstrations": 3} if first == "demonstrations" else {}
+    log.clear()
+    folder = None if dataset is None else dataset.folder
+    spec = RunSpec(protocol=small(**changes), agent="table", seed=0, dataset=folder)
+    run_observed(spec, tmp_path / "run", lambda progress: None)
+    heard = [words for words in " ".join(log).split("sees") if "new" in words]
+    assert len(heard) == 2 + 8 + 2 + 2 and all("told" in words for words in heard)
+
+
 def test_an_agent_that_does_not_learn_is_tested_once(tmp_path: Path) -> None:
     first, second = do(tmp_path / "run", "oracle", agents=("oracle",)).checkpoints
     assert dataclasses.replace(first, episodes=9) == second
@@ -136,6 +191,7 @@ import bench_fakes
 from imagine_bench.running import run_state, runner
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import RunSpec
+from imagine_bench.recording import episodes
 
 save, saves = run_state.save_snapshot, iter(range(int(sys.argv[3])))
 def saying(folder, snapshot):

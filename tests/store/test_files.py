@@ -15,6 +15,7 @@ from imagine_bench.errors import ArtefactError, BusyError, SetupError
 from imagine_bench.store.files import (
     first_difference,
     lock,
+    make_plain,
     read_sealed,
     sealed,
     table_rows,
@@ -55,6 +56,24 @@ def test_a_refusal_is_one_sentence_and_keeps_the_old_file(
     assert str(caught.value).startswith(f"Cannot write {path}: {sentence}")
     assert json.loads(path.read_text()) == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("written", "kept"),
+    [
+        (b"\x1b[31mred\n", "\\x1b[31mred\n"),
+        (b"\xff gone\n", "\ufffd gone\n"),
+        (b"all right\n", "all right\n"),
+        (b"", None),
+    ],
+)
+def test_a_log_of_any_bytes_becomes_a_text_that_a_terminal_can_show(
+    tmp_path: Path, written: bytes, kept: str | None
+) -> None:
+    log = tmp_path / "log.txt"
+    log.write_bytes(written)
+    make_plain(log)
+    assert (log.read_text(encoding="utf-8") if log.exists() else None) == kept
 
 
 def test_a_sealed_file_that_lost_its_seal_or_has_another_value_is_refused(tmp_path: Path) -> None:

@@ -22,6 +22,8 @@ import imagine_bench.tools.quiz  # noqa: F401 - all are loaded in no test's time
 from imagine_bench.cli import benches, parsed
 from imagine_bench.cli import exit_code as main
 from imagine_bench.judge.judgement import Judgement
+from imagine_bench.store import loading
+from imagine_bench.sweep.grid import Study, Suite
 
 
 class ReachedError(Exception):
@@ -53,10 +55,11 @@ def chosen(line: str) -> dict[str, Any]:
     """The options of a command line and their values: of ``--motion-hz 5 --sizes 2 3``, ``motion_hz`` is 5."""
     found: dict[str, Any] = {}
     for option in f" {line}".split(" --")[1:]:
-        name, *words = option.split()
-        values = tuple(map(meant, words))
-        found[name.replace("-", "_")] = values if len(values) > 1 else values[0] if values else True
-    return found
+        first, *words = option.split()
+        name = first.replace("-", "_")
+        values = (*found.get(name, ()), *map(meant, words))
+        found[name] = values or (True,)
+    return {name: values if len(values) > 1 else values[0] for name, values in found.items()}
 
 
 _JUDGING = "imagine_bench.cli.judging"
@@ -202,8 +205,21 @@ WIRES = [
     wire("new agent mine", "--out .", "--out here", "imagine_bench.tools.new.new_package", out=2),
     wire("report", "--out runs", "--task arrows --out here", f"{_BENCHES}.newest_bench", out=0, task=1),
     wire("report here --track wandb", "", "", f"{_BENCHES}.track", track=1),
-    wire("sweep", "--out runs", "--agents dqn random --out here", f"{_BENCHES}.run_suite", agents=1, out="root"),
-    wire("sweep arrow_puzzle", "--out runs", "--out here", f"{_BENCHES}.run_study", out="root"),
+    wire(
+        "sweep",
+        "--seeds 0 1 --out runs",
+        "--seeds 3 5 --experiment size --experiment memory --agents dqn random --out here",
+        f"{_BENCHES}.run_suite",
+        agents=1,
+        out="root",
+    ),
+    wire(
+        "sweep arrow_puzzle --name factors",
+        "--out runs",
+        "--variants dqn imagination_uncertainty --out here",
+        f"{_BENCHES}.run_study",
+        out="root",
+    ),
     wire(
         "bench arrow_puzzle",
         "--launcher local",
@@ -214,13 +230,16 @@ WIRES = [
     ),
     wire("bench arrow_puzzle", "--out runs", "--out here", f"{_BENCHES}.bench", out="root"),
     wire("bench arrow_puzzle --track wandb", "", "", f"{_BENCHES}.Tracked", track=1),
-    wire(
-        "bench arrow_puzzle --until-decided",
-        "--most-seeds 19 --out runs",
-        "--most-seeds 9 --out here",
-        f"{_BENCHES}.until_decided",
-        most_seeds="most",
-        out="root",
+    *(
+        wire(
+            f"bench arrow_puzzle --until-decided{tracked}",
+            "--most-seeds 19 --out runs",
+            "--most-seeds 9 --out here",
+            f"{_BENCHES}.until_decided",
+            most_seeds="most",
+            out="root",
+        )
+        for tracked in ("", " --track tensorboard")
     ),
     wire("submit here", "--out rows", "--out there --author me --encoder e --round r", f"{_BOARD}.submit"),
     wire(
@@ -233,14 +252,23 @@ WIRES = [
 ]
 
 
+def fields_of(given: object) -> Mapping[str, Any]:
+    """Of a judgement its fields; of a grid the parts of it that are wanted."""
+    if isinstance(given, Suite):
+        return {"seeds": given.seeds, "experiment": tuple(each.name for each in given.experiments)}
+    if isinstance(given, Study):
+        return {"name": given.name, "variants": tuple(each.name for each in given.variants)}
+    return vars(given) if isinstance(given, Judgement) else {}
+
+
 def arguments(line: str, target: str) -> dict[str | int, Any]:
-    """Those of the function that a command calls, by place or name; of a judgement its fields, too."""
+    """Those of the function that a command calls, by place or name, and :func:`fields_of` each."""
     with patch(target, side_effect=ReachedError) as function, pytest.raises(ReachedError):
         main(line.split())
     given, named = function.call_args
     found = {**dict(enumerate(given)), **named}
     for each in given:
-        found |= vars(each) if isinstance(each, Judgement) else {}
+        found |= fields_of(each)
     plain = {name: str(value) if isinstance(value, Path) else value for name, value in found.items()}
     return {
         name: value for name, value in plain.items() if value is None or isinstance(value, str | float | int | tuple)
@@ -257,6 +285,14 @@ def test_an_option_reaches_its_argument_and_no_other_and_left_out_is_what_its_he
     given, others = ({one.places.get(n, n): v for n, v in chosen(words).items()} for words in (one.line, one.others))
     assert {name: value for name, value in after.items() if value != before[name]} == others
     assert all(before[name] == value for name, value in given.items() if name in before or name in one.places.values())
+
+
+def test_every_folder_that_shall_be_merged_is_read() -> None:
+    reading = patch.object(loading, "load_so_far", side_effect=str)
+    merging = patch.object(loading, "merge", side_effect=ReachedError)
+    with reading, merging as merge, pytest.raises(ReachedError):
+        main("report a --merge b c --merge d --out here".split())
+    assert merge.call_args.args == (["a", "b", "c", "d"], Path("here"))
 
 
 _PUPIL = "arrow_puzzle --preset smoke --agents pupil"

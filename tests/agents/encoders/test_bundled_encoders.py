@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from contextlib import closing
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard, bundled_encoder
+from imagine_bench.agents.encoders.latent_observation import LatentObservation
 from imagine_bench.agents.encoders.probe import Latents
 from imagine_bench.agents.encoders.recipes import RECIPES
 from imagine_bench.agents.encoders.training import draw_frames
 
 import imagine_bench  # noqa: F401  (registers the environments)
 from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import appearance_of_tests
 from imagine_bench.seeding import SeedTree
 
@@ -52,6 +55,15 @@ def test_bundled_encoder_reads_fresh_frames_as_its_card_says(task: str, appearan
     assert read_sampled >= expected - 3 * math.sqrt(max(expected * (1 - expected), 0.005) * frames_of_both)
     shuffled = (encoder.read_macrostate(mu) == np.roll(macrostates, 1, axis=0)).all(axis=1).mean()
     assert shuffled < 2 / len(spec.rules.states) + 0.04  # the same measure fails where it should
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_an_encoder_that_reads_frames_otherwise_than_the_task_declares_is_refused(wrapped: bool) -> None:
+    with closing(gymnasium.make("imagine_bench/PickPlace-v0", disable_env_checker=True)) as made:
+        env = made if wrapped else made.unwrapped
+        assert LatentObservation(env, "pick_place-clean").observation_space.shape == (4,)
+        with pytest.raises(InvalidValueError, match="reads frames as 'gray_strips', this environment's task declares"):
+            LatentObservation(env, "arrow_puzzle-clean")
 
 
 @pytest.mark.parametrize("task", sorted({name for name, *_ in TARGETS}))

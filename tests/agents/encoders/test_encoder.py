@@ -14,7 +14,7 @@ import pytest
 import torch
 from encoder_frames import CHAPTER_5, QUICK, TINY, TINY_CONV, arrow_spec, draw
 from imagine_bench.agents.encoders import perception, training
-from imagine_bench.agents.encoders.cli import retrain
+from imagine_bench.agents.encoders.cli import retrain, sample_sheet
 from imagine_bench.agents.encoders.encoder import Encoder, EncoderCard
 from imagine_bench.agents.encoders.probe import Latents
 from imagine_bench.agents.encoders.recipes import Recipe, recipe_named
@@ -235,6 +235,9 @@ def test_probes_read_frames_and_looks_that_training_never_saw() -> None:
         float((made.read_macrostate(made.encode(seen)[0]) == states).all(axis=1).mean()) for _, states, seen in drawn
     ]
     assert made.card.probe["mlp"] == pytest.approx(read[1]) != pytest.approx(read[0]), "measured on frames held out"
+    mu, sigma = made.encode(drawn[1][2])
+    information = 0.5 * (mu.square() + sigma.square() - 1.0 - 2.0 * sigma.log()).sum(dim=1).mean()
+    assert made.card.kl_nats == pytest.approx(information.item(), abs=2e-3)
     assert [(looks, len(seen)) for looks, _, seen in drawn] == [("photo", 60), ("photo_held_out", 30)]
     first, second = ({frame.tobytes() for frame in seen} for *_, seen in drawn)
     assert first.isdisjoint(second)
@@ -322,6 +325,17 @@ def test_a_full_memory_of_frames_forgets_the_oldest(tiny: Encoder, monkeypatch: 
     for frame in shown:
         assert torch.equal(sees.posterior(frame)[0], tiny.encode(frame[None])[0][0])
     assert [frame.tobytes() for frame in shown[2:]] == list(sees._recent)
+
+
+def test_below_a_column_of_the_sheet_stands_what_was_read_red_where_it_is_wrong(encoder: Encoder) -> None:
+    shown = frames(3)
+    read = encoder.read_macrostate(encoder.encode(shown)[0])
+    truth = read.copy()
+    truth[1, 0] = (truth[1, 0] + 1) % 4
+    figure = sample_sheet(encoder, arrow_spec(), shown, truth, torch.Generator().manual_seed(0))
+    below = [axes.xaxis.label for axes in figure.axes[-3:]]
+    assert [label.get_text().split("\n") for label in below] == [list(arrow_spec().value_names(each)) for each in read]
+    assert [label.get_color() for label in below] == ["black", "red", "black"]
 
 
 def made(out: Path, recipe: Any = QUICK, appearance: str = "mild", **how: Any) -> str:

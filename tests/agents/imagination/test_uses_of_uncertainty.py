@@ -108,6 +108,11 @@ def test_a_shown_rollout_is_accepted_as_far_as_it_has_gathered_little() -> None:
     limit = float(np.cumsum(epistemic)[3]) * 1.001
     assert shown(threshold=limit, accumulates=True).accepted.tolist() == [True] * 4 + [False] * 4
     assert shown(threshold=max(limit, float(epistemic.max()))).accepted.all(), "no step alone is too uncertain"
+    below = int(np.argmax(np.diff(epistemic) < 0.0))  # the first step whose next is less uncertain
+    limit = float(epistemic[below : below + 2].mean())
+    kept = np.logical_and.accumulate(epistemic < limit)
+    assert shown(threshold=limit).accepted.tolist() == kept.tolist(), "nothing after a discarded step is kept"
+    assert (epistemic < limit).sum() > kept.sum()
 
 
 def test_known_noise_pays_nothing_to_the_bit() -> None:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import functools
+import itertools
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
+from unittest import mock
 
 import numpy as np
 import pytest
 import torch
 from imagine_bench.tasks.scenes.constants import TABLE_HEIGHT_M
+from imagine_bench_motion import trials
 from imagine_bench_motion.cloning import Clone, Standardisation, Training, _varied, train
 from imagine_bench_motion.demonstrations import DemonstrationData, collect, turn_of
 from imagine_bench_motion.instruction import GO_BACK, words_vector
@@ -155,6 +159,15 @@ def test_swapped_images_are_those_of_another_start() -> None:
     assert np.abs(first[0]["proprio"] - second[0]["proprio"]).max() > 0.01
     with pytest.raises(InvalidValueError, match="no images to swap"):
         tries(ScriptedClone(), 1, seed=3, swapped=True)
+
+
+def test_every_macro_action_is_tried_at_every_appearance() -> None:
+    def noted(env: Any, clone: object, macro_action: int, *others: object) -> tuple[str, int]:
+        return env.world.level.name, macro_action
+
+    with mock.patch.object(trials, "one_try", noted):
+        found = tries(ScriptedClone(), 2 * 12, seed=0)
+    assert Counter(found) == dict.fromkeys(itertools.product(("clean", "mild"), range(6)), 2)
 
 
 class Counting(ChunkPolicy):

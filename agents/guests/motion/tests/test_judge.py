@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
+from imagine_bench_motion.judge.interface import MotionModelEntry
 from imagine_bench_motion.judge.judgement import SIMULATOR, MotionJudgement, judge, judged
 from imagine_bench_motion.judge.labelled import Labelled
 from imagine_bench_motion.judge.no_change import NoChange
@@ -22,7 +23,17 @@ from imagine_bench_motion.judge.report import motion_tables
 from imagine_bench_motion.judge.scores import Simulator, score
 
 from imagine_bench.arrays import Array, Ints
-from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
+from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, UnknownNameError
+
+
+@pytest.mark.parametrize("others", [{}, {"encoder_kind": "latents"}])
+def test_a_model_of_no_known_level_or_encoder_is_no_entry(others: dict[str, str]) -> None:
+    made = {"make": "theirs:Model", "description": "A model.", "level": "commands", **others}
+    MotionModelEntry(**made)
+    for wrong in ({"level": "pixels"}, {"encoder_kind": "words"}):
+        with pytest.raises(UnknownNameError, match=r"pixels|words"):
+            MotionModelEntry(**{**made, **wrong})
+
 
 FEW = MotionJudgement(task="arrow_puzzle", models=("no_change",), sizes=(3,), seeds=(0,), pairs=2, chains=1)
 FAMILIES = {"arrows": make_arrows, "pick_place": make_pick_place}

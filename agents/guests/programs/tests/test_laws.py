@@ -441,6 +441,30 @@ class ByteSymbols(Symbols):
         return np.array(states) + 10
 
 
+class LateSymbols(ByteSymbols):
+    """The code of a frame is its first byte."""
+
+    def __init__(self) -> None:
+        self.sizes = (5,)
+
+    def read(self, frames: Frame) -> list[State]:
+        return [(each,) for each in frames[:, 0, 0, 0].tolist()]
+
+
+def test_the_agent_tells_its_writer_that_an_episode_begins() -> None:
+    """Else the first plan would begin after macro-actions of the episode before, which no frame will show."""
+    context = AgentContext(n_actions=2, preprocessing="none", encoder=None, seeds=SeedTree(0))
+    agent = LawsAgent(LateSymbols(), context)
+    for each in late(1, episodes=40):
+        agent.writer.learn(each)
+    start = Observation(frame=np.full((64, 64, 3), 2, dtype=np.uint8))
+    plans = []
+    for _ in range(2):
+        agent.begin_episode()
+        plans.append([agent.act(start, explore=False) for _ in range(2)])
+    assert plans[0] == plans[1] and plans[0][0] != plans[0][1], "the second counts the first, which is still to show"
+
+
 def test_the_agents_expectations_are_those_of_its_laws() -> None:
     context = AgentContext(n_actions=2, preprocessing="none", encoder=None, seeds=SeedTree(0))
     agent = LawsAgent(ByteSymbols(), context)

@@ -43,6 +43,15 @@ def test_a_sampled_value_is_as_uncertain_as_its_component() -> None:
             assert found.item() == pytest.approx(variance, rel=1e-5)
 
 
+def test_a_value_between_two_components_is_of_each_by_its_density() -> None:
+    """Components N(0, 1) and N(4, 3) at the value 2: densities of exp(-2) / 1 and exp(-2 / 9) / 3."""
+    both = mixtures([[0.5, 0.5]] * 2, [[0.0, 4.0]] * 2, [[1.0, 3.0]] * 2)
+    narrow, wide = math.exp(-2.0), math.exp(-2.0 / 9.0) / 3.0
+    expected = (narrow * 1.0 + wide * 9.0) / (narrow + wide)
+    sampled = torch.tensor([[2.0]], dtype=torch.float64)
+    assert sampled_component_variance(both, mdn.average(both), sampled).item() == pytest.approx(expected, rel=1e-6)
+
+
 def divergence(found: Mixture, draws: int) -> float:
     return jensen_shannon(found, draws, torch.Generator().manual_seed(0))[0].item()
 

@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -192,6 +192,22 @@ def test_a_player_comes_back_to_another_server(tmp_path: Path) -> None:
 def test_large_requests_are_refused(refusing: Server, body: bytes, headers: dict[str, str], status: int) -> None:
     found, answer = ask(refusing, "/reset", body, **headers)
     assert found == status and set(answer) == {"error"}
+
+
+@pytest.mark.parametrize(
+    ("path", "headers"),
+    [("/nothing", {}), ("/health", {}), ("/reset", {"Origin": "http://elsewhere"}), ("/reset", {"Host": "elsewhere"})],
+)
+def test_a_refused_request_leaves_nothing_of_its_body_to_the_next(
+    refusing: Server, path: str, headers: dict[str, str]
+) -> None:
+    with closing(http.client.HTTPConnection("127.0.0.1", refusing.server_port, timeout=30)) as line:
+        line.request("POST", path, b"GET /state HTTP/1.1\r\n\r\n", headers)
+        with line.getresponse() as answer:
+            assert answer.status >= 400 and set(json.loads(answer.read())) == {"error"}
+        line.request("GET", "/health")
+        with line.getresponse() as answer:
+            assert (answer.status, json.loads(answer.read())) == (200, {"status": "healthy"})
 
 
 class Line:
