@@ -99,6 +99,15 @@ def test_seeds_of_two_benches_are_those_of_one_in_any_order(tmp_path: Path) -> N
         assert np.array_equal(joined.success_rates(agent), whole.success_rates(agent))
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+def test_each_kind_of_encoder_may_be_named_by_some_benches_only(tmp_path: Path, order: tuple[int, ...]) -> None:
+    latents, codes = "a@0123456789ab", "c@ba9876543210"
+    named: tuple[dict[str, Any], ...] = ({"encoder": latents}, {"codes": codes}, {})
+    made = [do(tmp_path / str(seed), "oracle", seeds=(seed,), **each) for seed, each in enumerate(named)]
+    joined = load_merged([made[each] for each in order], tmp_path).protocol
+    assert (joined.encoder, joined.codes) == (latents, codes)
+
+
 def test_headlines_may_differ(tmp_path: Path) -> None:
     first = do(tmp_path, "oracle", "random", seeds=(0,), headlines=(("oracle", "random"),))
     second = do(tmp_path / "other", "oracle", "random", seeds=(2,))

@@ -9,6 +9,8 @@ from imagine_bench.agents.settings import PROBABILITY, ConfigGroup, Hyperparamet
 
 _MANY = "BBF's replay ratio"
 _SLOW = "a slowly updated target network, as BBF's"
+PRIORITIES = frozenset({"memory.priority", "memory.priority_correction"})
+"""Settings that agents without prioritised replay do without."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +44,12 @@ class EfficientSettings(DQNSettings):
     reuse: ReuseSettings = field(default_factory=ReuseSettings)
 
 
-def _hyperparameters(published: S, published_3: S, more: dict[str, Override]) -> Hyperparameters[S]:
+def _hyperparameters(
+    published: S, published_3: S, more: dict[str, Override], unused: frozenset[str] = frozenset()
+) -> Hyperparameters[S]:
     def group(settings: S, fast: dict[str, Override]) -> ConfigGroup[S]:
         quick = {**fast, **more}
-        return ConfigGroup(settings, {"minimal": quick, "fast": quick, "published": more})
+        return ConfigGroup(settings, {"minimal": quick, "fast": quick, "published": more}, unused)
 
     return Hyperparameters({"chapter_3": group(published_3, FAST_3), "chapter_5": group(published, FAST_5)})
 
@@ -57,4 +61,5 @@ EFFICIENT = _hyperparameters(
         "controller.updates_per_step": Override(8, _MANY),
         "controller.target_rate": Override(0.02, _SLOW),
     },
+    PRIORITIES,
 )  # fmt: skip

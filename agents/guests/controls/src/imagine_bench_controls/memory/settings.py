@@ -21,6 +21,8 @@ from imagine_bench.agents.settings import (
     setting,
 )
 
+from ..settings import PRIORITIES
+
 
 @dataclass(frozen=True, kw_only=True)
 class RecurrenceSettings:
@@ -59,7 +61,6 @@ _FAST_IMAGINATION = {
     **_FAST_DQN,
     "model.batch_size": Override(32, "CPU time; each row is a sequence of several transitions"),
 }
-_UNUSED = frozenset({"memory.priority", "memory.priority_correction"})
 S = TypeVar("S", RecurrentDQNSettings, RecurrentSettings)
 
 
@@ -78,7 +79,7 @@ def _with_memory(
     groups = {}
     for name, group in base.groups.items():
         sets = {each: {**changes, **({} if each == "published" else fast)} for each, changes in group.sets.items()}
-        groups[name] = ConfigGroup(replaced(kind(), flatten(group.published)), sets, unused=_UNUSED)
+        groups[name] = ConfigGroup(replaced(kind(), flatten(group.published)), sets, unused=PRIORITIES)
     return Hyperparameters(groups)
 
 

@@ -1,0 +1,119 @@
+"""Every setting of an agent changes what it learns: no way through its code leaves one out."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import pytest
+from fake_latents import ACTIONS, SMALL, FakeEncoder, live
+from imagine_bench.agents.encoders import perception
+
+from imagine_bench import registry
+from imagine_bench.interfaces import AgentContext
+from imagine_bench.interfaces.capabilities import ModelOnlyTrainer
+from imagine_bench.seeding import SeedTree
+
+BASE: dict[str, Any] = {
+    **SMALL,
+    "memory.real": 9,
+    "memory.imagined": 8,
+    "memory.priority": 0.5,
+    "controller.epsilon_max": 0.7,
+    "controller.epsilon_min": 0.3,
+    "controller.epsilon_decay": 0.4,
+    "controller.target_rate": 0.5,
+    "model.dropout": 0.5,
+    "model.max_norm": 0.5,
+    "model.precision": "float32",
+    "imagination.start_episode": 1,
+    "imagination.end_episode": 4,
+    "imagination.breadth": 4,
+    "imagination.threshold": 0.002,
+    "imagination.exploration": 0.9,
+    "imagination.curiosity": 0.5,
+    "imagination.model_only_episodes": 30,
+    "recurrence.burn_in": 1,
+    "recurrence.sequence": 1,
+    "reuse.reset_every": 8,
+}
+"""Settings with which all others count."""
+OTHERS: dict[str, dict[str, Any]] = {
+    "controller.epsilon_decay": {"controller.epsilon_decay": 5.0},
+    "imagination.threshold": {"imagination.threshold": 1e-9},
+    "model.precision": {"model.precision": "bfloat16"},
+    "model.shared_hidden": {"model.shared_hidden": (8,), "model.reward_hidden": (), "model.termination_hidden": ()},
+    "recurrence.burn_in": {"recurrence.burn_in": 0},
+    "reuse.steps": {"reuse.steps": 1},
+}
+"""Other values than those that follow from the type of a setting, and the settings that they need."""
+_PRIORITIES = {"memory.priority", "memory.priority_correction"}
+_ROLLOUTS = {f"imagination.{name}" for name in ("start_episode", "end_episode", "start_states", "breadth")}
+INERT = {
+    "dqn": set[str](),
+    "dqn_efficient": _PRIORITIES,
+    "drqn": _PRIORITIES,
+    "imagination_uncertainty": {"imagination.model_only_episodes"},
+    "imagination_only_uncertainty": _ROLLOUTS | {"imagination.updates_per_step"},
+}
+"""Agents, and the settings of each that change nothing: it replays otherwise, or imagines whole episodes."""
+
+
+def other(setting: str, value: Any, allowed: Any) -> dict[str, Any]:
+    """Another value of a setting."""
+    if setting in OTHERS:
+        return OTHERS[setting]
+    if isinstance(allowed, tuple):
+        return {setting: next(word for word in allowed if word != value)}
+    if isinstance(value, bool):
+        return {setting: not value}
+    if isinstance(value, tuple):
+        return {setting: (value[0] + 1, *value[1:])}
+    return {setting: 0.1 if not value else value + 1 if isinstance(value, int) else 0.5 * value}
+
+
+def settings_of(agent: str) -> dict[str, tuple[Any, Any]]:
+    """The value of each setting, and the allowed ones; of training in the model alone those of its imagination."""
+    found = registry.settings(agent, "published", BASE, "chapter_5")
+    sections = {part.name: getattr(found, part.name) for part in fields(found)}
+    only = {"imagination"} if agent.startswith("imagination_only") else sections.keys()
+    return {
+        f"{name}.{each.name}": (getattr(section, each.name), each.metadata["allowed"])
+        for name, section in sections.items()
+        if name in only
+        for each in fields(section)
+    }
+
+
+@functools.cache
+def learned(agent: str, settings: tuple[tuple[str, Any], ...] = ()) -> dict[str, Any]:
+    """All that an agent has after six short episodes, but its settings."""
+    context = AgentContext(
+        n_actions=ACTIONS,
+        preprocessing="gray_strips",
+        encoder=Path("fake.safetensors"),
+        seeds=SeedTree(0),
+        hyperparameters="published",
+        overrides=registry.own_settings(agent, {**BASE, **dict(settings)}),
+    )
+    with mock.patch.object(perception, "Encoder", FakeEncoder):
+        learner = registry.make_agent(agent, context)
+    actions = live(learner, range(6), np.random.default_rng(1))
+    if isinstance(learner, ModelOnlyTrainer):
+        while learner.train_in_model():
+            pass
+        actions += live(learner, range(6, 7), np.random.default_rng(2))
+    state = learner.state()
+    values = {name: value for name, value in state.values.items() if name not in ("settings", "meters")}
+    arrays = {name: array.tobytes() for name, array in state.arrays.items() if name != "imagination/threshold"}
+    return {"actions": actions, **values, **arrays}
+
+
+@pytest.mark.parametrize(("agent", "setting"), [(agent, name) for agent in INERT for name in settings_of(agent)])
+def test_a_setting_changes_what_is_learned(agent: str, setting: str) -> None:
+    changed = other(setting, *settings_of(agent)[setting])
+    assert (learned(agent, tuple(changed.items())) == learned(agent)) == (setting in INERT[agent])
