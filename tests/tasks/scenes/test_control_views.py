@@ -14,7 +14,7 @@ from imagine_bench.tasks.rendering.cameras import DRAWN_GROUPS, agent_camera_vie
 from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import AppearanceSampler, appearance, appearance_arrays
 from imagine_bench.tasks.scenes.arm import FINGER_JOINTS, TIP_IN_NAME
-from imagine_bench.tasks.scenes.control_views import varied_by_appearance
+from imagine_bench.tasks.scenes.control_views import _RGBA, varied_by_appearance
 
 CUBES = (1, 2, 3, 4, 5, 6)
 PICK = 0
@@ -171,3 +171,22 @@ def test_strong_appearance_varies_each_camera_and_the_coarse_arm(control, camera
         assert len(moved) == len(np.unique(moved, axis=0)) == cameras
     assert np.abs(places[model.camera(c.AGENT_CAMERA).id]).max() > 0
     assert (np.abs(colors).sum(axis=1) > 0).sum() == materials
+
+
+@pytest.mark.parametrize("control", [False, True])
+@pytest.mark.parametrize("cubes", [3, PICK])
+def test_a_strong_scene_varies_all_that_its_cameras_show_and_drawn_parts_touch_nothing(
+    cubes: int, control: bool
+) -> None:
+    """The coarse arm is drawn for the cameras of continuous control alone, and there it varies too."""
+    looks = appearance("strong")
+    world = ArrowWorld(looks, Arrows(cubes=cubes), control=control) if cubes else PickWorld(looks, control=control)
+    model = world.model
+    colors, places = model.mat_rgba.copy(), model.cam_pos.copy()
+    world.vary(np.random.default_rng(0))
+    varied = {model.material(index).name for index in np.flatnonzero((model.mat_rgba != colors).any(axis=1))}
+    moved = {model.camera(index).name for index in np.flatnonzero((model.cam_pos != places).any(axis=1))}
+    assert moved == {c.AGENT_CAMERA, *(c.CONTROL_CAMERAS if control else ())}
+    assert {name for name in varied if name.startswith("control_")} == (set(_RGBA) if control else set())
+    drawn = np.isin(model.geom_group, (c.SETTING_GROUP, c.CONTROL_GROUP))
+    assert drawn.sum() > 5 and not model.geom_contype[drawn].any() and not model.geom_conaffinity[drawn].any()

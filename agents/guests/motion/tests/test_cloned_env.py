@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from imagine_bench.tasks.scenes.arm import FINGER_JOINTS
 from imagine_bench_motion.cloned_env import BUNDLED, CloneExecutedEnv
 from imagine_bench_motion.cloning import Clone
 from imagine_bench_motion.levels import make_agent
@@ -40,7 +41,7 @@ def test_a_clone_sees_images_of_its_own_size() -> None:
 
 
 def test_the_clone_turns_the_cube_that_it_is_asked_to_and_the_rules_judge_it() -> None:
-    """And its arm ends where it began."""
+    """And its arm ends where it began, with open fingers."""
     env = environment()
     rules = task("arrow_puzzle").rules
     done = 0
@@ -50,6 +51,7 @@ def test_the_clone_turns_the_cube_that_it_is_asked_to_and_the_rules_judge_it() -
         _, reward, terminated, truncated, info = env.step(action)
         assert not truncated
         np.testing.assert_allclose(env.motion.data.qpos[:7], joints_rad, atol=5e-3)
+        assert min(env.motion.data.joint(name).qpos[0] for name in FINGER_JOINTS) > 0.04
         if info["done"]:
             (expected,) = rules.outcomes(START, action)
             done += 1

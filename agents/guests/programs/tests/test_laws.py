@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -319,6 +320,19 @@ class BytePerception(LearnedPerception):
 
     def take(self, frame_factors: FrameFactors, found_in: int) -> None:
         self.frame_factors = frame_factors
+
+
+@pytest.mark.parametrize(("unknown", "first"), [(True, 111), (False, 200)])
+def test_factors_are_looked_for_again_sooner_where_an_image_shows_something_unknown(unknown: bool, first: int) -> None:
+    rng = np.random.default_rng(0)
+    perception = SeeingWriter(registry.task("arrows:cubes=2"), "clean", rng, rng).perception
+    perception.looked_at = 100
+    perception.unknown = unknown
+    perception.frames = [np.zeros((64, 64, 3), dtype=np.uint8)] * 100
+    with mock.patch.object(perception, "look") as look:
+        while not perception.renew():
+            perception.frames.append(perception.frames[0])
+    assert look.call_args.args == (first,)
 
 
 @pytest.mark.parametrize(("step", "keeps"), [(1, True), (2, False)])
