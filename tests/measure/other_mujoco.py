@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench_board import motions
-from imagine_bench_board.motion_rows import FORMAT, Motion, MotionProtocol, MotionRow, read_motions
+from imagine_bench_board.motion_rows import FORMAT, MotionProtocol, MotionRow, PlayedMotion, read_motions
 from imagine_bench_board.rows import read_card
 from numpy.typing import NDArray
 
@@ -37,7 +37,7 @@ def rows_of(folder: Path) -> list[MotionRow]:
     return [read_motions(row) for row in sorted(folder.iterdir()) if read_card(row).get("format") == FORMAT]
 
 
-def path_of(env: MotionEnv, protocol: MotionProtocol, test: int, motion: Motion) -> NDArray[np.float64]:
+def path_of(env: MotionEnv, protocol: MotionProtocol, test: int, motion: PlayedMotion) -> NDArray[np.float64]:
     """All positions (K, nq) at the start and after each command of a test, until its episode is over."""
     env.restart(seed=protocol.start(test))
     path = [env.data.qpos.copy()]
