@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import bench_fakes  # noqa: F401 - registers the fakes
@@ -22,8 +23,10 @@ from small_runs import Inline
 
 from imagine_bench import cli, errors, registry
 from imagine_bench.cli import exit_code as main
+from imagine_bench.cli import tools
 from imagine_bench.errors import ImagineBenchError, UnknownNameError
 from imagine_bench.protocols.control import PRESETS
+from imagine_bench.recording import stream
 from imagine_bench.registry import AGENTS, TASKS, WORLD_MODELS
 from imagine_bench.registry.entries import AgentConfiguration, parse_configuration
 from imagine_bench.store.bench_folder import newest_bench
@@ -266,3 +269,23 @@ def test_every_error_comes_back_from_a_worker_process(kind: type[ImagineBenchErr
     error = UnknownNameError("task", "arow", ["arrow"]) if kind is UnknownNameError else kind("the fault")
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is kind and str(again) == str(error) and vars(again) == vars(error)
+
+
+def test_demonstrations_are_recorded_anew_each_time_they_are_viewed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Others may lie in the folder by then."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / tools.CARD).write_text("{}")
+    collected, opened = ["old"], []
+
+    def record(episodes: str, index: int, file: Path) -> None:
+        file.write_text(f"{episodes}, episode {index}")
+
+    monkeypatch.setattr(tools, "read_demonstrations", lambda folder: collected[-1])
+    monkeypatch.setattr(tools, "demonstrations", lambda: SimpleNamespace(record=record))
+    monkeypatch.setattr(stream, "open_in_viewer", lambda file: opened.append((file.name, file.read_text())))
+    for content in ("old", "new"):
+        collected.append(content)
+        assert main(["view", str(tmp_path / "mine"), "--episode", "2"]) == 0
+    assert opened == [("mine-episode_2.rrd", f"{content}, episode 2") for content in ("old", "new")]

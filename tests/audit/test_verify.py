@@ -17,9 +17,10 @@ from kinds import take_row
 from small_runs import Inline, small, written
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError
+from imagine_bench.errors import ArtefactError, SetupError, UnknownNameError
 from imagine_bench.judge.verify import Replays, has_own_failures, verdicts
 from imagine_bench.protocols.control import protocol
+from imagine_bench.registry import AgentEntry
 from imagine_bench.report import bench_page
 from imagine_bench.report.page import texts
 from imagine_bench.running.bench import bench, load_bench
@@ -91,11 +92,20 @@ NAMED = {
 }
 
 
-def test_a_report_on_agents_that_are_not_installed_here_is_not_blamed(
-    finished: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("error", [UnknownNameError("agent", "table", ()), SetupError("Its package is not installed.")])
+def test_a_bench_of_agents_that_are_not_installed_here_is_not_blamed(
+    finished: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    monkeypatch.delitem(registry.AGENTS, "table")
-    *_, last = verify(finished)
+    entry = registry.agent_entry
+
+    def absent(agent: str) -> AgentEntry:
+        if agent == "table":
+            raise error
+        return entry(agent)
+
+    monkeypatch.setattr(registry, "agent_entry", absent)
+    first, *others, last = verify(finished)
+    assert str(first).startswith("table seed 0: holds") and [each.complaint for each in others] == ["", ""]
     assert str(last) == "report: not compared; not shown: its words, for no package here offers table"
 
 
