@@ -47,6 +47,8 @@ def test_headlines_of_a_preset_are_about_its_own_agents() -> None:
     assert {each.headlines for each in (*others, protocol("pick_place"))} == {()}
     assert protocol("arrow_puzzle", agents=("dqn",)).few_seeds == ()
     assert protocol("arrow_puzzle", seeds=(7,)).few_seeds == (), "nobody has more seeds than there are"
+    last = dict(protocol("arrow_puzzle", seeds=tuple(range(20, 30))).few_seeds)
+    assert (last.pop("imagination"), last.pop("dqn"), {*last.values()}) == (26, 25, {20}), "of seven, six and one"
 
 
 def test_headlines_are_corrected_for_one_another_and_for_all_looks(tmp_path: Path) -> None:

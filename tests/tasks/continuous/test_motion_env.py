@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from typing import Any
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -13,7 +14,7 @@ from imagine_bench.tasks.arrows.world import MAX_OFF_SLOT_M
 from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
-from imagine_bench.tasks.continuous.segments import least_seconds, measure
+from imagine_bench.tasks.continuous.segments import _move, least_seconds, measure
 from imagine_bench.tasks.world import Reading
 
 from imagine_bench.arrays import Floats
@@ -82,6 +83,19 @@ def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(family: str,
     assert (env.world.observed(after)[-1] == -1) == bool(hidden and not (family == "pick_place" and after[-1] == 4))
     seen = env.step(np.zeros(7, dtype=np.float32))[0]
     assert np.array_equal(seen["state"], first["state"]) == ("lag" in option)
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, -1, -1)])
+def test_a_segment_begins_with_the_hand_moved_and_turned_about_the_vertical(signs: tuple[int, ...]) -> None:
+    env, _ = environment("arrows")
+    env.reset(seed=0)
+    place_m, turned = env.controls.hand_pose(env.servo_targets()[:7])
+    _move(env, mock.Mock(uniform=mock.Mock(side_effect=[np.array(signs[:3]), signs[3]])))
+    then_m, then_turned = env.controls.hand_pose(env.servo_targets()[:7])
+    assert np.allclose(then_m - place_m, 0.04 * np.array(signs[:3]), atol=0.004)
+    turn = (then_turned @ turned.T)[:2, :2]
+    assert np.isclose(np.linalg.det(turn), 1.0, atol=0.002), "it does not tilt"
+    assert math.degrees(math.atan2(turn[1, 0], turn[0, 0])) == pytest.approx(15.0 * signs[3], abs=1.0)
 
 
 @pytest.mark.parametrize("cubes", range(1, 7))
