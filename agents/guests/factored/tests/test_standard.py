@@ -163,3 +163,8 @@ def test_crops_that_are_all_hidden_in_part_are_compared_by_the_rest() -> None:
     hidden[:, 0] = np.nan
     apart = appearance.distances(hidden, whole, mask, 1e-6)
     assert (apart.argmin(axis=1) == np.arange(3)).all()
+    half = whole.shape[1] // 2
+    hidden[:, :half] = np.nan
+    whole[:, :half] *= 20.0
+    apart = appearance.distances(hidden, whole, mask, 1e-6)
+    assert apart.diagonal() == pytest.approx([0.0] * 3, abs=1e-5) and (apart + np.eye(3)).min() > 0.05

@@ -102,12 +102,17 @@ def test_questions_are_the_same_after_they_were_in_a_file() -> None:
     assert all(np.array_equal(arrays[name], again[name]) for name in arrays)
 
 
-def test_a_model_is_given_each_part_of_a_motion_in_its_place() -> None:
+def test_a_model_is_given_each_part_of_a_motion_in_its_place_and_in_a_chain_its_own_frames() -> None:
     asked = questions("arrows")
-    with mock.patch.object(Simulator, "imagine_motion", side_effect=[each.after for each in every(asked)]) as given:
+    planned, raised, first, second = every(asked)
+    answers = [planned.after, raised.after, first.after[::-1], second.after]
+    with mock.patch.object(Simulator, "imagine_motion", side_effect=answers) as given:
         score("noting", Simulator(asked), asked, KnownFrames(asked))
     wanted = [(each.actions, each.lengths, each.labels) for each in every(asked)]
     assert [tuple(map(id, call.args[1:])) for call in given.call_args_list] == [tuple(map(id, each)) for each in wanted]
+    begun = [planned.before, raised.before, first.before, first.after[::-1]]
+    assert all(np.array_equal(call.args[0], each) for call, each in zip(given.call_args_list, begun, strict=True))
+    assert not np.array_equal(begun[-1], second.before)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
