@@ -252,10 +252,11 @@ def test_every_import_goes_down_and_every_draw_has_a_generator() -> None:
 
 
 def test_no_class_name_is_defined_twice() -> None:
+    """Neither in the core nor in its guests, private ones included."""
     where: dict[str, list[str]] = {}
-    for path in _MODULES.values():
+    for path in [*_MODULES.values(), *_GUESTS]:
         for node in ast.walk(parsed(path.read_text())):
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            if isinstance(node, ast.ClassDef):
                 where.setdefault(node.name, []).append(str(path.relative_to(_TOP)))
     assert {name: files for name, files in where.items() if len(files) > 1} == {}
 
