@@ -37,7 +37,7 @@ class LearnerRun:
     done: bool  #: whether it knew an optimal policy when it stopped
 
 
-class _Learner:
+class CautiousLearner:
     """One learner in the machine. ``E`` dynamics entries, of which the first is always known; ``Q`` points."""
 
     def __init__(self, machine: Machine, graph: FactorGraph, horizon: int) -> None:
@@ -253,7 +253,7 @@ class _Learner:
 
 def learn(machine: Machine, graph: FactorGraph, horizon: int, rng: np.random.Generator) -> LearnerRun:
     """Let one learner learn until it is done."""
-    learner = _Learner(machine, graph, horizon)
+    learner = CautiousLearner(machine, graph, horizon)
     transitions = 0
     episodes = 0
     done = learner.solve()

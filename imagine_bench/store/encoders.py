@@ -22,7 +22,7 @@ from imagine_bench.registry.entries import file_name
 from imagine_bench.rules import states_of
 from imagine_bench.store.files import expanded, lock, make_folder, reading, sha256
 
-_TRAIN = "imagine_bench.agents.encoders.cli:retrain"
+TRAIN = "imagine_bench.agents.encoders.cli:retrain"
 _FIT = "imagine_bench.agents.encoders.training:fit_offered"
 _BUNDLED_AT = [name for name in APPEARANCES if name != "harsh"]
 """Named appearances for which encoders are made beforehand; for all others they are trained on first use."""
@@ -142,7 +142,7 @@ def own(spec: TaskSpec, appearance: str, kind: str = "latents") -> Path:
     recipe = "codes" if kind == "codes" else "default"
     what = f"{spec.id} has no encoder for {kind} at {appearance_typed(appearance)}; one is trained"
     settings = {"recipe": recipe, "appearance": appearance, "seed": 0, "out": path.parent}
-    _once(path, what, lambda: registry.load(_TRAIN)(spec, **settings))
+    _once(path, what, lambda: registry.load(TRAIN)(spec, **settings))
     return path
 
 

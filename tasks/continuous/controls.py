@@ -75,7 +75,7 @@ class HandControl:
         self.control = require_known("control", control, CONTROL_NAMES)
         self.names = CONTROL_NAMES[control]
         self._ik = DifferentialIK(arm)
-        self._most_rad = arm.speed_limit_rad_s * period_s
+        self.most_rad = arm.speed_limit_rad_s * period_s
         self._most_m = FINGER_SPEED_M_S * period_s
         self._per_unit = np.array([HAND_SPEED_M_S] * 3 + [HAND_TURN_RAD_S] * 3) * period_s
         self._lowest_m = np.array(WORKSPACE_LOW_M)
@@ -126,7 +126,7 @@ class HandControl:
         elif self.control == "pose":
             joints_rad, limited = self._by_pose(action[:3], action[3:7], joints_rad)
         else:
-            most_rad = self._most_rad
+            most_rad = self.most_rad
             asked_rad = action[:-1] * most_rad if self.control == "joint_delta" else action[:-1] - joints_rad
             step_rad = np.minimum(np.maximum(asked_rad, -most_rad), most_rad)
             within_rad = np.minimum(np.maximum(joints_rad + step_rad, self._ik.lower_rad), self._ik.upper_rad)
@@ -139,13 +139,13 @@ class HandControl:
         target_m = place_m + motion[:3]
         inside_m = np.minimum(np.maximum(target_m, self._lowest_m), self._highest_m)
         motion[:3] = inside_m - place_m
-        step_rad, missed = self._ik.step(motion, self._most_rad)
+        step_rad, missed = self._ik.step(motion, self.most_rad)
         outside = inside_m.tolist() != target_m.tolist()
         return joints_rad + step_rad, "workspace" if outside else "reach" if missed else ""
 
     def _by_pose(self, target_m: Floats, quat: Floats, joints_rad: Floats) -> tuple[Floats, str]:
         target_quat = quat / np.linalg.norm(quat)
-        room_rad = self._most_rad.copy()
+        room_rad = self.most_rad.copy()
         missed = False
         at_quat = np.empty(4)
         in_hand_rad = np.empty(3)

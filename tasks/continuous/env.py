@@ -216,9 +216,9 @@ class MotionEnv(SceneEnv):
         self.controls = HandControl(control, ArmModel(), self.period_s)
         self.control_names = self.action_names = self.controls.names
         self.action_space = self.controls.space
-        self._columns = arm_columns(self.model)
+        self.columns = arm_columns(self.model)
         self._ramp = (np.arange(1, self._n_steps + 1) / self._n_steps)[:, None]
-        self._referee = Referee(self.world, spec.rules, spec.macrostate_values)
+        self.referee = Referee(self.world, spec.rules, spec.macrostate_values)
         self._observer = Observer(observation, size, self.world, spec.macrostate_values, self.camera, control=True)
         self.observation_space = self._observer.space
         self.time_limit_s = SECONDS_PER_MACRO_ACTION * spec.horizon
@@ -255,7 +255,7 @@ class MotionEnv(SceneEnv):
             InvalidValueError: As :meth:`step`.
         """
         self._require_begun()
-        before = self.data.ctrl[self._columns.ctrl]
+        before = self.data.ctrl[self.columns.ctrl]
         change, limited = self._servo_change(self.checked(action), before)
         period = self._advance(before + self._ramp * change, limited)
         self.world.update()
@@ -273,7 +273,7 @@ class MotionEnv(SceneEnv):
         """
         self._require_begun()
         actions = actions[: max(0, math.ceil(self.time_limit_s / self.period_s) - self.episode.periods)]
-        before = self.data.ctrl[self._columns.ctrl]
+        before = self.data.ctrl[self.columns.ctrl]
         commands = []
         limits = []
         for action in self.controls.checked(actions, len(actions)):
@@ -295,9 +295,9 @@ class MotionEnv(SceneEnv):
         Raises:
             InvalidValueError: As :meth:`step`.
         """
-        before = self.data.ctrl[self._columns.ctrl]
+        before = self.data.ctrl[self.columns.ctrl]
         change, self.episode.limited = self._servo_change(self.checked(action), before)
-        self.data.ctrl[self._columns.ctrl] = before + change
+        self.data.ctrl[self.columns.ctrl] = before + change
 
     def observe(self, envs: Sequence[MotionEnv]) -> list[Observed]:
         """The observations of :meth:`reset` and :meth:`step` for environments like this, by its cameras; once a
@@ -333,18 +333,18 @@ class MotionEnv(SceneEnv):
 
     def hand_target_m(self) -> Floats:
         """Where the servos are told to bring the point between the fingers, in the world. Shape (3,)."""
-        return self.controls.hand_pose(self.data.ctrl[self._columns.ctrl[: len(ARM_JOINTS)]])[0]
+        return self.controls.hand_pose(self.data.ctrl[self.columns.ctrl[: len(ARM_JOINTS)]])[0]
 
     def servo_targets(self) -> Floats:
         """The servos' present commands: the seven joints (rad), and the opening of each finger (m). Shape (8,)."""
-        targets: Floats = self.data.ctrl[self._columns.ctrl[: len(ARM_JOINTS) + 1]].copy()
+        targets: Floats = self.data.ctrl[self.columns.ctrl[: len(ARM_JOINTS) + 1]].copy()
         return targets
 
     def servo_forces(self) -> Floats:
         """The present efforts of the servos: torques of the seven joints (N m), forces of both fingers (N). Shape
         (9,).
         """
-        forces: Floats = self.data.actuator_force[self._columns.ctrl].copy()
+        forces: Floats = self.data.actuator_force[self.columns.ctrl].copy()
         return forces
 
     def get_state(self) -> MotionState:
@@ -413,7 +413,7 @@ class MotionEnv(SceneEnv):
     def _simulate(self, servos: Floats) -> None:
         """Simulate the steps of a control period, each with its commands to the servos. Shape (steps, 9)."""
         model, data, ctrl = self.model, self.data, self.data.ctrl
-        columns = self._columns.ctrl
+        columns = self.columns.ctrl
         step = mujoco.mj_step
         for commands in servos:
             ctrl[columns] = commands
@@ -423,8 +423,8 @@ class MotionEnv(SceneEnv):
         """The event of the period that is over, with all that it changes in the scene."""
         episode = self.episode
         if self._slip:
-            self._slip_or_hold(self._referee.touched())
-        event = self._referee.event(episode.macrostate, self.np_random)
+            self._slip_or_hold(self.referee.touched())
+        event = self.referee.event(episode.macrostate, self.np_random)
         episode.latest = event
         if event is None:
             return None
@@ -439,7 +439,7 @@ class MotionEnv(SceneEnv):
     def _slip_or_hold(self, touched: Ints) -> None:
         """Draw at the beginning of a grip whether it slips; it is over when the fingers are told to open."""
         episode = self.episode
-        told_m = float(self.data.ctrl[self._columns.ctrl[-1]])
+        told_m = float(self.data.ctrl[self.columns.ctrl[-1]])
         if episode.gripped_m is None and bool((touched & GRIPPED == GRIPPED).any()):
             episode.gripped_m = told_m
             held_at_start = episode.periods == 1

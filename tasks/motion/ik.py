@@ -59,8 +59,8 @@ class ArmIK:
     """Solves for the seven joints, one call a waypoint. A solution depends on the arguments alone."""
 
     def __init__(self, arm: ArmModel) -> None:
-        self._configuration = mink.Configuration(arm.model)
-        self._reach = mink.FrameTask(
+        self.configuration = mink.Configuration(arm.model)
+        self.frame_task = mink.FrameTask(
             TCP_SITE, "site", position_cost=1.0, orientation_cost=_ORIENTATION_COST, lm_damping=_FAR_DAMPING
         )
         self._home_rad = np.array(HOME_QPOS_RAD)
@@ -85,29 +85,29 @@ class ArmIK:
         Raises:
             UnreachableTargetError: No convergence; the message gives target and residual.
         """
-        self._reach.set_target(mink.SE3.from_rotation_and_translation(pointing_down(yaw_rad), place_m))
-        self._configuration.update(start_qpos_rad)
+        self.frame_task.set_target(mink.SE3.from_rotation_and_translation(pointing_down(yaw_rad), place_m))
+        self.configuration.update(start_qpos_rad)
         for step in range(_MAX_STEPS + 1):
-            error = self._reach.compute_error(self._configuration)  # [6], position then rotation vector
+            error = self.frame_task.compute_error(self.configuration)  # [6], position then rotation vector
             error_m = math.hypot(*error[:3])
             angle_rad = math.hypot(*error[3:])
             if error_m < POSITION_TOLERANCE_M and angle_rad < ANGLE_TOLERANCE_RAD:
-                return IKSolution(qpos_rad=self._configuration.q.copy(), error_m=error_m)
+                return IKSolution(qpos_rad=self.configuration.q.copy(), error_m=error_m)
             if step < _MAX_STEPS:
-                self._configuration.integrate_inplace(self._step(), 1.0)
+                self.configuration.integrate_inplace(self.next_step(), 1.0)
         raise UnreachableTargetError(
             f"The gripper cannot reach {np.round(place_m, 4).tolist()} m at yaw {math.degrees(yaw_rad):.0f} deg: after "
             f"{_MAX_STEPS} steps {1000 * error_m:.1f} mm and {math.degrees(angle_rad):.1f} deg are missing; choose a "
             "target nearer to the middle of the table."
         )
 
-    def _step(self) -> Floats:
+    def next_step(self) -> Floats:
         """The next step in the joints (7,): ``mink.solve_ik``'s to the bit, in a third of its time.
 
         Nothing is made, looked up or checked again that is the same in every step.
         """
-        joints_rad = self._configuration.data.qpos
-        self._weights[:6], error, damping = self._reach.compute_qp_residual(self._configuration)
+        joints_rad = self.configuration.data.qpos
+        self._weights[:6], error, damping = self.frame_task.compute_qp_residual(self.configuration)
         hessian = self._weights.T @ self._weights
         hessian.flat[:: len(hessian) + 1] += _DAMPING + damping
         errors = np.concatenate([error, _POSTURE_COST * (self._home_rad - joints_rad)])

@@ -314,8 +314,8 @@ class Renderer:
         require_known("camera", view.camera, [model.camera(index).name for index in range(model.ncam)])
         self.view = view
         self._model = model
-        self._canvas: _Canvas | None = None
-        self._option, self._camera, self._scene = _drawing(model, view)
+        self.canvas: _Canvas | None = None
+        self.option, self.camera, self.scene = _drawing(model, view)
 
     @functools.cached_property
     def _drawn_as(self) -> bytes:
@@ -340,15 +340,15 @@ class Renderer:
         drawn = []
         with _canvases.lock:
             theirs = None
-            canvas = self._canvas
+            canvas = self.canvas
             if canvas is None or not canvas.is_current():
                 theirs = _canvases.of_others()
-                canvas = _canvases.find(self._drawn_as, self._model, self.view, self._canvas)
-                self._canvas = canvas
+                canvas = _canvases.find(self._drawn_as, self._model, self.view, self.canvas)
+                self.canvas = canvas
                 canvas.make_current()
             for scene in scenes:
                 self._fill(*scene)
-                drawn.append(canvas.draw(self._scene)[::-1].copy())
+                drawn.append(canvas.draw(self.scene)[::-1].copy())
             if canvas.thread is None or theirs is not None:
                 _release(theirs)
         return drawn
@@ -359,12 +359,12 @@ class Renderer:
         as_compiled = lights.copy()
         if self.view.for_people:
             lights[:] = True
-        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, _ALL_OBJECTS, self._scene)
+        mujoco.mjv_updateScene(model, data, self.option, None, self.camera, _ALL_OBJECTS, self.scene)
         lights[:] = as_compiled
 
     def close(self) -> None:
         """Leave the OpenGL context to the next renderer. Safe to call again; a later frame finds or makes one."""
-        self._canvas = None
+        self.canvas = None
 
     def __reduce__(self) -> tuple[type[Renderer], tuple[mujoco.MjModel, View]]:
         return type(self), (self._model, self.view)

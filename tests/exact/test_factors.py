@@ -90,13 +90,13 @@ def test_a_learner_that_is_done_has_seen_what_it_needs(parameters):
 
 def test_a_learner_looks_no_further_than_its_episode_goes_on(monkeypatch):
     full, left = machine(Wheels(n=2)), []
-    choose = learner._Learner.choose
+    choose = learner.CautiousLearner.choose
 
     def look(self, row, most, rng):
         left.append(most)
         return choose(self, row, most, rng)
 
-    monkeypatch.setattr(learner._Learner, "choose", look)
+    monkeypatch.setattr(learner.CautiousLearner, "choose", look)
     run = learner.learn(full, factor_graph(full), 3, np.random.default_rng(0))
     assert len(left) == run.transitions and left.count(3) == run.episodes
     assert all(later in {now - 1, 3} for now, later in pairwise(left)) and min(left) == 1

@@ -143,8 +143,7 @@ LATE = WorldModelEntry(make="their_models:late", title="late")
 
 
 _MODELS = ("nearest", "spy", "cheat", "raises", "late", "unmade", "exits", "dies", "copy", "exact")
-
-
+_LATENTS = "pick_place-mild"
 _COMMAND = "judge --task pick_place --workers 1 --sizes 60 --seeds 1000 --samples 2".split()
 
 
@@ -472,9 +471,6 @@ def test_nonsense_is_refused(runs: dict[str, Path]) -> None:
     for words, given in nonsense:
         with pytest.raises(InvalidValueError, match=words):
             Judgement(**{"task": "pick_place", "models": ("copy",), **given})
-
-
-_LATENTS = "pick_place-mild"
 
 
 def test_judgements_that_cannot_be_compared_lie_apart() -> None:

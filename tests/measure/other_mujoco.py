@@ -59,8 +59,8 @@ def write_paths(folder: Path, out: Path) -> None:
             for test, motion in enumerate(row.motions):
                 name = f"{row.name} {test}"
                 found[name] = path_of(unwrapped, row.protocol, test, motion)
-                played = motions._played(unwrapped, row.protocol.start(test), motion.commands)
-                found[f"{ENDS} {name}"] = np.array(not motions._difference(motion, played))
+                played = motions.replayed(unwrapped, row.protocol.start(test), motion.commands)
+                found[f"{ENDS} {name}"] = np.array(not motions.difference(motion, played))
     np.savez(out, **found)
 
 

@@ -162,8 +162,8 @@ def _mjr_alone(scene: gymnasium.Env) -> Callable[[], object]:
     rect = mujoco.MjrRect(0, 0, camera.view.width, camera.view.height)
 
     def draw() -> None:
-        mujoco.mjr_render(rect, camera._scene, camera._canvas.mjr)
-        mujoco.mjr_readPixels(pixels, None, rect, camera._canvas.mjr)
+        mujoco.mjr_render(rect, camera.scene, camera.canvas.mjr)
+        mujoco.mjr_readPixels(pixels, None, rect, camera.canvas.mjr)
 
     return draw
 

@@ -31,7 +31,7 @@ def trained(tmp_path, monkeypatch):
 
     load = registry.load
     monkeypatch.setenv("IMAGINE_BENCH_CACHE", str(tmp_path))
-    monkeypatch.setattr(registry, "load", lambda name: retrain if name == encoders._TRAIN else load(name))
+    monkeypatch.setattr(registry, "load", lambda name: retrain if name == encoders.TRAIN else load(name))
     return made
 
 

@@ -39,7 +39,7 @@ class Hand:
     events: list[dict[str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.at_m, rotation = self.env.controls.hand_pose(self.env.data.ctrl[self.env._columns.ctrl[:7]])
+        self.at_m, rotation = self.env.controls.hand_pose(self.env.data.ctrl[self.env.columns.ctrl[:7]])
         self.yaw_deg = math.degrees(math.atan2(rotation[1, 0], rotation[0, 0]))
 
     def go(

@@ -105,12 +105,12 @@ class MujocoAlone:
 
     def _draw(self, camera: Renderer) -> float:
         """CPU seconds of ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``."""
-        context = camera._canvas.mjr
-        camera._canvas.make_current()
+        context = camera.canvas.mjr
+        camera.canvas.make_current()
         every = mujoco.mjtCatBit.mjCAT_ALL.value
         start = time.process_time()
-        mujoco.mjv_updateScene(self._model, self._data, camera._option, None, camera._camera, every, camera._scene)
-        mujoco.mjr_render(self._rect, camera._scene, context)
+        mujoco.mjv_updateScene(self._model, self._data, camera.option, None, camera.camera, every, camera.scene)
+        mujoco.mjr_render(self._rect, camera.scene, context)
         mujoco.mjr_readPixels(self._pixels, None, self._rect, context)
         return time.process_time() - start
 

@@ -49,7 +49,7 @@ def test_commands_keep_the_limits_of_speed_and_range_whatever_is_asked(control: 
         before = env.servo_targets()
         _, _, over, _, _ = env.step(np.where(rng.random(len(low)) < 0.5, low, high))
         joints_rad = env.servo_targets()[:7]
-        assert (np.abs(joints_rad - before[:7]) <= env.controls._most_rad + 1e-12).all()
+        assert (np.abs(joints_rad - before[:7]) <= env.controls.most_rad + 1e-12).all()
         assert (joints_rad == joints_rad.clip(*env.model.jnt_range[:7].T)).all()
 
 

@@ -113,7 +113,7 @@ def test_copies_and_states_in_the_middle_of_a_grasp_go_on_to_the_bit(family: str
     env.reset(seed=6, options={"macrostate": STARTS[family]})
     expert = Expert(env)
     expert.begin(0)
-    while not (env.episode.slipping if slips else env._referee.touched().any()):
+    while not (env.episode.slipping if slips else env.referee.touched().any()):
         env.step(expert.act())
     env.step(expert.act())
     another = make()

@@ -397,7 +397,7 @@ def guarded(guard: str) -> MotionEnv:
     env = make_arrows(control="pose", observation="proprio")
     if guard != "as built":
         world = env.world if guard == "quarters passed" else cast("World", QuartersUnseen(env.world))
-        env._referee = Referee(world, AnyChange(env.task.rules.world), env.task.macrostate_values)
+        env.referee = Referee(world, AnyChange(env.task.rules.world), env.task.macrostate_values)
     return env
 
 

@@ -68,15 +68,15 @@ def test_the_error_of_a_reach_is_the_larger_one_of_its_two_places(arm, ik):
 def test_steps_are_mink_s_to_the_bit(ik):
     """Near targets and far ones, at the joints' limits too."""
     rng, at_limits = np.random.default_rng(0), 0
-    configuration, limits = ik._configuration, mink.ConfigurationLimit(ik._configuration.model)
+    configuration, limits = ik.configuration, mink.ConfigurationLimit(ik.configuration.model)
     posture = mink.PostureTask(configuration.model, cost=1e-3)
     posture.set_target(np.array(HOME_QPOS_RAD))
     for _ in range(200):
         place = mink.SE3.from_rotation_and_translation(pointing_down(rng.uniform(-3, 3)), rng.uniform(-0.9, 0.9, 3))
-        ik._reach.set_target(place)
+        ik.frame_task.set_target(place)
         configuration.update(rng.uniform(limits.lower, limits.upper))
-        expected = mink.solve_ik(configuration, [ik._reach, posture], 1.0, "daqp", limits=[limits])
-        np.testing.assert_array_equal(ik._step(), expected)
+        expected = mink.solve_ik(configuration, [ik.frame_task, posture], 1.0, "daqp", limits=[limits])
+        np.testing.assert_array_equal(ik.next_step(), expected)
         after = configuration.q + expected / limits.gain
         at_limits += bool(np.isclose(after, limits.lower).any() or np.isclose(after, limits.upper).any())
     assert 20 < at_limits

@@ -218,8 +218,10 @@ def test_a_test_that_depends_on_rounding_is_marked_by_its_author(
 ) -> None:
     """One of the replays is not disturbed here, and agrees; that is not enough."""
     monkeypatch.setattr(motions, "DISTURBANCE", CHAOS_RAD)
-    periods = motions._periods
-    monkeypatch.setattr(motions, "_periods", lambda env, commands, number: periods(env, commands, number or None))
+    periods = motions.control_periods
+    monkeypatch.setattr(
+        motions, "control_periods", lambda env, commands, number: periods(env, commands, number or None)
+    )
     folder = played(tmp_path, control="joint")
     read = read_motions(folder)
     assert [each.reproducible for each in read.motions] == [False] * TESTS
@@ -296,7 +298,7 @@ def test_a_marked_test_may_end_otherwise_with_another_mujoco_and_has_failed(
 def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(
     row: OpenMotions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    replayed = motions._played
+    replayed = motions.replayed
 
     def worse(env: MotionEnv, seed: int, commands: Floats32) -> PlayedMotion | None:
         found = replayed(env, seed, commands)
@@ -304,7 +306,7 @@ def test_the_return_of_a_test_that_ends_otherwise_is_the_lower_one(
 
     for part in row.parts:
         part["reproducible"] = False
-    monkeypatch.setattr(motions, "_played", worse)
+    monkeypatch.setattr(motions, "replayed", worse)
     found = row.judged(OTHER).row
     assert isinstance(found, MotionRow)
     assert [each.total_reward for each in found.motions] == [part["total_reward"] - 40.0 for part in row.parts]

@@ -254,7 +254,7 @@ def test_it_is_curious_only_where_nothing_unknown_may_earn_more_and_the_goal_is_
     learner.model.outcomes.rewards = np.array([-1.0, 50.0])
     found = {"value": np.array([value, 0.0]), "r_max": np.array([r_max, 1.0]), "novelty": np.array([0.5, 0.9])}
     with mock.patch.object(learner, "_values", lambda _, objective="value": found[objective]):
-        assert learner._exploring_values((0, 0, 0)) is found[explores_by]
+        assert learner.exploring_values((0, 0, 0)) is found[explores_by]
 
 
 def test_a_likely_transition_is_still_a_surprise_while_unknown() -> None:

@@ -74,13 +74,13 @@ def test_the_target_follows_the_critic(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = learner(learning_starts=1000)
     episode(agent, 0)
     monkeypatch.setattr(dreamer.library, "train", lambda *_: None)
-    critic, target = (next(network.parameters()) for network in (agent._critic, agent._target))
-    rate = agent._config.algo.critic.tau
+    critic, target = (next(network.parameters()) for network in (agent.critic, agent.target))
+    rate = agent.config.algo.critic.tau
     for number, share in ((1.0, 1.0), (2.0, rate)):
         before = target.detach().clone()
         with torch.no_grad():
             critic.fill_(number)
-        agent._update()
+        agent.update()
         assert (critic == number).all(), "the critic learns by its own loss alone"
         torch.testing.assert_close(target.detach(), before + share * (number - before))
 
@@ -119,5 +119,5 @@ def test_a_memory_of_the_episode_decides_its_beliefs() -> None:
         if begins:
             agent.begin_episode()
         agent.act(seen(0), explore=False)
-        beliefs.append(agent._player.recurrent_state.clone())
+        beliefs.append(agent.player.recurrent_state.clone())
     assert torch.equal(beliefs[0], beliefs[2]) and not torch.equal(beliefs[0], beliefs[1])

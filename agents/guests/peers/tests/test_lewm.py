@@ -75,7 +75,7 @@ class Exact(torch.nn.Module):
 def test_a_full_memory_forgets_the_oldest() -> None:
     agent = learner(buffer_size=3, learning_starts=1000)
     actions = practise(agent, 5)
-    assert agent._rows["action"] == actions[-3:] and {len(kept) for kept in agent._rows.values()} == {3}
+    assert agent.rows["action"] == actions[-3:] and {len(kept) for kept in agent.rows.values()} == {3}
 
 
 def test_goals_are_the_frames_that_earned_most() -> None:
@@ -90,8 +90,8 @@ def test_goals_are_read_again_after_an_update(monkeypatch: pytest.MonkeyPatch) -
     agent = learner(learning_starts=2)
     practise(agent, 12)
     read: list[int] = []
-    encode = agent._model.encode
-    monkeypatch.setattr(agent._model, "encode", lambda pixels: read.append(len(pixels)) or encode(pixels))
+    encode = agent.network.encode
+    monkeypatch.setattr(agent.network, "encode", lambda pixels: read.append(len(pixels)) or encode(pixels))
     agent.act(seen(0), explore=False)
     before = agent.updates
     agent.observe(ended(0, 1, -1.0, 0), episode=12)
@@ -106,8 +106,8 @@ def test_goals_are_read_again_after_an_update(monkeypatch: pytest.MonkeyPatch) -
 
 def planner(model: torch.nn.Module, horizon: int) -> LeWMPlanner:
     agent = learner(horizon=horizon, learning_starts=100)
-    agent._model = model
-    agent._goals = [seen(GOAL).frame]
+    agent.network = model
+    agent.goals = [seen(GOAL).frame]
     return agent
 
 
@@ -117,8 +117,8 @@ def test_plans_lead_to_the_nearest_goal_at_whichever_step() -> None:
     assert agent.act(seen(GOAL + 1), explore=False) == 0
     two_away = agent.act(seen(0), explore=False)
     assert two_away in {0, 2} and agent.act(seen(moved(0, two_away)), explore=False) == two_away
-    agent._goals = [seen(0).frame, seen(3).frame]
-    agent._aims = None
+    agent.goals = [seen(0).frame, seen(3).frame]
+    agent.goal_latents = None
     assert moved(2, agent.act(seen(2), explore=False)) in {1, 3}, "the one that is one away, or on the way to the other"
 
 

@@ -260,8 +260,8 @@ def check_motions(row: MotionRow, env: gymnasium.Env[Any, Any], *, other_mujoco:
     motions = []
     for test, kept in enumerate(row.motions):
         start = row.protocol.start(test)
-        played = _played(unwrapped, start, kept.commands)
-        complaint = _difference(kept, played)
+        played = replayed(unwrapped, start, kept.commands)
+        complaint = difference(kept, played)
         if not complaint:
             motions.append(kept)
             continue
@@ -273,7 +273,7 @@ def check_motions(row: MotionRow, env: gymnasium.Env[Any, Any], *, other_mujoco:
     return dataclasses.replace(row, motions=tuple(motions), vouched=MotionFigures.of(motions))
 
 
-def _difference(kept: PlayedMotion, played: PlayedMotion | None) -> str:
+def difference(kept: PlayedMotion, played: PlayedMotion | None) -> str:
     """The first result in which an episode is not as it was kept, in words; empty if there is none."""
     if played is None:
         return "it does not end where its commands do."
@@ -286,20 +286,20 @@ def _difference(kept: PlayedMotion, played: PlayedMotion | None) -> str:
 
 def _is_reproducible(env: MotionEnv, seed: int, kept: PlayedMotion) -> bool:
     """Whether all disturbed replays of a test have the results that were kept."""
-    return all(not _difference(kept, _played(env, seed, kept.commands, disturbance=k)) for k in range(DISTURBED))
+    return all(not difference(kept, replayed(env, seed, kept.commands, disturbance=k)) for k in range(DISTURBED))
 
 
 def _same_when_disturbed(env: MotionEnv, seed: int, commands: Floats32, played: PlayedMotion | None) -> bool:
     """Whether all disturbed replays of some commands have the results of an undisturbed one."""
     wanted = None if played is None else played.facts
     for number in range(DISTURBED):
-        disturbed = _played(env, seed, commands, disturbance=number)
+        disturbed = replayed(env, seed, commands, disturbance=number)
         if (None if disturbed is None else disturbed.facts) != wanted:
             return False
     return True
 
 
-def _played(env: MotionEnv, seed: int, commands: Floats32, *, disturbance: int | None = None) -> PlayedMotion | None:
+def replayed(env: MotionEnv, seed: int, commands: Floats32, *, disturbance: int | None = None) -> PlayedMotion | None:
     """The episode of some commands, None where it does not end with the last of them, give or take the slack.
 
     With the number of a disturbance, each joint of arm and objects moves a little, once a second.
@@ -308,7 +308,7 @@ def _played(env: MotionEnv, seed: int, commands: Floats32, *, disturbance: int |
     tally = _EpisodeFacts(env.episode.macrostate)
     after_last = np.repeat(commands[-1:], SLACK_PERIODS, axis=0)
     length = 0
-    for each in _periods(env, np.concatenate([commands, after_last]), disturbance):
+    for each in control_periods(env, np.concatenate([commands, after_last]), disturbance):
         length += 1
         tally.add(
             each.reward,
@@ -321,7 +321,7 @@ def _played(env: MotionEnv, seed: int, commands: Floats32, *, disturbance: int |
     return tally.motion(commands) if tally.over and is_near else None
 
 
-def _periods(env: MotionEnv, commands: Floats32, disturbance: int | None) -> Iterator[Period]:
+def control_periods(env: MotionEnv, commands: Floats32, disturbance: int | None) -> Iterator[Period]:
     """The control periods of some commands, until the episode is over."""
     if disturbance is None:
         yield from env.carry_out(commands)

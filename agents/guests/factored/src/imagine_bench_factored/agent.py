@@ -96,14 +96,14 @@ class CodeAgent:
         return self.planner.values(code, objective, self._left) if self._ready else np.zeros(self.n_actions)
 
     def act(self, observation: Observation, *, explore: bool) -> int:
-        """The action of the largest value; exploring, see :meth:`_exploring_values`."""
+        """The action of the largest value; exploring, see :meth:`exploring_values`."""
         if not self._ready:
             return int(self.rng.integers(self.n_actions)) if explore else 0
         code = self.perception.code(observation.frame)
         if not explore:
             return self._act_greedily(code)
         self._chosen = None
-        values = self._exploring_values(code)
+        values = self.exploring_values(code)
         return int(self.rng.choice(np.flatnonzero(values >= values.max() - TIE)))
 
     def _act_greedily(self, code: Code) -> int:
@@ -118,7 +118,7 @@ class CodeAgent:
         self._chosen = (code, action)
         return action
 
-    def _exploring_values(self, code: Code) -> Floats:
+    def exploring_values(self, code: Code) -> Floats:
         """Values (A,) that it acts by in training.
 
         By R-max, as long as something unknown may earn more than all that is known, or the best reward seen is known to

@@ -57,7 +57,7 @@ class Dreamer:
         self.settings = settings
         self.n_actions = n_actions
         self._perception = perception
-        self._config = _config(settings, pixels=perception is None)
+        self.config = _config(settings, pixels=perception is None)
         self._fabric = Fabric(accelerator="cuda" if device == "cuda" else "cpu", devices=1)
         self._blank = self._shown(np.zeros((64, 64, 3), np.uint8))
         self._random = LentGenerator(seed, device)
@@ -65,10 +65,10 @@ class Dreamer:
         self._rng = np.random.default_rng([seed, 1])
         with self._drawing():
             shown = spaces.Dict({name: spaces.Box(-np.inf, np.inf, array.shape) for name, array in self._blank.items()})
-            *learners, self._player = build_agent(self._fabric, (n_actions,), False, self._config, shown)
-        self._world, self._actor, self._critic, self._target = learners
+            *learners, self.player = build_agent(self._fabric, (n_actions,), False, self.config, shown)
+        self._world, self._actor, self.critic, self.target = learners
         self._optimisers = self._new_optimisers()
-        moments = self._config.algo.actor.moments
+        moments = self.config.algo.actor.moments
         self._moments = Moments(moments.decay, moments.max, moments.percentile.low, moments.percentile.high)
         self._memory = SequenceReplay(settings.buffer_size)
         self.meters = Meters()
@@ -79,7 +79,7 @@ class Dreamer:
 
     def _new_optimisers(self) -> list[Any]:
         settings = self.settings
-        modules = self._world, self._actor, self._critic
+        modules = self._world, self._actor, self.critic
         rates = settings.model_learning_rate, settings.actor_learning_rate, settings.critic_learning_rate
         return [
             self._fabric.setup_optimizers(torch.optim.Adam(module.parameters(), lr=rate, eps=eps, fused=True))
@@ -101,7 +101,7 @@ class Dreamer:
 
     def begin_episode(self) -> None:
         """Forget the earlier frames: the next frame is an episode's first."""
-        self._player.init_states()
+        self.player.init_states()
         self._first = True
         self._acted = False
         self._test_random.reset(0)
@@ -115,7 +115,7 @@ class Dreamer:
         with self._drawing(test=not explore):
             shown = {name: array[None] for name, array in self._shown(observation.frame).items()}
             seen = prepare_obs(self._fabric, shown, cnn_keys=[_PIXELS])
-            chosen = self._player.get_actions(seen, greedy=not explore)
+            chosen = self.player.get_actions(seen, greedy=not explore)
         self._acted = explore
         if not explore or self.steps >= self.settings.learning_starts:
             return int(chosen[0].argmax())
@@ -125,7 +125,7 @@ class Dreamer:
 
     def _take(self, action: int) -> None:
         """Let the recurrent state take in a macro-action that the policy did not choose."""
-        self._player.actions = nn.functional.one_hot(torch.tensor([[action]]), self.n_actions).to(self._player.actions)
+        self.player.actions = nn.functional.one_hot(torch.tensor([[action]]), self.n_actions).to(self.player.actions)
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Remember the transition, and update the networks as often as the replay ratio says.
@@ -150,7 +150,7 @@ class Dreamer:
             self._owed += self.settings.replay_ratio
             with self.meters.cpu_time("time/updates_s"), self._drawing():
                 while self._owed >= 1.0:
-                    self._update()
+                    self.update()
                     self._owed -= 1.0
         self.meters.count("time/updates_s")
 
@@ -166,17 +166,18 @@ class Dreamer:
             return {_PIXELS: frame.transpose(_CHANNELS_FIRST)}
         return {_LATENTS: self._perception.posterior(frame)[0].cpu().numpy()}
 
-    def _update(self) -> None:
+    def update(self) -> None:
+        """One gradient step of world model, actor and critic."""
         settings = self.settings
         drawn = self._memory.sample(settings.batch_size, settings.sequence_length, self._rng)
         batch = {name: torch.tensor(array, device=self._fabric.device).float() for name, array in drawn.items()}
-        rate = 1.0 if self.updates == 0 else self._config.algo.critic.tau
+        rate = 1.0 if self.updates == 0 else self.config.algo.critic.tau
         with torch.no_grad():
-            for fast, slow in zip(self._critic.parameters(), self._target.parameters(), strict=True):
+            for fast, slow in zip(self.critic.parameters(), self.target.parameters(), strict=True):
                 slow.lerp_(fast, rate)
         library.train(
-            self._fabric, self._world, self._actor, self._critic, self._target, *self._optimisers, batch,
-            _Losses(self.meters), self._config, False, (self.n_actions,), self._moments,
+            self._fabric, self._world, self._actor, self.critic, self.target, *self._optimisers, batch,
+            _Losses(self.meters), self.config, False, (self.n_actions,), self._moments,
         )  # fmt: skip
         self.updates += 1
 
@@ -203,7 +204,7 @@ class Dreamer:
         arrays = {"generator": self._random.state.numpy().copy()}
         for name, module, optimiser in self._trained():
             arrays |= snapshot.prefixed(name, snapshot.training_arrays(module, optimiser))
-        for name, module in (("target", self._target), ("returns", self._moments)):
+        for name, module in (("target", self.target), ("returns", self._moments)):
             arrays |= snapshot.prefixed(name, {k: v.cpu().numpy().copy() for k, v in module.state_dict().items()})
         arrays |= snapshot.prefixed("replay", self._memory.arrays(self._blank, self.n_actions))
         values = {
@@ -219,7 +220,7 @@ class Dreamer:
         values = state.values
         for name, module, optimiser in self._trained():
             snapshot.load_training(module, optimiser, snapshot.below(name, arrays))
-        for name, module in (("target", self._target), ("returns", self._moments)):
+        for name, module in (("target", self.target), ("returns", self._moments)):
             module.load_state_dict({k: torch.tensor(v) for k, v in snapshot.below(name, arrays).items()})
         self._random.state = torch.tensor(arrays["generator"])
         self._memory.load(snapshot.below("replay", arrays))
@@ -231,7 +232,7 @@ class Dreamer:
         self.begin_episode()
 
     def _trained(self) -> Iterator[tuple[str, nn.Module, Any]]:
-        modules = self._world, self._actor, self._critic
+        modules = self._world, self._actor, self.critic
         yield from zip(("world", "actor", "critic"), modules, self._optimisers, strict=True)
 
 

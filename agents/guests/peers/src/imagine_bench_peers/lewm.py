@@ -54,16 +54,16 @@ class LeWMPlanner:
         self._random = LentGenerator(seed, device)
         self._rng = np.random.default_rng([seed, 1])
         with self._random.lent():
-            self._model = _network(settings, n_actions).to(device).eval()
+            self.network = _network(settings, n_actions).to(device).eval()
         self._optimiser = torch.optim.AdamW(
-            self._model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True
+            self.network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True
         )
         sequences = torch.tensor(list(product(range(n_actions), repeat=settings.horizon)))  # [S, H]
         self._first = sequences[:, 0].tolist()
         self._sequences = nn.functional.one_hot(sequences, n_actions).float().to(device)  # [S, H, A]
-        self._rows: dict[str, list[Any]] = {name: [] for name in _ROW}
-        self._goals: list[Frame] = []
-        self._aims: Tensor | None = None  # latents of the goals (G, D), until these or the model change
+        self.rows: dict[str, list[Any]] = {name: [] for name in _ROW}
+        self.goals: list[Frame] = []
+        self.goal_latents: Tensor | None = None  # latents of the goals (G, D), until these or the model change
         self._most = -np.inf  # earned by a transition
         self.meters = Meters()
         self.steps = self.updates = 0
@@ -83,9 +83,9 @@ class LeWMPlanner:
         if explore:
             left = max(0.0, 1.0 - self.steps / settings.exploration_steps)
             epsilon = settings.exploration_final_eps + left * (1.0 - settings.exploration_final_eps)
-            if not self._goals or self.updates == 0 or self._rng.random() < epsilon:
+            if not self.goals or self.updates == 0 or self._rng.random() < epsilon:
                 return int(self._rng.integers(self.n_actions))
-        return self._planned(observation.frame) if self._goals else 0
+        return self._planned(observation.frame) if self.goals else 0
 
     @torch.no_grad()
     def _planned(self, frame: Frame) -> int:
@@ -93,11 +93,11 @@ class LeWMPlanner:
 
         That is the library's objective of a path, whose mean distance counts, of an episode that arrives at any step.
         """
-        if self._aims is None:
-            self._aims = self._model.encode(self._pixels(self._goals))[:, 0]
-        start = self._model.encode(self._pixels([frame]))
-        path = self._model.rollout(start.expand(len(self._sequences), -1, -1), self._sequences)[:, 1:]  # [S, H, D]
-        apart = torch.cdist(path.flatten(0, 1), self._aims).square().unflatten(0, path.shape[:2])  # [S, H, G]
+        if self.goal_latents is None:
+            self.goal_latents = self.network.encode(self._pixels(self.goals))[:, 0]
+        start = self.network.encode(self._pixels([frame]))
+        path = self.network.rollout(start.expand(len(self._sequences), -1, -1), self._sequences)[:, 1:]  # [S, H, D]
+        apart = torch.cdist(path.flatten(0, 1), self.goal_latents).square().unflatten(0, path.shape[:2])  # [S, H, G]
         rest = torch.arange(path.shape[1] - 1, -1, -1, device=apart.device)[:, None]  # [H, 1]
         return self._first[int((apart.cumsum(dim=1) + rest * apart).flatten(1).amin(dim=1).argmin())]
 
@@ -113,14 +113,14 @@ class LeWMPlanner:
         frame = transition.observation.frame
         following = transition.next_observation.frame
         for name, value in zip(_ROW, (frame, transition.action, following), strict=True):
-            self._rows[name].append(value)
-            del self._rows[name][: -self.settings.buffer_size]
+            self.rows[name].append(value)
+            del self.rows[name][: -self.settings.buffer_size]
         if transition.reward > self._most:
             self._most = transition.reward
-            self._goals = []
+            self.goals = []
         if transition.reward == self._most:
-            self._goals = [*self._goals, following][-self.settings.goals :]
-            self._aims = None
+            self.goals = [*self.goals, following][-self.settings.goals :]
+            self.goal_latents = None
         self.steps += 1
         if self.steps >= self.settings.learning_starts:
             self._owed += self.settings.replay_ratio
@@ -131,22 +131,22 @@ class LeWMPlanner:
         self.meters.count("time/updates_s")
 
     def _update(self) -> None:
-        rows = self._rng.integers(len(self._rows["action"]), size=self.settings.batch_size).tolist()
-        frames, actions, following = ([kept[row] for row in rows] for kept in self._rows.values())
+        rows = self._rng.integers(len(self.rows["action"]), size=self.settings.batch_size).tolist()
+        frames, actions, following = ([kept[row] for row in rows] for kept in self.rows.values())
         pixels = torch.cat([self._pixels(frames), self._pixels(following)], dim=1)  # [B, 2, 3, 64, 64]
         taken = nn.functional.one_hot(torch.tensor(actions, device=self._device), self.n_actions).float()
         batch = pixels, taken.unsqueeze(1)
         with self._random.lent():
-            losses = self._model.train()(*batch)
+            losses = self.network.train()(*batch)
             self._optimiser.zero_grad()
             losses["loss"].backward()
             self._optimiser.step()
             with torch.no_grad():
-                recompute_batchnorm(self._model.eval(), [batch], lambda each: self._model(*each))
+                recompute_batchnorm(self.network.eval(), [batch], lambda each: self.network(*each))
         for name in ("pred_loss", "sigreg_loss"):
             self.meters.add(f"loss/{name.removesuffix('_loss')}", losses[name].item())
         self.updates = self.updates + 1
-        self._aims = None
+        self.goal_latents = None
         if self.updates % _RELEASED_EVERY == 0:
             release_freed_memory()
 
@@ -160,14 +160,14 @@ class LeWMPlanner:
 
     def state(self) -> AgentState:
         """A snapshot between two episodes: weights, statistics, replay, goals, generator, counters."""
-        arrays = snapshot.prefixed("model", snapshot.training_arrays(self._model, self._optimiser))
-        arrays |= {f"buffer/{name}": value.cpu().numpy().copy() for name, value in self._model.named_buffers()}
+        arrays = snapshot.prefixed("model", snapshot.training_arrays(self.network, self._optimiser))
+        arrays |= {f"buffer/{name}": value.cpu().numpy().copy() for name, value in self.network.named_buffers()}
         frames: dict[str, NDArray[Any]] = {
-            f"replay/{name}": np.array(self._rows[name], dtype).reshape(-1, *shape)
+            f"replay/{name}": np.array(self.rows[name], dtype).reshape(-1, *shape)
             for name, (shape, dtype) in _ROW.items()
         }
         frames["generator"] = self._random.state.numpy().copy()
-        frames["replay/goals"] = np.array(self._goals, np.uint8).reshape(-1, 64, 64, 3)
+        frames["replay/goals"] = np.array(self.goals, np.uint8).reshape(-1, 64, 64, 3)
         values = {
             "steps": self.steps, "updates": self.updates, "owed": self._owed, "meters": self.meters.state(),
             "most": None if self._most == -np.inf else self._most, "exploration": self._rng.bit_generator.state,
@@ -180,12 +180,12 @@ class LeWMPlanner:
         snapshot.require_fit(state, self.state())
         arrays = state.arrays
         values = state.values
-        snapshot.load_training(self._model, self._optimiser, snapshot.below("model", arrays))
-        for name, value in self._model.named_buffers():
+        snapshot.load_training(self.network, self._optimiser, snapshot.below("model", arrays))
+        for name, value in self.network.named_buffers():
             value.copy_(torch.tensor(arrays[f"buffer/{name}"]))
-        self._rows = {name: list(arrays[f"replay/{name}"]) for name in _ROW}
-        self._goals = list(arrays["replay/goals"])
-        self._aims = None
+        self.rows = {name: list(arrays[f"replay/{name}"]) for name in _ROW}
+        self.goals = list(arrays["replay/goals"])
+        self.goal_latents = None
         self._most = -np.inf if values["most"] is None else values["most"]
         self._random.state = torch.tensor(arrays["generator"])
         self._rng.bit_generator.state = values["exploration"]
