@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ from imagine_bench_motion.judge.labelled import Labelled
 from imagine_bench_motion.judge.no_change import NoChange
 from imagine_bench_motion.judge.questions import AnsweredMotions, MotionQuestions, MotionSource, moved, moving_actions
 from imagine_bench_motion.judge.recurrent import MotionNetwork
-from imagine_bench_motion.judge.report import motion_tables
+from imagine_bench_motion.judge.report import motion_rows, motion_tables
 from imagine_bench_motion.judge.scores import Simulator, score
 
 from imagine_bench.arrays import Array, Ints
@@ -142,6 +143,42 @@ def test_the_simulator_is_right_in_all_and_a_copy_where_nothing_changes(family: 
 def test_a_judgement_that_cannot_be_is_one_sentence(change: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ImagineBenchError, match=sentence):
         replace(FEW, **change)
+
+
+def test_tables_and_rows_say_what_was_measured() -> None:
+    """Means over seeds by hand, with their ends; a dash where nothing was measured; the simulator learns nothing."""
+    measured = {
+        "right": 0.5,
+        "unread": 0.0,
+        "raised_right": 1.0,
+        "painted": None,
+        "pairs": 0.5,
+        "by_depth": [1.0, 0.5, 0.5, 0.0],
+    }
+    judgement = replace(FEW, sizes=(3, 30), seeds=(0, 1), pairs=4, chains=2)
+    cells = [
+        {"model": name, "transitions": size, "seed": seed, **measured, "pairs": share, "fit_s": seconds}
+        for name, size, seed, share, seconds in (
+            ("no_change", 3, 0, 0.25, 1.0), ("no_change", 3, 1, 0.75, 4.0), ("no_change", 30, 0, 0.25, 9.0),
+            (SIMULATOR.model, 0, 0, 1.0, 0.0), ("gone", 3, 0, 0.25, 1.0),
+        )
+    ]  # fmt: skip
+    del cells[3]["fit_s"]
+    scores, drift = motion_tables(judgement, cells)
+    shares = ["50", "0", "100", "–"]
+    assert scores.rows == [
+        ["no_change", "3", "commands", "2", *shares, "50 (25 to 75)", "2"],
+        ["no_change", "30", "commands", "1", *shares, "25", "9"],
+        [SIMULATOR.model, "–", "–", "–", *shares, "100", "–"],
+        ["gone", "3", "–", "1", *shares, "25", "1"],
+    ]
+    assert [row[2:] for row in drift.rows] == [["100", "50", "50", "0"]] * 4
+    assert "of 4 pairs" in scores.remark and "of 2 chains of 4 planned" in drift.remark
+    seven = [{**cells[0], "seed": seed, "right": 0.1 * seed} for seed in range(7)]
+    assert re.fullmatch(r"30 \[\d+, \d+\]", motion_tables(judgement, seven)[0].rows[0][4])
+    first, *_ = motion_rows(cells)
+    kept = {name: value for name, value in cells[0].items() if name not in ("by_depth", "transitions")}
+    assert first == {**kept, "motions": 3, "after_1": 1.0, "after_2": 0.5, "after_3": 0.5, "after_4": 0.0}
 
 
 @pytest.mark.slow
