@@ -15,6 +15,7 @@ from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import AppearanceSampler, appearance, appearance_arrays
 from imagine_bench.tasks.scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from imagine_bench.tasks.scenes.control_views import _RGBA, varied_by_appearance
+from imagine_bench.tasks.scenes.tabletop import _CAMERAS
 
 CUBES = (1, 2, 3, 4, 5, 6)
 PICK = 0
@@ -73,6 +74,18 @@ def act(world, index):
 def scenes():
     made = {}
     return lambda cubes: made.setdefault(cubes, Scene(cubes))
+
+
+@pytest.mark.parametrize("cubes", [PICK, 3])
+def test_cameras_that_stand_in_the_room_are_upright_and_see_the_table(scenes, cubes):
+    scene = scenes(cubes)
+    names = {*_CAMERAS, c.FRONT_CAMERA}
+    assert len(names) > 1 and names <= {scene.model.camera(index).name for index in range(scene.model.ncam)}
+    for name in names:
+        column, row = scene.at_px(name, np.array([0.55, 0.0, c.TABLE_HEIGHT_M]))
+        _, above = scene.at_px(name, np.array([0.55, 0.0, c.TABLE_HEIGHT_M + 0.1]))
+        right, up, _ = scene.data.cam_xmat[scene.model.camera(name).id].reshape(3, 3)[2]
+        assert abs(right) < 1e-6 < up and 0 < column < 64 and 0 < above < row < 64, name
 
 
 @pytest.mark.parametrize("cubes", [PICK, 1, 3, 6])
