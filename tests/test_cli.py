@@ -170,7 +170,7 @@ def test_words_of_a_caller_are_read_instead_of_those_of_the_process(
 
 
 @pytest.mark.parametrize("offered", [registry.agents, registry.world_models, registry.regressors])
-def test_a_described_setting_is_typed_as_it_stands_there_and_has_a_meaning(
+def test_a_described_setting_can_be_typed_and_has_a_meaning(
     offered: Callable[[], Mapping[str, Any]],
 ) -> None:
     for name, entry in offered().items():

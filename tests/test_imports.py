@@ -368,7 +368,7 @@ assert not {"torch", "mink"} & set(sys.modules)
 
 
 @pytest.mark.slow
-def test_the_functions_of_the_package_outlive_the_import_of_all_of_its_modules() -> None:
+def test_functions_of_the_package_outlive_imports_of_modules() -> None:
     rooms = ("imagine_bench.agents", "imagine_bench.tasks", "imagine_bench.__main__")
     modules = [name for name in _MODULES if not name.startswith(rooms)]
     probe = f"""

@@ -125,7 +125,7 @@ def code(source: str = _SOURCE) -> dict[str, Any]:
         ("Acts by the sum of pixels.", "Acts.", False),
     ],
 )
-def test_a_digest_changes_with_all_that_the_code_does_and_with_nothing_else(was: str, now: str, changes: bool) -> None:
+def test_a_digest_changes_with_the_code_s_behavior_alone(was: str, now: str, changes: bool) -> None:
     before, after = code(), code(_SOURCE.replace(was, now))
     assert _SOURCE.count(was) == 1
     for name in ("MyAgent", "make", "partial"):

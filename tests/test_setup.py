@@ -227,7 +227,7 @@ def test_variables_become_options(words: str, expected: str) -> None:
     assert (code, did) == (0, expected.format("arrow_puzzle"))
 
 
-def test_variables_of_the_environment_count_and_unknown_ones_are_refused() -> None:
+def test_variables_count_and_unknown_ones_are_refused() -> None:
     assert make("report", TASK="pick_place")[1].endswith("report --task pick_place")
     code, error = make("bench", "AGENT=dqn", "SEEDS=0")
     assert code == 2 and "'make bench' takes no AGENT. It takes AGENTS APPEARANCE ARGS BUDGETS " in error

@@ -67,7 +67,7 @@ def test_equals_single_environments_with_gymnasiums_statistics():
     assert len(printed) > 10 and sum(length for *_, length in printed) == sum(map(sum, lanes)) > 100
 
 
-def test_what_a_truncated_episode_reached_is_stored_not_the_next_start():
+def test_the_last_frame_of_a_truncated_episode_is_stored():
     lanes = [lambda: _Numbered(gym.make(ARROWS, execution="kinematic"))] * 2
     sync = gym.vector.SyncVectorEnv(lanes, autoreset_mode=AutoresetMode.SAME_STEP)
     (seen, seen_next, *_), printed = collected(as_cleanrl(sync), 6)

@@ -50,7 +50,7 @@ class MotionContractTest(ContractTest):
     ("task", "execution", "episodes"),
     [("arrow_puzzle", "kinematic", 12), ("arrow_puzzle", "physics", 3), ("pick_place", "kinematic", 3)],
 )
-def test_equals_gymnasium_step_for_step_and_a_time_limit_keeps_the_discount(task, execution, episodes):
+def test_equals_gymnasium_and_a_time_limit_keeps_the_discount(task, execution, episodes):
     env_id = registry.TASKS[task].env_id
     ours = gymnasium.make(env_id, execution=execution)
     theirs = as_dm_env(env_id, seed=3, execution=execution)

@@ -90,7 +90,7 @@ def test_copies_of_adapted_lanes_play_on(copied, adapted):
     twin.close()
 
 
-def test_gymnasiums_normalisation_takes_lanes_that_reset_at_the_next_step():
+def test_gymnasium_normalises_lanes_that_reset_at_the_next_step():
     env = NormalizeObservation(gymnasium.make_vec(ARROWS, num_envs=2, autoreset_mode="NextStep", **KINEMATIC))
     assert env.reset(seed=0)[0].shape == (2, 64, 64, 3)
     env.close()

@@ -59,7 +59,7 @@ def test_another_environment_is_one_clear_error():
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_random_policy_scores_chance_and_without_the_wrapper_nearly_everything(task):
+def test_a_random_policy_scores_chance_with_the_wrapper(task):
     swm = pytest.importorskip("stable_worldmodel")
     entry, n, level = registry.TASKS[task], 1000, registry.task(task).facts().chance_level
     options = {"num_envs": 4, "image_shape": (64, 64), "max_episode_steps": entry.horizon, **KINEMATIC}

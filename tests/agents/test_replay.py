@@ -39,7 +39,7 @@ def test_no_batch_pairs_states_of_different_transitions() -> None:
 
 
 @pytest.mark.parametrize("spread", [1.0, 5.0])
-def test_latents_are_drawn_anew_from_their_posteriors_as_widely_as_asked(spread: float) -> None:
+def test_latents_are_drawn_anew_as_widely_as_set(spread: float) -> None:
     sigma = torch.tensor([0.1, 0.3])
     memory = RealMemory(1, 2, CPU)
     memory.add((torch.tensor([3.0, -1.0]), sigma), 0, 0.0, (NOTHING[0], sigma), terminated=False)

@@ -82,7 +82,7 @@ def invented(name: str) -> Forge:
 elsewhere = sessions(lambda found: found["environment"]["machine"].update(cpu="another"))
 
 
-def test_an_honest_run_repeats_to_the_bit_and_each_nonce_draws_its_own(pair: Path) -> None:
+def test_an_honest_run_repeats_to_the_bit(pair: Path) -> None:
     wanted = small(seeds=(0, 1))
     assert {seed for nonce in "abcdefgh" for _, seed in drawn(wanted, 1, nonce)} == {0, 1}
     assert drawn(wanted, 1, "a") == drawn(wanted, 1, "a")
@@ -91,7 +91,7 @@ def test_an_honest_run_repeats_to_the_bit_and_each_nonce_draws_its_own(pair: Pat
     assert "--nonce a" in what_is_shown(pair, found, again("a"))
 
 
-def test_the_chance_to_find_a_forged_run_is_that_of_the_runs_an_agent_has(tmp_path: Path) -> None:
+def test_the_chance_to_find_a_forgery_counts_an_agents_runs(tmp_path: Path) -> None:
     wanted = dataclasses.replace(small(agents=("table", "random")), seeds=(0, 1, 2, 3), few_seeds=(("random", 0),))
     folder = bench(wanted, {}, root=tmp_path, launcher=Inline()).folder
     said = what_is_shown(folder, [Verdict(what="one", of_training=True)], again("a")).splitlines()

@@ -233,7 +233,7 @@ def test_two_seeds_of_a_learner_share_nothing(pair: Path, tmp_path: Path, what: 
 
 
 @pytest.mark.parametrize("name", IN_TRAINING)
-def test_whatever_is_claimed_of_training_follows_from_its_macro_actions(pair: Path, tmp_path: Path, name: str) -> None:
+def test_claims_of_training_follow_from_its_macro_actions(pair: Path, tmp_path: Path, name: str) -> None:
     folder = forged(pair, tmp_path, lambda folder: IN_TRAINING[name](folder, np.random.default_rng(0)))
     assert any(each.complaint for each in verify(folder))
 
@@ -253,7 +253,7 @@ def test_what_a_protocol_says_follows_from_its_runs(
     assert complaint in " ".join(each.complaint for each in verify(folder))
 
 
-def test_failures_are_a_seeds_own_unless_it_knows_nothing_or_chance_decides() -> None:
+def test_failures_are_a_seeds_own_unless_chance_decides() -> None:
     slips = protocol("arrows:slip=0.3", "smoke", agents=("random",))
     for own, task, failed in (
         (True, small(), [[0, 1, 2]]),
@@ -271,16 +271,14 @@ def test_failures_are_a_seeds_own_unless_it_knows_nothing_or_chance_decides() ->
         assert has_own_failures(counts.kept(), task) == own
 
 
-def test_a_run_of_an_earlier_version_holds_and_says_what_it_does_not_keep(tmp_path: Path) -> None:
+def test_an_earlier_run_holds_and_names_its_missing_facts(tmp_path: Path) -> None:
     older = Path(__file__).parents[1] / "store" / "of_abcb05c" / "whole"
     run, *_ = verify(forged(older, tmp_path, lambda folder: None))
     assert str(run).startswith("table seed 0: holds; 10 episodes")
     assert "env_steps, budgets and successes in training are claims" in str(run)
 
 
-def test_whatever_is_written_into_a_sealed_file_is_a_complaint_in_one_line(
-    pair: Path, replays: Replays, tmp_path: Path
-) -> None:
+def test_a_changed_sealed_file_is_a_complaint_in_one_line(pair: Path, replays: Replays, tmp_path: Path) -> None:
     """Texts, numbers of 4,000 digits, and parts that are missing: none of them ends in a raw error."""
     folder = forged(pair, tmp_path, lambda folder: None)
     run = folder / "table" / "seed_1"

@@ -138,7 +138,7 @@ def test_a_share_below_1_is_never_shown_as_100_percent() -> None:
 
 
 @needs_node
-def test_hostile_worlds_names_of_rows_and_rows_are_refused_in_one_sentence(expected: Expected) -> None:
+def test_hostile_worlds_and_rows_are_refused_in_one_sentence(expected: Expected) -> None:
     """Rows are forged: their episodes are none of the rules."""
     kept = (KEPT / "refused_by_the_page.txt").read_text(encoding="utf-8")
     asked = [(kind, json.loads(text)) for kind, text in re.findall(r"^\$ (\w+) (.*)$", kept, re.MULTILINE)]
@@ -252,7 +252,7 @@ def test_actions_of_continuous_control_are_the_events_of_the_replay(
 
 @needs_node
 @pytest.mark.usefixtures("made")
-def test_a_test_ends_at_the_horizon_and_is_solved_only_if_it_is_reproducible(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_test_is_solved_only_if_it_is_reproducible(monkeypatch: pytest.MonkeyPatch) -> None:
     (_, whole), (_, cut) = _moved(monkeypatch, 1), _moved(monkeypatch, 1, task="arrows:horizon=1")
     _, row = _moved(monkeypatch, 1, reproducible=False)
     ((long,), (short,), (episode,)) = (each["episodes"] for each in (whole, cut, row))

@@ -258,7 +258,7 @@ def test_a_wrong_macrostate_is_refused(kinematic, given):
 
 
 @pytest.mark.parametrize("task", ["arrow_puzzle", "arrows:lag=2"])
-def test_a_simulation_that_blows_up_truncates_and_only_a_reset_begins_an_episode(task, monkeypatch, tmp_path):
+def test_a_simulation_that_blows_up_truncates(task, monkeypatch, tmp_path):
     """The scene stands as before."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)  # MuJoCo's own log

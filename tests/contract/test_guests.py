@@ -101,7 +101,7 @@ def without_guests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("without_guests")
-def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_line(
+def test_absent_guests_are_marked_with_their_install_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], expected: Expected
 ) -> None:
     assert main(["describe"]) == 0
@@ -120,7 +120,7 @@ def test_guests_that_are_not_installed_are_marked_and_named_with_their_install_l
 
 
 @pytest.mark.usefixtures("without_guests")
-def test_a_default_leaves_out_agents_that_are_not_installed_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_default_leaves_out_absent_agents_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     install = f"To install: pip install -e {ROOT / 'agents' / 'guests' / 'factored'}"
     default, _ = plan_control("arrow_puzzle", "quick")
     assert capsys.readouterr().out == f"Left out, as not installed: factored:given. {install}\n"
@@ -152,7 +152,7 @@ def test_kept_results_of_a_guest_that_is_not_installed_are_read(
     assert "\nfactored:given" in capsys.readouterr().out
 
 
-def test_an_old_path_into_a_guest_that_is_not_installed_says_how_to_install_it(
+def test_an_old_path_into_an_absent_guest_names_its_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "imagine_bench_factored", None)

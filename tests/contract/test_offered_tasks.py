@@ -33,7 +33,7 @@ def site(guests: Guests, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
 
 
 @pytest.mark.usefixtures("site")
-def test_every_macrostate_looks_otherwise_and_as_its_environment_shows_it() -> None:
+def test_every_macrostate_has_a_frame_of_its_own() -> None:
     spec = registry.task("lights_out")
     env = gymnasium.make(spec.env_id)
     frames = spec.render_macrostates(np.array(spec.rules.states), "clean", np.random.default_rng(0))

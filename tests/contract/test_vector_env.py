@@ -101,7 +101,7 @@ def quiet_plan(rules, state, length, rng):
     return actions
 
 
-def test_each_lane_goes_its_own_pace_as_if_alone_and_the_first_in_simulated_time_is_received_first():
+def test_each_lane_goes_its_own_pace_and_the_first_comes_first():
     rules, rng = registry.task("arrow_puzzle").rules, np.random.default_rng(5)
     plans = [quiet_plan(rules, START, 3, rng) for _ in range(N_LANES)]
     vector = make(autoreset_mode="Disabled")
@@ -140,7 +140,7 @@ def blown_up(env, actions):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_lane_that_blows_up_is_its_own_fault_and_ends_as_a_single_environment(mode, monkeypatch, tmp_path):
+def test_a_lane_that_blows_up_ends_as_a_single_environment(mode, monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)  # MuJoCo's own log
     sync, vector = make_sync(mode), make(autoreset_mode=mode)

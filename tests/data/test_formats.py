@@ -178,7 +178,7 @@ def test_what_lerobots_tools_made_is_read_with_the_last_frames_copied(
     assert [told(found, episode) for episode in range(len(found))] == wanted and wanted
 
 
-def test_episodes_alike_up_to_their_last_frames_keep_these_in_their_order(tmp_path: Path) -> None:
+def test_episodes_that_differ_late_keep_their_order(tmp_path: Path) -> None:
     written(tmp_path / "set", "lerobot")
     edited(tmp_path / "out", *((tmp_path / "set", range(6)),) * 2)
     ends = pq.read_table(tmp_path / "set/final_frames.parquet")
@@ -192,7 +192,7 @@ def test_episodes_alike_up_to_their_last_frames_keep_these_in_their_order(tmp_pa
     np.testing.assert_array_equal(last, wanted)
 
 
-def test_last_frames_of_before_they_had_digests_are_read_in_their_order(tmp_path: Path) -> None:
+def test_last_frames_without_digests_are_read_in_order(tmp_path: Path) -> None:
     written(tmp_path / "set", "lerobot")
     path = tmp_path / "set/final_frames.parquet"
     pq.write_table(pq.read_table(path).drop_columns("episode_digest"), path)

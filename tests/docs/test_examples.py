@@ -108,7 +108,7 @@ def test_the_task_keeps_the_contract(example: ModuleType, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize("example", ["own_world_model"], indirect=True)
-def test_the_world_model_keeps_the_contract_and_knows_what_it_has_seen(example: ModuleType) -> None:
+def test_the_world_model_keeps_the_contract(example: ModuleType) -> None:
     assert report(checks(model="own_model")) == 0
     spec = registry.task("pick_place")
     index, seeds = RenderedFrameIndex(spec, "clean"), SeedTree(0)
@@ -125,7 +125,7 @@ def test_the_world_model_keeps_the_contract_and_knows_what_it_has_seen(example: 
 
 
 @pytest.mark.parametrize("example", ["elsewhere"], indirect=True)
-def test_the_agent_that_learns_to_see_acts_where_nobody_here_wrote_the_task(example: ModuleType) -> None:
+def test_the_agent_that_learns_to_see_acts_in_a_foreign_task(example: ModuleType) -> None:
     """Gymnasium's frozen lake from pixels."""
     found = example.learn("FrozenLake-v1", seed=0, tests=1, budgets=(1, 2))
     assert list(found["success"]) == [1, 2] and found["real_steps"] >= 4

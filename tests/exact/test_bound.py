@@ -122,7 +122,7 @@ def test_a_bound_by_hand() -> None:
     assert bound(RING) == 0
 
 
-def test_in_the_arrow_puzzle_each_of_the_twelve_pairs_of_names_must_be_known() -> None:
+def test_all_twelve_pairs_of_names_must_be_known() -> None:
     """3 cubes with 4 directions each: 12 cells of two names. Without chance, a transition shows one pair."""
     spec = registry.task("arrow_puzzle")
     full = machine(spec.rules)

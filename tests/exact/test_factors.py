@@ -102,7 +102,7 @@ def test_a_learner_looks_no_further_than_its_episode_goes_on(monkeypatch):
     assert all(later in {now - 1, 3} for now, later in pairwise(left)) and min(left) == 1
 
 
-def test_the_cost_of_learning_is_the_mean_of_learners_with_its_standard_error():
+def test_the_cost_of_learning_is_a_mean_with_standard_error():
     rules = Wheels(n=2)
     cost, full = certificate(spec_of(rules, 8)).learning_cost, machine(rules)
     runs = [learn(full, factor_graph(full), 8, np.random.default_rng(seed)) for seed in range(cost.learners)]

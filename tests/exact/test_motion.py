@@ -50,14 +50,14 @@ def test_what_is_shown_is_the_product_of_the_segments_lower_bounds() -> None:
     assert certificate(spec, measure).shown == pytest.approx((2 * share + share**2) / 3)
 
 
-def test_a_time_limit_without_room_for_two_shows_what_one_macro_action_solves() -> None:
+def test_a_short_time_limit_shows_one_macro_action() -> None:
     spec = registry.task("arrow_puzzle_easy")
     found = certificate(spec, measurement(spec, longest_s=2.0, limit_s=3.9))
     assert found.macro_actions == 1
     assert found.shown == pytest.approx(2 / 3, abs=1e-6)
 
 
-def test_pairs_that_were_not_tried_show_nothing_unless_pairs_were_sampled() -> None:
+def test_untried_pairs_show_nothing_unless_sampled() -> None:
     spec = registry.task("arrow_puzzle_easy")
     measure = measurement(spec, limit_s=5.0)
     measure["segments"] = [each for each in measure["segments"] if each[:2] != [[1], 1]]
@@ -108,6 +108,6 @@ def test_the_command_measures_and_keeps_a_certificate(name: str, tmp_path: Any, 
 @pytest.mark.parametrize(
     ("name", "nearest"), [("ArowPuzzleMotion", "ArrowPuzzleMotion"), ("PickMotion", "PickPlaceMotion")]
 )
-def test_a_misspelt_name_of_continuous_control_is_answered_by_the_nearest(name: str, nearest: str, capsys: Any) -> None:
+def test_a_misspelt_control_task_is_answered_by_the_nearest(name: str, nearest: str, capsys: Any) -> None:
     assert main(["describe", name]) == 2
     assert f"Did you mean '{nearest}'?" in capsys.readouterr().err

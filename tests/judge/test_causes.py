@@ -63,7 +63,7 @@ def cause(agent: PolicyTable, tried: NDArray[np.int64], happened: FailedEpisode,
 FAILED = episode(FAR[0], [ILLEGAL[FAR[0]]])
 
 
-def test_the_best_stands_for_what_an_agent_does_where_it_reads_nothing() -> None:
+def test_the_best_action_stands_where_an_agent_reads_nothing() -> None:
     """The answers of its model there, from frames that it misreads, is not held against the model."""
     readable = np.array([state != FAR[0] for state in STATES])
     there = model_of(SPEC, lambda state, action: state == FAR[0])
@@ -146,7 +146,7 @@ def test_a_model_that_expects_the_gesture_to_be_hidden_is_not_wrong() -> None:
     assert found == ["planning", "planning"]
 
 
-def test_a_frame_that_hides_something_and_is_misread_too_is_not_blamed_on_memory() -> None:
+def test_a_misread_hidden_frame_is_not_blamed_on_memory() -> None:
     start = FAR[0]
     (outcome,) = RULES.outcomes(start, OPTIMAL[start])
     lost = episode(start, [OPTIMAL[start], ILLEGAL[outcome.macrostate]], hidden=[False, True])

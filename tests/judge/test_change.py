@@ -95,7 +95,7 @@ def test_false_alarms_are_as_rare_as_promised() -> None:
 
 
 @BOTH
-def test_copy_is_right_where_two_macro_actions_change_nothing_and_exact_everywhere(task: str) -> None:
+def test_copy_is_right_where_nothing_changes_exact_everywhere(task: str) -> None:
     there = judged_world(task)
     assert there.counterfactual_error(there.exact) == 0.0
     rules, states = there.spec.rules, there.counterfactuals[0].states

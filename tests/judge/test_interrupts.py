@@ -127,7 +127,7 @@ def test_it_ends_at_once_with_all_its_processes(command: Command, workers: int, 
         assert len(whole) == 8 and cut == whole, "to the bit"
 
 
-def test_two_at_once_in_one_folder_share_its_cells_and_keep_the_figures_of_one(command: Command) -> None:
+def test_two_judges_in_one_folder_share_its_cells(command: Command) -> None:
     shared = command.scores("shared", *[command.start("shared") for _ in range(2)])
     alone = command.scores("alone", command.start("alone"))
     assert len(alone) == 8 and shared == alone, "to the bit"

@@ -231,7 +231,7 @@ def test_a_model_finds_no_truth_and_changes_nothing_for_the_next(said: Said) -> 
     assert learned.frames.any(axis=(1, 2, 3)).all(), "the data that this process holds are as they were"
 
 
-def test_a_judgement_is_loaded_from_its_folder_and_marks_privileged_models_everywhere(said: Said) -> None:
+def test_a_loaded_judgement_marks_privileged_models(said: Said) -> None:
     report = said.folder / "report"
     page = (report / "index.html").read_text()
     found = imagine_bench.load(said.folder)
@@ -246,9 +246,7 @@ def test_a_judgement_is_loaded_from_its_folder_and_marks_privileged_models_every
         assert "frame (privileged)" not in text
 
 
-def test_a_cell_says_whether_its_model_was_privileged_when_it_was_judged(
-    said: Said, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cell_says_whether_its_model_was_privileged(said: Said, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = registry.world_model_entry("cheat")
     assert _cells(said, "cheat")
     monkeypatch.setitem(registry.WORLD_MODELS, "cheat", dataclasses.replace(entry, privileged=False))
@@ -262,7 +260,7 @@ def test_a_command_that_judges_nothing_leaves_the_report_of_others(said: Said) -
     assert {path: path.read_bytes() for path in before} == before
 
 
-def test_each_cell_names_reader_and_policies_and_is_not_compared_with_those_of_another(copied: Path) -> None:
+def test_cells_of_other_readers_or_policies_are_not_compared(copied: Path) -> None:
     cell = copied / ModelFit("copy", 1000, 60).file
     before = read_sealed(cell, "a cell")
     assert len(before["policies"]) == 12
@@ -337,7 +335,7 @@ def test_the_page_of_a_judgement(said: Said, expected: Expected) -> None:
     expected("judgement", short(text), exactly=False)
 
 
-def test_lost_cells_and_images_are_made_anew_by_the_same_judgement_and_nothing_else_is(copied: Path) -> None:
+def test_lost_cells_and_images_alone_are_made_anew(copied: Path) -> None:
     """To the same figures, but for times."""
     one, cell, images = (
         _of("nearest", "copy", "exact"),
@@ -360,9 +358,7 @@ def test_lost_cells_and_images_are_made_anew_by_the_same_judgement_and_nothing_e
     assert made == {cell.file, images.replace(".npz", ".json")}
 
 
-def test_a_cell_judged_at_once_by_several_is_kept_with_the_images_of_the_same_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cell_judged_by_several_has_images_of_the_same_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, cell, at_once = _of("exact"), ModelFit("exact", 1000, 60), threading.Barrier(4)
 
     def fitted(*_: object) -> tuple[dict[str, object], Arrays]:
@@ -486,7 +482,7 @@ def test_judgements_that_cannot_be_compared_lie_apart() -> None:
         assert folder(**more) == folder(), "these are cells of one folder"
 
 
-def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> None:
+def test_models_take_the_given_encoder_if_it_is_of_their_kind() -> None:
     costs = [_source(name, "pick_place", encoder=_LATENTS).cost for name in ("gaussian", "structured")]
     assert [cost["encoder"] for cost in costs] == [_LATENTS, "pick_place-clean-codes"]
     assert "encoder_reads" not in costs[0]
@@ -494,7 +490,7 @@ def test_models_see_through_the_given_encoder_if_they_read_what_it_gives() -> No
     assert few == pytest.approx(0.115, abs=1e-3)
 
 
-def test_a_judged_model_whose_encoder_reads_few_frames_is_marked_in_its_row(copied: Path) -> None:
+def test_a_model_whose_encoder_reads_few_frames_is_marked(copied: Path) -> None:
     for path in copied.glob("nearest-*.json"):
         write_json(path, sealed({**read_sealed(path, "a cell"), "encoder_reads": 0.115}))
     assert "(encoder reads 11.5%)" in judgement_page(judged(copied, _of("nearest", "copy"))).summary

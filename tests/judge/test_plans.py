@@ -114,7 +114,7 @@ def test_optimal_plans_are_solved_without_a_second_look(right: list[PlanResult])
     assert dreamer.looks == 3
 
 
-def test_what_is_written_holds_every_plan_and_a_wrong_one_stops_where_the_episode_does(
+def test_every_plan_is_written_and_stops_with_its_episode(
     wrong: list[PlanResult], right: list[PlanResult], tmp_path: Path, expected: Expected
 ) -> None:
     failed = next(plan for plan in wrong if not plan.solved)
@@ -226,9 +226,7 @@ def test_no_agent_without_imagination_and_no_empty_series() -> None:
             next(make_plans(trained(object()), count=count, execution="kinematic"))
 
 
-def test_plans_with_another_bound_or_number_lie_in_folders_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plans_of_other_options_lie_in_other_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that none overwrites the table and the films of those before; each names the world that it was tried in."""
     imaginer = small(agents=("imaginer",), budgets=(2,), evaluation_episodes=1, test_appearance="mild")
     folder = bench(imaginer, {}, root=tmp_path, launcher=Inline()).folder

@@ -153,7 +153,7 @@ def changed(world: JudgedWorld, **changes: float | None) -> Altered:
     return Altered(world, alter)
 
 
-def test_a_model_that_expects_the_end_everywhere_is_charged_for_its_haste() -> None:
+def test_a_model_that_expects_ends_everywhere_is_charged() -> None:
     """Its own probability of an end decides its plans: it takes the largest reward at once."""
     world = judged_world(ARROWS)
     rules = world.spec.rules
@@ -209,7 +209,7 @@ class Drawing:
 
 
 @pytest.mark.parametrize("mistaken", [0.0, 0.3])
-def test_a_model_that_draws_is_comparable_with_one_that_gives_probabilities(mistaken: float) -> None:
+def test_drawing_and_probabilistic_models_are_comparable(mistaken: float) -> None:
     """Without bias: total variation tells them apart, the unbiased score does not."""
     world = judged_world("arrows:cubes=2,slip=0.2")
     whole = world.rollouts
@@ -228,7 +228,7 @@ def test_a_model_that_draws_is_comparable_with_one_that_gives_probabilities(mist
         assert mean["perfect_by_depth"][0] == pytest.approx(0.117, abs=0.001)
 
 
-def test_a_brier_score_is_a_mean_over_questions_however_many_guesses_each_has() -> None:
+def test_a_brier_score_is_a_mean_over_questions() -> None:
     """Half of the probability on the truth, half on an impossible outcome: 1/4 + 1/4 a question."""
     world = judged_world(ARROWS)
     scores = world.scores(giving(world, 0.5))

@@ -52,7 +52,7 @@ def test_the_sampling_floor_is_what_samples_of_the_truth_show() -> None:
 
 @pytest.mark.parametrize("drawn", [2, 3, 5])
 @pytest.mark.parametrize("model", [THREE, HALVES, {(1,): 0.1, (4,): 0.9}])
-def test_the_mean_squared_distance_of_all_samples_is_that_of_the_model(model: dict[State, float], drawn: int) -> None:
+def test_the_squared_distance_of_samples_is_unbiased(model: dict[State, float], drawn: int) -> None:
     """Every sequence of futures, with its probability: unbiased for any model and number of futures."""
     exact = squared_distance(THREE, model)
     assert exact == pytest.approx(sum((THREE.get(key, 0.0) - model.get(key, 0.0)) ** 2 for key in THREE | model))

@@ -243,7 +243,7 @@ def test_members_of_a_pair_differ_in_one_cause_and_both_must_be_right(task: str)
     assert scores["only the look"]["right"] < 0.2 < scores["only the look"]["exact"]
 
 
-def test_the_hamming_distance_counts_edges_whatever_factors_are_called() -> None:
+def test_the_hamming_distance_counts_edges_under_any_names() -> None:
     rules = labelled("pick_place").rules
     edges = edges_of_rules(rules)
     states = np.array(states_of_play(rules))

@@ -60,7 +60,7 @@ def test_looking_again_and_again_claims_no_more() -> None:
     assert np.any(careless, axis=0).mean() > 0.08
 
 
-def test_a_repetition_has_as_many_seeds_of_each_agent_as_the_default_bench(tmp_path: Path) -> None:
+def test_a_repetition_has_the_seeds_of_the_default_bench(tmp_path: Path) -> None:
     """Of 21 seeds, two disjoint groups; agents that differ by 40 points are told apart in all of them.
 
     They differ at the number of episodes of the default bench, and at no other.

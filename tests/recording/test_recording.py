@@ -88,9 +88,7 @@ class _SeesAndExplores(FakeAgent):
         return rng.random(6, dtype=np.float32)
 
 
-def test_how_it_learned_to_see_comes_before_it_acts_and_what_it_does_not_know_beside_each_step(
-    imagined: Path, tmp_path: Path
-) -> None:
+def test_a_recording_shows_perception_first_and_unknown_steps(imagined: Path, tmp_path: Path) -> None:
     path = record(_SeesAndExplores(), tmp_path / "tells.rrd", name="random")
     looked, acted = times(path, "/seen/factors", "sim_time"), times(path, "/real/reward", "sim_time")
     assert len(looked) == 2 and max(looked) < min(acted)
@@ -113,7 +111,7 @@ class _Repeats(FakeAgent):
 
 
 @pytest.mark.parametrize("action", [0, 4])
-def test_the_first_solved_and_the_first_lost_episode_are_kept_as_they_were_seen(tmp_path: Path, action: int) -> None:
+def test_the_first_solved_and_lost_episodes_are_kept(tmp_path: Path, action: int) -> None:
     path = tmp_path / "recording.rrd"
     with closing(gymnasium.make("imagine_bench/ArrowPuzzle-v0", execution="kinematic")) as env:
         given: dict[str, Any] = {"name": "random", "env": env, "seed": 3, "appearance": "clean", "episodes": 12}
@@ -236,7 +234,7 @@ def labelled(states: NDArray[np.int64], appearance: str, rng: np.random.Generato
 
 
 @pytest.mark.parametrize("before", [0, 1, 4])
-def test_compared_rollouts_follow_the_rules_as_late_as_the_agent_s_frames_and_hide_as_much(before: int) -> None:
+def test_compared_rollouts_are_as_late_and_hidden_as_frames(before: int) -> None:
     """With a lag of 2 and a human who points once: a frame shows two macro-actions ago, and the hand at the start."""
     spec = dataclasses.replace(registry.task("arrows:gesture=first,lag=2"), render_macrostates=labelled)
     rng, episode = np.random.default_rng(0), [spec.rules.start_states[0]]

@@ -88,7 +88,7 @@ def recorded(length: int, success: bool) -> RecordedEpisode:
 
 
 @pytest.mark.parametrize("length", [1, 3, 6])
-def test_an_episode_s_strip_shows_every_frame_in_order_and_how_it_ended(length: int) -> None:
+def test_an_episode_s_strip_shows_every_frame_and_the_end(length: int) -> None:
     success = length != 3
     episode = recorded(length, success)
     strip = filmstrips.episode_strip(episode, PICK_PLACE.action_names)
@@ -99,7 +99,7 @@ def test_an_episode_s_strip_shows_every_frame_in_order_and_how_it_ended(length: 
     assert places == sorted(places) and strip.shape[1] < 700, "in order, and it fits a page"
 
 
-def test_a_report_begins_with_a_solved_and_a_lost_episode_and_links_recordings(tmp_path: Path) -> None:
+def test_a_report_begins_with_a_solved_and_a_lost_episode(tmp_path: Path) -> None:
     protocol = Protocol(task="pick_place", preset="quick", agents=("random", "dqn"), seeds=(0, 1), budgets=(5,))
     plain = bench_result(tmp_path, protocol=protocol)
     assert not any(section.links for section in bench_page(plain).sections), "older runs kept no episodes"

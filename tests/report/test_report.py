@@ -139,7 +139,7 @@ def test_three_seeds_are_too_few_to_say_whatever_they_solve(result: BenchResult)
     assert all(row[name] in ("", "nan") for row in rows for name in (*SCORE[1:], *DIFFERENCE[1:], "p_holm"))
 
 
-def test_an_agent_of_one_seed_hides_no_difference_that_others_could_show(many: BenchResult) -> None:
+def test_one_seed_hides_no_difference_of_others(many: BenchResult) -> None:
     first = collect(many).compared[0]
     protocol = dataclasses.replace(many.protocol, few_seeds=((first, many.protocol.seeds[0]),))
     runs = tuple(run for run in many.runs if run.agent != first or run.seed == many.protocol.seeds[0])

@@ -203,7 +203,7 @@ def test_a_task_of_an_absent_package_has_no_facts(error: Exception, monkeypatch:
     assert math.isnan(found.facts().chance_level)
 
 
-def test_an_agent_of_an_absent_package_has_an_entry_that_makes_nothing() -> None:
+def test_an_agent_of_an_absent_package_makes_nothing() -> None:
     found = known_agent("of_nobody")
     assert found.make == "" and found.description == "Its package is not installed here."
     assert known_agent("dqn") == registry.agent_entry("dqn")

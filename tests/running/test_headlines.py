@@ -94,7 +94,7 @@ def test_stages_end_once_decided_or_at_the_most(staged: Any, tmp_path: Path, gap
     assert again == asked, "the same call asks for the same benches, which are then only read"
 
 
-def test_a_setting_that_no_agent_of_headlines_has_is_of_the_first_stage(staged: Any, tmp_path: Path) -> None:
+def test_a_setting_without_a_headline_agent_is_of_the_first_stage(staged: Any, tmp_path: Path) -> None:
     asked: list[Protocol] = []
     first = dataclasses.replace(FIRST, overrides=(("controller.discount", 0.9), ("dynamics.parents", 2)))
     _, whole = until_decided(partial(staged(0, asked), overrides=first.overrides), first, most=8, root=tmp_path)

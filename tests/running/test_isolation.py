@@ -96,7 +96,7 @@ def test_each_end_of_a_guest_is_one_sentence(start: Start, closed: bool) -> None
             guest = start(closed=closed, call_s=5.0)
 
 
-def test_a_guest_that_is_killed_or_answers_with_a_pickle_is_a_sentence(start: Start, tmp_path: Path) -> None:
+def test_a_killed_or_pickling_guest_is_a_sentence(start: Start, tmp_path: Path) -> None:
     with pytest.raises(InvalidValueError, match="was killed, such as for lack of memory"):
         start(closed=False).call("killed")
     if sys.platform == "linux":

@@ -30,9 +30,7 @@ def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return clock
 
 
-def test_time_left_counts_neither_work_done_before_nor_that_of_a_failed_run(
-    now_s: list[float], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_time_left_counts_no_earlier_or_failed_work(now_s: list[float], capsys: pytest.CaptureFixture[str]) -> None:
     """Of 72 parts, 9 were done before and 10 take ten hours; 34 are left, for a run that failed has 19."""
     with ProgressBar(SPECS) as show:
         show(far(0, 9))

@@ -39,7 +39,7 @@ def test_quick_finds_encoders_at_every_appearance(name, appearance):
 
 
 @pytest.mark.parametrize("kind", ["latents", "codes"])
-def test_latents_that_are_given_are_for_agents_that_read_them_and_codes_for_all(kind, tmp_path):
+def test_given_latents_are_for_readers_and_codes_for_all(kind, tmp_path):
     spec = task("arrow_puzzle")
     own = {each: encoders.own(spec, "clean", each) for each in ("latents", "codes")}
     given = tmp_path / "given.safetensors"

@@ -177,7 +177,7 @@ def test_earlier_tasks_come_first_on_episodes_of_their_own(tmp_path: Path, monke
     assert len(result.training_length) == len(alone.training_length) == 6
 
 
-def test_an_unannounced_change_is_told_to_nobody_and_episodes_are_counted_on(tmp_path: Path) -> None:
+def test_an_unannounced_change_stays_hidden(tmp_path: Path) -> None:
     result = do(
         tmp_path / "run", after=("arrow_puzzle_hard", "arrow_puzzle_toward"), after_episodes=3, unannounced=True
     )

@@ -45,7 +45,7 @@ def test_figures_of_a_test_by_hand() -> None:
     }  # fmt: skip
 
 
-def test_a_macro_action_that_is_tried_again_keeps_the_episode_of_its_first_time() -> None:
+def test_a_repeated_action_keeps_the_episode_of_its_first_time() -> None:
     counters = Counters()
     counters.try_out((0, 3), 1)
     counters.add_episode(success=False, length=1)
@@ -54,7 +54,7 @@ def test_a_macro_action_that_is_tried_again_keeps_the_episode_of_its_first_time(
     assert counters.tried == {"0 3 1": 0, "0 3 2": 1}
 
 
-def test_an_episode_begins_where_its_seed_says_unless_a_start_is_asked_for() -> None:
+def test_an_episode_begins_by_seed_unless_a_start_is_given() -> None:
     starts, elsewhere = [(0, 1, 2, 1), (1, 2, 0, 1)], {"macrostate": (1, 2, 3, 0)}
     with closing(start_from(make_env(small(), "arrow_puzzle"), starts)) as env:
         one, other = ([tuple(env.reset(seed=seed)[1]["macrostate"]) for seed in range(12)] for _ in range(2))
@@ -71,7 +71,7 @@ def test_an_episode_begins_where_its_seed_says_unless_a_start_is_asked_for() -> 
         (0, {"split": "values=3:0:1"}, ("evaluation", "clean")),
     ],
 )
-def test_tests_and_recordings_have_starts_and_looks_that_training_never_saw_and_observers_ask_about_these(
+def test_tests_and_recordings_have_starts_and_appearances_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, looks: dict[str, str], tests: tuple[str, str]
 ) -> None:
     reset, seen, asked = MacroEnv.reset, set(), []

@@ -63,7 +63,7 @@ def test_every_present_and_absent_part_is_read_back(kind: Any) -> None:
             assert type(read) is kind and exact(dataclasses.asdict(read)) == exact(dataclasses.asdict(value))
 
 
-def test_2000_training_episodes_take_less_than_150_kb_and_are_read_back_to_the_bit() -> None:
+def test_2000_training_episodes_take_150_kb_and_come_back_to_the_bit() -> None:
     rng = np.random.default_rng(0)
     count, n_actions = 2000, 30
     whole = {"starts": (4, (count, 6)), "actions": (6, count * n_actions), "faults": (2, count)}
@@ -81,7 +81,7 @@ def test_2000_training_episodes_take_less_than_150_kb_and_are_read_back_to_the_b
     assert read is not None and exact(vars(read)) == exact(vars(kept))
 
 
-def test_numpy_scalars_are_kept_as_numbers_and_what_an_older_file_lacks_takes_its_default() -> None:
+def test_numpy_scalars_are_numbers_and_absent_fields_defaults() -> None:
     row = variants(Checkpoint)[-1]
     numbers = {"x": np.float32(0.1), "count": np.int64(5), "flag": np.True_, "text": np.str_("a")}
     values, arrays = pack(dataclasses.replace(row, diagnostics=numbers))
@@ -155,7 +155,7 @@ _watch: list[Callable[[str], None]] = []
 sys.addaudithook(lambda event, _: [call(event) for call in _watch[:1]] and None)
 
 
-def test_a_whole_checkpoint_is_there_at_every_moment_of_a_save_and_of_a_reading(tmp_path: Path) -> None:
+def test_a_whole_checkpoint_is_there_at_every_moment(tmp_path: Path) -> None:
     save_snapshot(tmp_path, snapshot(1))
     seen: list[int] = []
 

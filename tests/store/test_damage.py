@@ -61,7 +61,7 @@ def test_whatever_json_holds_is_one_sentence(tmp_path: Path, name: str, content:
     assert len(str(caught.value)) < 500 and "\n" not in str(caught.value)
 
 
-def test_folders_of_other_names_are_no_checkpoints_and_a_renamed_one_is_named(tmp_path: Path) -> None:
+def test_other_folders_are_no_checkpoints_a_renamed_one_is_named(tmp_path: Path) -> None:
     checkpoint = unfinished(tmp_path)
     for name in ("checkpoint_old", "checkpoint_000099_episode_9 (copy)", "checkpoint_x_episode_1"):
         shutil.copytree(checkpoint, checkpoint.with_name(name))
@@ -96,7 +96,7 @@ def test_neither_a_lock_nor_a_file_half_written_follows_a_link(
     assert precious.read_text() == "precious" and (tmp_path / "a.json").read_bytes() == b"1"
 
 
-def test_a_recording_that_changed_is_noticed_one_that_was_removed_is_not(tmp_path: Path) -> None:
+def test_a_changed_recording_is_noticed_a_removed_one_is_not(tmp_path: Path) -> None:
     unfinished(tmp_path)
     recording = recording_path(tmp_path)
     recording.write_bytes(b"as it was recorded")

@@ -76,7 +76,7 @@ def test_a_log_of_any_bytes_becomes_a_text_that_a_terminal_can_show(
     assert (log.read_text(encoding="utf-8") if log.exists() else None) == kept
 
 
-def test_a_sealed_file_that_lost_its_seal_or_has_another_value_is_refused(tmp_path: Path) -> None:
+def test_a_sealed_file_without_its_seal_or_value_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     whole = sealed({"seed": 1, "rate": 0.5})
     bare = {name: value for name, value in whole.items() if name != "seal"}

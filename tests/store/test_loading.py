@@ -139,7 +139,7 @@ def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
     ],
     ids=["the others of an agent of few seeds", "a gap in its seeds", "few seeds in both"],
 )
-def test_agents_of_few_seeds_are_joined_with_all_that_follow_each_other(
+def test_agents_of_few_seeds_are_joined_with_their_neighbors(
     tmp_path: Path,
     seeds: tuple[int, ...],
     more: dict[str, Any],

@@ -60,7 +60,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in kept}
 
 
-def test_a_kept_bench_is_read_under_todays_labels_and_goes_on_with_its_own_version_alone(tmp_path: Path) -> None:
+def test_a_kept_bench_has_todays_labels_and_its_own_version(tmp_path: Path) -> None:
     """Its finished run keeps the learned arrays. The other one cannot be finished as it would have been: the agent has
     learned otherwise since 2026-11-29.
     """

@@ -154,7 +154,7 @@ def test_every_level_is_a_world_in_which_something_can_be_learned():
                 assert split_of(registry.task(level.task).rules, split).test
 
 
-def test_what_separates_names_its_agents_and_tells_learners_nothing_of_the_changed_rule():
+def test_separating_names_its_agents_and_hides_the_changed_rule():
     assert SEPARATING.agents != LADDER.agents and {"dqn", "lewm", "laws:given"} < set(SEPARATING.agents)
     assert dataclasses.replace(SEPARATING, agents=("dqn",)).hash == SEPARATING.hash
     by_name = {each.name: each.levels for each in SEPARATING.experiments}

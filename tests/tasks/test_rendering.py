@@ -221,7 +221,7 @@ def test_a_window_of_gymnasium_s_ends_no_environment_s_drawing(desktop):
         ("PYOPENGL_PLATFORM", "glx", "but frames are drawn by EGL; unset it"),
     ],
 )
-def test_a_variable_that_keeps_egl_from_drawing_is_named_and_no_library(variable, value, sentence):
+def test_a_variable_that_blocks_egl_is_named(variable, value, sentence):
     draw = "from imagine_bench.tasks.rendering import gl_renderer\ntry:\n    gl_renderer()\nexcept Exception as error:"
     done = run_script(f"{draw}\n    print(error)", **{variable: value})
     assert done.stdout.startswith(f"{variable} is {value!r}, {sentence}")
@@ -295,7 +295,7 @@ def test_any_thread_draws_one_at_a_time(world, made):
     camera.close()
 
 
-def test_a_view_for_people_has_one_more_light_and_leaves_agents_frames_as_they_were(world):
+def test_a_view_for_people_leaves_agents_frames_as_they_were(world):
     camera = own_camera(world.model)
     before = camera.frame(world.data)
     lights = world.model.light_active.tolist()

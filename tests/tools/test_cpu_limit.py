@@ -51,7 +51,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> str:
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False).stdout
 
 
-def test_far_over_the_limit_fails_over_it_is_named_and_a_first_import_is_nobodys(report: str) -> None:
+def test_a_slow_test_is_named_and_a_very_slow_one_fails(report: str) -> None:
     assert "2 failed, 5 passed" in report
     assert "test_far_over" in report and "more than twice the limit of 0.1 CPU s" in report
     _, _, named = report.partition("fast tests over")

@@ -177,7 +177,7 @@ def test_a_task_of_others_shows_the_agent_s_frame():
     game.close()
 
 
-def test_a_model_brings_its_task_and_its_looks_and_what_cannot_be_played_is_refused(keyboard, monkeypatch, tmp_path):
+def test_a_model_brings_its_task_and_its_appearance(keyboard, monkeypatch, tmp_path):
     world = {"execution": "kinematic"}
     spec = SimpleNamespace(protocol=SimpleNamespace(world=world, appearance="mild"))
     trained = SimpleNamespace(task=registry.task("arrow_puzzle"), imaginer=FakeImaginer(), spec=spec)
@@ -218,7 +218,7 @@ def test_keys_move_the_hand_where_they_say(hand):
         assert moved_m.argmax() == place // 2 and moved_m.max() > 0.02, key
 
 
-def test_a_press_of_the_grip_closes_the_fingers_and_the_end_stands_still_for_two_seconds(hand):
+def test_a_press_closes_the_fingers_and_the_end_stands_still(hand):
     game = hand
     game.reset()
     grip, nothing = keys_to_commands()[("g",)], np.zeros(7, np.float32)

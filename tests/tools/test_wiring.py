@@ -276,9 +276,7 @@ def arguments(line: str, target: str) -> dict[str | int, Any]:
 
 
 @pytest.mark.parametrize("one", WIRES, ids=lambda one: f"{one.line} {one.target.rpartition('.')[2]}")
-def test_an_option_reaches_its_argument_and_no_other_and_left_out_is_what_its_help_says(
-    one: Wire, tmp_path: Path
-) -> None:
+def test_an_option_reaches_its_argument_alone(one: Wire, tmp_path: Path) -> None:
     with contextlib.chdir(tmp_path):
         before, same, after = (arguments(f"{one.line} {more}", one.target) for more in ("", one.default, one.others))
     assert same == before
@@ -344,9 +342,7 @@ def planned(words: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("bench", "words", "otherwise"), OPTIONS)
-def test_an_option_of_a_bench_sets_its_fields_of_the_protocol_and_no_other(
-    bench: str, words: str, otherwise: Mapping[str, Any]
-) -> None:
+def test_an_option_of_a_bench_sets_its_own_fields_alone(bench: str, words: str, otherwise: Mapping[str, Any]) -> None:
     before, after = planned(bench), planned(f"{bench} {words}")
     given = {**chosen(words), **otherwise}
     given.pop("set", None)

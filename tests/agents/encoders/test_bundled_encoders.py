@@ -58,7 +58,7 @@ def test_bundled_encoder_reads_fresh_frames_as_its_card_says(task: str, appearan
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_an_encoder_that_reads_frames_otherwise_than_the_task_declares_is_refused(wrapped: bool) -> None:
+def test_an_encoder_of_other_preprocessing_is_refused(wrapped: bool) -> None:
     with closing(gymnasium.make("imagine_bench/PickPlace-v0", disable_env_checker=True)) as made:
         env = made if wrapped else made.unwrapped
         assert LatentObservation(env, "pick_place-clean").observation_space.shape == (4,)

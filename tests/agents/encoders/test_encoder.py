@@ -182,9 +182,7 @@ def weights(encoder: Encoder) -> Tensor:
     return torch.nn.utils.parameters_to_vector([*encoder.network.parameters(), *encoder.probe.parameters()])
 
 
-def test_training_that_is_killed_goes_on_to_the_same_bits_without_global_randomness(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_training_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "SAVE_EVERY_S", 0.0)
     file = tmp_path / "unfinished.pt"
     told: list[str] = []
@@ -327,7 +325,7 @@ def test_a_full_memory_of_frames_forgets_the_oldest(tiny: Encoder, monkeypatch: 
     assert [frame.tobytes() for frame in shown[2:]] == list(sees._recent)
 
 
-def test_below_a_column_of_the_sheet_stands_what_was_read_red_where_it_is_wrong(encoder: Encoder) -> None:
+def test_a_sheet_names_each_reading_red_where_it_is_wrong(encoder: Encoder) -> None:
     shown = frames(3)
     read = encoder.read_macrostate(encoder.encode(shown)[0])
     truth = read.copy()

@@ -40,7 +40,7 @@ def test_log_likelihood_stays_finite_where_densities_underflow() -> None:
     assert torch.isfinite(mdn.log_likelihood(mixture, far)).all()
 
 
-def test_sigma_stays_between_its_floor_and_ceiling_and_keeps_a_gradient() -> None:
+def test_sigma_stays_within_its_bounds_and_keeps_a_gradient() -> None:
     log_variances = torch.tensor([[-1e3, -2.0, 0.0, 2.0, 1e3]], dtype=torch.float64)
     outputs = torch.cat([torch.zeros(1, 10, dtype=torch.float64), log_variances], dim=1)  # K = 5, Z = 1
     bounded = mdn.from_outputs(outputs, 5, 1, log_sigma_floor=-30.0, log_sigma_ceiling=40.0).log_sigmas.flatten()

@@ -55,7 +55,7 @@ def training(agent: ModelOnlyAgent, part: str = "") -> dict[str, bytes]:
     return {name: array.tobytes() for name, array in arrays.items() if name.startswith(f"model_only/{part}")}
 
 
-def test_the_explorer_is_the_dqn_and_the_tested_controller_sees_no_real_transition() -> None:
+def test_the_tested_controller_sees_no_real_transition() -> None:
     """Only new experience asks for new training."""
     plain, agent = built(make_dqn), made()
     assert not agent.train_in_model(), "nothing was learned yet"

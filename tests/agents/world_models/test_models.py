@@ -76,7 +76,7 @@ def test_latent_models_offer_three_uncertainties(name: str) -> None:
 
 
 @pytest.mark.usefixtures("quick")
-def test_the_filter_discards_what_its_threshold_says_and_all_that_follows() -> None:
+def test_the_filter_discards_from_its_threshold_on() -> None:
     model = fitted("mdn_thesis")
     assert isinstance(model, latent.LatentModel)
     first = imagined(model).epistemic[:, 0]
@@ -88,7 +88,7 @@ def test_the_filter_discards_what_its_threshold_says_and_all_that_follows() -> N
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("name", ["mdn_thesis", "structured"])
-def test_one_network_offers_no_epistemic_uncertainty_and_pictures_are_as_the_task_draws_them(name: str) -> None:
+def test_one_network_has_no_epistemic_uncertainty(name: str) -> None:
     """Chapter 3 of the thesis, pick-and-place, has neither dropout nor an ensemble: a dash, not zeros."""
     found = imagined(fitted(name, data("pick_place", 20), "pick_place"), depth=2, n_actions=4)
     assert found.pictures.shape == (5, 4, 2, 32, 32, 3), "in color, of 32 pixels"
@@ -115,7 +115,7 @@ def test_the_structured_model_knows_what_it_never_tried() -> None:
     assert np.allclose(one, many)
 
 
-def test_patches_finds_the_cubes_and_the_hand_and_how_many_looks_each_has() -> None:
+def test_patches_finds_cubes_hand_and_their_appearances() -> None:
     model = fitted("patches")
     assert isinstance(model, Patches)
     assert sorted(len(patch.gray) for patch in model.patches) == [3, 4, 4, 4], "the hand, and three arrows"

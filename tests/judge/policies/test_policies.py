@@ -196,7 +196,7 @@ def test_a_course_ends_with_the_episode_the_plan_or_the_known_world(reached: Sta
 # Lift --------------------------------------------------------------------------------------------------------------
 
 
-def test_a_table_of_every_transition_plans_as_the_truth_and_one_of_none_never_tries() -> None:
+def test_a_whole_table_plans_as_the_truth_an_empty_one_never_tries() -> None:
     """Episodes of one transition each, in a world without chance."""
     world = world_of(ARROWS)
     truth, count = world.truth, world.truth.reward.size
@@ -238,7 +238,7 @@ def test_agents_that_train_in_the_truth_are_as_good_as_its_best_plan(task: str) 
         assert len(returns) == AGENTS and returns.mean() == pytest.approx(best, abs=0.1)
 
 
-def test_an_agent_that_trains_on_data_tries_nothing_that_the_data_has_not() -> None:
+def test_an_agent_on_data_tries_nothing_else() -> None:
     world = world_of(ARROWS)
     tried = np.random.default_rng(0).random(world.truth.reward.shape) < 0.4
     assert not tried.any(axis=1).all(), "somewhere nothing was tried"
@@ -249,7 +249,7 @@ def test_an_agent_that_trains_on_data_tries_nothing_that_the_data_has_not() -> N
     assert (with_all & ~tried)[:, tried.any(axis=1)].any(), "where all was tried it chooses such macro-actions"
 
 
-def test_training_in_a_wrong_model_pays_less_than_training_on_the_data() -> None:
+def test_training_in_a_wrong_model_earns_less_than_on_the_data() -> None:
     world = world_of(ARROWS)
     wrong = world.truth._replace(reward=-world.truth.reward)
     without = without_model(world, world.truth, np.random.default_rng(1))

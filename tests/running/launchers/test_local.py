@@ -106,7 +106,7 @@ def _carried(item: int, tell: Callable[[int], None]) -> str:
     return f"{item} fails" if item == 2 else ""
 
 
-def test_a_worker_that_dies_costs_one_item_and_others_go_on_in_one_process() -> None:
+def test_a_worker_that_dies_costs_one_item() -> None:
     workers: list[int] = []
     ends: list[tuple[int, str]] = []
     work_through(

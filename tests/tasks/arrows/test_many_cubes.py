@@ -38,7 +38,7 @@ def test_fingers_open_no_wider_than_there_is_room(seed):
 
 
 @pytest.mark.parametrize("clockwise", [True, False])
-def test_fingers_let_go_with_as_much_room_as_there_is_where_a_cube_is_put_down(clockwise):
+def test_fingers_open_as_far_as_there_is_room(clockwise):
     """The next cube of its row stands 9 mm nearer, and the cube is put down 9 mm nearer to that."""
     world = _world(cubes=6, forbid="none")
     world.place((0,) * 6 + (0,), np.random.default_rng(0))

@@ -74,7 +74,7 @@ def test_a_random_episode_is_of_actions_one_by_one() -> None:
     assert env.episode.periods > 25
 
 
-def test_nothing_is_carried_out_after_the_end_and_only_that_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_carried_out_after_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_arrows(control="joint", observation="proprio", time_limit_s=1.0)
     env.reset(seed=541)
     computed = []
@@ -98,9 +98,7 @@ TO_A_POSE = [0.6, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0, 1.0]
         ("pose", [TO_A_POSE, [*TO_A_POSE[:3], 0.0, 0.0, 0.0, 0.0, 1.0]]),
     ],
 )
-def test_a_wrong_action_among_several_is_refused_before_anything_moves(
-    control: str, actions: list[list[float]]
-) -> None:
+def test_a_wrong_action_is_refused_before_anything_moves(control: str, actions: list[list[float]]) -> None:
     env = make_arrows(control=control, observation="proprio")
     env.reset(seed=541)
     before = pickle.dumps(env.get_state())
@@ -109,7 +107,7 @@ def test_a_wrong_action_among_several_is_refused_before_anything_moves(
     assert pickle.dumps(env.get_state()) == before
 
 
-def test_a_simulation_that_blows_up_after_an_event_has_no_second_event(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_blown_up_simulation_has_no_second_event(monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_arrows(control="twist", observation="proprio")
     actions = experts(env, 541, 120)
     env.reset(seed=541)

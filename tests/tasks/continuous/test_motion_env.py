@@ -38,7 +38,7 @@ def test_the_best_macro_actions_by_hand_are_one_event_each_as_ruled(family: str,
 
 
 @pytest.mark.parametrize("control", CONTROL_NAMES)
-def test_commands_keep_the_limits_of_speed_and_range_whatever_is_asked(control: str) -> None:
+def test_commands_keep_the_limits_of_speed_and_range(control: str) -> None:
     env, _ = environment("arrows", control=control, **FREE["arrows"])
     rng = np.random.default_rng(0)
     low, high = env.action_space.low, env.action_space.high
@@ -86,7 +86,7 @@ def test_parameters_of_a_world_mean_what_they_mean_of_macro_actions(family: str,
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, -1, -1)])
-def test_a_segment_begins_with_the_hand_moved_and_turned_about_the_vertical(signs: tuple[int, ...]) -> None:
+def test_a_segment_begins_with_the_hand_moved_and_turned(signs: tuple[int, ...]) -> None:
     env, _ = environment("arrows")
     env.reset(seed=0)
     place_m, turned = env.controls.hand_pose(env.servo_targets()[:7])
@@ -107,7 +107,7 @@ def test_any_number_of_cubes_is_turned_by_hand(cubes: int) -> None:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_the_dense_reward_sums_to_the_sparse_one_less_the_potential_of_the_start(family: str) -> None:
+def test_dense_rewards_sum_to_sparse_ones_less_the_potential(family: str) -> None:
     """Shaping by a potential telescopes, whatever the motion; and a good motion is paid before its event."""
     dense, expert = environment(family, reward="dense")
     sparse, _ = environment(family)
@@ -155,9 +155,7 @@ def test_a_grip_that_slips_leaves_the_object_where_it_is(family: str) -> None:
     ("family", "options"),
     [("arrows", {"cubes": 1}), ("arrows", {}), ("arrows", {"cubes": 6}), ("pick_place", {})],
 )
-def test_a_placement_moves_objects_apart_from_each_other_and_reads_as_before(
-    family: str, options: dict[str, int]
-) -> None:
+def test_a_placement_moves_each_object_and_reads_as_before(family: str, options: dict[str, int]) -> None:
     """In 100 starts some object is more than 3 cm off its slot, none more than 4.3 cm, and two are 8 cm apart."""
     (placed, _), (plain, _) = environment(family, placement=0.04, **options), environment(family, **options)
     plain.reset(seed=0)
@@ -246,7 +244,7 @@ def test_the_hand_keeps_to_its_plan_beside_other_cubes(seed: int, start: tuple[i
     assert (event["macro_action"], event["fault"]) == (action, False)
 
 
-def test_the_least_time_of_a_macro_action_follows_from_heights_and_the_largest_twist() -> None:
+def test_the_least_time_follows_from_heights_and_largest_twist() -> None:
     env, _ = environment("arrows", **FREE["arrows"])
     down_m = 0.1952 - 0.04 - (-0.1 + 0.055) - 0.022 - 0.01
     turn_s = math.radians(70) / 6.0

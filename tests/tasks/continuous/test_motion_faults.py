@@ -35,7 +35,7 @@ def wrong_actions(n: int) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("control", CONTROL_NAMES)
-def test_an_action_that_is_no_real_numbers_is_refused_and_moves_nothing(control: str) -> None:
+def test_an_action_without_real_numbers_is_refused(control: str) -> None:
     env = make_arrows(control=control, observation="proprio")
     env.reset(seed=0)
     before = pickle.dumps(env.get_state())

@@ -44,7 +44,7 @@ def on_the_screen(env):
         (PICK_PLACE, {}, [(0, 0, 0, 0), (0, 0, 0, 2), (0, 1, 0, 0), (0, 0, 1, 3), (2, 0, 0, 3)]),
     ],
 )
-def test_frames_differ_only_where_distractors_are_and_nothing_that_matters_is_hidden(id_, options, states):
+def test_frames_differ_only_where_distractors_are(id_, options, states):
     plain, hidden, noisy = make(id_, **options), make(id_, gesture=0.0, **options), make(id_, distractors=4, **options)
     screen = on_the_screen(noisy)
     for state in states:

@@ -81,7 +81,7 @@ def test_motions_follow_the_rules_within_the_robot_s_limits(world, state, action
     assert np.abs(world.object_poses()[untouched, :3] - before[untouched, :3]).max(initial=0.0) < 1e-4
 
 
-def test_an_object_is_held_midway_between_the_fingers_and_anywhere_along_their_pads():
+def test_an_object_is_held_midway_anywhere_along_the_pads():
     varied = PickWorld(appearance("strong"))
     off_m = []
     for seed in range(3):
@@ -128,7 +128,7 @@ def slippery_tips(model):
         *(((0, 0, 0, index), index, f"closed and do not hold the {OBJECTS[index].name}") for index in range(3)),
     ],
 )
-def test_only_friction_holds_and_what_slips_is_a_fault_and_ends_the_episode(macrostate, action, reason):
+def test_only_friction_holds_and_a_slip_ends_the_episode(macrostate, action, reason):
     """No weld, no teleport; wherever it lies then, the human does not take it for the wanted object."""
     env = gymnasium.make(SPEC.env_id).unwrapped
     env.reset(seed=0, options={"macrostate": macrostate})
@@ -141,7 +141,7 @@ def test_only_friction_holds_and_what_slips_is_a_fault_and_ends_the_episode(macr
     assert info["macrostate"][3] == WITHDRAWN
 
 
-def test_what_was_reached_against_the_draw_is_judged_from_where_the_action_began(monkeypatch):
+def test_an_end_against_the_draw_is_judged_from_its_beginning(monkeypatch):
     """The handover should have slipped, and the car came into the palm all the same: a fault, and the wish is
     fulfilled.
     """

@@ -115,7 +115,7 @@ def test_other_views_of_a_scene_with_control_views_stay_as_they_are(scenes):
 
 @pytest.mark.parametrize("camera", c.CONTROL_CAMERAS)
 @pytest.mark.parametrize("cubes", [PICK, *CUBES])
-def test_at_rest_both_cameras_show_objects_fingers_and_which_gesture_it_is(scenes, cubes, camera):
+def test_at_rest_both_cameras_show_objects_fingers_and_gesture(scenes, cubes, camera):
     """The nearest of the images of another draw has the same gesture."""
     scene = scenes(cubes)
     gestures = range(OPEN_PALM + 1) if cubes == PICK else range(cubes)
@@ -133,7 +133,7 @@ def test_at_rest_both_cameras_show_objects_fingers_and_which_gesture_it_is(scene
 
 
 @pytest.mark.parametrize("cubes", [PICK, 1, 3, 6])
-def test_the_hand_camera_shows_the_fingertips_and_all_of_what_they_hold(scenes, cubes):
+def test_the_hand_camera_shows_fingertips_and_the_held_object(scenes, cubes):
     scene = scenes(cubes)
     for index, name in enumerate(scene.objects):
         scene.place([0] * (len(scene.objects) + 1), np.random.default_rng(0))
@@ -188,9 +188,7 @@ def test_strong_appearance_varies_each_camera_and_the_coarse_arm(control, camera
 
 @pytest.mark.parametrize("control", [False, True])
 @pytest.mark.parametrize("cubes", [3, PICK])
-def test_a_strong_scene_varies_all_that_its_cameras_show_and_drawn_parts_touch_nothing(
-    cubes: int, control: bool
-) -> None:
+def test_a_strong_scene_varies_all_that_its_cameras_show(cubes: int, control: bool) -> None:
     """The coarse arm is drawn for the cameras of continuous control alone, and there it varies too."""
     looks = appearance("strong")
     world = ArrowWorld(looks, Arrows(cubes=cubes), control=control) if cubes else PickWorld(looks, control=control)

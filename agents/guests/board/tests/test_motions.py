@@ -242,7 +242,7 @@ def marked(found: Checked) -> MotionRow:
     return found.row
 
 
-def test_a_test_that_ends_in_another_way_is_excused_only_if_disturbed_replays_do_so_too(
+def test_another_end_is_excused_only_if_disturbed_replays_vary(
     row: OpenMotions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other_fingerprint(row, 2)  # of a test that the expert solves
@@ -279,9 +279,7 @@ def test_a_row_of_another_mujoco_is_not_vouched_for_and_never_holds(
 
 @pytest.mark.usefixtures("few_replays")
 @pytest.mark.parametrize(("total_reward", "least"), [(50.0, -5.0), (-40.0, -40.0)])
-def test_a_marked_test_may_end_otherwise_with_another_mujoco_and_has_failed(
-    row: OpenMotions, total_reward: float, least: float
-) -> None:
+def test_a_marked_test_has_failed_and_may_end_otherwise(row: OpenMotions, total_reward: float, least: float) -> None:
     """With the MuJoCo of the card the same row is refused. Nobody gains: a policy that does nothing has 0, not -5."""
     honest = read_motions(row.folder).vouched
     row.parts[1] |= {"solved": True, "total_reward": total_reward, "reproducible": False}

@@ -64,7 +64,7 @@ def test_a_full_ring_joins_no_new_row_to_an_old_one() -> None:
     }
 
 
-def test_a_reset_keeps_a_share_of_the_hidden_layers_and_nothing_of_the_last() -> None:
+def test_a_reset_keeps_a_share_of_hidden_layers_alone() -> None:
     learner = agent(reuse__kept=1.0, controller__target_rate=0.1)
     live(learner, range(3), np.random.default_rng(0))
     before = [part.detach().clone() for part in learner.controller.network.parameters()]

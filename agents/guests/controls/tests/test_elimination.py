@@ -56,7 +56,7 @@ def test_an_unseen_macrostate_is_told_as_far_as_others_decide_it() -> None:
     assert taught(TRIPLE, (0, 0, 0)).outcome((0, 0, 0)) is None, "no other tells anything of a triple"
 
 
-def test_a_pair_stays_a_cause_where_another_outcome_needs_three_values() -> None:
+def test_a_pair_stays_a_cause_beside_one_of_three_values() -> None:
     """Every triple around a forbidden pair is as suspect as the pair; only the pair is asked about."""
     forbidden: Outcome = (-5.0, True)
     unseen = (0, 0, 2)
@@ -66,7 +66,7 @@ def test_a_pair_stays_a_cause_where_another_outcome_needs_three_values() -> None
     assert model.outcome((1, 1, 2)) == PAID
 
 
-def test_a_pair_never_seen_is_unknown_and_a_pair_seen_as_usual_is_cleared() -> None:
+def test_a_pair_never_seen_is_unknown_a_usual_one_is_cleared() -> None:
     model = model_of(dict.fromkeys([(0, 0, 1), (0, 1, 0), (1, 0, 0)], USUAL))
     assert model.outcome((0, 0, 0)) == USUAL, "its three pairs came with the usual outcome"
     assert model.outcome((0, 1, 1)) is None, "the values 1 and 1 never came together"
@@ -111,7 +111,7 @@ def test_the_unknown_is_worth_the_largest_reward_and_nothing_in_tests() -> None:
     assert agent.act(here, explore=False) == 0
 
 
-def test_it_solves_the_arrow_puzzle_from_every_start_within_150_macro_actions() -> None:
+def test_it_solves_every_start_within_150_macro_actions() -> None:
     """Chance solves 4.6 % of episodes."""
     one = checked_agent("elimination", "arrow_puzzle")
     agent = one.make()

@@ -180,7 +180,7 @@ def test_rollouts_carry_what_they_imagine() -> None:
     assert torch.allclose(state[:, LATENTS:], whole[:, -1], atol=1e-6)
 
 
-def test_the_world_model_remembers_every_frame_and_the_macro_actions_between(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_world_model_remembers_frames_and_macro_actions(monkeypatch: pytest.MonkeyPatch) -> None:
     """In its training, where each reward names a transition, and before it imagines."""
     monkeypatch.setattr(
         FakeEncoder,
@@ -234,7 +234,7 @@ def test_the_world_model_remembers_every_frame_and_the_macro_actions_between(mon
     )
 
 
-def test_a_new_task_keeps_dynamics_and_recurrence_which_the_model_s_updates_train() -> None:
+def test_a_new_task_keeps_dynamics_and_recurrence() -> None:
     agent = make("imagination_memory")
     recall(agent, range(4), np.random.default_rng(1))
     old = agent.imagination.model

@@ -71,7 +71,7 @@ def test_a_complete_table_has_the_exact_values(task: str) -> None:
     np.testing.assert_allclose([found[i].max() for i in going_on], exact[list(going_on)], atol=1e-3)
 
 
-def test_what_chance_decides_is_worth_its_mean_and_only_news_change_that() -> None:
+def test_a_chance_outcome_has_its_mean_value_until_new_counts() -> None:
     table = CountTable(2)
     assert table.action_values(0.5, untried=9.0) == {}
     assert table.add(5, 0, 5, -1.0, False)
@@ -211,7 +211,7 @@ def test_each_reading_sees_its_own_state_alone() -> None:
         read_macrostate(Observation(frame=shown.frame))
 
 
-def test_what_is_learned_after_a_restore_leaves_the_snapshot_as_it_was() -> None:
+def test_learning_after_a_restore_leaves_the_snapshot() -> None:
     learner, resumed, again = (dyna_q(5, read=CODES, seed=seed) for seed in (0, 7, 9))
     live(learner, range(10), np.random.default_rng(1))
     saved = learner.state()
@@ -221,7 +221,7 @@ def test_what_is_learned_after_a_restore_leaves_the_snapshot_as_it_was() -> None
     assert same(again.state(), learner.state()) and not same(resumed.state(), learner.state())
 
 
-def test_posterior_sampling_follows_one_model_to_the_end_of_an_episode() -> None:
+def test_posterior_sampling_keeps_one_model_for_an_episode() -> None:
     learner = sampler()
     learner.observe(moved(0, 0, 1.0, 1, cut=True), episode=0)
     first = learner.values(at(0), explore=True)

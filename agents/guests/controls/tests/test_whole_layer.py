@@ -13,14 +13,14 @@ from imagine_bench_controls.whole_layer import WholeLayerModel, limit_layer_norm
 LIMIT = 0.5
 
 
-def test_a_member_within_the_limit_stays_as_it_is_and_a_larger_one_keeps_its_direction() -> None:
+def test_a_norm_limit_keeps_directions_and_small_members() -> None:
     weights = torch.stack([0.3 * torch.eye(2), 3.0 * torch.eye(2)])
     limit_layer_norm(weights, LIMIT)
     assert torch.equal(weights[0], 0.3 * torch.eye(2))
     torch.testing.assert_close(weights[1], LIMIT / 2**0.5 * torch.eye(2))  # two equal weights
 
 
-def test_after_an_update_every_layer_is_within_the_limit_where_units_alone_are_not() -> None:
+def test_every_layer_is_within_the_limit_after_an_update() -> None:
     settings = HYPERPARAMETERS.resolve("published", {"model.max_norm": LIMIT}, "chapter_5").model
     settings = replace(settings, dynamics_hidden=(32, 32), reward_hidden=(32,), termination_hidden=(32,))
     draws = torch.Generator().manual_seed(0)

@@ -115,9 +115,7 @@ def test_values_are_discounted_by_the_step_and_end_at_the_depth(depth: int) -> N
 
 
 @pytest.mark.parametrize(("unknown", "hopes"), [(0.5, True), (0.21, True), (0.19, False)])
-def test_optimism_values_the_unknown_at_the_best_reward_and_r_max_where_it_is_enough(
-    unknown: float, hopes: bool
-) -> None:
+def test_optimism_and_r_max_value_the_unknown_at_the_best_reward(unknown: float, hopes: bool) -> None:
     planner = chain_planner(unknown, depth=9, r_max_threshold=0.2)
     known = value = 10.0  # in part known, and in part hoped for
     for place in (4, 3, 2, 1, 0):
@@ -129,7 +127,7 @@ def test_optimism_values_the_unknown_at_the_best_reward_and_r_max_where_it_is_en
 
 
 @pytest.mark.parametrize("states", [8, 18])
-def test_a_plan_depends_on_the_model_alone_not_on_what_was_asked_or_learned_before(states: int) -> None:
+def test_a_plan_depends_on_the_model_alone(states: int) -> None:
     planning = dataclasses.replace(PLANNING, states=states)
     model = fitted([])
     seen = rows(starts())
@@ -246,9 +244,7 @@ def test_what_draws_it_can_be_read_and_changes_nothing() -> None:
     ("value", "r_max", "explores_by"),
     [(30.0, 40.0, "r_max"), (30.0, 30.0, "r_max"), (10.0, 10.0, "novelty"), (10.0, 12.0, "r_max")],
 )
-def test_it_is_curious_only_where_nothing_unknown_may_earn_more_and_the_goal_is_far(
-    value: float, r_max: float, explores_by: str
-) -> None:
+def test_it_is_curious_only_where_the_unknown_earns_no_more(value: float, r_max: float, explores_by: str) -> None:
     """50 is the best reward seen; after the 20 macro-actions of a plan it is worth 17.9."""
     learner = agent()
     learner.model.outcomes.rewards = np.array([-1.0, 50.0])

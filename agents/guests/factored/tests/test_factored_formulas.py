@@ -194,7 +194,7 @@ def by_noisy_or(model: FactoredModel, code: Code, action: int, following: Code) 
     return {outcome: share / sum(chance.values()) for outcome, share in chance.items()}, float(1.0 - tested) * none
 
 
-def test_where_a_step_leads_is_as_probable_as_its_factors_say_and_without_a_trial_not_at_all(
+def test_a_step_is_as_probable_as_its_factors_say(
     model: FactoredModel,
 ) -> None:
     following, sure = model.likeliest(np.array(CODES))
@@ -247,7 +247,7 @@ def test_what_follows_is_summed_over_all_that_may(model: FactoredModel) -> None:
         assert unknown == pytest.approx(unsure(factors, untested))
 
 
-def test_a_goal_of_all_values_but_one_is_expected_whatever_that_one_is() -> None:
+def test_a_goal_of_all_values_but_one_is_expected() -> None:
     """Four values of five are the goal; it was met with one value of the fifth alone, and each smaller part in vain."""
     goal = (1, 1, 1, 1)
     learned = OutcomeModel((2, 2, 2, 2, 3), ACTIONS, OutcomeSettings())
@@ -366,7 +366,7 @@ def test_starts_say_that_nothing_in_them_ends_an_episode() -> None:
     assert not learned.starts, "another task may end where this one began"
 
 
-def test_where_causes_of_two_outcomes_hold_that_prevails_which_prevailed_before() -> None:
+def test_of_two_outcomes_the_one_prevails_that_did_before() -> None:
     """Both ends have a cause, one value each; both causes held twice, and the bad end came. Then a new such code."""
     sizes = (2, 2, 5)
     learned = OutcomeModel(sizes, ACTIONS, OutcomeSettings(order=1))

@@ -130,7 +130,7 @@ def test_what_is_nearly_alike_is_parted_where_that_tells_what_follows(matters: b
     assert parted == (matters and told)
 
 
-def test_how_likely_values_make_what_follows_is_a_product_of_predictions() -> None:
+def test_the_likelihood_of_values_is_a_product_of_predictions() -> None:
     """Laplace's rule, one after the other: (1 + times seen so far) / (values + times of that context so far)."""
     rng = np.random.default_rng(0)
     values, actions, following = rng.integers(3, size=(3, 40))
@@ -170,7 +170,7 @@ def test_the_widest_gap_parts_the_groups() -> None:
     assert not appearance.groups(0.1 * (1.0 - np.eye(30)))[0].any(), "jitter alone makes one group"
 
 
-def test_what_changed_often_enough_is_a_factor_however_long_nothing_changed() -> None:
+def test_frequent_changes_are_a_factor_after_any_pause() -> None:
     """In 2.5 % of the steps, the share of one of many things; a thing that changed half as often is none yet."""
     frames = gray(800)
     show(frames, slice(40, None, 80), 0)
@@ -200,7 +200,7 @@ def test_a_look_that_was_never_seen_is_unknown() -> None:
     assert known[~without][:, wheel].mean() < 0.1 and known[without].all(axis=1).mean() > 0.95
 
 
-def test_a_resumed_perception_looks_again_as_soon_as_one_that_was_not_interrupted() -> None:
+def test_a_resumed_perception_is_renewed_as_soon_as_any() -> None:
     """Sooner once something had no known value."""
     _, frames = walk(16, np.random.default_rng(0))
     eyes, resumed = (LearnedPerception(LearnedPerceptionSettings(), factored=True) for _ in range(2))
@@ -253,7 +253,7 @@ def test_it_learns_to_see_and_to_act_from_nothing(trained: Trained) -> None:
     assert (found["perception/factors"], found["perception/values"]) == (3, 8)
 
 
-def test_remembered_transitions_get_the_codes_that_their_frames_have_now(trained: Trained) -> None:
+def test_remembered_transitions_get_their_frames_present_codes(trained: Trained) -> None:
     learner, _ = trained
     eyes = learner.perception
     codes, _ = eyes.codes(np.stack(eyes.frames))
@@ -297,7 +297,7 @@ def late(learner: LearnedPerceptionAgent) -> list[NDArray[np.float32]]:
     return values
 
 
-def test_what_was_done_is_remembered_with_its_frames_and_how_long_episodes_are(trained: Trained) -> None:
+def test_actions_frames_and_episode_lengths_are_remembered(trained: Trained) -> None:
     learner, taken = trained
     resumed = agent(seed=5)
     resumed.restore(learner.state())

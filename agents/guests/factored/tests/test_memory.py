@@ -33,7 +33,7 @@ def lived(episodes: int, rng: np.random.Generator, *, covered: bool) -> tuple[li
     return rows, begins
 
 
-def test_the_last_value_that_told_something_is_remembered_for_an_episode() -> None:
+def test_the_last_informative_value_is_remembered() -> None:
     shown_values = [[2, 0, 2, 1, 2], [2, 2, 1], [0, 2]]
     rows, begins = [], []
     for episode in shown_values:
@@ -119,7 +119,7 @@ def rememberer() -> LearnedPerceptionAgent:
     return learner
 
 
-def test_from_pictures_it_learns_to_remember_and_then_acts_as_well_as_if_nothing_was_hidden(
+def test_from_images_it_learns_to_remember_hidden_values(
     rememberer: LearnedPerceptionAgent,
 ) -> None:
     seen, memory = rememberer.perception, rememberer.perception.memory
@@ -141,7 +141,7 @@ def seeing() -> AgentState:
     return learner.state()
 
 
-def test_what_was_seen_is_kept_where_outcomes_contradict_what_is_seen_anew(seeing: AgentState) -> None:
+def test_factors_are_kept_where_new_ones_contradict_outcomes(seeing: AgentState) -> None:
     """Once it sees well, another look that loses the lamp is not believed."""
     learner, resumed = (agent(seed=seed, perception__growth_if_known=1.25) for seed in (0, 5))
     learner.restore(seeing)

@@ -52,7 +52,7 @@ def test_noisy_rewards_have_the_classes_of_the_rules(std: float, step: float) ->
     assert found.reward(new._replace(terminated=False)) == 49.0
 
 
-def test_transitions_seen_often_are_told_apart_though_their_rewards_overlap() -> None:
+def test_frequent_transitions_differ_though_rewards_overlap() -> None:
     noisy, exact = (rows(600, outcomes=PICKS, std=std) for std in (0.5, 0.0))
     found = reward_classes(noisy)
     assert found.centers[False] == pytest.approx([0.0, 1.0], abs=0.15)

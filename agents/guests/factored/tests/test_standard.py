@@ -101,7 +101,7 @@ def test_a_shift_is_undone_to_the_pixel() -> None:
     assert min(apart) == 0.0, "all frames lie alike, by whatever all of them are off"
 
 
-def test_nearly_all_values_are_read_where_something_hides_parts_of_them() -> None:
+def test_nearly_all_half_hidden_values_are_read() -> None:
     codes, frames = drawn(2)
     seen, _ = occluded(frames, np.random.default_rng(2))
     standard = standard_of(seen)

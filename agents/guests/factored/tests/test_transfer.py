@@ -65,7 +65,7 @@ def test_rewards_of_a_task_are_classed_as_often_as_those_of_the_first() -> None:
             classed.reset_mock()
 
 
-def test_an_earlier_outcome_is_believed_as_far_as_its_tested_causes_hold() -> None:
+def test_an_earlier_outcome_is_believed_by_its_tested_causes() -> None:
     """Two walls of three still hurt, so the third is believed to; goals that failed speak against the third."""
     learner = OutcomeModel((4, 4), 1, OutcomeSettings(transfer_weight=0.5))
 

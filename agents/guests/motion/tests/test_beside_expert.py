@@ -17,7 +17,7 @@ from recordings import contents, times
 from scripted_clone import ScriptedClone
 
 
-def test_a_clone_that_does_as_the_expert_has_its_hand_where_the_experts_is(
+def test_a_clone_of_the_expert_has_its_hand_beside_the_expert_s(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And one that does nothing is recorded for the longest time of a try, from the same start."""

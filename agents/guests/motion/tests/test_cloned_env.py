@@ -40,7 +40,7 @@ def test_a_clone_sees_images_of_its_own_size() -> None:
     assert CloneExecutedEnv(clone=clone).motion.observation_space["front"].shape == (96, 96, 3)
 
 
-def test_the_clone_turns_the_cube_that_it_is_asked_to_and_the_rules_judge_it() -> None:
+def test_the_clone_turns_the_cube_of_its_instruction() -> None:
     """And its arm ends where it began, with open fingers."""
     env = environment()
     rules = task("arrow_puzzle").rules

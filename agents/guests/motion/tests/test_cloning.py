@@ -67,7 +67,7 @@ def test_demonstrations_ask_for_the_turns_and_after_each_to_go_back() -> None:
     assert (joints_rad[first_rows(data)].std(axis=0) > 0.01).all()
 
 
-def test_demonstrations_depend_on_the_seed_alone_and_come_back_from_their_file(tmp_path: Path) -> None:
+def test_demonstrations_depend_on_the_seed_and_come_back(tmp_path: Path) -> None:
     data = demonstrations()
     again = collect(4, seed=5, observation=VECTORS)
     np.testing.assert_array_equal(again.numbers, data.numbers)
@@ -93,7 +93,7 @@ def test_half_of_each_macro_actions_demonstrations_are_disturbed(appearances: in
         assert sorted(turn.macro_action for turn in turns[:12] if turn.disturbed) == list(range(6))
 
 
-def test_a_chunk_stays_within_its_demonstration_and_the_hand_is_down_where_it_grips() -> None:
+def test_a_chunk_stays_within_its_demonstration() -> None:
     data = demonstrations()
     chunks = data.chunks(16)
     assert (data.episode[chunks] == data.episode[:, None]).all()
@@ -182,7 +182,7 @@ class Counting(ChunkPolicy):
         return 10.0 * self.calls + torch.arange(3.0).reshape(1, 3, 1)
 
 
-def test_a_command_is_the_mean_of_all_predictions_for_its_period_the_oldest_first() -> None:
+def test_a_command_is_the_mean_of_predictions_for_its_period() -> None:
     unit = Standardisation(mean=np.zeros(1, dtype=np.float32), deviation=np.ones(1, dtype=np.float32))
     policy = Clone(Counting(), unit, unit, {})
     policy.begin(GO_BACK)

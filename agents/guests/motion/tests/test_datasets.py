@@ -50,7 +50,7 @@ def written(folder: Path, format: str = "npz", task: str = EASY, **changes: np.n
     return Demonstrations(folder=folder, card=whole)
 
 
-def test_the_expert_solves_its_episodes_and_says_which_macro_action_is_under_way() -> None:
+def test_the_expert_solves_its_episodes_and_names_its_action() -> None:
     told = episode()
     n_steps = len(told["rewards"])
     assert told["success"][-1] and told["terminated"][-1] and not told["success"][:-1].any()
@@ -93,7 +93,7 @@ def test_each_format_gives_the_episode_back(tmp_path: Path, format: str) -> None
         read_dataset(tmp_path / "set")
 
 
-def test_lerobot_is_told_of_both_cameras_the_state_and_the_task_of_each_row(tmp_path: Path) -> None:
+def test_lerobot_rows_have_cameras_state_and_task(tmp_path: Path) -> None:
     said = episode()["instruction"].copy()
     said[40:] = "Stop."
     written(tmp_path / "set", "lerobot", instruction=said.astype("<U40"))
@@ -171,7 +171,7 @@ def test_names_of_continuous_control_are_those_of_its_environments() -> None:
 
 
 @pytest.mark.slow
-def test_fifty_episodes_replay_and_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+def test_fifty_episodes_replay_whatever_the_number_of_workers(tmp_path: Path) -> None:
     words = ["dataset", "ArrowPuzzleMotion", "--policy", "mixed", "--size", "32", "--episodes"]
     assert main([*words, "50", "--format", "lerobot", "--out", str(tmp_path / "two"), "--workers", "2"]) == 0
     assert main([*words, "4", "--out", str(tmp_path / "one"), "--workers", "1"]) == 0

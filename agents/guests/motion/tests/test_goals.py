@@ -43,7 +43,7 @@ def test_a_goal_is_reached_by_the_optimal_macro_actions_alone(task: str, start: 
     assert relabelled[0] == -1.0
 
 
-def test_every_task_of_continuous_control_has_goals_by_an_id_of_its_own() -> None:
+def test_every_control_task_has_a_goal_id_of_its_own() -> None:
     named = [env_id for env_id in IDS if "Goals" in env_id]
     assert len(named) == sum(bool(entry.motion) for entry in registry.TASKS.values())
     env = gymnasium.make("imagine_bench_motion/PickPlaceGoals-v0", control="pose")

@@ -86,7 +86,7 @@ def test_a_pair_begins_alike_and_only_its_height_decides_the_end(family: str) ->
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_each_motion_of_a_chain_moves_an_object_from_where_the_one_before_ended(family: str) -> None:
+def test_each_motion_of_a_chain_begins_where_the_last_ended(family: str) -> None:
     first, second = questions(family).chains
     np.testing.assert_array_equal(first.reached, second.states)
     np.testing.assert_array_equal(first.after, second.before)
@@ -103,7 +103,7 @@ def test_questions_are_the_same_after_they_were_in_a_file() -> None:
     assert all(np.array_equal(arrays[name], again[name]) for name in arrays)
 
 
-def test_a_model_is_given_each_part_of_a_motion_in_its_place_and_in_a_chain_its_own_frames() -> None:
+def test_a_model_is_given_each_part_of_a_motion_in_its_place() -> None:
     asked = questions("arrows")
     planned, raised, first, second = every(asked)
     answers = [planned.after, raised.after, first.after[::-1], second.after]
@@ -117,7 +117,7 @@ def test_a_model_is_given_each_part_of_a_motion_in_its_place_and_in_a_chain_its_
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_the_simulator_is_right_in_all_and_a_copy_where_nothing_changes(family: str) -> None:
+def test_the_simulator_is_right_a_copy_where_nothing_changes(family: str) -> None:
     asked = questions(family)
     reader = KnownFrames(asked)
     exact = score("simulator", Simulator(asked), asked, reader)
@@ -182,7 +182,7 @@ def test_tables_and_rows_say_what_was_measured() -> None:
 
 
 @pytest.mark.slow
-def test_a_judgement_goes_on_where_it_was_stopped_and_refuses_what_is_damaged(tmp_path: Path) -> None:
+def test_a_judgement_goes_on_and_refuses_damaged_cells(tmp_path: Path) -> None:
     folder, failed = judge(FEW, tmp_path, workers=1)
     assert not failed
     (cell,) = [each for each in FEW.cells if each != SIMULATOR]
@@ -208,7 +208,7 @@ def test_what_is_no_frame_is_refused() -> None:
         score("half", half, asked, KnownFrames(asked))
 
 
-def test_a_network_follows_its_generator_and_no_command_after_a_motions_end() -> None:
+def test_a_network_follows_its_generator_until_a_motions_end() -> None:
     motions = questions("arrows").planned
     networks = []
     for global_seed in (1, 2):

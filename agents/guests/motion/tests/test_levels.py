@@ -22,7 +22,7 @@ from imagine_bench.interfaces.capabilities import ExpectedOutcomes
 KEPT = Path(__file__).parents[4] / "docs" / "results" / "motion"
 
 
-def test_what_a_model_expects_not_to_change_is_weighted_by_its_probability() -> None:
+def test_unchanged_values_are_weighted_by_their_probability() -> None:
     """Nothing in three macro-actions of four, and success in the others."""
 
     def predict(frames: Any, rng: Any) -> ExpectedOutcomes:
@@ -73,7 +73,7 @@ class _Rememberer:
         return self.left >= 0
 
 
-def test_an_agent_is_told_of_each_episode_and_trained_in_its_model_before_tests() -> None:
+def test_an_agent_hears_of_episodes_and_trains_before_tests() -> None:
     info = {"macrostate": np.zeros(1), "sim_time_s": 1.0, "fault": False, "is_success": False}
     frame = np.zeros((64, 64, 3), dtype=np.uint8)
     env: Any = SimpleNamespace(reset=lambda seed: (frame, info), step=lambda action: (frame, 0.0, True, False, info))
@@ -131,7 +131,7 @@ def test_a_kept_file_names_its_clone_and_its_world(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
-def test_sac_is_tested_on_whole_episodes_and_its_training_faults_are_counted(settings: str) -> None:
+def test_sac_has_whole_tests_and_counted_training_faults(settings: str) -> None:
     told: list[Point] = []
     short = {"reward": "dense", "time_limit_s": 0.4}
     curve = flat.learn(50, seed=3, settings=settings, every=25, tests=1, told=told.append, **short)

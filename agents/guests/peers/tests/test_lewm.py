@@ -135,12 +135,12 @@ class Detour(torch.nn.Module):
         return torch.stack([z[:, 0, 0], one, two], dim=1).unsqueeze(2)
 
 
-def test_a_plan_costs_the_squared_distances_of_all_its_steps_at_rest_after_its_arrival() -> None:
+def test_a_plan_costs_the_squared_distances_of_all_its_steps() -> None:
     """To stay at 1 costs 1 + 1, the way over 1.5 costs 2.25."""
     assert planner(Detour(), 2).act(seen(0), explore=False) == 0
 
 
-def test_updates_follow_the_ratio_and_the_global_generator_is_left_alone() -> None:
+def test_updates_follow_the_ratio_without_the_global_generator() -> None:
     before = torch.get_rng_state()
     agent = learner(replay_ratio=0.7)
     assert [agent.act(seen(place), explore=False) for place in range(PLACES)] == [0] * PLACES, "without a goal, 0"

@@ -87,7 +87,7 @@ def test_a_permutation_makes_one_cycle_of_values_that_were_never_seen() -> None:
     ]
 
 
-def test_one_probability_for_all_macro_actions_is_shorter_than_a_certain_one_among_them() -> None:
+def test_one_probability_for_all_actions_is_the_shorter_law() -> None:
     counts = [(41, 17), (34, 8), (41, 9), (35, 0), (41, 15), (38, 6)]  # of one exploration at slip=0.2
     rows = [
         row((value % 4,), ((value + turns) % 4,), action)
@@ -203,7 +203,7 @@ _HARDER = ("arrows:slip=0.2", "arrows:horizon=5,gesture=first", "arrows:horizon=
 
 
 @pytest.mark.parametrize("name", ["arrow_puzzle", *(pytest.param(name, marks=pytest.mark.slow) for name in _HARDER)])
-def test_the_writer_is_exact_after_twice_the_cautious_learners_experience(name: str) -> None:
+def test_the_writer_is_exact_after_twice_the_cautious_cost(name: str) -> None:
     spec = registry.task(name)
     cost = certificate(spec).learning_cost
     assert cost is not None
@@ -323,7 +323,7 @@ class BytePerception(LearnedPerception):
 
 
 @pytest.mark.parametrize(("unknown", "first"), [(True, 111), (False, 200)])
-def test_factors_are_looked_for_again_sooner_where_an_image_shows_something_unknown(unknown: bool, first: int) -> None:
+def test_unknown_values_bring_an_earlier_search_for_factors(unknown: bool, first: int) -> None:
     rng = np.random.default_rng(0)
     perception = SeeingWriter(registry.task("arrows:cubes=2"), "clean", rng, rng).perception
     perception.looked_at = 100
@@ -392,7 +392,7 @@ def test_a_factor_that_drifts_is_left_out_if_nothing_depends_on_it(matters: bool
 
 
 @pytest.mark.slow  # half a minute: a perception learns to see
-def test_the_writer_is_exact_from_codes_of_a_perception_that_it_learns() -> None:
+def test_the_writer_is_exact_from_its_own_codes() -> None:
     found = written(registry.task("arrows:horizon=5,gesture=first"), 218, seed=1002, appearance="clean", own=True)
     assert found["total_variation"] < 0.005 and found["found"] == found["facts"]
 
@@ -524,7 +524,7 @@ def test_an_agent_plans_from_its_macro_actions_of_this_episode_alone() -> None:
 
 
 @pytest.mark.parametrize(("own", "experiments"), [(False, 10), (True, 8)])
-def test_kept_programs_are_exact_in_as_many_experiments_as_the_page_says(own: bool, experiments: int) -> None:
+def test_kept_programs_are_as_exact_as_the_page_says(own: bool, experiments: int) -> None:
     every = json.loads(KEPT.read_text())["rows"]
     assert all(each["macro_actions"] <= 2 * each["learner"] for each in every)
     exact = []

@@ -209,7 +209,7 @@ def test_a_program_without_rewards_is_judged_and_not_planned_in(tmp_path: Path) 
 
 
 @pytest.mark.slow  # three processes
-def test_the_tests_of_experience_pass_for_the_truth_and_fall_for_a_wrong_program(tmp_path: Path) -> None:
+def test_tests_of_experience_pass_for_the_true_program_alone(tmp_path: Path) -> None:
     folder = tmp_path / "experience"
     write_experience("arrow_puzzle", folder, macro_actions=60, seed=0)
     known = json.loads((folder / "experience.json").read_text())
