@@ -10,6 +10,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import unicodedata
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -289,3 +290,10 @@ def test_demonstrations_are_recorded_anew_each_time_they_are_viewed(
         collected.append(content)
         assert main(["view", str(tmp_path / "mine"), "--episode", "2"]) == 0
     assert opened == [("mine-episode_2.rrd", f"{content}, episode 2") for content in ("old", "new")]
+
+
+def test_a_text_for_a_terminal_has_no_control_character_but_ends_of_lines() -> None:
+    others = [mark for mark in map(chr, range(0x2100)) if unicodedata.category(mark)[0] in "CZ" and mark not in "\n "]
+    assert {"\r", "\t", "\f", "\x1b", "\x85", "\xa0", "\u2028"} <= {*others}
+    assert [mark for mark in others if mark in errors.plain(f"a{mark}b")] == []
+    assert errors.plain("Größe 5 µm,\nline 2") == "Größe 5 µm,\nline 2" and errors.plain("50 %\r99 %") == r"50 %\r99 %"
