@@ -147,6 +147,74 @@ def test_a_bench_ends_with_a_table_a_report_and_recordings(
     assert capsys.readouterr().out.splitlines()[-4:] == said.splitlines()[-4:]
 
 
+_SUITE = """
+agents = ["oracle"]
+evaluation_episodes = 4
+hyperparameters = "minimal"
+[[experiments]]
+name = "size"
+dial = "cubes"
+question = "?"
+levels = [{name = "1", task = "arrows:cubes=1", episodes = 5}, {name = "2", task = "arrows:cubes=2", episodes = 5}]
+[[experiments]]
+name = "other"
+dial = "cubes"
+question = "?"
+levels = [{name = "1", task = "arrows:cubes=1", episodes = 5}]
+"""
+_STUDY = """
+question = "?"
+budgets = [2]
+evaluation_episodes = 2
+seeds = [1000]
+variants = [
+    {name = "table", factor = "", agent = "table"},
+    {name = "mild", factor = "appearance", agent = "table", against = "table", world = {appearance = "mild"}},
+    {name = "imaginer", factor = "agent", agent = "imaginer", against = "table"},
+]
+"""
+
+
+def test_a_sweep_of_a_file_runs_what_is_wanted_of_it_and_leaves_its_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline
+) -> None:
+    grids = {"mine.toml": _SUITE, "factor.toml": _STUDY}
+    for name, text in grids.items():
+        (tmp_path / name).write_text(text)
+    suite, study = (["sweep", "--out", str(tmp_path / "runs"), "--name", str(tmp_path / name)] for name in grids)
+    assert main([*suite, *"--experiment size --agents oracle random --seeds 4 3".split()]) == 0
+    assert sorted(inline.order) == sorted((agent, seed) for agent in ("oracle", "random") for seed in (3, 4) * 2)
+    said = capsys.readouterr().out
+    assert re.search(r"^size: cubes +1\.00 ", said, re.MULTILINE)
+    (page,) = (tmp_path / "runs" / "suite").glob("mine-*/report/index.html")
+    assert f"Report:     {page}" in said
+    inline.jobs.clear()
+    assert main([*suite, *"--experiment other --seeds 4 1".split()]) == 0
+    assert inline.order == [("oracle", 1)], "the agent of the file; the run that there was is kept"
+    assert main([*suite, *"--experiment other --agents failing --seeds 1".split()]) == 1
+    assert capsys.readouterr().err.splitlines()[-1].endswith("1 runs failed; the same command tries them again.")
+    inline.jobs.clear()
+    assert main([*study, "arrow_puzzle", "--variants", "mild"]) == 0
+    assert [job.spec.protocol.appearance for job in inline.jobs] == ["clean", "mild"], "with what it is compared with"
+    (page,) = (tmp_path / "runs" / "arrow_puzzle").glob("study-factor-*/index.html")
+    assert f"Report:     {page}" in capsys.readouterr().out
+
+
+def test_seeds_are_added_until_it_is_decided_or_there_are_enough(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = {"agents": ("table", "imaginer", "random"), "headlines": (("imaginer", "table"),), "seeds": (0, 1)}
+    monkeypatch.setitem(PRESETS, "smoke", {**PRESETS["smoke"], **few, "recorded_episodes": 0, "open_loop_starts": 0})
+    words = bench_words(tmp_path, *"--budgets 2 --evaluation-episodes 2 --until-decided --most-seeds 3".split())
+    assert main(words) == 0
+    assert sorted(inline.order) == sorted(
+        [*((agent, seed) for agent in few["agents"] for seed in (0, 1)), ("table", 2), ("imaginer", 2)]
+    )
+    reports = re.findall(r"Report: +(\S+)", capsys.readouterr().out)
+    assert ["merged-" in report for report in reports] == [False, True]
+    assert main(words) == 0 and len(inline.order) == 8, "a finished search is only read"
+
+
 @pytest.mark.parametrize("group", [registry.TASK_GROUP, registry.AGENT_GROUP, registry.WORLD_MODEL_GROUP])
 def test_a_misspelt_name_is_answered_by_the_nearest(group: str) -> None:
     """By its own right spelling first, of all names that there are; those that are few are all named."""

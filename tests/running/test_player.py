@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_runs import Inline, measured
+from small_runs import Inline, do, measured
 
 from imagine_bench import registry
 from imagine_bench.cli import exit_code as main
@@ -66,6 +66,20 @@ def content(folder: Path) -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def anna(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return play_all(wanted(), tmp_path_factory.mktemp("runs"))
+
+
+def test_a_players_episodes_begin_where_every_agents_of_its_number_do(tmp_path: Path) -> None:
+    protocol = wanted(training=2, tests=2, seed=3)
+    with played_run(protocol, tmp_path, camera="far") as run:
+        assert run.unwrapped.camera_for_people == "far"  # type: ignore[attr-defined]
+        while not run.is_done:
+            play_one(run)
+    result = run_folder.load_run(run.folder)
+    agents = do(tmp_path / "agent", "table", 3, seeds=(3,), budgets=(2,), evaluation_episodes=2)
+    for mine, theirs in ((result.training, agents.training), (result.checkpoints[0].kept, agents.checkpoints[0].kept)):
+        assert mine is not None and theirs is not None and mine.starts.tolist() == theirs.starts.tolist()
+    assert result.seed == 3 and result.checkpoints[0].env_steps == result.training_length.sum() > 2
+    assert not (run.folder / "moves.txt").exists()
 
 
 def test_a_persons_run_is_verified_explained_and_reported(anna: Path, tmp_path: Path) -> None:

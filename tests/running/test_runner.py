@@ -26,10 +26,11 @@ from imagine_bench import registry
 from imagine_bench.cli import observers
 from imagine_bench.errors import DivergedError
 from imagine_bench.exact.splits import split_of
-from imagine_bench.interfaces import Transition
+from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.interfaces.episodes import Episodes
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.recording import episodes
+from imagine_bench.registry import AgentEntry
 from imagine_bench.running.evaluation import EpisodeRecord, EvaluationCounts, start_from
 from imagine_bench.running.run_state import Counters, make_env
 from imagine_bench.seeding import TUNING_SEEDS, episode_seed
@@ -166,6 +167,49 @@ def test_an_agent_is_told_of_each_episode_that_it_begins(
     assert len(heard) == 2 + 8 + 2 + 2 and all("told" in words for words in heard)
 
 
+class Elsewhere(bench_fakes.TableAgent):
+    """Trains in a loop of its own: leaves its first episode, and begins another in a macrostate that it chooses."""
+
+    clock_s = 0.0
+    given: dict[str, int] = {}  # noqa: RUF012 - how a test finds it
+
+    def act(self, observation: Observation, *, explore: bool) -> int:
+        Elsewhere.clock_s += 100.0
+        return super().act(observation, explore=explore)
+
+    def train(self, env: Any, *, episodes: int, horizon: int, on_episode: Callable[[bool, int], bool]) -> None:
+        env.reset()
+        env.step(0)
+        goes_on, played = True, 0
+        while goes_on:
+            env.reset(seed=7, options={"macrostate": (1, 2, 3, 0)} if played == 1 else None)
+            length, over = 0, False
+            while not over:
+                _, _, terminated, truncated, info = env.step(length % 6)
+                length, over = length + 1, terminated or truncated
+            played += 1
+            Elsewhere.clock_s += 1.0
+            goes_on = on_episode(bool(info["is_success"]), length)
+        Elsewhere.given = {"episodes": episodes, "horizon": horizon, "played": played}
+
+
+def test_a_loop_of_its_own_has_the_starts_of_all_agents_and_pays_for_its_training_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = AgentEntry(make=f"{__name__}:Elsewhere", needs_encoder=False, external_training_loop=True)
+    monkeypatch.setitem(registry.AGENTS, "elsewhere", made)
+    of: dict[str, Any] = {"task": "arrows:horizon=7", "budgets": (2, 5), "evaluation_episodes": 2, "seeds": (3,)}
+    usual = do(tmp_path / "usual", "table", 3, **of)
+    monkeypatch.setattr(time, "process_time", lambda: Elsewhere.clock_s)
+    result = do(tmp_path / "own", "elsewhere", 3, agents=("elsewhere",), **of)
+    assert Elsewhere.given == {"episodes": 5, "horizon": 7, "played": 5}
+    assert [row.train_cpu_s for row in result.checkpoints] == [2.0, 5.0] and result.checkpoints[0].eval_cpu_s >= 100.0
+    assert usual.training is not None and result.training is not None
+    starts, others = result.training.starts.tolist(), usual.training.starts.tolist()
+    assert starts == [*others[:2], [1, 2, 3, 0], *others[3:], starts[-1]] and len(starts) == 6
+    assert result.training.lengths.tolist() == [1, *result.training_length.tolist()]
+
+
 def test_an_agent_that_does_not_learn_is_tested_once(tmp_path: Path) -> None:
     first, second = do(tmp_path / "run", "oracle", agents=("oracle",)).checkpoints
     assert dataclasses.replace(first, episodes=9) == second
@@ -191,7 +235,6 @@ import bench_fakes
 from imagine_bench.running import run_state, runner
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import RunSpec
-from imagine_bench.recording import episodes
 
 save, saves = run_state.save_snapshot, iter(range(int(sys.argv[3])))
 def saying(folder, snapshot):

@@ -15,13 +15,15 @@ from small_runs import do, final_arrays, small
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
+from imagine_bench.interfaces import AgentState
 from imagine_bench.judge.plans import make_plans
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running.runner import run
-from imagine_bench.running.trained import best_run, encoder_of_run, load_trained
+from imagine_bench.running.trained import best_run, encoder_of_run, learners, load_trained
 from imagine_bench.store import encoders, run_folder
-from imagine_bench.store.files import sealed
+from imagine_bench.store.bench_folder import BenchStore
+from imagine_bench.store.files import sealed, write_json
 
 TASK = registry.task("arrow_puzzle")
 
@@ -49,6 +51,21 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
     other = dataclasses.replace(spec, encoder=encoders.own(TASK, "mild"))
     with pytest.raises(ArtefactError, match=r"is arrow_puzzle-mild@.*, and this bench is of .*-clean@"):
         run(other, tmp_path / "another node", lambda progress: None)
+
+
+def test_learners_are_those_that_learned_something_and_can_be_taken_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = registry.AGENTS["table"]
+    monkeypatch.setitem(registry.AGENTS, "of_a_library", dataclasses.replace(entry, external_training_loop=True))
+    wanted = small(agents=("table", "imaginer", "of_a_library", "random"))
+    store = BenchStore(tmp_path, wanted)
+    write_json(tmp_path / "protocol.json", wanted.as_dict())
+    nothing = AgentState(arrays={}, values={})
+    for agent, episode in (("table", 1), ("imaginer", 0), ("of_a_library", 5), ("random", 5)):
+        found = run_folder.Snapshot(episode=episode, agent=nothing, arrays={}, values={})
+        run_folder.save_snapshot(store.run_folder(agent, 0) / run_folder.CHECKPOINTS, found)
+    assert learners(tmp_path) == (store.run_folder("table", 0),), "imaginer is still at the tasks before"
 
 
 def test_training_in_the_model_comes_before_an_analysis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

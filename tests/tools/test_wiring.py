@@ -263,7 +263,8 @@ def fields_of(given: object) -> Mapping[str, Any]:
 
 def arguments(line: str, target: str) -> dict[str | int, Any]:
     """Those of the function that a command calls, by place or name, and :func:`fields_of` each."""
-    with patch(target, side_effect=ReachedError) as function, pytest.raises(ReachedError):
+    none_runs = patch(f"{_BENCHES}.bench", side_effect=AssertionError("a bench was run instead"))
+    with none_runs, patch(target, side_effect=ReachedError) as function, pytest.raises(ReachedError):
         main(line.split())
     given, named = function.call_args
     found = {**dict(enumerate(given)), **named}
@@ -291,6 +292,15 @@ def test_every_folder_that_shall_be_merged_is_read() -> None:
     with reading, merging as merge, pytest.raises(ReachedError):
         main("report a --merge b c --merge d --out here".split())
     assert merge.call_args.args == (["a", "b", "c", "d"], Path("here"))
+
+
+def test_the_agents_of_a_days_world_are_run_as_the_command_says() -> None:
+    world = patch(f"{_BOARD}.daily", return_value="arrows:cubes=2")
+    with world, patch(f"{_BENCHES}.carry_out", side_effect=ReachedError) as run, pytest.raises(ReachedError):
+        main("daily --agents dqn random --seeds 3 4 --budgets 7 9 --out here".split())
+    options = {"agents": ("dqn", "random"), "seeds": (3, 4), "budgets": (7, 9), "execution": "kinematic"}
+    assert run.call_args.args == ("arrows:cubes=2", "quick", {**options, "overrides": (), "device": "cpu"})
+    assert run.call_args.kwargs["root"] == Path("here")
 
 
 _PUPIL = "arrow_puzzle --preset smoke --agents pupil"
