@@ -360,7 +360,7 @@ def test_demonstrations_are_recorded_anew_each_time_they_are_viewed(
     assert opened == [("mine-episode_2.rrd", f"{content}, episode 2") for content in ("old", "new")]
 
 
-def test_a_text_for_a_terminal_has_no_control_character_but_ends_of_lines() -> None:
+def test_a_terminal_is_sent_no_control_character_but_line_ends() -> None:
     others = [mark for mark in map(chr, range(0x2100)) if unicodedata.category(mark)[0] in "CZ" and mark not in "\n "]
     assert {"\r", "\t", "\f", "\x1b", "\x85", "\xa0", "\u2028"} <= {*others}
     assert [mark for mark in others if mark in errors.plain(f"a{mark}b")] == []

@@ -84,7 +84,7 @@ def measure(env: MotionEnv, *, tries: int, turns: int, seed: int = 0) -> Measure
         for attempt in range(math.ceil(tries / len(chosen))):
             env.reset(seed=seed + 10_000 * number + attempt, options={"macrostate": state})
             if attempt:
-                _move(env, rng)
+                move_aside(env, rng)
             fault, taken_s = _segment(env, expert, action)
             seconds.append(taken_s)
             as_ruled += fault is None
@@ -158,7 +158,7 @@ def _pairs(env: MotionEnv) -> list[tuple[State, int]]:
     return [(state, action) for (_, action), (_, state) in found.items()]
 
 
-def _move(env: MotionEnv, rng: np.random.Generator) -> None:
+def move_aside(env: MotionEnv, rng: np.random.Generator) -> None:
     """Move the hand off its observation pose, as far as starts may be."""
     offset: Floats = np.append(START_M * rng.uniform(-1, 1, 3), START_RAD * rng.uniform(-1, 1))
     twist = offset / np.array([HAND_SPEED_M_S] * 3 + [HAND_TURN_RAD_S]) / (_MOVE_PERIODS * env.period_s)

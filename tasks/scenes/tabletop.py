@@ -14,7 +14,7 @@ _TABLE_X_M = 0.72
 _FLOOR_Z_M = -0.92
 _LEG_INSET_M = 0.05
 
-_CAMERAS: dict[str, tuple[c.Point, c.Point, float]] = {
+ROOM_CAMERAS: dict[str, tuple[c.Point, c.Point, float]] = {
     c.HUMAN_CAMERA: ((1.22, 0.62, 0.66), (0.55, -0.01, 0.13), 36.0),
     c.FAR_CAMERA: ((1.44, 1.14, 0.70), (0.46, 0.03, 0.215), 41.0),
 }
@@ -157,7 +157,7 @@ def add_room_camera(spec: mujoco.MjSpec, name: str, place_m: c.Point, target_m: 
 
 def _add_cameras(spec: mujoco.MjSpec) -> None:
     """The views for people, from the human's left: of the objects on the table, and of everything."""
-    for name, (place_m, target_m, fovy_deg) in _CAMERAS.items():
+    for name, (place_m, target_m, fovy_deg) in ROOM_CAMERAS.items():
         add_room_camera(spec, name, place_m, target_m, fovy_deg)
 
 

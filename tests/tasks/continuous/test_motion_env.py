@@ -14,7 +14,7 @@ from imagine_bench.tasks.arrows.world import MAX_OFF_SLOT_M
 from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
-from imagine_bench.tasks.continuous.segments import _move, least_seconds, measure
+from imagine_bench.tasks.continuous.segments import least_seconds, measure, move_aside
 from imagine_bench.tasks.world import Reading
 
 from imagine_bench.arrays import Floats
@@ -90,7 +90,7 @@ def test_a_segment_begins_with_the_hand_moved_and_turned(signs: tuple[int, ...])
     env, _ = environment("arrows")
     env.reset(seed=0)
     place_m, turned = env.controls.hand_pose(env.servo_targets()[:7])
-    _move(env, mock.Mock(uniform=mock.Mock(side_effect=[np.array(signs[:3]), signs[3]])))
+    move_aside(env, mock.Mock(uniform=mock.Mock(side_effect=[np.array(signs[:3]), signs[3]])))
     then_m, then_turned = env.controls.hand_pose(env.servo_targets()[:7])
     assert np.allclose(then_m - place_m, 0.04 * np.array(signs[:3]), atol=0.004)
     turn = (then_turned @ turned.T)[:2, :2]

@@ -15,7 +15,7 @@ from imagine_bench.tasks.scenes import constants as c
 from imagine_bench.tasks.scenes.appearance import AppearanceSampler, appearance, appearance_arrays
 from imagine_bench.tasks.scenes.arm import FINGER_JOINTS, TIP_IN_NAME
 from imagine_bench.tasks.scenes.control_views import _RGBA, varied_by_appearance
-from imagine_bench.tasks.scenes.tabletop import _CAMERAS
+from imagine_bench.tasks.scenes.tabletop import ROOM_CAMERAS
 
 CUBES = (1, 2, 3, 4, 5, 6)
 PICK = 0
@@ -79,7 +79,7 @@ def scenes():
 @pytest.mark.parametrize("cubes", [PICK, 3])
 def test_cameras_that_stand_in_the_room_are_upright_and_see_the_table(scenes, cubes):
     scene = scenes(cubes)
-    names = {*_CAMERAS, c.FRONT_CAMERA}
+    names = {*ROOM_CAMERAS, c.FRONT_CAMERA}
     assert len(names) > 1 and names <= {scene.model.camera(index).name for index in range(scene.model.ncam)}
     for name in names:
         column, row = scene.at_px(name, np.array([0.55, 0.0, c.TABLE_HEIGHT_M]))
