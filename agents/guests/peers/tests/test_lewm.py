@@ -45,7 +45,7 @@ def ended(place: int, action: int, reward: float, then: int) -> Transition:
     )  # fmt: skip
 
 
-def practise(agent: LeWMPlanner, steps: int) -> list[int]:
+def trained(agent: LeWMPlanner, steps: int) -> list[int]:
     """Episodes from each place in turn, paid where they end at the goal."""
     actions = []
     for step in range(steps):
@@ -74,7 +74,7 @@ class Exact(torch.nn.Module):
 
 def test_a_full_memory_forgets_the_oldest() -> None:
     agent = learner(buffer_size=3, learning_starts=1000)
-    actions = practise(agent, 5)
+    actions = trained(agent, 5)
     assert agent.rows["action"] == actions[-3:] and {len(kept) for kept in agent.rows.values()} == {3}
 
 
@@ -88,7 +88,7 @@ def test_goals_are_the_frames_that_earned_most() -> None:
 
 def test_goals_are_read_again_after_an_update(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = learner(learning_starts=2)
-    practise(agent, 12)
+    trained(agent, 12)
     read: list[int] = []
     encode = agent.network.encode
     monkeypatch.setattr(agent.network, "encode", lambda pixels: read.append(len(pixels)) or encode(pixels))
@@ -144,7 +144,7 @@ def test_updates_follow_the_ratio_without_the_global_generator() -> None:
     before = torch.get_rng_state()
     agent = learner(replay_ratio=0.7)
     assert [agent.act(seen(place), explore=False) for place in range(PLACES)] == [0] * PLACES, "without a goal, 0"
-    practise(agent, 8)
+    trained(agent, 8)
     assert torch.equal(before, torch.get_rng_state()) and agent.updates == 3, "0.7 a step, from the fourth of eight"
 
 
@@ -152,7 +152,7 @@ def test_freed_memory_goes_back_every_fifty_updates(monkeypatch: pytest.MonkeyPa
     released = []
     monkeypatch.setattr(lewm, "release_freed_memory", lambda: released.append(agent.updates))
     agent = learner(replay_ratio=20.0)
-    practise(agent, 9)
+    trained(agent, 9)
     assert agent.updates == 120 and released == [50, 100]
 
 

@@ -52,9 +52,9 @@ def _linked(row: Row, budget: int, text: str) -> str:
 
 
 def _at(row: Row, budget: int, name: str) -> list[float]:
-    """A figure or a price of each seed after a budget."""
+    """A figure or a cost of each seed after a budget."""
     both = zip(row.vouched, row.claimed.prices, strict=True)
-    found = [{**vars(figures), **vars(price)} for figures, price in both if figures.episodes == budget]
+    found = [{**vars(figures), **vars(cost)} for figures, cost in both if figures.episodes == budget]
     return [float(each[name]) for each in found]
 
 
@@ -171,7 +171,7 @@ def board_page(checked: Sequence[Checked]) -> Page:
     return Page(
         title="Leaderboard",
         subtitle="Rows that anyone can check: imagine-bench board check",
-        question="Which agents solve unseen tests, and at what price?",
+        question="Which agents solve unseen tests, and at what cost?",
         table=verdicts,
         sections=sections,
         files={"board.csv": table_text([cells for rows in worlds.values() for row in rows for cells in _csv(row)])},
@@ -183,7 +183,7 @@ def _csv(row: Row) -> list[Mapping[str, float | str]]:
     """A row a seed and budget, with everything that the page shows."""
     named = {"world": row.world, "row": row.name, "player": row.claimed.agent, "starts": row.starts}
     both = zip(row.vouched, row.claimed.prices, strict=True)
-    return [{**named, **vars(tested), **vars(price)} for tested, price in both]
+    return [{**named, **vars(tested), **vars(cost)} for tested, cost in both]
 
 
 def motion_page(row: MotionRow, verdict: str) -> Page:

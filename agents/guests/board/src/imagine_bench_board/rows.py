@@ -67,7 +67,7 @@ class Figures:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Price:
+class Cost:
     """The cost of one run until a budget, as its author says it."""
 
     env_steps: int  #: Real training macro-actions
@@ -89,7 +89,7 @@ class Claims:
     machine: str = ""  #: Processor
     seen_beforehand: str = ""  #: Encoders, datasets, demonstrations and earlier tasks before the first episode
     frames_beforehand: int | None = None  #: Frames in that; None where nobody knows
-    prices: tuple[Price, ...] = ()  #: One for each of the row's figures
+    prices: tuple[Cost, ...] = ()  #: One for each of the row's figures
 
     def __post_init__(self) -> None:
         require_types(self)
@@ -117,12 +117,12 @@ class Row:
         """The figures and tests of a place, in the form in which runs keep them."""
         figures = dataclasses.asdict(self.vouched[place])
         figures.pop("seed")
-        price = self.claimed.prices[place]
+        cost = self.claimed.prices[place]
         return Checkpoint(
             **figures,
             solved=self.logs[place].solved,
-            env_steps=price.env_steps,
-            train_cpu_s=price.train_cpu_s,
+            env_steps=cost.env_steps,
+            train_cpu_s=cost.train_cpu_s,
             eval_cpu_s=0.0,
             kept=self.kept(place),
         )
@@ -140,7 +140,7 @@ class Row:
     def agents(self) -> dict[str, str]:
         """The digest of the agent of each seed, as a round has them."""
         both = zip(self.vouched, self.claimed.prices, strict=True)
-        return {str(figures.seed): price.agent_sha256 for figures, price in both}
+        return {str(figures.seed): cost.agent_sha256 for figures, cost in both}
 
     @property
     def world(self) -> str:
@@ -279,8 +279,8 @@ def require_whole(row: Row, task: TaskSpec) -> None:
     for log in row.logs:
         tests = protocol.evaluation_episodes
         require(log.episodes == tests, f"it has {log.episodes} tests, and its protocol {tests}.")
-    for figures, price in zip(row.vouched, row.claimed.prices, strict=True):
-        steps = price.env_steps
+    for figures, cost in zip(row.vouched, row.claimed.prices, strict=True):
+        steps = cost.env_steps
         is_possible = steps == 0 or figures.episodes <= steps <= figures.episodes * task.horizon
         require(is_possible, f"{steps:,} macro-actions cannot be those of {figures.episodes:,} training episodes.")
-        require(0.0 <= price.train_cpu_s < math.inf, f"its CPU seconds are {brief(price.train_cpu_s)}.")
+        require(0.0 <= cost.train_cpu_s < math.inf, f"its CPU seconds are {brief(cost.train_cpu_s)}.")

@@ -23,7 +23,7 @@ from imagine_bench.store.files import sha256
 from imagine_bench.store.results import Checkpoint
 
 from . import rounds
-from .rows import Claims, Figures, Price, Row, one_line, row_name, write_row
+from .rows import Claims, Cost, Figures, Row, one_line, row_name, write_row
 
 T = TypeVar("T")
 
@@ -101,7 +101,7 @@ class Submitter:
                     raise ArtefactError(f"{self.bench} kept no test episodes; run the bench anew.")
                 values = {**vars(each), "seed": seed, "agent_sha256": digests[seed]}
                 figures.append(_some(Figures, values))
-                prices.append(_some(Price, values))
+                prices.append(_some(Cost, values))
                 logs.append(EpisodeLog.of(each.kept))
         environment = bench_facts(self.bench)["environment"]
         claimed = Claims(

@@ -32,7 +32,7 @@ from torch.distributions import Distribution
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 
 from .dreamer_settings import HYPERPARAMETERS, DreamerSettings
-from .lent_generator import LentGenerator
+from .global_rng_scope import GlobalRngScope
 
 _PIXELS = "rgb"
 _LATENTS = "latents"
@@ -60,8 +60,8 @@ class Dreamer:
         self.config = _config(settings, pixels=perception is None)
         self._fabric = Fabric(accelerator="cuda" if device == "cuda" else "cpu", devices=1)
         self._blank = self._shown(np.zeros((64, 64, 3), np.uint8))
-        self._random = LentGenerator(seed, device)
-        self._test_random = LentGenerator(0, device)
+        self._random = GlobalRngScope(seed, device)
+        self._test_random = GlobalRngScope(0, device)
         self._rng = np.random.default_rng([seed, 1])
         with self._drawing():
             shown = spaces.Dict({name: spaces.Box(-np.inf, np.inf, array.shape) for name, array in self._blank.items()})
@@ -190,7 +190,7 @@ class Dreamer:
         validated = Distribution._validate_args
         Distribution.set_default_validate_args(False)
         try:
-            with (self._test_random if test else self._random).lent():
+            with (self._test_random if test else self._random).active():
                 yield
         finally:
             Distribution.set_default_validate_args(validated)

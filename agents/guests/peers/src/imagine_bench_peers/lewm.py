@@ -25,7 +25,7 @@ from torch_world.utils import recompute_batchnorm
 
 from imagine_bench.interfaces import AgentContext, AgentState, Frame, Observation, Transition
 
-from .lent_generator import LentGenerator
+from .global_rng_scope import GlobalRngScope
 from .lewm_settings import HYPERPARAMETERS, LeWMSettings
 
 _RELEASED_EVERY = 50
@@ -51,9 +51,9 @@ class LeWMPlanner:
         self.settings = settings
         self.n_actions = n_actions
         self._device = device
-        self._random = LentGenerator(seed, device)
+        self._random = GlobalRngScope(seed, device)
         self._rng = np.random.default_rng([seed, 1])
-        with self._random.lent():
+        with self._random.active():
             self.network = _network(settings, n_actions).to(device).eval()
         self._optimiser = torch.optim.AdamW(
             self.network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, fused=True
@@ -136,7 +136,7 @@ class LeWMPlanner:
         pixels = torch.cat([self._pixels(frames), self._pixels(following)], dim=1)  # [B, 2, 3, 64, 64]
         taken = nn.functional.one_hot(torch.tensor(actions, device=self._device), self.n_actions).float()
         batch = pixels, taken.unsqueeze(1)
-        with self._random.lent():
+        with self._random.active():
             losses = self.network.train()(*batch)
             self._optimiser.zero_grad()
             losses["loss"].backward()

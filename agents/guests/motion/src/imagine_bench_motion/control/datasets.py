@@ -107,7 +107,7 @@ def collect(
         (partial / "episodes").mkdir()
         files = [partial / f"episodes/{index:06}.npz" for index in range(episodes)]
         _collect_all(settings, files, at_a_time(workers))
-        tally = _Tally()
+        tally = _EpisodeCounts()
         card = {**_card(settings), "format": format}
         registry.load(FORMATS[format]).write_motion(partial, tally.through(files), card)
         if format != "npz":
@@ -215,7 +215,7 @@ def lived(env: MotionEnv, seed: int, actor_of: Callable[[], Actor], watch: Watch
     return {**columns, **images, "macrostates": np.array(macrostates)}
 
 
-class _Tally:
+class _EpisodeCounts:
     """Counts the episodes that go through it on their way into a format, and keeps the arrays apart."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Torch's global generator, lent to a library that draws from no other."""
+"""Torch's global generator, with a state of its own for a library that draws from no other."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from contextlib import contextmanager
 import torch
 
 
-class LentGenerator:
-    """A state of torch's global generator, which goes on where it stopped each time it is lent.
+class GlobalRngScope:
+    """A state of torch's global generator, which goes on where it stopped each time it is active.
 
     Args:
         seed: Where it begins.
@@ -25,7 +25,7 @@ class LentGenerator:
         self.state = torch.Generator().manual_seed(seed).get_state()
 
     @contextmanager
-    def lent(self) -> Iterator[None]:
+    def active(self) -> Iterator[None]:
         """Random numbers in this block are drawn from here; the global generator is afterwards as it was."""
         before = torch.get_rng_state()
         torch.set_rng_state(self.state)
