@@ -82,8 +82,11 @@ def test_what_is_seen_while_acting_is_the_state_and_is_forgotten() -> None:
     whole = remembered(agent, [1, 0, 2], actions)
     assert torch.equal(agent.perceive(frames[1]), remembered(agent, [1, 0], actions[:1])), "it was acted on"
     assert torch.equal(agent.perceive(frames[2]), whole), "it would be the next"
-    agent.begin_episode()
-    assert torch.equal(agent.perceive(frames[2]), remembered(agent, [2], []))
+    kept = agent.state()
+    for forget in (agent.begin_episode, lambda: agent.restore(kept)):
+        agent.act(Observation(frame=frames[0]), explore=False)
+        forget()
+        assert torch.equal(agent.perceive(frames[2]), remembered(agent, [2], []))
 
 
 def test_what_is_lived_is_stored_by_step() -> None:
