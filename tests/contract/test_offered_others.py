@@ -114,9 +114,10 @@ def test_an_own_representation_trains_an_agent(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_one_without_a_decoder_draws_gray(monkeypatch: pytest.MonkeyPatch) -> None:
-    path = encoders.resolve(registry.task("arrow_puzzle"), "clean", "tiles")
+    path = encoders.resolve(registry.task("arrow_puzzle"), "mild", "tiles")
     monkeypatch.delattr(sys.modules["their_things"].Tiles, "decode")
     encoder = Encoder.load(path)
+    assert encoder.card.appearance == "mild"
     pictures = encoder.decode(encoder.encode(np.zeros((2, 64, 64, 3), np.uint8))[0])
     assert pictures.shape == (2, 64, 64) and (pictures == 0.5).all()
     monkeypatch.delattr(sys.modules["their_things"], "Tiles")

@@ -38,13 +38,15 @@ def test_quick_finds_encoders_at_every_appearance(name, appearance):
     assert set(paths) == {"latents", "codes"} and wanted.codes is not None
 
 
+@pytest.mark.parametrize("appearance", ["clean", "mild"])
 @pytest.mark.parametrize("kind", ["latents", "codes"])
-def test_given_latents_are_for_readers_and_codes_for_all(kind, tmp_path):
+def test_given_latents_are_for_readers_and_codes_for_all(kind, appearance, tmp_path):
     spec = task("arrow_puzzle")
-    own = {each: encoders.own(spec, "clean", each) for each in ("latents", "codes")}
+    own = {each: encoders.own(spec, appearance, each) for each in ("latents", "codes")}
     given = tmp_path / "given.safetensors"
     shutil.copy(own[kind], given)
-    _, paths = plan_control("arrow_puzzle", "quick", agents=("dqn", "factored:given"), encoder=str(given))
+    how = {"agents": ("dqn", "factored:given"), "appearance": appearance, "encoder": str(given)}
+    _, paths = plan_control("arrow_puzzle", "quick", **how)
     assert paths == ({"latents": given, "codes": given} if kind == "codes" else {**own, "latents": given})
 
 

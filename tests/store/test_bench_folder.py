@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from small_runs import small
@@ -12,7 +13,7 @@ from small_runs import small
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, BusyError
 from imagine_bench.running.bench import load_bench
-from imagine_bench.store.bench_folder import BenchStore, bench_folder, newest_bench, newest_recording
+from imagine_bench.store.bench_folder import BenchStore, bench_facts, bench_folder, newest_bench, newest_recording
 from imagine_bench.store.files import make_folder, sealed, write_json
 
 _ENVIRONMENT = {"command": "imagine-bench bench", "commit": "abc", "versions": {"torch": "1"}, "gl_renderer": "x"}
@@ -77,6 +78,19 @@ def test_a_session_elsewhere_is_noticed(tmp_path: Path) -> None:
         assert opened(tmp_path).begin_session({**_ENVIRONMENT, **change}) == changed
     sessions = json.loads((opened(tmp_path).folder / "sessions.json").read_text())["sessions"]
     assert [session["changed"] for session in sessions][:2] == [{}, torch]
+
+
+def test_the_time_of_a_bench_is_that_of_its_sessions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = mock.Mock(return_value=0.0)
+    monkeypatch.setattr("imagine_bench.store.bench_folder.time.monotonic", clock)
+    for waited_s, worked_s in ((3.0, 5.0), (100.0, 7.0)):
+        store = BenchStore(tmp_path, small())
+        make_folder(tmp_path)
+        clock.return_value += waited_s  # such as for its lock
+        store.begin_session({"command": "bench"})
+        clock.return_value += worked_s
+        store.save_time()
+    assert bench_facts(tmp_path)["wall_s"] == 12.0
 
 
 def test_the_newest_bench_or_recording_of_some_tasks_or_of_all(tmp_path: Path) -> None:

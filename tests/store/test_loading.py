@@ -112,7 +112,21 @@ def test_headlines_may_differ(tmp_path: Path) -> None:
     first = do(tmp_path, "oracle", "random", seeds=(0,), headlines=(("oracle", "random"),))
     second = do(tmp_path / "other", "oracle", "random", seeds=(2,))
     for folders in ([first, second], [second, first]):
-        assert load_merged(folders, tmp_path).protocol.seeds == (0, 2)
+        joined = load_merged(folders, tmp_path).protocol
+        assert (joined.seeds, joined.headlines) == ((0, 2), (("oracle", "random"),))
+
+
+@pytest.mark.parametrize("lacks", [0, 1])
+def test_exact_facts_are_those_of_any_and_time_is_that_of_all(tmp_path: Path, lacks: int) -> None:
+    both = [load_bench(do(tmp_path / str(seed), "oracle", seeds=(seed,))) for seed in (0, 1)]
+    exact = both[0].certificate
+    parts = [
+        dataclasses.replace(each, wall_s=2.0 + number, certificate=None if number == lacks else exact)
+        for number, each in enumerate(both)
+    ]
+    joined = merge(parts, tmp_path)
+    assert joined.wall_s == 5.0 and joined.certificate == exact is not None
+    assert all(each.wall_s > 0.0 for each in both), "the time of a session is noted at its end, too"
 
 
 def test_what_one_of_them_lacks_is_said(tmp_path: Path) -> None:
