@@ -130,6 +130,7 @@ def test_a_learner_keeps_its_dynamics_network_and_nothing_else(make) -> None:  #
     kept = {name for name in weights if np.array_equal(before[name], after[name])}
     assert kept == {name for name in weights if name.startswith("imagination/model/dynamics.")} < weights
     assert len(learner.real) == len(learner.imagination.memory) == learner.steps == 0
+    assert not any(name.startswith("loss/") for name in learner.diagnostics()), "of a task that is over"
     assert learner.imagination.filter.threshold == 99.0
     first, second = (live(each, range(5), np.random.default_rng(1)) for each in (learner, resumed))
     assert first == second and same(learner.state(), resumed.state())
