@@ -9,7 +9,8 @@ import gymnasium
 import numpy as np
 import pytest
 from bench_fakes import TableAgent
-from small_runs import Inline, collected, do
+from fake_agents import FakeAgent
+from small_runs import Inline, collected, do, small
 
 from imagine_bench import registry
 from imagine_bench.arrays import Frame, Info
@@ -17,7 +18,9 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.data.folder import read_dataset
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Observation
+from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running.collect import collect, describe, policy_of
+from imagine_bench.running.trained import Trained
 from imagine_bench.seeding import episode_seed
 from imagine_bench.tools import standard_data
 
@@ -54,6 +57,25 @@ def test_one_seed_is_one_content_and_another_is_another() -> None:
     assert first.hash == again.hash != other.hash
     longer, _, _ = collected(episodes=6)
     assert np.array_equal(longer.frames[: len(first.frames)], first.frames), "more episodes begin with the same"
+
+
+def test_starts_macro_actions_and_chance_all_follow_from_the_seed() -> None:
+    (one, hidden, _), (other, others, _) = (collected("uniform", 6, seed) for seed in (0, 1))
+    assert not np.array_equal(one.actions, other.actions)
+    for name in ("macrostates", "seeds"):
+        assert not np.array_equal(hidden["privileged"][name][::2], others["privileged"][name][::2]), name
+
+
+def test_a_runs_agent_sees_through_the_given_encoder_and_what_its_entry_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent = "pupil_privileged"
+    spec = RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0)
+    trained = Trained(agent=FakeAgent(), spec=spec, task=TASK, episodes=3, folder=tmp_path)
+    loading = mock.Mock(return_value=trained)
+    monkeypatch.setattr("imagine_bench.running.collect.load_trained", loading)
+    assert policy_of(str(tmp_path), TASK, 0, "given").players == [(trained.agent, True)]
+    loading.assert_called_once_with(tmp_path, encoder="given")
 
 
 def test_starts_are_those_of_no_run() -> None:
