@@ -175,7 +175,7 @@ variants = [
 """
 
 
-def test_a_sweep_of_a_file_runs_what_is_wanted_of_it_and_leaves_its_report(
+def test_a_sweep_of_a_file_runs_what_is_wanted_and_reports(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline
 ) -> None:
     grids = {"mine.toml": _SUITE, "factor.toml": _STUDY}

@@ -66,9 +66,7 @@ def test_starts_macro_actions_and_chance_all_follow_from_the_seed() -> None:
         assert not np.array_equal(hidden["privileged"][name][::2], others["privileged"][name][::2]), name
 
 
-def test_a_runs_agent_sees_through_the_given_encoder_and_what_its_entry_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_runs_agent_plays_through_the_given_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     agent = "pupil_privileged"
     spec = RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0)
     trained = Trained(agent=FakeAgent(), spec=spec, task=TASK, episodes=3, folder=tmp_path)

@@ -68,7 +68,7 @@ def anna(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return play_all(wanted(), tmp_path_factory.mktemp("runs"))
 
 
-def test_a_players_episodes_begin_where_every_agents_of_its_number_do(tmp_path: Path) -> None:
+def test_a_players_episodes_begin_where_those_of_agents_do(tmp_path: Path) -> None:
     protocol = wanted(training=2, tests=2, seed=3)
     with played_run(protocol, tmp_path, camera="far") as run:
         assert run.unwrapped.camera_for_people == "far"  # type: ignore[attr-defined]

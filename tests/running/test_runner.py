@@ -72,7 +72,7 @@ def test_an_episode_begins_by_seed_unless_a_start_is_given() -> None:
         (0, {"split": "values=3:0:1"}, ("evaluation", "clean")),
     ],
 )
-def test_tests_and_recordings_have_starts_and_appearances_of_their_own(
+def test_tests_and_recordings_have_their_own_starts_and_looks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, looks: dict[str, str], tests: tuple[str, str]
 ) -> None:
     reset, seen, asked = MacroEnv.reset, set(), []
@@ -193,7 +193,7 @@ class Elsewhere(bench_fakes.TableAgent):
         Elsewhere.given = {"episodes": episodes, "horizon": horizon, "played": played}
 
 
-def test_a_loop_of_its_own_has_the_starts_of_all_agents_and_pays_for_its_training_alone(
+def test_a_loop_of_its_own_has_all_agents_starts_and_own_cpu_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = AgentEntry(make=f"{__name__}:Elsewhere", needs_encoder=False, external_training_loop=True)

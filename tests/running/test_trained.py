@@ -53,9 +53,7 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
         run(other, tmp_path / "another node", lambda progress: None)
 
 
-def test_learners_are_those_that_learned_something_and_can_be_taken_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_learners_are_those_that_learned_and_can_be_taken_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = registry.AGENTS["table"]
     monkeypatch.setitem(registry.AGENTS, "of_a_library", dataclasses.replace(entry, external_training_loop=True))
     wanted = small(agents=("table", "imaginer", "of_a_library", "random"))
