@@ -20,7 +20,7 @@ from .dqn_settings import HYPERPARAMETERS, MORE_UPDATES, ControllerSettings, DQN
 from .encoders.perception import Perception, load_perception, prepare_torch
 from .meters import Meters
 from .networks.adam import Adam, TrainedModule
-from .networks.mlp import mlp
+from .networks.mlp import backpropagate, mlp, outputs_of_layers
 from .replay import Batch, RealMemory, Transitions
 from .settings import Hyperparameters, flatten
 
@@ -37,6 +37,12 @@ def td_target(reward: Tensor, terminated: Tensor, q_next: Tensor, discount: floa
     Termination stops bootstrapping; truncation does not, since ``terminated`` is 0 there.
     """
     return reward + discount * (1.0 - terminated) * q_next.amax(dim=-1)
+
+
+def _mean_square(q: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
+    if weight is None:
+        return functional.mse_loss(q, target)
+    return (weight * (q - target).square()).mean()
 
 
 class Controller(TrainedModule):
@@ -71,10 +77,7 @@ class Controller(TrainedModule):
 
     def loss(self, batch: Batch) -> Tensor:
         """Mean squared Bellman error, weighted where the batch has weights; no gradient flows through the targets."""
-        q, target = self._sides(batch)
-        if batch.weight is None:
-            return functional.mse_loss(q, target)
-        return (batch.weight * (q - target).square()).mean()
+        return _mean_square(*self._sides(batch), batch.weight)
 
     @torch.no_grad()
     def errors(self, batch: Batch) -> Tensor:
@@ -83,23 +86,39 @@ class Controller(TrainedModule):
         return q - target
 
     def _sides(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        with torch.no_grad():
-            q_next = self.target(batch.next_z)
-            target = td_target(batch.reward, batch.terminated, q_next, self.settings.discount)
-        return self.network(batch.z).gather(1, batch.action.unsqueeze(1)).squeeze(1), target
+        return self.network(batch.z).gather(1, batch.action.unsqueeze(1)).squeeze(1), self._targets(batch)
+
+    @torch.no_grad()
+    def _targets(self, batch: Batch) -> Tensor:
+        return td_target(batch.reward, batch.terminated, self.target(batch.next_z), self.settings.discount)
 
     def update(self, batch: Batch) -> float:
         """One step of Adam; the loss before it. DivergedError, and weights as they were, if that is not finite."""
-        loss = self.loss(batch)
-        value = loss.item()
+        value = self._differentiate(batch)
         if not math.isfinite(value):
             raise DivergedError(f"The controller's loss is {value}. Lower controller.learning_rate.")
-        self.optimiser.zero_grad()
-        loss.backward()
         self.optimiser.step()
         if self.target is not self.network:
             self._follow()
         return value
+
+    def _differentiate(self, batch: Batch) -> float:
+        """Set the gradients of the loss, and return it; of a dense network without autograd, which is slower there."""
+        network = self.network
+        if not isinstance(network, nn.Sequential):
+            loss = self.loss(batch)
+            self.optimiser.zero_grad()
+            loss.backward()
+            return loss.item()
+        values = outputs_of_layers(network, batch.z)
+        action = batch.action.unsqueeze(1)
+        q = values[-1].gather(1, action).squeeze(1)
+        target = self._targets(batch)
+        slopes = 2.0 / len(q) * (q - target)
+        if batch.weight is not None:
+            slopes = batch.weight * slopes
+        backpropagate(network, values, torch.zeros_like(values[-1]).scatter_(1, action, slopes.unsqueeze(1)))
+        return _mean_square(q, target, batch.weight).item()
 
     @torch.no_grad()
     def _follow(self) -> None:

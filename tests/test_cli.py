@@ -210,8 +210,12 @@ def test_seeds_are_added_until_it_is_decided_or_there_are_enough(
     assert sorted(inline.order) == sorted(
         [*((agent, seed) for agent in few["agents"] for seed in (0, 1)), ("table", 2), ("imaginer", 2)]
     )
-    reports = re.findall(r"Report: +(\S+)", capsys.readouterr().out)
-    assert ["merged-" in report for report in reports] == [False, True]
+    printed = capsys.readouterr().out
+    (report,) = re.findall(r"Report: +(\S+)", printed)
+    assert "merged-" in report
+    (parts,) = re.findall(r"Parts: +(.+)", printed)
+    assert all((Path(part) / "report" / "index.html").is_file() for part in parts.split(", "))
+    assert [Path(part).parts[-3] == "added" for part in parts.split(", ")] == [False, True]
     assert main(words) == 0 and len(inline.order) == 8, "a finished search is only read"
 
 

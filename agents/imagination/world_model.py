@@ -20,7 +20,7 @@ from torch.nn import functional
 from imagine_bench.errors import DivergedError
 
 from ..networks.adam import Adam, TrainedModule
-from ..networks.mlp import Masks, MemberMLP, clip_unit_norms
+from ..networks.mlp import Masks, MemberMLP, clip_gradient_norm, clip_unit_norms
 from ..networks.precision import hidden_dtype
 from ..networks.weight_samples import sample_outputs
 from ..replay import Batch
@@ -138,9 +138,9 @@ class EnvironmentModel(TrainedModule):
             raise DivergedError(f"The world model's losses are no longer finite: {losses}. Lower model.learning_rate.")
         self.optimiser.zero_grad()
         terms.sum().backward()
-        for part in self.clipped:
-            if self.settings.gradient_clip is not None:
-                nn.utils.clip_grad_norm_(part.parameters(), self.settings.gradient_clip)
+        if self.settings.gradient_clip is not None:
+            for part in self.clipped:
+                clip_gradient_norm([*part.parameters()], self.settings.gradient_clip)
         self.optimiser.step()
         if self.settings.max_norm is not None:
             self.limit_norms(self.settings.max_norm)

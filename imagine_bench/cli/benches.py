@@ -37,7 +37,8 @@ from imagine_bench.protocols.control import PRESETS, Protocol
 from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, load_so_far, plan
-from imagine_bench.running.headlines import until_decided
+from imagine_bench.running.headlines import most_of, until_decided
+from imagine_bench.seeding import seeds_text
 from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import newest_bench
 from imagine_bench.store.results import BenchResult
@@ -49,6 +50,8 @@ if TYPE_CHECKING:
 
 _MOST_SEEDS = 19
 """Where --until-decided stops."""
+_ADDED = "added"
+"""Folder of benches of added seeds, below that of all benches, so that none is taken for the newest bench."""
 
 
 TrackWord = Annotated[str | None, shown(f"{{{','.join(TOOLS)}}}")]
@@ -115,9 +118,10 @@ class Budget:
     networks: Count = None
     """Of regression tasks: networks a run, by default the preset's, each on data of its own."""
     until_decided: bool = False
-    """Add seeds, three at a time, until every headline of the preset is decided; p-values allow for all looks."""
+    """Add seeds, three at a time, until every headline of the preset is decided; p-values allow for all looks. Without
+    it the preset quick adds three once."""
     most_seeds: Count = None
-    """With --until-decided: seeds an agent at most; 19 by default."""
+    """With --until-decided: seeds of an agent at most; 19 by default."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +172,7 @@ class Bench:
 
     def __call__(self) -> None:
         """Plan, run, report."""
-        results = carry_out(
+        *parts, whole = carry_out(
             *self.asked(),
             root=self.launch.out,
             launcher=self.launch.chosen(),
@@ -176,8 +180,11 @@ class Bench:
             most=self.budget.most_seeds,
             track=self.track,
         )
-        for result in results:
-            _show(result)
+        for part in parts:
+            _written(page_of(part), part.folder / "report")
+        _show(whole)
+        if parts:
+            print(f"Parts:      {', '.join(str(part.folder) for part in parts)}")
 
 
 def carry_out(
@@ -191,7 +198,7 @@ def carry_out(
     most: int | None = None,
     track: str | None = None,
 ) -> list[Result]:
-    """Carry out the missing runs of a bench, or with ``until`` of its stages, and read it.
+    """Carry out the missing runs of a bench, in stages where its headlines are tested several times, and read it.
 
     Args:
         task: The task.
@@ -199,12 +206,12 @@ def carry_out(
         options: Fields of the protocol that differ from the preset's, as :func:`.running.bench.plan` takes them.
         root: The folder of all benches.
         launcher: Carries out the runs.
-        until: Whether seeds are added until the headlines are decided.
-        most: With it, seeds an agent at most; 19 by default.
+        until: Whether seeds are added until the headlines are decided, more often than the preset says.
+        most: With it, seeds of an agent at most; 19 by default.
         track: Tool for which metrics are also written, as the runs go.
 
     Returns:
-        The bench; or the bench of the first stage and, if there were more, that of all seeds.
+        The bench; or, if seeds were added, its parts, and last all of them as one bench.
 
     Raises:
         InvalidValueError: ``most`` without ``until``, or ``until`` for a task without headlines.
@@ -218,17 +225,25 @@ def carry_out(
         tracked.note(results[-1])
         return results
     wanted, encoders = plan(task, preset, **options)
-    if not until:
-        return [bench(wanted, encoders, root=root, launcher=launcher)]
     if not isinstance(wanted, Protocol):
-        raise InvalidValueError(f"{task} is a regression task without headlines; leave --until-decided out.")
+        if until:
+            raise InvalidValueError(f"{task} is a regression task without headlines; leave --until-decided out.")
+        return [bench(wanted, encoders, root=root, launcher=launcher)]
+    if until:
+        most = _MOST_SEEDS if most is None else most
+    elif wanted.most_looks > 1:
+        most = most_of(len(wanted.seeds), wanted.most_looks)
+    else:
+        return [bench(wanted, encoders, root=root, launcher=launcher)]
 
     def staged(**changes: Any) -> BenchResult:
         stage, paths = plan(task, preset, **{**options, **changes})
-        return cast("BenchResult", bench(stage, paths, root=root, launcher=launcher))
+        if stage.seeds[0] == wanted.seeds[0]:
+            return cast("BenchResult", bench(stage, paths, root=root, launcher=launcher))
+        print(f"Not decided: {' and '.join(stage.agents)} with the seeds {seeds_text(stage.seeds)} are added.")
+        return cast("BenchResult", bench(stage, paths, root=root / _ADDED, launcher=launcher))
 
-    begun, whole = until_decided(staged, wanted, most=_MOST_SEEDS if most is None else most, root=root)
-    return [begun] if whole is begun else [begun, whole]
+    return [*until_decided(staged, wanted, most=most, root=root)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -381,7 +396,12 @@ def page_of(result: Result) -> Page:
 
 def write_report(page: Page, folder: Path) -> None:
     """Print the tables and the verdict of a page, write it, and say where it lies."""
+    print(page.summary)  # first, as it needs no place to write
+    print(f"\nReport:     {_written(page, folder)}")
+
+
+def _written(page: Page, folder: Path) -> Path:
+    """Write a page; returns its path."""
     from imagine_bench.report.page import write_page  # noqa: PLC0415 - matplotlib loads slowly
 
-    print(page.summary)  # first, as it needs no place to write
-    print(f"\nReport:     {write_page(folder, page)}")
+    return write_page(folder, page)

@@ -73,23 +73,26 @@ def stages(first: int, most: int) -> list[int]:
     return [*range(first, most, STAGE), most]
 
 
-def until_decided(
-    plan: Callable[..., BenchResult], first: Protocol, *, most: int, root: Path
-) -> tuple[BenchResult, BenchResult]:
+def most_of(first: int, looks: int) -> int:
+    """How many seeds a bench has at the last of several looks, from ``first`` at the first one."""
+    return first + STAGE * (looks - 1)
+
+
+def until_decided(plan: Callable[..., BenchResult], first: Protocol, *, most: int, root: Path) -> list[BenchResult]:
     """Run seeds in stages until every headline is decided, or ``most`` seeds are done.
 
-    Each stage is a bench of its own, so whatever was run before is only read: an interrupted call, made again, goes on
-    and ends in the same results. The agents of headlines have all seeds, and from the second stage on they alone are
-    run.
+    Each stage is made of benches of their own, so whatever was run before is only read: an interrupted call, made
+    again, goes on and ends in the same results. From the second stage on the agents of headlines alone are run, each
+    with as many more seeds as the others.
 
     Args:
         plan: Runs a bench with changes to fields of ``first``, or reads it where it is finished.
         first: The protocol of the first stage.
-        most: Most seeds an agent.
+        most: Most seeds of the agent that has most of them.
         root: Folder of all benches.
 
     Returns:
-        The first stage, of all agents, and all stages as one bench of the agents of headlines.
+        The bench of the first stage, those of all further seeds, and last, if there are any, all as one bench.
 
     Raises:
         InvalidValueError: The protocol has no headline, or ``most`` is less than its seeds.
@@ -100,26 +103,35 @@ def until_decided(
             "has two if --agents is left out."
         )
     counts = stages(len(first.seeds), most)
-    agents = tuple(dict.fromkeys(agent for pair in first.headlines for agent in reversed(pair)))
-    known = frozenset[str]().union(*map(registry.setting_names, agents))
-    overrides = tuple(pair for pair in first.overrides if pair[0] in known)  # of the others no run is left
-    few = {agent: len(first.seeds_of(agent)) for agent, _ in first.few_seeds if agent not in agents}
-    begun = plan(seeds=first.seeds, most_looks=len(counts), few_seeds=few)
-    parts: list[BenchResult] = []
-    whole = begun
+    few = {agent: len(first.seeds_of(agent)) for agent, _ in first.few_seeds}
+    whole = plan(seeds=first.seeds, most_looks=len(counts), few_seeds=few)
+    parts = [whole]
     for before, count in itertools.pairwise(counts):
         if decided(whole):
             break
-        seeds = tuple(first.seeds[-1] + 1 + step for step in range(before - counts[0], count - counts[0]))
-        changes = {"headlines": first.headlines, "most_looks": len(counts), "overrides": overrides}
-        parts.append(plan(agents=agents, seeds=seeds, **changes))
-        whole = merge([_of_agents(begun, parts[0].protocol), *parts], root)
-    return begun, whole
+        parts += _stage(plan, first, before, count, most_looks=len(counts))
+        whole = merge(parts, root)
+    return parts if whole is parts[0] else [*parts, whole]
 
 
-def _of_agents(result: BenchResult, like: Protocol) -> BenchResult:
-    """A bench with the agents of another protocol alone, which have the same settings there."""
-    of_agents = {name: getattr(like, name) for name in ("agents", "settings_digest", "few_seeds", "overrides")}
-    part = dataclasses.replace(result.protocol, **of_agents)
-    runs = tuple(run for run in result.runs if run.agent in part.agents)
-    return dataclasses.replace(result, protocol=part, runs=runs)
+def _stage(
+    plan: Callable[..., BenchResult], first: Protocol, before: int, count: int, *, most_looks: int
+) -> list[BenchResult]:
+    """The benches that take the agent of most seeds from ``before`` to ``count`` of them, and others as far."""
+    seeds = (*first.seeds, *range(first.seeds[-1] + 1, first.seeds[-1] + 1 + count - len(first.seeds)))
+    groups: dict[int, list[str]] = {}
+    for agent in dict.fromkeys(agent for pair in first.headlines for agent in reversed(pair)):
+        fewer = len(first.seeds) - len(first.seeds_of(agent))
+        groups.setdefault(fewer, []).append(agent)
+    found = []
+    for fewer, agents in groups.items():
+        known = frozenset[str]().union(*map(registry.setting_names, agents))
+        part = plan(
+            agents=tuple(agents),
+            seeds=seeds[before - fewer : count - fewer],
+            headlines=first.headlines,
+            most_looks=most_looks,
+            overrides=tuple(pair for pair in first.overrides if pair[0] in known),  # others are of other agents
+        )
+        found.append(dataclasses.replace(part, protocol=dataclasses.replace(part.protocol, overrides=first.overrides)))
+    return found

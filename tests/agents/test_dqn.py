@@ -56,6 +56,24 @@ def test_loss_is_the_mean_squared_bellman_error_row_by_row() -> None:
     assert expected.abs().max() > 0.0
 
 
+@pytest.mark.parametrize("target_rate", [1.0, 0.25])
+@pytest.mark.parametrize("weight", [None, torch.tensor([1.0, 0.5, 0.0, 0.25, 1.0])])
+def test_an_update_moves_against_the_gradient_of_the_loss(target_rate: float, weight: torch.Tensor | None) -> None:
+    """Adam's first step is the learning rate times the sign of the gradient, which is autograd's to the bit."""
+    controller, rows = make(0, target_rate), replace(batch(), weight=weight)
+    before = weights(controller.network)
+    loss = controller.loss(rows)
+    expected = torch.autograd.grad(loss, [*controller.network.parameters()])
+    assert controller.update(rows) == loss.item()
+    found = [each.grad for each in controller.network.parameters()]
+    for given, slope in zip(found, expected, strict=True):
+        torch.testing.assert_close(given, slope, rtol=1e-6, atol=1e-7)
+    moved = weights(controller.network) - before
+    slopes = torch.cat([slope.flatten() for slope in expected])
+    torch.testing.assert_close(moved, -1e-3 * slopes / (slopes.abs() + 1e-8), rtol=1e-3, atol=1e-6)
+    assert (slopes != 0.0).any()
+
+
 def test_a_loss_that_is_no_number_leaves_the_weights() -> None:
     controller = make()
     before = weights(controller)

@@ -1,11 +1,11 @@
-"""``python tests/measure/decisions.py [BENCH ...] [DRAWS]``: how often would the default bench decide its headlines?
+"""``python tests/measure/decisions.py [BENCH ...] [DRAWS]``: how often does the default bench decide its headlines?
 
 The benches are kept ones of the agents of the headlines, by default those of this repository; their seeds are put
-together. A group with as many seeds of each agent as the default bench has is a repetition of it. First come groups
-that share no seed, then groups drawn with replacement, which differ as groups of new seeds would. Where the kept runs
-have another number of tests than the default bench, the drawn scores get its noise (:func:`with_noise_of`). Printed
-before is how often one look, and several with more seeds each time, claim a headline though all agents have one law.
-Printed last are the CPU seconds of these runs.
+together. A group of these runs, in an order, is a repetition of the default bench: its first runs are the first stage,
+and if they do not decide, those of the next stage count, too. First come groups that share no run, then groups drawn
+with replacement, which differ as groups of new seeds would. Where the kept runs have another number of tests than the
+default bench, the drawn scores get its noise (:func:`with_noise_of`). Printed before is how often one bench claims a
+headline though all agents have one law. Printed last are the CPU seconds of these runs.
 """
 
 from __future__ import annotations
@@ -20,43 +20,63 @@ import numpy as np
 from imagine_bench import statistics
 from imagine_bench.interfaces import Floats
 from imagine_bench.protocols.control import PRESETS, protocol
-from imagine_bench.running.headlines import stages
+from imagine_bench.running.headlines import most_of, stages
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult
 
 KEPT = (interval_coverage.RESULTS / "arrow_puzzle-quick-seeds_570_to_593",)
 PAIRS: Sequence[tuple[str, str]] = PRESETS["quick"]["headlines"]
 _DEFAULT = protocol("arrow_puzzle")
-COUNTS = {agent: len(_DEFAULT.seeds_of(agent)) for pair in PAIRS for agent in pair}
-"""Seeds of each agent in the default bench."""
-LOOKS = stages(len(_DEFAULT.seeds), 19)
-"""Seeds of each agent at each look of --until-decided."""
+AGENTS = tuple(dict.fromkeys(agent for pair in PAIRS for agent in pair))
+
+
+def looks_until(most: int) -> list[dict[str, int]]:
+    """Seeds of each agent at each look of a bench that ends with ``most`` seeds of the agent that has most."""
+    first = len(_DEFAULT.seeds)
+    return [{agent: len(_DEFAULT.seeds_of(agent)) + count - first for agent in AGENTS} for count in stages(first, most)]
+
+
+LOOKS = looks_until(most_of(len(_DEFAULT.seeds), _DEFAULT.most_looks))
+"""Of the default bench."""
+UNTIL_DECIDED = looks_until(19)
+"""Of --until-decided."""
 _LEVEL = 1.0 - statistics.LEVEL
 
 
-def decided(scores: Mapping[str, Floats], trials: int) -> list[bool]:
-    """Which headlines are decided, of the scores (seeds,) of each agent."""
+def p_values(scores: Mapping[str, Floats], trials: int) -> Floats:
+    """The p-value of each headline, corrected for all headlines and looks, of the scores (seeds,) of each agent."""
     found = [statistics.difference(scores[agent], scores[base], trials=trials).p for agent, base in PAIRS]
-    return (statistics.holm(found) < _LEVEL).tolist()
+    corrected: Floats = statistics.holm(found) * len(LOOKS)
+    return corrected
 
 
-def repetitions(benches: Sequence[Path], draws: int, rng: np.random.Generator) -> dict[str, list[list[bool]]]:
-    """Which headlines each repetition decides, of groups that share no seed and of groups drawn with replacement."""
+def deciding_look(scores: Mapping[str, Floats], trials: int) -> int | None:
+    """At which look, from 0 on, the default bench has decided all its headlines; None if it never has."""
+    for look, counts in enumerate(LOOKS):
+        so_far = {agent: scores[agent][:count] for agent, count in counts.items()}
+        if (p_values(so_far, trials) < _LEVEL).all():
+            return look
+    return None
+
+
+def repetitions(benches: Sequence[Path], draws: int, rng: np.random.Generator) -> dict[str, list[int | None]]:
+    """When each repetition is decided, of groups that share no run and of groups drawn with replacement."""
     results = [load_so_far(bench) for bench in benches]
     trials = min(result.protocol.evaluation_episodes for result in results)
-    scores = {agent: rng.permutation(scores_of(agent, results)) for agent in COUNTS}
-    apart = min(len(scores[agent]) // count for agent, count in COUNTS.items())
+    scores = {agent: rng.permutation(scores_of(agent, results)) for agent in AGENTS}
+    last = LOOKS[-1]
+    apart = min(len(scores[agent]) // count for agent, count in last.items())
     tests = _DEFAULT.evaluation_episodes
     noisy = {agent: with_noise_of(tests, each, trials, rng, draws) for agent, each in scores.items()}
     groups = {
         "disjoint": [
-            {agent: scores[agent][place * count : (place + 1) * count] for agent, count in COUNTS.items()}
+            {agent: scores[agent][place * count : (place + 1) * count] for agent, count in last.items()}
             for place in range(apart)
         ],
-        "drawn": [{agent: rng.choice(noisy[agent], count) for agent, count in COUNTS.items()} for _ in range(draws)],
+        "drawn": [{agent: rng.choice(noisy[agent], count) for agent, count in last.items()} for _ in range(draws)],
     }
     trials_of = {"disjoint": trials, "drawn": tests}
-    return {name: [decided(group, trials_of[name]) for group in each] for name, each in groups.items()}
+    return {name: [deciding_look(group, trials_of[name]) for group in each] for name, each in groups.items()}
 
 
 def with_noise_of(tests: int, scores: Floats, trials: int, rng: np.random.Generator, draws: int) -> Floats:
@@ -81,24 +101,22 @@ def scores_of(agent: str, results: Sequence[BenchResult]) -> Floats:
 
 
 def cpu_seconds(benches: Sequence[Path]) -> dict[str, float]:
-    """CPU seconds that a run of each agent takes on average, for all its training and tests."""
-    results = [load_so_far(bench) for bench in benches]
-    spent: dict[str, list[float]] = {agent: [] for agent in COUNTS}
-    for run in (run for result in results for run in result.runs if run.agent in COUNTS):
-        spent[run.agent].append(run.checkpoints[-1].train_cpu_s + sum(row.eval_cpu_s for row in run.checkpoints))
+    """CPU seconds of one run of each agent in the default bench: training to its end, and its tests."""
+    spent: dict[str, list[float]] = {agent: [] for agent in AGENTS}
+    for run in (run for bench in benches for run in load_so_far(bench).runs if run.agent in AGENTS):
+        rows = [row for row in run.checkpoints if row.episodes in _DEFAULT.budgets]
+        tests = sum(row.eval_cpu_s / row.test_episodes for row in rows) * _DEFAULT.evaluation_episodes
+        spent[run.agent].append(rows[-1].train_cpu_s + tests)
     return {agent: float(np.mean(each)) for agent, each in spent.items()}
 
 
 def false_claims(
-    runs: Floats, looks: Sequence[Sequence[int]] = tuple((count,) * 3 for count in LOOKS), trials: int | None = None
+    runs: Floats, looks: Sequence[Mapping[str, int]] = tuple(UNTIL_DECIDED), trials: int | None = None
 ) -> float:
-    """Share of benches that claim a headline at any look, from scores (draws, 3, seeds) of three agents of one law.
-
-    A look is the number of seeds of the agent and of both that it is compared with.
-    """
+    """Share of benches that claim a headline at any look, from scores (draws, 3, seeds) of three agents of one law."""
     claimed = np.zeros(len(runs), dtype=bool)
     for counts in looks:
-        agent, *bases = (runs[:, place, :count] for place, count in enumerate(counts))
+        agent, *bases = (runs[:, place, : counts[name]] for place, name in enumerate(AGENTS))
         p_values = [statistics.differences(agent, base, trials=trials)[3] for base in bases]
         claimed |= len(looks) * len(bases) * np.min(p_values, axis=0) < _LEVEL
     return float(claimed.mean())
@@ -106,7 +124,7 @@ def false_claims(
 
 def drawn(draws: int, rng: np.random.Generator) -> dict[str, Floats]:
     """Scores (draws, 3, seeds) of three agents of one law: every law of :mod:`interval_coverage`, and kept scores."""
-    shape = (draws, 3, LOOKS[-1])
+    shape = (draws, 3, max(UNTIL_DECIDED[-1].values()))
     found = {name: law(rng, shape) for name, law in interval_coverage.LAWS.items()}
     many = interval_coverage.populations(interval_coverage.RESULTS)
     kept = [rng.choice(many[which], shape[1:]) for which in rng.integers(len(many), size=draws)]
@@ -118,21 +136,24 @@ def main(words: Sequence[str]) -> None:
     benches = [Path(word) for word in words if not word.isdigit()] or KEPT
     draws = next((int(word) for word in words if word.isdigit()), 4000)
     rng = np.random.default_rng(0)
-    once = [tuple(COUNTS[agent] for agent in ("imagination", "dqn", "dqn_more_updates"))]
     for name, runs in drawn(draws, rng).items():
-        shares = [100.0 * share for share in (false_claims(runs, once), false_claims(runs))]
+        shares = [100.0 * false_claims(runs, looks) for looks in (LOOKS, UNTIL_DECIDED)]
         print(
-            f"{name}: {shares[0]:.1f} % of benches claim a difference that is none, with {once[0]} seeds; "
-            f"{shares[1]:.1f} % at any look, with {LOOKS} seeds of each"
+            f"{name}: {shares[0]:.1f} % of default benches claim a difference that is none, {shares[1]:.1f} % of ",
+            end="",
         )
+        print("those with --until-decided")
+    spent = cpu_seconds(benches)
+    prices = [sum(spent[agent] * count for agent, count in counts.items()) for counts in LOOKS]
     for name, found in repetitions(benches, draws, rng).items():
-        both = np.mean([all(each) for each in found])
-        single = np.mean(found, axis=0)
-        print(f"{len(found)} {name} repetitions of {COUNTS} seeds: both decided in {100 * both:.1f} %")
-        for (agent, base), share in zip(PAIRS, single, strict=True):
-            print(f"  {agent} against {base}: {100 * share:.1f} %")
-    for agent, cpu_s in cpu_seconds(benches).items():
-        print(f"{agent}: {COUNTS[agent]} runs of {cpu_s:.0f} CPU s")
+        shares = [100.0 * found.count(look) / len(found) for look in range(len(LOOKS))]
+        taken = np.mean([prices[-1 if look is None else look] for look in found])
+        print(f"{len(found)} {name} repetitions: both headlines are decided in {sum(shares):.1f} %")
+        for counts, share, price in zip(LOOKS, shares, prices, strict=True):
+            print(f"  at {counts} seeds, after {price:.0f} CPU s: {share:.1f} %")
+        print(f"  on average after {taken:.0f} CPU s")
+    for agent, cpu_s in spent.items():
+        print(f"{agent}: a run takes {cpu_s:.0f} CPU s")
 
 
 if __name__ == "__main__":

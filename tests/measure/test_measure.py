@@ -48,37 +48,37 @@ def test_a_true_gap_of_40_points_is_shown() -> None:
 
 
 def test_looking_again_and_again_claims_no_more() -> None:
-    """Headlines of agents of one law, at four looks; without the allowance two modes would claim too many."""
-    once = [tuple(decisions.COUNTS[agent] for agent in ("imagination", "dqn", "dqn_more_updates"))]
+    """Headlines of agents of one law; without the allowance two modes would claim too many."""
     for name, runs in decisions.drawn(300, np.random.default_rng(0)).items():
         assert decisions.false_claims(runs) <= 0.05 + CHANCE, name
-        assert decisions.false_claims(runs, once) <= 0.05 + CHANCE, name
+        assert decisions.false_claims(runs, decisions.LOOKS) <= 0.05 + CHANCE, name
     modes = interval_coverage.LAWS[interval_coverage.WORST](np.random.default_rng(0), (1000, 3, 40))
     looks = range(6, 41, 4)
-    assert decisions.false_claims(modes, [(count,) * 3 for count in looks]) < 0.05
+    assert decisions.false_claims(modes, [dict.fromkeys(decisions.AGENTS, count) for count in looks]) < 0.05
     careless = [statistics.differences(*modes[:, :2, :count].swapaxes(0, 1))[3] < 0.05 for count in looks]
     assert np.any(careless, axis=0).mean() > 0.08
 
 
-def test_a_repetition_has_the_seeds_of_the_default_bench(tmp_path: Path) -> None:
-    """Of 21 seeds, two disjoint groups; agents that differ by 40 points are told apart in all of them.
+@pytest.mark.parametrize(("gap", "look"), [(80, 0), (12, 1), (0, None)])
+def test_a_repetition_is_decided_as_the_default_bench_would_be(tmp_path: Path, gap: int, look: int | None) -> None:
+    """Of 21 seeds, two disjoint groups of ten. Agents differ at the last budget of the default bench alone.
 
-    They differ at the number of episodes of the default bench, and at no other.
+    A gap of 40 points is shown by the first stage, one of 6 points by the second, and none by neither.
     """
     agents = ("dqn", "dqn_more_updates", "imagination")
     protocol = Protocol(task="arrow_puzzle", preset="quick", agents=agents, seeds=tuple(range(21)), budgets=(400, 500))
     result = bench_result(tmp_path, protocol=protocol)
-    levels = {"dqn": 100, "dqn_more_updates": 110, "imagination": 190}
 
     def change(run: RunResult, row: Checkpoint) -> Checkpoint:
-        level = levels[run.agent] if row.episodes == 400 else 100
-        return dataclasses.replace(row, successes=level + run.seed % 7)
+        ahead = gap * (run.agent == "imagination") * (row.episodes == 400)
+        return dataclasses.replace(row, successes=100 + ahead + run.seed % 7)
 
     for name, text in archive_files(rewritten(result, change)).items():
         (tmp_path / name).write_text(text)
     found = decisions.repetitions([tmp_path], 10, np.random.default_rng(0))
     assert [len(found[name]) for name in ("disjoint", "drawn")] == [2, 10]
-    assert all(each == [True, True] for each in [*found["disjoint"], *found["drawn"]])
+    assert found["disjoint"] == [look] * 2
+    assert [dict(decisions.LOOKS[place])["imagination"] for place in (0, 1)] == [5, 8]
 
 
 def test_a_mistake_of_these_tests_would_be_seen() -> None:

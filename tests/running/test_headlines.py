@@ -14,21 +14,23 @@ from fake_results import bench_result, rewritten
 from small_runs import Inline, small
 
 from imagine_bench import statistics
+from imagine_bench.cli import benches
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.protocols.control import Protocol, protocol
 from imagine_bench.running.bench import bench
 from imagine_bench.running.headlines import decided, headlines, stages, until_decided
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
 
+FEW = {"evaluation_episodes": 200}
 PAIRS = (("imagination", "dqn"), ("imagination", "dqn_more_updates"))
 FIRST = Protocol(
     task="arrow_puzzle",
     preset="quick",
     agents=("random", "dqn", "dqn_more_updates", "imagination"),
-    seeds=(0, 1, 2, 3, 4, 5),
+    seeds=(0, 1, 2, 3, 4, 5, 6),
     budgets=(100, 500),
     headlines=PAIRS,
-    few_seeds=(("random", 2), ("imagination", 4)),
+    few_seeds=(("random", 2), ("imagination", 4), ("dqn", 4)),
 )
 
 
@@ -45,10 +47,13 @@ def test_headlines_of_a_preset_are_about_its_own_agents() -> None:
     assert protocol("arrow_puzzle", seeds=(7, 8)).headlines == protocol("arrow_puzzle").headlines == PAIRS
     others = [protocol("arrow_puzzle", agents=("dqn", "imagination")), protocol("arrow_puzzle", "smoke")]
     assert {each.headlines for each in (*others, protocol("pick_place"))} == {()}
+    assert {each.most_looks for each in (*others, protocol("arrow_puzzle", seeds=(7, 8)))} == {1}
+    assert protocol("arrow_puzzle").most_looks == protocol("arrow_puzzle", budgets=(9,)).most_looks == 2
     assert protocol("arrow_puzzle", agents=("dqn",)).few_seeds == ()
     assert protocol("arrow_puzzle", seeds=(7,)).few_seeds == (), "nobody has more seeds than there are"
     last = dict(protocol("arrow_puzzle", seeds=tuple(range(20, 30))).few_seeds)
-    assert (last.pop("imagination"), last.pop("dqn"), {*last.values()}) == (26, 25, {20}), "of seven, six and one"
+    headed = [last.pop(agent) for agent in ("dqn_more_updates", "imagination", "dqn")]
+    assert (headed, {*last.values()}) == ([26, 24, 24], {20}), "of seven, five and one"
 
 
 def test_headlines_are_corrected_for_one_another_and_for_all_looks(tmp_path: Path) -> None:
@@ -78,28 +83,29 @@ def staged(tmp_path: Path) -> Callable[[int, list[Protocol]], Callable[..., Benc
     return with_gap
 
 
-@pytest.mark.parametrize(("gap", "seeds"), [(60, 6), (33, 9), (29, 12), (0, 13)])
+@pytest.mark.parametrize(("gap", "seeds"), [(60, 7), (27, 10), (22, 13), (0, 14)])
 def test_stages_end_once_decided_or_at_the_most(staged: Any, tmp_path: Path, gap: int, seeds: int) -> None:
+    """The others have two seeds fewer than ``dqn_more_updates`` in each stage, and ``random`` has its three."""
     asked: list[Protocol] = []
-    begun, whole = until_decided(staged(gap, asked), FIRST, most=13, root=tmp_path)
-    assert whole.protocol.seeds == tuple(range(seeds)) and begun.protocol.agents == FIRST.agents
+    *_, whole = until_decided(staged(gap, asked), FIRST, most=14, root=tmp_path)
     assert decided(whole) == (gap > 0)
-    assert [seed for each in asked for seed in each.seeds] == list(range(seeds)), "each seed once"
-    assert {each.most_looks for each in asked} == {len(stages(6, 13))} == {4}
-    assert all("random" not in each.agents for each in asked[1:])
-    assert {len(whole.success_rates(agent)) for pair in PAIRS for agent in pair} == {seeds}, "all have all seeds"
-    assert begun.protocol.few_seeds == (("random", 2),)
+    assert whole.protocol.agents == FIRST.agents and whole.protocol.seeds == tuple(range(seeds))
+    counts = {agent: len(whole.success_rates(agent)) for agent in FIRST.agents}
+    assert counts == {"random": 3, "dqn": seeds - 2, "dqn_more_updates": seeds, "imagination": seeds - 2}
+    runs = [(agent, seed) for each in asked for agent in each.agents for seed in each.seeds_of(agent)]
+    assert len(runs) == len(set(runs)) == sum(counts.values()), "each run once"
+    assert {each.most_looks for each in asked} == {len(stages(7, 14))} == {4}
     again: list[Protocol] = []
-    assert until_decided(staged(gap, again), FIRST, most=13, root=tmp_path)[1].protocol == whole.protocol
+    assert until_decided(staged(gap, again), FIRST, most=14, root=tmp_path)[-1].protocol == whole.protocol
     assert again == asked, "the same call asks for the same benches, which are then only read"
 
 
 def test_a_setting_without_a_headline_agent_is_of_the_first_stage(staged: Any, tmp_path: Path) -> None:
     asked: list[Protocol] = []
     first = dataclasses.replace(FIRST, overrides=(("controller.discount", 0.9), ("dynamics.parents", 2)))
-    _, whole = until_decided(partial(staged(0, asked), overrides=first.overrides), first, most=8, root=tmp_path)
-    assert asked[0].overrides == first.overrides
-    assert whole.protocol.overrides == asked[1].overrides == first.overrides[:1]
+    *_, whole = until_decided(partial(staged(0, asked), overrides=first.overrides), first, most=9, root=tmp_path)
+    assert {each.overrides for each in asked[1:]} == {first.overrides[:1]}
+    assert whole.protocol.overrides == asked[0].overrides == first.overrides
 
 
 def test_an_interrupted_search_ends_in_the_same_results(tmp_path: Path) -> None:
@@ -112,7 +118,7 @@ def test_an_interrupted_search_ends_in_the_same_results(tmp_path: Path) -> None:
             asked = small(**{**wanted, "headlines": first.headlines, **changes})
             return bench(asked, {}, root=root, launcher=launcher)
 
-        return until_decided(plan, first, most=8, root=root)[1]
+        return until_decided(plan, first, most=8, root=root)[-1]
 
     whole = search(tmp_path / "whole", Inline())
     assert whole.protocol.seeds == tuple(range(8)) and whole.protocol.most_looks == 2
@@ -133,6 +139,33 @@ def test_without_headlines_or_with_too_few_seeds_nothing_is_run(tmp_path: Path) 
 
     with pytest.raises(InvalidValueError, match="This bench has no headlines"):
         until_decided(never, dataclasses.replace(FIRST, headlines=()), most=15, root=tmp_path)
-    for most in (5, 0, -1):
-        with pytest.raises(InvalidValueError, match=f"--most-seeds {most} is fewer than .* give at least 6"):
+    for most in (6, 0, -1):
+        with pytest.raises(InvalidValueError, match=f"--most-seeds {most} is fewer than .* give at least 7"):
             until_decided(never, FIRST, most=most, root=tmp_path)
+
+
+@pytest.mark.parametrize(("gap", "added"), [(60, []), (0, [("dqn", 5, 7), ("dqn_more_updates", 7, 9)])])
+def test_the_default_bench_adds_three_seeds_once(
+    gap: int, added: list[tuple[str, int, int]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where they are needed, and in a folder that no command takes for the newest bench."""
+    asked: list[tuple[Protocol, Path]] = []
+
+    def run(wanted: Protocol, paths: object, *, root: Path, launcher: object) -> BenchResult:
+        asked.append((wanted, root))
+        return result_of(wanted, tmp_path, gap)
+
+    monkeypatch.setattr(benches, "bench", run)
+    *parts, whole = benches.carry_out("arrow_puzzle", "quick", FEW, root=tmp_path, launcher=Inline())
+    assert [(each.agents[0], each.seeds[0], each.seeds[-1]) for each, _ in asked[1:]] == added
+    assert [root for _, root in asked] == [tmp_path] + [tmp_path / "added"] * len(added)
+    assert len(parts) == (1 + len(added) if added else 0)
+    usual = protocol("arrow_puzzle", **FEW)
+    assert whole.protocol.agents == usual.agents and decided(whole) == (gap > 0)
+    more = 3 if added else 0
+    for agent in usual.agents:
+        is_headed = agent in {name for pair in PAIRS for name in pair}
+        assert len(whole.success_rates(agent)) == len(usual.seeds_of(agent)) + more * is_headed
+    asked.clear()
+    benches.carry_out("arrow_puzzle", "quick", {**FEW, "seeds": (0, 1, 2, 3, 4, 5)}, root=tmp_path, launcher=Inline())
+    assert len(asked) == 1, "seeds that are named are all there are"

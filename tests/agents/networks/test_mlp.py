@@ -5,7 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 from imagine_bench.agents.networks.adam import Adam
-from imagine_bench.agents.networks.mlp import MemberMLP, clip_unit_norms, dropout_mask, mlp
+from imagine_bench.agents.networks.mlp import (
+    MemberMLP,
+    backpropagate,
+    clip_gradient_norm,
+    clip_unit_norms,
+    dropout_mask,
+    mlp,
+    outputs_of_layers,
+)
 from torch import nn
 
 
@@ -88,3 +96,33 @@ def test_steps_are_torchs_own_to_the_bit() -> None:
     assert torch.equal(own[2], weights()[2])
     adam.zero_grad()
     assert all(weight.grad is None for weight in own)
+
+
+@pytest.mark.parametrize("hidden", [(), (7,), (7, 5)])
+def test_gradients_of_a_dense_network_are_those_of_autograd(hidden: tuple[int, ...]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    network = mlp((4, *hidden, 3), generator)
+    x, slope = torch.randn(6, 4, generator=generator), torch.randn(6, 3, generator=generator)
+    expected = torch.autograd.grad(network(x), [*network.parameters()], slope)
+    values = outputs_of_layers(network, x)
+    assert torch.equal(values[0], x) and torch.equal(values[-1], network(x).detach())
+    backpropagate(network, values, slope)
+    for weight, gradient in zip(network.parameters(), expected, strict=True):
+        torch.testing.assert_close(weight.grad, gradient)
+        assert gradient.abs().max() > 0.0
+
+
+@pytest.mark.parametrize("limit", [0.5, 1e6])
+def test_gradients_are_clipped_to_a_common_norm(limit: float) -> None:
+    """As torch does it, to the bit; a large limit changes nothing."""
+    generator = torch.Generator().manual_seed(0)
+    both = [[*mlp((4, 5, 3), generator).parameters()] for _ in range(2)]
+    for mine, its in zip(*both, strict=True):
+        mine.grad = torch.randn(mine.shape, generator=generator)
+        its.grad = mine.grad.clone()
+    before = torch.cat([weight.grad.flatten() for weight in both[0]]).norm().item()
+    clip_gradient_norm(both[0], limit)
+    torch.nn.utils.clip_grad_norm_(both[1], limit)
+    assert all(torch.equal(mine.grad, its.grad) for mine, its in zip(*both, strict=True))
+    after = torch.cat([weight.grad.flatten() for weight in both[0]]).norm().item()
+    assert after == pytest.approx(min(before, limit), rel=1e-5)

@@ -20,6 +20,7 @@ LEVELS = {
     "imagination": (0.1, 0.55),
     "imagination_uncertainty": (0.15, 0.85),
     "imagination_only": (0.1, 0.8),
+    "factored:given": (0.9, 1.0),
 }
 DEPTH = 10
 WIDE = Protocol(task="arrow_puzzle", preset="thesis", budgets=(250, 2000, 6000), seeds=(0, 1, 7))
