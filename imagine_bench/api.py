@@ -201,7 +201,7 @@ def bench(
             ``evaluation_episodes=50``, ``execution="kinematic"``, ``set={"controller.discount": 0.9}``.
 
     Returns:
-        The results, of all stages where seeds were added. Their method :meth:`~Comparison.report` writes
+        The results, with ``until_decided=True`` those of all stages. Their method :meth:`~Comparison.report` writes
         the report.
 
     Raises:

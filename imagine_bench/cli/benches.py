@@ -37,7 +37,7 @@ from imagine_bench.protocols.control import PRESETS, Protocol
 from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData, Result, digest
 from imagine_bench.registry.entries import file_name, parse_settings
 from imagine_bench.running.bench import bench, load_so_far, plan
-from imagine_bench.running.headlines import most_of, until_decided
+from imagine_bench.running.headlines import until_decided
 from imagine_bench.seeding import seeds_text
 from imagine_bench.store import loading
 from imagine_bench.store.bench_folder import newest_bench
@@ -118,8 +118,7 @@ class Budget:
     networks: Count = None
     """Of regression tasks: networks a run, by default the preset's, each on data of its own."""
     until_decided: bool = False
-    """Add seeds, three at a time, until every headline of the preset is decided; p-values allow for all looks. Without
-    it the preset quick adds three once."""
+    """Add seeds, three at a time, until every headline of the preset is decided; p-values allow for all looks."""
     most_seeds: Count = None
     """With --until-decided: seeds of an agent at most; 19 by default."""
 
@@ -198,7 +197,7 @@ def carry_out(
     most: int | None = None,
     track: str | None = None,
 ) -> list[Result]:
-    """Carry out the missing runs of a bench, in stages where its headlines are tested several times, and read it.
+    """Carry out the missing runs of a bench, or with ``until`` of its stages, and read it.
 
     Args:
         task: The task.
@@ -206,7 +205,7 @@ def carry_out(
         options: Fields of the protocol that differ from the preset's, as :func:`.running.bench.plan` takes them.
         root: The folder of all benches.
         launcher: Carries out the runs.
-        until: Whether seeds are added until the headlines are decided, more often than the preset says.
+        until: Whether seeds are added until the headlines are decided.
         most: With it, seeds of an agent at most; 19 by default.
         track: Tool for which metrics are also written, as the runs go.
 
@@ -225,16 +224,10 @@ def carry_out(
         tracked.note(results[-1])
         return results
     wanted, encoders = plan(task, preset, **options)
+    if not until:
+        return [bench(wanted, encoders, root=root, launcher=launcher)]
     if not isinstance(wanted, Protocol):
-        if until:
-            raise InvalidValueError(f"{task} is a regression task without headlines; leave --until-decided out.")
-        return [bench(wanted, encoders, root=root, launcher=launcher)]
-    if until:
-        most = _MOST_SEEDS if most is None else most
-    elif wanted.most_looks > 1:
-        most = most_of(len(wanted.seeds), wanted.most_looks)
-    else:
-        return [bench(wanted, encoders, root=root, launcher=launcher)]
+        raise InvalidValueError(f"{task} is a regression task without headlines; leave --until-decided out.")
 
     def staged(**changes: Any) -> BenchResult:
         stage, paths = plan(task, preset, **{**options, **changes})
@@ -243,7 +236,7 @@ def carry_out(
         print(f"Not decided: {' and '.join(stage.agents)} with the seeds {seeds_text(stage.seeds)} are added.")
         return cast("BenchResult", bench(stage, paths, root=root / _ADDED, launcher=launcher))
 
-    return [*until_decided(staged, wanted, most=most, root=root)]
+    return [*until_decided(staged, wanted, most=_MOST_SEEDS if most is None else most, root=root)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -285,9 +285,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "quick": {
         "agents": ("random", "dqn", "dqn_more_updates", *_THESIS_AGENTS[1:], "factored:given", "oracle"),
-        "seeds": tuple(range(6)), "budgets": (250, 400), "evaluation_episodes": 100, "most_looks": 2,
+        "seeds": tuple(range(6)), "budgets": (250, 400), "evaluation_episodes": 100,
         "few_seeds": {
-            "dqn_more_updates": 7, "imagination": 5, "dqn": 5,
+            "dqn_more_updates": 10, "imagination": 7, "dqn": 6,
             "imagination_uncertainty": 1, "factored:given": 1, "random": 1, "oracle": 1,
         },
         "open_loop_starts": 20, "recorded_seeds": 1,
@@ -341,8 +341,6 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     for part in (PRESETS[preset], own, changes):
         if "agents" in part:  # headlines and numbers of seeds are of the agents that stand beside them
             values |= {"headlines": (), "few_seeds": {}}
-        if {"agents", "seeds"} & {*part}:  # nobody asked for other seeds
-            values["most_looks"] = 1
         values |= part
     if "agents" not in changes:
         usual = usual_agents(task_name, preset)

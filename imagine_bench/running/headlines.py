@@ -73,11 +73,6 @@ def stages(first: int, most: int) -> list[int]:
     return [*range(first, most, STAGE), most]
 
 
-def most_of(first: int, looks: int) -> int:
-    """How many seeds a bench has at the last of several looks, from ``first`` at the first one."""
-    return first + STAGE * (looks - 1)
-
-
 def until_decided(plan: Callable[..., BenchResult], first: Protocol, *, most: int, root: Path) -> list[BenchResult]:
     """Run seeds in stages until every headline is decided, or ``most`` seeds are done.
 

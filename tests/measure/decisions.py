@@ -1,11 +1,11 @@
 """``python tests/measure/decisions.py [BENCH ...] [DRAWS]``: how often does the default bench decide its headlines?
 
 The benches are kept ones of the agents of the headlines, by default those of this repository; their seeds are put
-together. A group of these runs, in an order, is a repetition of the default bench: its first runs are the first stage,
-and if they do not decide, those of the next stage count, too. First come groups that share no run, then groups drawn
-with replacement, which differ as groups of new seeds would. Where the kept runs have another number of tests than the
-default bench, the drawn scores get its noise (:func:`with_noise_of`). Printed before is how often one bench claims a
-headline though all agents have one law. Printed last are the CPU seconds of these runs.
+together. A group of these runs, in an order, is a repetition of the default bench, and of one with --until-decided,
+whose first stage has the first runs. First come groups that share no run, then groups drawn with replacement, which
+differ as groups of new seeds would. Where the kept runs have another number of tests than the default bench, the drawn
+scores get its noise (:func:`with_noise_of`). Printed before is how often one bench claims a headline though all agents
+have one law. Printed last are the CPU seconds of these runs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from imagine_bench import statistics
 from imagine_bench.interfaces import Floats
 from imagine_bench.protocols.control import PRESETS, protocol
-from imagine_bench.running.headlines import most_of, stages
+from imagine_bench.running.headlines import stages
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult
 
@@ -36,35 +36,29 @@ def looks_until(most: int) -> list[dict[str, int]]:
     return [{agent: len(_DEFAULT.seeds_of(agent)) + count - first for agent in AGENTS} for count in stages(first, most)]
 
 
-LOOKS = looks_until(most_of(len(_DEFAULT.seeds), _DEFAULT.most_looks))
-"""Of the default bench."""
-UNTIL_DECIDED = looks_until(19)
-"""Of --until-decided."""
+BENCHES = {"the default bench": looks_until(len(_DEFAULT.seeds)), "--until-decided": looks_until(19)}
+"""The looks of both kinds of benches; the default bench has one."""
 _LEVEL = 1.0 - statistics.LEVEL
 
 
-def p_values(scores: Mapping[str, Floats], trials: int) -> Floats:
-    """The p-value of each headline, corrected for all headlines and looks, of the scores (seeds,) of each agent."""
-    found = [statistics.difference(scores[agent], scores[base], trials=trials).p for agent, base in PAIRS]
-    corrected: Floats = statistics.holm(found) * len(LOOKS)
-    return corrected
-
-
-def deciding_look(scores: Mapping[str, Floats], trials: int) -> int | None:
-    """At which look, from 0 on, the default bench has decided all its headlines; None if it never has."""
-    for look, counts in enumerate(LOOKS):
+def deciding_look(looks: Sequence[Mapping[str, int]], scores: Mapping[str, Floats], trials: int) -> int | None:
+    """At which look, from 0 on, all headlines are decided, of the scores (seeds,) of each agent; None if at none."""
+    for look, counts in enumerate(looks):
         so_far = {agent: scores[agent][:count] for agent, count in counts.items()}
-        if (p_values(so_far, trials) < _LEVEL).all():
+        found = [statistics.difference(so_far[agent], so_far[base], trials=trials).p for agent, base in PAIRS]
+        if (statistics.holm(found) * len(looks) < _LEVEL).all():
             return look
     return None
 
 
-def repetitions(benches: Sequence[Path], draws: int, rng: np.random.Generator) -> dict[str, list[int | None]]:
+def repetitions(
+    looks: Sequence[Mapping[str, int]], benches: Sequence[Path], draws: int, rng: np.random.Generator
+) -> dict[str, list[int | None]]:
     """When each repetition is decided, of groups that share no run and of groups drawn with replacement."""
     results = [load_so_far(bench) for bench in benches]
     trials = min(result.protocol.evaluation_episodes for result in results)
     scores = {agent: rng.permutation(scores_of(agent, results)) for agent in AGENTS}
-    last = LOOKS[-1]
+    last = looks[-1]
     apart = min(len(scores[agent]) // count for agent, count in last.items())
     tests = _DEFAULT.evaluation_episodes
     noisy = {agent: with_noise_of(tests, each, trials, rng, draws) for agent, each in scores.items()}
@@ -76,7 +70,7 @@ def repetitions(benches: Sequence[Path], draws: int, rng: np.random.Generator) -
         "drawn": [{agent: rng.choice(noisy[agent], count) for agent, count in last.items()} for _ in range(draws)],
     }
     trials_of = {"disjoint": trials, "drawn": tests}
-    return {name: [deciding_look(group, trials_of[name]) for group in each] for name, each in groups.items()}
+    return {name: [deciding_look(looks, group, trials_of[name]) for group in each] for name, each in groups.items()}
 
 
 def with_noise_of(tests: int, scores: Floats, trials: int, rng: np.random.Generator, draws: int) -> Floats:
@@ -110,9 +104,7 @@ def cpu_seconds(benches: Sequence[Path]) -> dict[str, float]:
     return {agent: float(np.mean(each)) for agent, each in spent.items()}
 
 
-def false_claims(
-    runs: Floats, looks: Sequence[Mapping[str, int]] = tuple(UNTIL_DECIDED), trials: int | None = None
-) -> float:
+def false_claims(runs: Floats, looks: Sequence[Mapping[str, int]], trials: int | None = None) -> float:
     """Share of benches that claim a headline at any look, from scores (draws, 3, seeds) of three agents of one law."""
     claimed = np.zeros(len(runs), dtype=bool)
     for counts in looks:
@@ -124,7 +116,7 @@ def false_claims(
 
 def drawn(draws: int, rng: np.random.Generator) -> dict[str, Floats]:
     """Scores (draws, 3, seeds) of three agents of one law: every law of :mod:`interval_coverage`, and kept scores."""
-    shape = (draws, 3, max(UNTIL_DECIDED[-1].values()))
+    shape = (draws, 3, max(BENCHES["--until-decided"][-1].values()))
     found = {name: law(rng, shape) for name, law in interval_coverage.LAWS.items()}
     many = interval_coverage.populations(interval_coverage.RESULTS)
     kept = [rng.choice(many[which], shape[1:]) for which in rng.integers(len(many), size=draws)]
@@ -137,21 +129,21 @@ def main(words: Sequence[str]) -> None:
     draws = next((int(word) for word in words if word.isdigit()), 4000)
     rng = np.random.default_rng(0)
     for name, runs in drawn(draws, rng).items():
-        shares = [100.0 * false_claims(runs, looks) for looks in (LOOKS, UNTIL_DECIDED)]
-        print(
-            f"{name}: {shares[0]:.1f} % of default benches claim a difference that is none, {shares[1]:.1f} % of ",
-            end="",
-        )
-        print("those with --until-decided")
+        shares = [f"{100.0 * false_claims(runs, looks):.1f} % of {bench}" for bench, looks in BENCHES.items()]
+        print(f"{name}: a difference that is none is claimed by {', '.join(shares)}")
     spent = cpu_seconds(benches)
-    prices = [sum(spent[agent] * count for agent, count in counts.items()) for counts in LOOKS]
-    for name, found in repetitions(benches, draws, rng).items():
-        shares = [100.0 * found.count(look) / len(found) for look in range(len(LOOKS))]
-        taken = np.mean([prices[-1 if look is None else look] for look in found])
-        print(f"{len(found)} {name} repetitions: both headlines are decided in {sum(shares):.1f} %")
-        for counts, share, price in zip(LOOKS, shares, prices, strict=True):
-            print(f"  at {counts} seeds, after {price:.0f} CPU s: {share:.1f} %")
-        print(f"  on average after {taken:.0f} CPU s")
+    for bench, looks in BENCHES.items():
+        prices = [sum(spent[agent] * count for agent, count in counts.items()) for counts in looks]
+        for name, found in repetitions(looks, benches, draws, rng).items():
+            shares = [100.0 * found.count(look) / len(found) for look in range(len(looks))]
+            taken = np.mean([prices[-1 if look is None else look] for look in found])
+            print(
+                f"{bench}: {sum(shares):.1f} % of {len(found)} {name} repetitions are decided, on average after ",
+                end="",
+            )
+            print(f"{taken:.0f} CPU s of these agents")
+            for counts, share, price in zip(looks, shares, prices, strict=True):
+                print(f"  with {counts} seeds, after {price:.0f} CPU s: {share:.1f} %")
     for agent, cpu_s in spent.items():
         print(f"{agent}: a run takes {cpu_s:.0f} CPU s")
 

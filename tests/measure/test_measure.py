@@ -20,6 +20,7 @@ from imagine_bench import statistics
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Floats
 from imagine_bench.protocols.control import Protocol
+from imagine_bench.protocols.control import protocol as default_protocol
 from imagine_bench.store.loading import archive_files
 from imagine_bench.store.results import Checkpoint, RunResult
 
@@ -50,8 +51,8 @@ def test_a_true_gap_of_40_points_is_shown() -> None:
 def test_looking_again_and_again_claims_no_more() -> None:
     """Headlines of agents of one law; without the allowance two modes would claim too many."""
     for name, runs in decisions.drawn(300, np.random.default_rng(0)).items():
-        assert decisions.false_claims(runs) <= 0.05 + CHANCE, name
-        assert decisions.false_claims(runs, decisions.LOOKS) <= 0.05 + CHANCE, name
+        for bench, looks in decisions.BENCHES.items():
+            assert decisions.false_claims(runs, looks) <= 0.05 + CHANCE, (name, bench)
     modes = interval_coverage.LAWS[interval_coverage.WORST](np.random.default_rng(0), (1000, 3, 40))
     looks = range(6, 41, 4)
     assert decisions.false_claims(modes, [dict.fromkeys(decisions.AGENTS, count) for count in looks]) < 0.05
@@ -60,11 +61,8 @@ def test_looking_again_and_again_claims_no_more() -> None:
 
 
 @pytest.mark.parametrize(("gap", "look"), [(80, 0), (12, 1), (0, None)])
-def test_a_repetition_is_decided_as_the_default_bench_would_be(tmp_path: Path, gap: int, look: int | None) -> None:
-    """Of 21 seeds, two disjoint groups of ten. Agents differ at the last budget of the default bench alone.
-
-    A gap of 40 points is shown by the first stage, one of 6 points by the second, and none by neither.
-    """
+def test_a_repetition_is_decided_at_the_look_where_it_shows(tmp_path: Path, gap: int, look: int | None) -> None:
+    """Of 21 seeds, two disjoint groups of ten. Agents differ at the last budget of the default bench alone."""
     agents = ("dqn", "dqn_more_updates", "imagination")
     protocol = Protocol(task="arrow_puzzle", preset="quick", agents=agents, seeds=tuple(range(21)), budgets=(400, 500))
     result = bench_result(tmp_path, protocol=protocol)
@@ -75,10 +73,14 @@ def test_a_repetition_is_decided_as_the_default_bench_would_be(tmp_path: Path, g
 
     for name, text in archive_files(rewritten(result, change)).items():
         (tmp_path / name).write_text(text)
-    found = decisions.repetitions([tmp_path], 10, np.random.default_rng(0))
+    looks = [dict.fromkeys(agents, count) for count in (5, 10)]
+    found = decisions.repetitions(looks, [tmp_path], 10, np.random.default_rng(0))
     assert [len(found[name]) for name in ("disjoint", "drawn")] == [2, 10]
     assert found["disjoint"] == [look] * 2
-    assert [dict(decisions.LOOKS[place])["imagination"] for place in (0, 1)] == [5, 8]
+    (usual,) = decisions.BENCHES["the default bench"]
+    default = default_protocol("arrow_puzzle")
+    assert usual == {agent: len(default.seeds_of(agent)) for agent in agents}
+    assert len(decisions.BENCHES["--until-decided"]) == 4
 
 
 def test_a_mistake_of_these_tests_would_be_seen() -> None:
