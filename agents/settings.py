@@ -104,13 +104,8 @@ class Hyperparameters(Generic[S]):
         return cls({group: ConfigGroup(settings, {**{name: {} for name in SETS}, **sets}) for group in CONFIG_GROUPS})
 
     def names(self) -> frozenset[str]:
-        """The dotted names of all settings that any group uses."""
-        unused = frozenset[str].intersection(*(group.unused for group in self.groups.values()))
-        return frozenset(flatten(next(iter(self.groups.values())).published)) - unused
-
-    def without(self, *unused: str) -> Hyperparameters[S]:
-        """The same settings of an agent on which some have no effect."""
-        return Hyperparameters({name: replace(group, unused=frozenset(unused)) for name, group in self.groups.items()})
+        """The dotted names of all settings."""
+        return frozenset(flatten(next(iter(self.groups.values())).published))
 
     def of(self, context: AgentContext) -> S:
         """The settings that an agent's context asks for; raises as :meth:`resolve`."""

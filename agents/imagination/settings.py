@@ -247,15 +247,3 @@ HYPERPARAMETERS = Hyperparameters(
         "chapter_5": ConfigGroup(Settings(), {"minimal": _MINIMAL_5, "fast": _FAST_5, "published": {}}),
     }
 )
-"""The settings of every agent that imagines."""
-_FILTER = tuple(
-    f"imagination.{name}" for name in ("threshold", "threshold_quantile", "reward_threshold", "termination_threshold")
-)
-_BRANCHES = tuple(
-    f"imagination.{name}" for name in ("start_episode", "end_episode", "start_states", "breadth", "updates_per_step")
-)
-UNFILTERED = HYPERPARAMETERS.without(*_FILTER, "imagination.model_only_episodes")
-FILTERED = HYPERPARAMETERS.without("imagination.model_only_episodes")
-MODEL_ONLY = HYPERPARAMETERS.without(*_BRANCHES, *_FILTER, "imagination.accumulates")
-"""Of agents that imagine whole episodes, without branches from real states."""
-MODEL_ONLY_FILTERED = HYPERPARAMETERS.without(*_BRANCHES)

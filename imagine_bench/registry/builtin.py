@@ -53,7 +53,7 @@ TASKS: dict[str, TaskEntry] = {
     ),
 }
 
-_IMAGINATION_SETTINGS = "imagine_bench.agents.imagination.settings"
+_IMAGINATION_SETTINGS = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
 
 AGENTS: dict[str, AgentEntry] = {
     "random": AgentEntry(
@@ -87,13 +87,13 @@ AGENTS: dict[str, AgentEntry] = {
     "imagination": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make",
         relative_cost=5.0,
-        settings=f"{_IMAGINATION_SETTINGS}:UNFILTERED",
+        settings=_IMAGINATION_SETTINGS,
         description="DQN that also learns a world model and trains on all transitions that it imagines with it.",
     ),
     "imagination_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make_uncertainty",
         relative_cost=5.0,
-        settings=f"{_IMAGINATION_SETTINGS}:FILTERED",
+        settings=_IMAGINATION_SETTINGS,
         title="imagination + uncertainty",
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
         "the model is uncertain.",
@@ -101,14 +101,14 @@ AGENTS: dict[str, AgentEntry] = {
     "imagination_only": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make",
         relative_cost=4.0,
-        settings=f"{_IMAGINATION_SETTINGS}:MODEL_ONLY",
+        settings=_IMAGINATION_SETTINGS,
         description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
         "world is trained in that model alone, and is then tested.",
     ),
     "imagination_only_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make_uncertainty",
         relative_cost=4.0,
-        settings=f"{_IMAGINATION_SETTINGS}:MODEL_ONLY_FILTERED",
+        settings=_IMAGINATION_SETTINGS,
         title="imagination only + uncertainty",
         description="Like imagination only, but an imagined episode ends where the model is uncertain.",
     ),
@@ -149,28 +149,28 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
         make="imagine_bench.agents.world_models.latent:make_gaussian",
         title="VAE + one Gaussian",
         encoder_kind="latents",
-        settings=f"{_IMAGINATION_SETTINGS}:HYPERPARAMETERS",
+        settings=_IMAGINATION_SETTINGS,
         description="The thesis' model with a single Gaussian, which cannot hold two outcomes apart.",
     ),
     "mdn_dropout": WorldModelEntry(
         make="imagine_bench.agents.world_models.latent:make_dropout",
         title="VAE + MDN, MC dropout",
         encoder_kind="latents",
-        settings=f"{_IMAGINATION_SETTINGS}:HYPERPARAMETERS",
+        settings=_IMAGINATION_SETTINGS,
         description="The thesis' model: a mixture density network between latents, uncertain by Monte-Carlo dropout.",
     ),
     "mdn_ensemble": WorldModelEntry(
         make="imagine_bench.agents.world_models.latent:make_ensemble",
         title="VAE + MDN, ensemble",
         encoder_kind="latents",
-        settings=f"{_IMAGINATION_SETTINGS}:HYPERPARAMETERS",
+        settings=_IMAGINATION_SETTINGS,
         description="Three mixture density networks between latents, uncertain where they disagree.",
     ),
     "mdn_thesis": WorldModelEntry(
         make="imagine_bench.agents.world_models.latent:make_thesis",
         title="VAE + MDN, thesis' settings",
         encoder_kind="latents",
-        settings=f"{_IMAGINATION_SETTINGS}:HYPERPARAMETERS",
+        settings=_IMAGINATION_SETTINGS,
         description="The same at the settings that the thesis prints; a minute to fit, so judged only when named.",
         by_default=False,
     ),
