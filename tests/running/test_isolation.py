@@ -85,7 +85,7 @@ _ENDS = [
 
 @pytest.mark.parametrize("closed", [CLOSED, OPEN])
 def test_each_end_of_a_guest_is_one_sentence(start: Start, closed: bool) -> None:
-    guest = start(closed=closed, call_s=5.0)
+    guest = start(closed=closed, call_s=10.0)  # a loaded machine takes seconds to start it
     for method, given, words in _ENDS:
         with pytest.raises(InvalidValueError, match=words) as found:
             guest.call(method, *given)
@@ -93,7 +93,7 @@ def test_each_end_of_a_guest_is_one_sentence(start: Start, closed: bool) -> None
         if "Error" not in words and "Exit" not in words:
             with pytest.raises(InvalidValueError, match="its process "):
                 guest.call("others")
-            guest = start(closed=closed, call_s=5.0)
+            guest = start(closed=closed, call_s=10.0)
 
 
 def test_a_killed_or_pickling_guest_is_a_sentence(start: Start, tmp_path: Path) -> None:
