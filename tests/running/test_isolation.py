@@ -77,7 +77,7 @@ _ENDS = [
     ("exits", (0,), "SystemExit: 0"),
     ("dies", (0,), "ended itself with exit code 0"),
     ("dies", (3,), "ended itself with exit code 3"),
-    ("hangs", (), "was stopped after 5 s"),
+    ("hangs", (), "was stopped after 10 s"),
     ("raises", (), r"ValueError: depth\\x1b\[31m$"),
     ("gives_text", (), "AttributeError"),
 ]
