@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import functools
 from dataclasses import fields
-from pathlib import Path
+from functools import partial
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
-from fake_latents import ACTIONS, SMALL, FakeEncoder, live
-from imagine_bench.agents.encoders import perception
+from fake_latents import SMALL, built, live, with_own_settings
 
 from imagine_bench import registry
-from imagine_bench.interfaces import AgentContext
 from imagine_bench.interfaces.capabilities import ModelOnlyTrainer
-from imagine_bench.seeding import SeedTree
 
 BASE: dict[str, Any] = {
     **SMALL,
@@ -92,16 +88,8 @@ def settings_of(agent: str) -> dict[str, tuple[Any, Any]]:
 @functools.cache
 def learned(agent: str, settings: tuple[tuple[str, Any], ...] = ()) -> dict[str, Any]:
     """All that an agent has after six short episodes, but its settings."""
-    context = AgentContext(
-        n_actions=ACTIONS,
-        preprocessing="gray_strips",
-        encoder=Path("fake.safetensors"),
-        seeds=SeedTree(0),
-        hyperparameters="published",
-        overrides=registry.own_settings(agent, {**BASE, **dict(settings)}),
-    )
-    with mock.patch.object(perception, "Encoder", FakeEncoder):
-        learner = registry.make_agent(agent, context)
+    maker = with_own_settings(agent, partial(registry.make_agent, agent))
+    learner = built(maker, {**BASE, **dict(settings)})
     actions = live(learner, range(6), np.random.default_rng(1))
     if isinstance(learner, ModelOnlyTrainer):
         while learner.train_in_model():
