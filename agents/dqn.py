@@ -20,7 +20,7 @@ from .dqn_settings import HYPERPARAMETERS, MORE_UPDATES, ControllerSettings, DQN
 from .encoders.perception import Perception, load_perception, prepare_torch
 from .meters import Meters
 from .networks.adam import Adam, TrainedModule
-from .networks.mlp import backpropagate, mlp, outputs_of_layers
+from .networks.mlp import ReluLayers, mlp
 from .replay import Batch, RealMemory, Transitions
 from .settings import Hyperparameters, flatten
 
@@ -105,19 +105,19 @@ class Controller(TrainedModule):
     def _differentiate(self, batch: Batch) -> float:
         """Set the gradients of the loss, and return it; of a dense network without autograd, which is slower there."""
         network = self.network
-        if not isinstance(network, nn.Sequential):
+        if not isinstance(network, ReluLayers):
             loss = self.loss(batch)
             self.optimiser.zero_grad()
             loss.backward()
             return loss.item()
-        values = outputs_of_layers(network, batch.z)
+        values = network.outputs(batch.z)
         action = batch.action.unsqueeze(1)
         q = values[-1].gather(1, action).squeeze(1)
         target = self._targets(batch)
         slopes = 2.0 / len(q) * (q - target)
         if batch.weight is not None:
             slopes = batch.weight * slopes
-        backpropagate(network, values, torch.zeros_like(values[-1]).scatter_(1, action, slopes.unsqueeze(1)))
+        network.backpropagate(values, torch.zeros_like(values[-1]).scatter_(1, action, slopes.unsqueeze(1)))
         return _mean_square(q, target, batch.weight).item()
 
     @torch.no_grad()

@@ -16,7 +16,29 @@ Masks = tuple[Tensor, ...]
 """One dropout mask a hidden layer, each (E, N, H): the factor of each unit, 0 or 1 / (1 - dropout)."""
 
 
-def relu_layers(sizes: Sequence[int], device: torch.device | str = "cpu") -> nn.Sequential:
+class ReluLayers(nn.Sequential):
+    """Linear layers with ReLU between them, whose gradients are computed here where autograd is not needed."""
+
+    @torch.no_grad()
+    def outputs(self, x: Tensor) -> list[Tensor]:
+        """The inputs (N, in), then the outputs of each layer, ReLU included."""
+        *hidden, last = [*self][::2]
+        values = [x]
+        for layer in hidden:
+            values.append(torch.addmm(layer.bias, values[-1], layer.weight.t()).relu_())
+        return [*values, torch.addmm(last.bias, values[-1], last.weight.t())]
+
+    @torch.no_grad()
+    def backpropagate(self, values: Sequence[Tensor], gradient: Tensor) -> None:
+        """Set the gradients of all weights, given :meth:`outputs` and the gradient of the last of them, (N, out)."""
+        for layer, entered in zip([*self][-1::-2], values[-2::-1], strict=True):
+            layer.weight.grad = gradient.t() @ entered
+            layer.bias.grad = gradient.sum(dim=0)
+            if entered is not values[0]:
+                gradient = (gradient @ layer.weight).mul_(entered > 0.0)
+
+
+def relu_layers(sizes: Sequence[int], device: torch.device | str = "cpu") -> ReluLayers:
     """Linear layers with ReLU between them; their weights are undefined, so that nothing is drawn.
 
     ``sizes`` are units of input, hidden and output layers, at least 2.
@@ -24,7 +46,7 @@ def relu_layers(sizes: Sequence[int], device: torch.device | str = "cpu") -> nn.
     layers: list[nn.Module] = []
     for n_in, n_out in pairwise(sizes):
         layers += [nn.utils.skip_init(nn.Linear, n_in, n_out, device=device), nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+    return ReluLayers(*layers[:-1])
 
 
 @torch.no_grad()
@@ -41,7 +63,7 @@ def initialise(network: nn.Module, generator: torch.Generator) -> None:
                 weight.uniform_(-bound, bound, generator=generator)
 
 
-def mlp(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequential:
+def mlp(sizes: Sequence[int], generator: torch.Generator) -> ReluLayers:
     """One network: ReLU hidden layers and a linear output; Glorot uniform weights, biases 0 (the defaults of Keras).
 
     ``sizes`` are units of input, hidden and output layers, at least 2; the generator's device is the network's.
@@ -52,30 +74,6 @@ def mlp(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequential:
             nn.init.xavier_uniform_(layer.weight, generator=generator)
             nn.init.zeros_(layer.bias)
     return network
-
-
-@torch.no_grad()
-def outputs_of_layers(network: nn.Sequential, x: Tensor) -> list[Tensor]:
-    """The inputs (N, in) of a network of :func:`relu_layers`, then the outputs of each of its layers, ReLU included."""
-    linear = [*network][::2]
-    values = [x]
-    for layer in linear[:-1]:
-        values.append(torch.addmm(layer.bias, values[-1], layer.weight.t()).relu_())
-    last = linear[-1]
-    return [*values, torch.addmm(last.bias, values[-1], last.weight.t())]
-
-
-@torch.no_grad()
-def backpropagate(network: nn.Sequential, values: Sequence[Tensor], gradient: Tensor) -> None:
-    """Set the gradients of all weights, given that of the last output, (N, out), and :func:`outputs_of_layers`.
-
-    They are autograd's to the bit, in 15 % less of an update's CPU time.
-    """
-    for layer, entered in zip([*network][-1::-2], values[-2::-1], strict=True):
-        layer.weight.grad = gradient.t() @ entered
-        layer.bias.grad = gradient.sum(dim=0)
-        if entered is not values[0]:
-            gradient = (gradient @ layer.weight).mul_(entered > 0.0)
 
 
 def dropout_mask(

@@ -59,7 +59,7 @@ def test_loss_is_the_mean_squared_bellman_error_row_by_row() -> None:
 @pytest.mark.parametrize("target_rate", [1.0, 0.25])
 @pytest.mark.parametrize("weight", [None, torch.tensor([1.0, 0.5, 0.0, 0.25, 1.0])])
 def test_an_update_moves_against_the_gradient_of_the_loss(target_rate: float, weight: torch.Tensor | None) -> None:
-    """Adam's first step is the learning rate times the sign of the gradient, which is autograd's to the bit."""
+    """Adam's first step is the learning rate times the sign of the gradient, which is autograd's."""
     controller, rows = make(0, target_rate), replace(batch(), weight=weight)
     before = weights(controller.network)
     loss = controller.loss(rows)
@@ -72,6 +72,18 @@ def test_an_update_moves_against_the_gradient_of_the_loss(target_rate: float, we
     slopes = torch.cat([slope.flatten() for slope in expected])
     torch.testing.assert_close(moved, -1e-3 * slopes / (slopes.abs() + 1e-8), rtol=1e-3, atol=1e-6)
     assert (slopes != 0.0).any()
+
+
+def test_another_network_is_differentiated_as_it_is() -> None:
+    """Its layers need not be ReLU layers, whose gradients the controller knows."""
+    network = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Tanh(), torch.nn.Linear(4, 2))
+    settings = ControllerSettings(hidden=(8,), discount=0.9)
+    controller = Controller(3, 2, settings, torch.Generator(), network)
+    rows = batch()
+    expected = torch.autograd.grad(controller.loss(rows), [*network.parameters()])
+    controller.update(rows)
+    for weight, slope in zip(network.parameters(), expected, strict=True):
+        assert torch.equal(weight.grad, slope)
 
 
 def test_a_loss_that_is_no_number_leaves_the_weights() -> None:

@@ -7,12 +7,10 @@ import torch
 from imagine_bench.agents.networks.adam import Adam
 from imagine_bench.agents.networks.mlp import (
     MemberMLP,
-    backpropagate,
     clip_gradient_norm,
     clip_unit_norms,
     dropout_mask,
     mlp,
-    outputs_of_layers,
 )
 from torch import nn
 
@@ -104,9 +102,9 @@ def test_gradients_of_a_dense_network_are_those_of_autograd(hidden: tuple[int, .
     network = mlp((4, *hidden, 3), generator)
     x, slope = torch.randn(6, 4, generator=generator), torch.randn(6, 3, generator=generator)
     expected = torch.autograd.grad(network(x), [*network.parameters()], slope)
-    values = outputs_of_layers(network, x)
+    values = network.outputs(x)
     assert torch.equal(values[0], x) and torch.equal(values[-1], network(x).detach())
-    backpropagate(network, values, slope)
+    network.backpropagate(values, slope)
     for weight, gradient in zip(network.parameters(), expected, strict=True):
         torch.testing.assert_close(weight.grad, gradient)
         assert gradient.abs().max() > 0.0
