@@ -8,8 +8,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from fake_reader import BlindReader
+from imagine_bench.agents.world_models.reader import images_of
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError
@@ -53,3 +55,12 @@ def test_a_half_written_reader_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "reader.safetensors").write_bytes(b"half")
     with pytest.raises(ArtefactError, match=r"reader\.safetensors is not the judge's reader; remove it, and the same"):
         reader_in(registry.task("pick_place"), "clean", tmp_path)
+
+
+@pytest.mark.parametrize("size", [64, 80, 96, 128])
+def test_an_image_of_any_size_is_read_by_the_means_of_its_pixels(size: int) -> None:
+    """A checkerboard is gray, so no detail of one pixel decides."""
+    checkers = np.indices((size, size)).sum(axis=0) % 2
+    (read,) = images_of(checkers[None].astype(np.uint8) * 255)
+    assert read.shape == (3, 32, 32)
+    assert abs(read[:, 2:-2, 2:-2] - 0.5).max() < 0.2

@@ -187,6 +187,19 @@ def test_an_appearance_that_is_asked_for_is_that_of_the_tests(tmp_path: Path, mo
         assert wanted.appearance_in_tests == found
 
 
+def test_nothing_of_the_learners_of_a_bench_is_said_of_a_player(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = protocol("arrow_puzzle", "smoke", agents=("dqn",))
+    made = {"encoder": "a@0123456789ab", "codes": "c@ba9876543210", "code": (("dqn", "1"),), "settings_digest": "one"}
+    players = []
+    for changes in ({}, made, {"agents": ("dqn", "oracle"), "few_seeds": (("oracle", 0),), "seeds": (0, 1)}):
+        there = dataclasses.replace(plain, **changes)
+        monkeypatch.setattr(player, "read_control", lambda folder, there=there: there)
+        players.append(protocol_of_player(None, "person", "anna", like=tmp_path))
+    assert players[0] == players[1] == players[2]
+
+
 def test_a_person_stands_in_the_table_of_a_bench(tmp_path: Path) -> None:
     """Its tests are the bench's first ones, and the bench's row with as many tests is that of its first ones."""
     planned = protocol(

@@ -101,11 +101,14 @@ def test_seeds_of_two_benches_are_those_of_one_in_any_order(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
 def test_each_kind_of_encoder_may_be_named_by_some_benches_only(tmp_path: Path, order: tuple[int, ...]) -> None:
+    """And the names of agents are spelled as in the newest bench."""
     latents, codes = "a@0123456789ab", "c@ba9876543210"
     named: tuple[dict[str, Any], ...] = ({"encoder": latents}, {"codes": codes}, {})
-    made = [do(tmp_path / str(seed), "oracle", seeds=(seed,), **each) for seed, each in enumerate(named)]
-    joined = load_merged([made[each] for each in order], tmp_path).protocol
-    assert (joined.encoder, joined.codes) == (latents, codes)
+    made = [load_bench(do(tmp_path / str(seed), "oracle", seeds=(seed,), **each)) for seed, each in enumerate(named)]
+    old = dataclasses.replace(made[2].protocol, agent_names=1)
+    made[2] = dataclasses.replace(made[2], protocol=old)
+    joined = merge([made[each] for each in order], tmp_path).protocol
+    assert (joined.encoder, joined.codes, joined.agent_names) == (latents, codes, 2)
 
 
 def test_headlines_may_differ(tmp_path: Path) -> None:

@@ -129,7 +129,8 @@ def test_directed_exploration_ends_in_greedy_actions() -> None:
 
 
 def test_every_transition_is_counted_once_however_often_it_sees_anew() -> None:
-    learner = OwnCountTableAgent(ACTIONS, OWN.resolve("fast", {}, "chapter_5"), SeedTree(0))
+    """And a table that was counted anew is planned anew."""
+    learner, restored = (OwnCountTableAgent(ACTIONS, OWN.resolve("fast", {}, "chapter_5"), SeedTree(0)) for _ in "ab")
     lived, sights = 0, set()
     for episode in range(8):
         for transition in played(None, np.random.default_rng(episode)):
@@ -138,6 +139,12 @@ def test_every_transition_is_counted_once_however_often_it_sees_anew() -> None:
             assert learner.table.arrays()["count"].sum() == lived
             sights.add(learner.diagnostics()["perception/looked_at"])
     assert len(sights) > 2
+    before = learner.q_values(transition.observation)
+    learner._happened = [(reward + 1.0, ended) for reward, ended in learner._happened]
+    learner._recount()
+    restored.restore(learner.state())
+    after = learner.q_values(transition.observation)
+    assert before.tolist() != after.tolist() == restored.q_values(transition.observation).tolist()
 
 
 def test_q_learning_updates_as_by_hand() -> None:

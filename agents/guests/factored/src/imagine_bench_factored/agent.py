@@ -147,7 +147,6 @@ class CodeAgent:
 
     def observe(self, transition: Transition, *, episode: int) -> None:
         """Keep the transition; if it was unexpected, learn from all since the last one, and plan anew."""
-        self._chosen = None
         with self.meters.cpu_time("time/model_s"):
             code = self.perception.code(transition.observation.frame)
             following = self.perception.code(transition.next_observation.frame)
