@@ -134,7 +134,7 @@ class BeliefRules:
         groups: dict[State | None, dict[Window, float]] = {}
         for window, weight in windows.items():
             frames = ((1.0, None),) if shown_step is None else self._sight.seen(window[0], shown_step)
-            kept = window[1:] if shown_step and self._sight.lag else window
+            kept = window[1:] if shown_step not in (None, 0) and self._sight.lag else window
             for share, what in frames:
                 groups.setdefault(what, defaultdict(float))[kept] += weight * share
         step = min(step, self._settled + self._sight.lag + 1)

@@ -149,7 +149,7 @@ def certificate_rows(found: Certificate) -> dict[str, str]:
     rows["factor graph"] = "; ".join(f"{c} from {p} ({n} actions)" for (c, p), n in moves.items())
     rows["reward and end"] = "; ".join(f"{what} by [{scopes}]" for what, scopes in found.outcomes)
     rows["facts"] = f"{found.facts} local entries and conditions, of at most {found.width} coordinates each"
-    if found.lower_bound:
+    if found.lower_bound not in (None, 0):
         rows["lower bound"] = (
             f"{found.lower_bound} transitions, before which no learner solves {100 * SHARE:.0f} % of the tests "
             "that the best policy solves, on average over the worlds that differ by the names of their actions"

@@ -69,7 +69,7 @@ def sheet(
 
     The image has shape (height, width, 3), uint8.
     """
-    room = columns or max(len(tiles) for _, tiles in rows)
+    room = max(len(tiles) for _, tiles in rows) if columns is None else columns
     return np.concatenate([_row(name, tiles[:room], LABELS_PX + room * STEP_PX, colors) for name, tiles in rows])
 
 

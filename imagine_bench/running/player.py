@@ -83,11 +83,11 @@ def protocol_of_player(
     else:
         found = protocol(task, "quick", agents=(registry.DEMONSTRATOR,))
     is_helped = found.dataset or found.after or found.demonstrations or found.queries or found.feedback
-    if not found.shows_frames_alone or (training and (is_helped or found.split or found.test_appearance)):
+    if not found.shows_frames_alone or (training is not None and (is_helped or found.split or found.test_appearance)):
         raise InvalidValueError(
             f"{like} shows more than frames, or trains otherwise than it tests; a player cannot be compared there."
         )
-    player = f"{'trained_' if training else ''}{kind}:{name}"
+    player = f"{'' if training is None else 'trained_'}{kind}:{name}"
     return dataclasses.replace(
         found,
         execution=registry.task(found.task).execution(execution or found.execution),
@@ -96,12 +96,12 @@ def protocol_of_player(
         agents=(player,),
         seeds=(seed,),
         few_seeds=(),
-        budgets=(training,) if training else found.budgets,
+        budgets=found.budgets if training is None else (training,),
         evaluation_episodes=TESTS if tests is None else tests,
         encoder=None,
         codes=None,
         code=(),
-        settings_digest=digest({player: {}} if training else {}),
+        settings_digest=digest({} if training is None else {player: {}}),
     )
 
 

@@ -37,7 +37,7 @@ class Fragment:
 @functools.cache
 def fragments(level: Appearance, subject: str, value: int) -> tuple[Fragment, ...]:
     """The pool of a microstate: subject ``"hand"`` or ``"object 0"`` and on, at one of its values."""
-    rng = SeedTree(level.pool or 0).child(level.name, subject, value).generator()
+    rng = SeedTree(0 if level.pool is None else level.pool).child(level.name, subject, value).generator()
     pool = []
     for _ in range(HAND_FRAGMENTS if subject == "hand" else OBJECT_FRAGMENTS):
         x, y, z, yaw = rng.uniform(-1.0, 1.0, 4).tolist()

@@ -67,7 +67,7 @@ class LearnedPerceptionAgent(CodeAgent):
         """Remember the frame, find factors anew if that is due, and learn as from any codes."""
         perception = self.perception
         if transition.truncated:
-            self._longest = max(self._observed + 1, self._longest or 0)
+            self._longest = max(self._observed + 1, 0 if self._longest is None else self._longest)
         if not perception.full:
             with self.meters.cpu_time("time/perception_s"):
                 before = transition.observation.frame
