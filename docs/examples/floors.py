@@ -19,7 +19,7 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.running.launchers.jobs import launcher
 from imagine_bench.store.results import BenchResult, RunResult
-from imagine_bench.sweep.grid import LADDER
+from imagine_bench.sweep.grid import GRIDS, SUITE
 
 BUDGETS = (10, 20, 30, 40, 50, 60, 70, 80, 100, 120, 150)
 SHARE = 0.95
@@ -28,7 +28,7 @@ SHARE = 0.95
 def worlds(cubes: int) -> Iterator[tuple[str, str]]:
     """Task and appearance of every level with up to so many cubes that tests where it trains, each once."""
     found = set()
-    for experiment in LADDER.experiments:
+    for experiment in GRIDS[SUITE].experiments:
         for level in experiment.levels:
             world = level.task, level.protocol.get("appearance", "clean")
             few = len(registry.task(level.task).macrostate_values) <= cubes + 1

@@ -14,7 +14,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError, InvalidValueError, brief, require_known, why
@@ -23,6 +23,7 @@ from imagine_bench.protocols.data import digest, require_types
 from imagine_bench.seeding import TUNING_SEEDS, is_tuning_seed
 from imagine_bench.values import Setting, dotted
 
+Member = TypeVar("Member", "Variant", "Experiment")
 BASE = "base"
 """Name of the factor of a variant that others are compared with."""
 SUITE_AGENTS = ("dqn", "imagination_uncertainty", "factored:given")
@@ -83,11 +84,11 @@ class Study:
 
     def only(self, names: Sequence[str]) -> Study:
         """The study with the named variants, or all, and those they are compared with. Raises UnknownNameError."""
-        known = {variant.name: variant for variant in self.variants}
-        wanted: set[str | None] = {require_known("variant", name, known) for name in names or known}
+        chosen = _chosen("variant", names, self.variants)
         for _ in self.variants:  # the variants that these are compared with may be compared with others
-            wanted |= {variant.against for variant in self.variants if variant.name in wanted}
-        return replace(self, variants=tuple(variant for variant in self.variants if variant.name in wanted))
+            against = {variant.against for variant in chosen}
+            chosen = tuple(each for each in self.variants if each in chosen or each.name in against)
+        return replace(self, variants=chosen)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,9 +148,14 @@ class Suite:
 
     def only(self, names: Sequence[str]) -> Suite:
         """The suite with some of its experiments, or all if none are named. Raises UnknownNameError."""
-        known = {each.name: each for each in self.experiments}
-        wanted = {require_known("experiment", name, known) for name in names or known}
-        return replace(self, experiments=tuple(each for each in self.experiments if each.name in wanted))
+        return replace(self, experiments=_chosen("experiment", names, self.experiments))
+
+
+def _chosen(what: str, names: Sequence[str], members: tuple[Member, ...]) -> tuple[Member, ...]:
+    """The members of these names, in their order; all if none are named. Raises UnknownNameError."""
+    known = [each.name for each in members]
+    wanted = [require_known(what, name, known) for name in names or known]
+    return tuple(each for each in members if each.name in wanted)
 
 
 def _require_names(grid: str, what: str, members: Sequence[Variant | Experiment | Level]) -> list[str]:
@@ -206,13 +212,9 @@ def _settings(variant: Mapping[str, Any]) -> dict[str, Setting]:
 
 
 SUITE = "suite"
-"""Name of the benchmark suite."""
+"""Name of the suite of ``make suite``, which two cores are meant to finish within the hour."""
 GRIDS = {path.stem: read_grid(path) for path in sorted((Path(__file__).parent / "grids").glob("*.toml"))}
 """The grids in ``sweep/grids``, by name."""
-LADDER, SEPARATING = (grid for grid in (GRIDS[SUITE], GRIDS["separating"]) if isinstance(grid, Suite))
-"""The suite of ``make suite``, which two cores are meant to finish within the hour; and a world that separates families
-of agents, with open challenges."""
-STUDIES = {name: grid for name, grid in GRIDS.items() if isinstance(grid, Study)}
 registry.describe_group(registry.STUDY_GROUP, what="study", kind=Study, own=GRIDS)
 
 

@@ -23,7 +23,7 @@ from imagine_bench.registry.entries import agent_label, label_today
 from imagine_bench.report.page import over_seeds
 from imagine_bench.running.bench import read_protocol
 from imagine_bench.store import encoders
-from imagine_bench.sweep.grid import STUDIES
+from imagine_bench.sweep.grid import GRIDS
 
 KEPT = sorted(path.parent for path in RESULTS.rglob("bench.json") if path.parent.name != "report")
 """The folders of kept benches."""
@@ -277,7 +277,7 @@ def study_right(budget: str, folder: str, variant: str) -> str:
 
 def study_difference(budget: str, folder: str, *variants: str) -> list[Compared]:
     """Against the variant that each is compared with, points [95 %]."""
-    found, tests = [], STUDIES["factors"].evaluation_episodes
+    found, tests = [], GRIDS["factors"].evaluation_episodes
     for variant in variants:
         against = _study(folder, variant, budget)[0]["against"]
         pair = (np.array(_success(folder, each, budget)) for each in (variant, against))

@@ -6,7 +6,7 @@ import numpy as np
 from kept import facts, table
 
 from imagine_bench.report.page import over_seeds
-from imagine_bench.sweep.grid import LADDER
+from imagine_bench.sweep.grid import GRIDS, SUITE
 
 _EXACT = 0.005
 """Total variation below which a program is exact."""
@@ -14,7 +14,7 @@ _EXACT = 0.005
 
 def _worlds(experiment: str, seen: str) -> set[tuple[str, str]]:
     """The worlds of an experiment, by task and by the codes that the writer reads; see :func:`written`."""
-    (levels,) = (each.levels for each in LADDER.experiments if each.name == experiment)
+    (levels,) = (each.levels for each in GRIDS[SUITE].experiments if each.name == experiment)
     prefix = {"codes": "", "own": "own "}
     return {
         (each.task, f"{prefix[seen]}{each.protocol.get('appearance', 'clean')}" if seen in prefix else "")

@@ -32,9 +32,10 @@ from imagine_bench.report.sweep import study_page
 from imagine_bench.rules import states_of
 from imagine_bench.statistics import Estimate
 from imagine_bench.store.results import PolicyTable
-from imagine_bench.sweep.grid import BASE, STUDIES, Study, Variant, read_grid
+from imagine_bench.sweep.grid import BASE, GRIDS, Study, Variant, read_grid
 from imagine_bench.sweep.run import imagined_right, run_study
 
+STUDIES = {name: grid for name, grid in GRIDS.items() if isinstance(grid, Study)}
 STUDY = Study(
     name="fakes",
     question="Is a table better than a table?",

@@ -19,7 +19,7 @@ from imagine_bench.exact.splits import split_of
 from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
 from imagine_bench.sweep import grid
-from imagine_bench.sweep.grid import LADDER, SEPARATING, Experiment, Level, Suite
+from imagine_bench.sweep.grid import GRIDS, SUITE, Experiment, Level, Suite
 from imagine_bench.sweep.run import plan_level, run_suite
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
@@ -125,28 +125,28 @@ def test_the_page_shows_every_score_and_the_hash(result, expected):
 
 def test_the_suite_is_that_of_all_kept_scores():
     kept = json.loads((RESULTS / "suite" / "suite.json").read_text())
-    assert LADDER.hash == kept["hash"] == "95bb5d4a0450" and len(LADDER.experiments) == 12
+    assert GRIDS[SUITE].hash == kept["hash"] == "95bb5d4a0450" and len(GRIDS[SUITE].experiments) == 12
 
 
 def test_a_suite_may_call_its_parameter_a_dial_as_before(tmp_path):
     today = (Path(grid.__file__).parent / "grids/suite.toml").read_text()
     (tmp_path / "suite.toml").write_text(today.replace("\nparameter = ", "\ndial = "))
     assert "\nparameter" not in (tmp_path / "suite.toml").read_text()
-    assert grid.read_grid(tmp_path / "suite.toml") == LADDER
+    assert grid.read_grid(tmp_path / "suite.toml") == GRIDS[SUITE]
 
 
 def test_any_change_of_any_level_changes_the_hash():
-    first, *others = LADDER.experiments
-    hashes = {LADDER.hash}
+    first, *others = GRIDS[SUITE].experiments
+    hashes = {GRIDS[SUITE].hash}
     for change in ({"name": "other"}, {"task": "pick_place"}, {"episodes": 7}, {"protocol": {"queries": 1}}):
         levels = (*first.levels[:-1], dataclasses.replace(first.levels[-1], **change))
         changed = dataclasses.replace(first, levels=levels)
-        hashes.add(dataclasses.replace(LADDER, experiments=(changed, *others)).hash)
+        hashes.add(dataclasses.replace(GRIDS[SUITE], experiments=(changed, *others)).hash)
     assert len(hashes) == 5
 
 
 def test_every_level_is_a_world_in_which_something_can_be_learned():
-    for each in LADDER.experiments:
+    for each in GRIDS[SUITE].experiments:
         assert 3 <= len(each.levels) <= 5
         for level in each.levels:
             assert registry.task_name(level.task) == level.task
@@ -155,13 +155,14 @@ def test_every_level_is_a_world_in_which_something_can_be_learned():
 
 
 def test_separating_names_its_agents_and_hides_the_changed_rule():
-    assert SEPARATING.agents != LADDER.agents and {"dqn", "lewm", "laws:given"} < set(SEPARATING.agents)
-    assert dataclasses.replace(SEPARATING, agents=("dqn",)).hash == SEPARATING.hash
-    by_name = {each.name: each.levels for each in SEPARATING.experiments}
+    separating = GRIDS["separating"]
+    assert separating.agents != GRIDS[SUITE].agents and {"dqn", "lewm", "laws:given"} < set(separating.agents)
+    assert dataclasses.replace(separating, agents=("dqn",)).hash == separating.hash
+    by_name = {each.name: each.levels for each in separating.experiments}
     for level in (level for levels in by_name.values() for level in levels):
-        (planned, _), *others = plan_level(SEPARATING, level, "sb3_dqn")
+        (planned, _), *others = plan_level(separating, level, "sb3_dqn")
         assert len(others) == 2 and planned.seeds == (400,) and planned.budgets[-1] == level.episodes
-    told = [plan_level(SEPARATING, by_name["changed_rule"][0], agent)[0][0] for agent in ("dqn", "random")]
+    told = [plan_level(separating, by_name["changed_rule"][0], agent)[0][0] for agent in ("dqn", "random")]
     assert [(each.after, each.unannounced) for each in told] == [(("arrow_puzzle",), True), ((), False)]
 
 

@@ -21,7 +21,7 @@ from whole_outputs import Expected, questions, rounded, tabulated
 from imagine_bench import registry
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.rules import facts, shortest_plans, tabulate
-from imagine_bench.sweep.grid import LADDER, SEPARATING
+from imagine_bench.sweep.grid import GRIDS, SUITE
 
 LARGE = 1_500  # macrostates, as of more than four cubes: they take seconds
 EPISODES = (
@@ -47,7 +47,7 @@ def test_exact_facts_of_all_experiments(expected: Expected) -> None:
     columns = ["world", "macrostates", "ends", "starts", "horizon", "chance", "seen", "return", "length"]
     rows: list[list[object]] = [[*columns, "plans: starts"]]
     compared = 0
-    experiments = (*LADDER.experiments, *SEPARATING.experiments)
+    experiments = (*GRIDS[SUITE].experiments, *GRIDS["separating"].experiments)
     for task in sorted({level.task for experiment in experiments for level in experiment.levels}):
         spec = registry.task(task)
         tables = tabulate(spec.rules)

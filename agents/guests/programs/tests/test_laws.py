@@ -32,7 +32,7 @@ from imagine_bench import registry
 from imagine_bench.exact.certificate import certificate
 from imagine_bench.interfaces import AgentContext, Frame, Observation, Outcome, State, TaskSpec, Transition
 from imagine_bench.seeding import SeedTree
-from imagine_bench.sweep.grid import LADDER
+from imagine_bench.sweep.grid import GRIDS, SUITE
 
 KEPT = Path(__file__).parents[4] / "docs" / "results" / "programs" / "written.json"
 
@@ -528,7 +528,7 @@ def test_kept_programs_are_as_exact_as_the_page_says(own: bool, experiments: int
     every = json.loads(KEPT.read_text())["rows"]
     assert all(each["macro_actions"] <= 2 * each["learner"] for each in every)
     exact = []
-    for experiment in LADDER.experiments:
+    for experiment in GRIDS[SUITE].experiments:
         worlds = {
             (level.task, f"own {level.protocol.get('appearance', 'clean')}" if own else "")
             for level in experiment.levels
