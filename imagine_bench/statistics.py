@@ -35,8 +35,8 @@ class Estimate(NamedTuple):
     """A point estimate, its interval, and for differences the two-sided p-value; NaN where too few runs allow none."""
 
     value: float
-    low: float
-    high: float
+    low: float = math.nan
+    high: float = math.nan
     p: float = math.nan
 
 
@@ -308,7 +308,7 @@ def gain(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None) -> E
     """
     found = ratio(treated, base, trials=trials)
     if min(len(_runs(treated)), len(_runs(base))) < FEWEST_TESTED:
-        return Estimate(found.value - 1.0, math.nan, math.nan)
+        return Estimate(found.value - 1.0)
     return Estimate(found.value - 1.0, found.low - 1.0, found.high - 1.0)
 
 
@@ -323,10 +323,10 @@ def ratio(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None, pai
     mean_a = float(a.mean())
     mean_b = float(b.mean())
     if mean_b == 0.0:
-        return Estimate(math.nan, math.nan, math.nan)
+        return Estimate(math.nan)
     value = mean_a / mean_b
     if min(len(a), len(b)) < 2:
-        return Estimate(value, math.nan, math.nan)
+        return Estimate(value)
     over = _location(a, trials, 0.0)
     under = _location(b, trials, 0.0)
     error_a = float(over.error)
@@ -336,7 +336,7 @@ def ratio(treated: ArrayLike, base: ArrayLike, *, trials: int | None = None, pai
     t = float(scipy.stats.t.ppf(0.5 + LEVEL / 2.0, freedom))
     g = (t * error_b / mean_b) ** 2
     if g >= 1.0:
-        return Estimate(value, math.nan, math.nan)
+        return Estimate(value)
     inner = error_a**2 - 2.0 * value * shared + (value * error_b) ** 2
     inner -= g * (error_a**2 - (shared / error_b) ** 2 if error_b > 0.0 else 0.0)
     middle = value - (g * shared / error_b**2 if error_b > 0.0 else 0.0)

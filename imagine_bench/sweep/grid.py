@@ -26,8 +26,6 @@ from imagine_bench.values import Setting, dotted
 Member = TypeVar("Member", "Variant", "Experiment")
 BASE = "base"
 """Name of the factor of a variant that others are compared with."""
-SUITE_AGENTS = ("dqn", "imagination_uncertainty", "factored:given")
-"""The agents that a suite compares unless others are named."""
 MEASURES = ("success", "auroc")
 """``"success"`` of test episodes, between a level's exact chance and optimum; or ``"auroc"``, with which epistemic
 uncertainty tells wrong imagined transitions from right ones, between 0.5 and 1."""
@@ -75,8 +73,7 @@ class Study:
                 raise InvalidValueError(
                     f"Variant {variant.name!r} is compared with {variant.against!r}, which the study lacks: {names}."
                 )
-        reported = [seed for seed in self.seeds if not is_tuning_seed(seed)]
-        if reported or not self.seeds:
+        if not self.seeds or not all(map(is_tuning_seed, self.seeds)):
             raise InvalidValueError(
                 f"Study {self.name!r} chooses settings on seeds {self.seeds}; give seeds from {TUNING_SEEDS} on, which "
                 "are tested on starts of their own."
@@ -129,7 +126,8 @@ class Suite:
     evaluation_episodes: int = 100
     execution: str = "kinematic"
     hyperparameters: str = "fast"
-    agents: tuple[str, ...] = SUITE_AGENTS  #: Those that are compared unless others are named
+    #: Those that are compared unless others are named
+    agents: tuple[str, ...] = ("dqn", "imagination_uncertainty", "factored:given")
 
     def __post_init__(self) -> None:
         require_types(self)
@@ -186,14 +184,14 @@ def read_grid(path: Path) -> Study | Suite:
         data = {"name": path.stem, **(json.loads(text) if path.suffix == ".json" else tomllib.loads(text))}
         if "experiments" not in data:
             variants = [Variant(**{**each, "settings": _settings(each)}) for each in data["variants"]]
-            return Study(**{**data, "variants": tuple(variants)})
+            return Study(**{**data, "variants": variants})
         experiments = []
         for each in data["experiments"]:
             if "dial" in each:  # the name that it had
                 each["parameter"] = each.pop("dial")
-            levels = tuple(Level(**level) for level in each["levels"])
+            levels = [Level(**level) for level in each["levels"]]
             experiments.append(Experiment(**{**each, "levels": levels}))
-        return Suite(**{**data, "experiments": tuple(experiments)})
+        return Suite(**{**data, "experiments": experiments})
     except ImagineBenchError as error:
         raise InvalidValueError(f"{path}: {error}") from error
     except Exception as error:  # a file can be wrong in any way

@@ -33,6 +33,7 @@ from imagine_bench.values import Json
 
 Planned = tuple[ProtocolData, Encoders]
 """A bench, and the encoders that its agents need."""
+_EARLIER_TASKS = ("after", "after_episodes", "unannounced")
 _FIGURES_ONLY = {"open_loop_starts": 0, "recorded_episodes": 0}
 
 
@@ -143,7 +144,7 @@ class SuiteResult:
         found = self.levels[experiment.name, agent]
         scales = [each.scale for each in found if each.scale is not None]
         if len(scales) < len(found):
-            return Estimate(math.nan, math.nan, math.nan)
+            return Estimate(math.nan)
         trials = self.suite.evaluation_episodes if experiment.measure == "success" else None
         return score(np.column_stack([each.values for each in found]), scales, trials=trials)
 
@@ -166,11 +167,10 @@ def plan_level(suite: Suite, level: Level, agent: str) -> list[Planned]:
     try:
         whole, encoders = plan(level.task, "quick", **fields)
     except InvalidValueError:
-        if fields.pop("after", None) is None:
+        if "after" not in fields:
             raise
-        for name in ("after_episodes", "unannounced"):
-            fields.pop(name, None)
-        whole, encoders = plan(level.task, "quick", **fields)
+        alone = {name: value for name, value in fields.items() if name not in _EARLIER_TASKS}
+        whole, encoders = plan(level.task, "quick", **alone)
     return [(dataclasses.replace(whole, seeds=(seed,)), encoders) for seed in whole.seeds]
 
 

@@ -41,10 +41,10 @@ def score(values: Floats, scales: Sequence[Scale], *, trials: int | None = None)
     """
     there = ~np.isnan(values).all(axis=0)
     known = values[:, there]
-    if not there.any() or np.isnan(known).all(axis=1).any():
-        return statistics.Estimate(math.nan, math.nan, math.nan)
-    chance = np.array([scale.chance for scale in scales])[there]
-    span = np.array([scale.optimum for scale in scales])[there] - chance
+    if np.isnan(known).all(axis=1).any():  # also where no level has values
+        return statistics.Estimate(math.nan)
+    chance, optimum = np.array([(scale.chance, scale.optimum) for scale in scales])[there].T
+    span = optimum - chance
     seeds = np.nanmean((known - chance) / span, axis=1)
     value = float(seeds.mean())
     low, high = statistics.interval(seeds, trim=0.0, share=False)
