@@ -81,7 +81,7 @@ def verdicts(folder: Path, replays: Replays) -> list[Verdict]:
     """As :func:`verify_runs`, in environments of the bench's protocol."""
     protocol = read_control(folder)
     store = BenchStore(folder, protocol)
-    checks = [_RunCheck(store.run_folder(*pair), protocol, *pair, replays) for pair in store.pairs]
+    checks = [_RunCheck(store.run_folder(*pair), protocol, *pair, replays) for pair in protocol.runs]
     owners: dict[tuple[str, str, str], int] = {}
     found = []
     for check in counted(checks, "runs", total=len(checks)):

@@ -60,11 +60,6 @@ class BenchStore:
         self._began_s = time.monotonic()
         self._facts: dict[str, Any] = {}
 
-    @property
-    def pairs(self) -> list[tuple[str, int]]:
-        """Agent and seed of every run, seed by seed."""
-        return self.protocol.runs
-
     @contextmanager
     def held(self) -> Iterator[None]:
         """Make the folder, and hold it for this process.
@@ -88,7 +83,7 @@ class BenchStore:
 
     def load(self, load_run: Callable[[Path], L]) -> dict[tuple[str, int], L]:
         """Read every run by ``load_run``. Raises ArtefactError: a run is damaged or of another protocol."""
-        found = {pair: load_run(self.run_folder(*pair)) for pair in self.pairs}
+        found = {pair: load_run(self.run_folder(*pair)) for pair in self.protocol.runs}
         for (agent, seed), run in found.items():
             if run is not None:
                 run_folder.require_run_of(self.run_folder(agent, seed), self.protocol, agent, seed)
@@ -96,7 +91,7 @@ class BenchStore:
 
     def missing(self) -> list[tuple[str, int]]:
         """Return the runs that are not finished, seed by seed."""
-        return [pair for pair in self.pairs if not run_folder.is_done(self.run_folder(*pair))]
+        return [pair for pair in self.protocol.runs if not run_folder.is_done(self.run_folder(*pair))]
 
     def begin_session(self, environment: Mapping[str, Json], certify: Certify = lambda task, split: None) -> list[str]:
         """Note that work starts now, in the facts that :func:`.describe_environment` gives; returns :meth:`changed`.

@@ -115,9 +115,9 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
     return text.getvalue()
 
 
-def table_text(rows: Sequence[Mapping[str, float | str]]) -> str:
-    """Rows as CSV under the names of all of them; a value that a row lacks is an empty cell."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
+def table_text(rows: Sequence[Mapping[str, float | str]], columns: Sequence[str] | None = None) -> str:
+    """Rows as CSV under ``columns``, or the names of all of them; a value that a row lacks is an empty cell."""
+    names = columns or list(dict.fromkeys(name for row in rows for name in row))
     return csv_text([names, *([row.get(name, "") for name in names] for row in rows)])
 
 

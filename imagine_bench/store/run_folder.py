@@ -15,10 +15,8 @@ named arrays, and :func:`.values.unpack` reads it back to the bit.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
-import io
 import json
 import re
 import shutil
@@ -37,7 +35,6 @@ from imagine_bench.interfaces import AgentState
 from imagine_bench.protocols.data import ProtocolData, RunSpec
 from imagine_bench.registry.entries import agent_label
 from imagine_bench.store.files import (
-    csv_text,
     first_difference,
     lock,
     make_folder,
@@ -162,12 +159,9 @@ def load_snapshot(checkpoint: Path, *, agent: bool = True) -> Snapshot:
 
 
 def _sweep_partial(folder: Path) -> None:
-    """Remove files that a process left below ``folder`` that was killed while it wrote or removed a checkpoint."""
+    """Remove checkpoints below ``folder`` of a process that was killed while it wrote or removed them."""
     for leftover in folder.glob(f"{_PARTIAL}*"):
-        if leftover.is_dir() and not leftover.is_symlink():
-            shutil.rmtree(leftover)
-        else:
-            leftover.unlink()
+        shutil.rmtree(leftover)
 
 
 def _checkpoints(folder: Path) -> list[Path]:
@@ -295,16 +289,16 @@ def require_run_of(folder: Path, protocol: ProtocolData, agent: str, seed: int) 
 
 def write_metrics(folder: Path, checkpoints: Sequence[Checkpoint]) -> None:
     """Write one row a budget done so far, atomically. Raises SetupError: it cannot be written."""
-    write_bytes(folder / _METRICS, _metrics(checkpoints).encode())
+    write_bytes(folder / _METRICS, table_text(_metrics(checkpoints)).encode())
 
 
-def _metrics(checkpoints: Sequence[Checkpoint]) -> str:
+def _metrics(checkpoints: Sequence[Checkpoint]) -> list[dict[str, float | str]]:
     rows = []
     for values in pack(checkpoints)[0]:
         row = {name: value for name, value in values.items() if name not in _APART}
         diagnostics = sorted(values["diagnostics"].items())
         rows.append(row | {_DIAGNOSTIC + name: value for name, value in diagnostics})
-    return table_text(rows)
+    return rows
 
 
 def forget(folder: Path) -> None:
@@ -348,17 +342,13 @@ def require_done(folder: Path) -> dict[str, Any]:
     what = "the mark of a finished run"
     done = read_sealed(folder / _DONE, what)
     with reading(folder / _DONE, what):
-        digests = {_CONFIG: None, _METRICS: None, **done["sha256"]}  # these have one in every run
+        digests = {_CONFIG: "", _METRICS: "", **done["sha256"]}  # these have one in every run
     for name, written in digests.items():
-        if name == _RECORDING and not recording_path(folder).exists():
-            continue  # recordings are large, and nothing else needs them
         path = folder / name
-        if not path.exists():
-            how = "missing"
-        elif sha256(path) != written:
-            how = "not as the run left it"
-        else:
+        found = sha256(path) if path.exists() else None
+        if found == written or (found is None and name == _RECORDING):  # recordings are large, and nothing needs them
             continue
+        how = "missing" if found is None else "not as the run left it"
         remedy = f"put it back, or delete {folder} to run it anew"
         raise ArtefactError(f"{path} is {how}, although the run is finished. It was left untouched; {remedy}.")
     return read_config(folder)
@@ -370,14 +360,11 @@ def load_run(folder: Path) -> RunResult:
     result = _result(folder)
     if result is None:
         raise ArtefactError(f"{folder} has no checkpoint, which holds its results; delete {folder} to run it anew.")
-    table = _metrics(result.checkpoints)
     with reading(folder / _METRICS, "the table of a run"):
-        kept = (folder / _METRICS).read_text()
-    if (folder / "measured.npz").exists():  # an older run's table may have fewer columns
-        columns = kept.partition("\n")[0].split(",")
-        rows = csv.DictReader(io.StringIO(table))
-        table = csv_text([columns, *([row.get(name, "") for name in columns] for row in rows)])
-    if kept != table:
+        table = (folder / _METRICS).read_text()
+    is_older = (folder / "measured.npz").exists()  # its table may have fewer columns
+    columns = table.partition("\n")[0].split(",") if is_older else None
+    if table != table_text(_metrics(result.checkpoints), columns):
         raise ArtefactError(f"{folder / _METRICS} says something else than its checkpoint. It was left untouched.")
     rollouts = grouped(read_arrays(folder / _IMAGINED))
     recording = recording_path(folder)
