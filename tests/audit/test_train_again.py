@@ -159,7 +159,7 @@ def test_what_was_made_on_another_processor_holds_in_part(pair: Path, tmp_path: 
 
 def commanded(seeds: str) -> Forge:
     """The session's command names these seeds."""
-    command = f"imagine-bench bench x --seeds {seeds} --out y"
+    command = f"imagine-bench bench x --seeds{seeds} --out y"
     return sessions(lambda found: found["sessions"][0].update(command=command))
 
 
@@ -167,8 +167,10 @@ def commanded(seeds: str) -> Forge:
     ("claim", "code", "first"),
     [
         (lambda folder: None, 0, "Holds."),
-        (commanded("0-1"), 0, "Holds."),
-        (commanded("0 1 2"), 1, "Does not hold. 1 of 3 verdicts"),
+        (commanded(" 0-1"), 0, "Holds."),
+        (commanded("=0-1"), 0, "Holds."),
+        (commanded(" 0 1 2"), 1, "Does not hold. 1 of 3 verdicts"),
+        (commanded("=0-2"), 1, "Does not hold. 1 of 3 verdicts"),
         (share_weights, 1, "Does not hold. 1 of 2 verdicts are complaints."),
         (in_runs(lambda run: run.values.update(before=7)), 1, "Does not hold. 2 of 2"),
         (sessions(lambda found: found["certificate"].update(chance_level=0.5)), 1, "Does not hold. 1 of 3 verdicts"),

@@ -45,6 +45,28 @@ def test_streams_walk_as_the_rules_say(task: str) -> None:
 
 
 @BOTH
+def test_an_episode_of_a_stream_ends_by_the_rules_or_the_horizon(task: str) -> None:
+    there = judged_world(task)
+    found = streams_of(dataclasses.replace(there.spec, horizon=2), there.one_step)
+    assert found is not None
+    streams, asked = found["usual"], there.one_step.pairs
+    stayed = []
+    for rows, reached in zip(streams.rows[:20], streams.reached[:20], strict=True):
+        lived = 0
+        for row, after, following in zip(rows, reached, rows[1:], strict=False):
+            lived += 1
+            outcomes = there.spec.rules.outcomes(*asked[row])
+            (over,) = {each.terminated for each in outcomes if each.macrostate == streams.states[after]}
+            if over or lived == 2:
+                assert asked[following][0] in there.spec.rules.start_states
+                stayed += [] if over else [asked[following][0] == streams.states[after]]
+                lived = 0
+            else:
+                assert asked[following][0] == streams.states[after]
+    assert len(stayed) > 50 and np.mean(stayed) < 0.5
+
+
+@BOTH
 def test_changed_rules_are_still_rules(task: str) -> None:
     there = judged_world(task)
     rules, states = there.spec.rules, tuple(dict.fromkeys(there.one_step.states))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import subprocess
 from contextlib import closing
 from pathlib import Path
@@ -21,7 +22,7 @@ from small_runs import Inline, small
 
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
-from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D
+from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D, State
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
 from imagine_bench.judge.open_loop import Moment
 from imagine_bench.recording import episodes, stream
@@ -285,6 +286,20 @@ def test_a_recording_shows_what_the_agent_sees_and_says_what_is_true(tmp_path: P
             assert f"- {name}: {now}{'' if now == late else f' (frame: {late})'}\n" in text
     assert "(frame: " in "".join(texts) and "(frame: " not in texts[0]
     assert not any(each.startswith(("/imagined", "/real/q_")) for each in contents(path)), "it does neither"
+
+
+def test_imagination_is_set_beside_its_own_episode_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    moments: list[tuple[list[State], State]] = []
+
+    def noted(**given: Any) -> Moment:
+        moments.append((list(given["before"]), given["macrostate"]))
+        return Moment(**given)
+
+    monkeypatch.setattr(episodes, "Moment", noted)
+    record(FakeImaginer(), tmp_path / "two.rrd", episodes=2)
+    assert [before for before, _ in moments].count([]) == 2
+    for (earlier, state), (before, _) in itertools.pairwise(moments):
+        assert before in ([], [*earlier, state])
 
 
 def test_of_so_many_seeds_alone_runs_are_recorded(tmp_path: Path) -> None:
