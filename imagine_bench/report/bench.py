@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,14 +60,6 @@ from imagine_bench.store.results import BenchResult
 _EQUAL_UPDATES = "dqn_more_updates"
 _UNTIL = " --until-decided"
 _SEEDS_OPTION = re.compile(r" --seeds[ =]\d[\d-]*(?: \d[\d-]*)*")
-_AGAINST_DQN: Mapping[str, Callable[[Record], str]] = {
-    "against dqn": lambda record: record["agent"],
-    "real episodes": lambda record: f"{record['episodes']:,}",
-    "difference (points)": lambda record: estimated(record, DIFFERENCE, signed_percent),
-    "p": lambda record: printed(record["p_holm"], ".3f"),
-    "gain (%)": lambda record: estimated(record, GAIN, signed_percent),
-    "thesis (%)": lambda record: DASH if record.get("thesis_gain") is None else signed_percent(record["thesis_gain"]),
-}
 
 
 def bench_page(result: BenchResult) -> Page:
@@ -108,7 +100,7 @@ def bench_page(result: BenchResult) -> Page:
 
 def verdict(data: ReportData) -> list[str]:
     """The verdict: headlines first, a line an agent; then every other learner against DQN; then the faults."""
-    amiss = [*_unfinished(data.result), *_left_out(data.result), *_not_installed(data), *_misread(data)]
+    amiss = list(_amiss(data))
     by_agent: dict[str, list[str]] = {}
     for headline in data.headlines:
         by_agent.setdefault(headline.agent, []).append(_of_headline(data, headline))
@@ -189,19 +181,30 @@ def shown(record: Record) -> int:
     return int(np.sign(record["difference_to_dqn"])) if record["p_holm"] < 1.0 - LEVEL else 0
 
 
-def _misread(data: ReportData) -> list[str]:
-    """A line an agent whose encoder reads few frames right."""
-    lines = []
-    for agent in data.result.protocol.agents:
+def _amiss(data: ReportData) -> Iterator[str]:
+    """A sentence on everything that the numbers lack, and on each agent whose encoder reads few frames right."""
+    result = data.result
+    part = result.protocol
+    if result.missing:
+        whole = result.whole or part
+        named = "; ".join(result.missing[:4]) + ("; …" if len(result.missing) > 4 else "")
+        then = "The same bench command goes on."
+        if whole.agent_names == FIRST:
+            then = "Its agents had other names when it was begun: today's command begins a new bench in another folder."
+        yield (
+            f"This bench is not finished: shown are {len(part.seeds)} of {len(whole.seeds)} seeds up to "
+            f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {named}. {then}"
+        )
+    if result.left_out:
+        yield f"Left out, for some agent has not been run with that seed or one before: {', '.join(result.left_out)}."
+    absent = [] if data.installed else [f"task {data.spec.id}"]
+    absent += [f"agent {agent}" for agent in part.agents if not known_agent(agent).make]
+    if absent:
+        yield f"Not installed here: {', '.join(absent)}. Numbers that need missing code are not shown."
+    for agent in part.agents:
         words = encoders.reading_warning(_encoder(data, agent))
         if words:
-            lines.append(f"“{agent}” sees through {words}.")
-    return lines
-
-
-def _marked(data: ReportData, agent: str) -> str:
-    """An agent's name, with the share that is read right from its encoder if that is low."""
-    return agent + encoders.mark(encoders.low_share(_encoder(data, agent)))
+            yield f"“{agent}” sees through {words}."
 
 
 def _encoder(data: ReportData, agent: str) -> Path | None:
@@ -209,33 +212,6 @@ def _encoder(data: ReportData, agent: str) -> Path | None:
     entry = known_agent(agent)
     used = data.result.protocol.encoder_of(entry.encoder_kind) if entry.make and entry.needs_encoder else None
     return None if used is None else encoders.find(used)
-
-
-def _unfinished(result: BenchResult) -> list[str]:
-    if not result.missing:
-        return []
-    part = result.protocol
-    whole = result.whole or part
-    named = "; ".join(result.missing[:4]) + ("; …" if len(result.missing) > 4 else "")
-    then = "The same bench command goes on."
-    if whole.agent_names == FIRST:
-        then = "Its agents had other names when it was begun: today's command begins a new bench in another folder."
-    return [
-        f"This bench is not finished: shown are {len(part.seeds)} of {len(whole.seeds)} seeds up to "
-        f"{part.budgets[-1]:,} of {whole.budgets[-1]:,} real episodes. Missing are {named}. {then}"
-    ]
-
-
-def _left_out(result: BenchResult) -> list[str]:
-    if not result.left_out:
-        return []
-    return [f"Left out, for some agent has not been run with that seed or one before: {', '.join(result.left_out)}."]
-
-
-def _not_installed(data: ReportData) -> list[str]:
-    names = [] if data.installed else [f"task {data.spec.id}"]
-    names += [f"agent {agent}" for agent in data.result.protocol.agents if not known_agent(agent).make]
-    return [f"Not installed here: {', '.join(names)}. Numbers that need missing code are not shown."] if names else []
 
 
 # Tables ------------------------------------------------------------------------------------------------------------
@@ -270,7 +246,8 @@ def _scores(data: ReportData, budgets: Sequence[int], *, short: bool = False) ->
     cell = _in_short if short else _solved
     rows: list[tuple[str, Mapping[int, str]]] = []
     for agent in data.result.protocol.agents:
-        rows.append((_marked(data, agent), {each["episodes"]: cell(data, each) for each in data.of(agent)}))
+        title = agent + encoders.mark(encoders.low_share(_encoder(data, agent)))
+        rows.append((title, {each["episodes"]: cell(data, each) for each in data.of(agent)}))
         if not short and not data.thesis[agent].keys().isdisjoint(budgets):
             cells = {budget: _mean_std(*each) for budget, each in data.thesis[agent].items()}
             rows.append((f"{agent}, thesis", cells))
@@ -343,7 +320,17 @@ def gain(data: ReportData) -> Section | None:
             f"p-values are Holm-corrected for {families}. The smallest difference that would be shown with "
             f"probability 80 % is {percent(min(sizes))} to {percent(max(sizes))} points, by cell."
         )
-    rows = [{heading: cell(record) for heading, cell in _AGAINST_DQN.items()} for record in records]
+    rows = [
+        {
+            "against dqn": record["agent"],
+            "real episodes": f"{record['episodes']:,}",
+            "difference (points)": estimated(record, DIFFERENCE, signed_percent),
+            "p": printed(record["p_holm"], ".3f"),
+            "gain (%)": estimated(record, GAIN, signed_percent),
+            "thesis (%)": DASH if record.get("thesis_gain") is None else signed_percent(record["thesis_gain"]),
+        }
+        for record in records
+    ]
     why = "not said by the thesis, too few seeds, or DQN solved nothing to compare with"
     tables = [Table.of("gains", rows, detectable, why), *_on_the_same_starts(records)]
     return Section("Gain over DQN", [words], tables=tables)

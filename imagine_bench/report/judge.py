@@ -34,7 +34,6 @@ from imagine_bench.report.page import (
     estimate,
     number,
     over_seeds,
-    p_value,
 )
 from imagine_bench.report.worlds import worlds_csv, worlds_section
 from imagine_bench.statistics import can_show, difference, holm, iqm
@@ -287,11 +286,7 @@ def question(found: Judged, title: str) -> Section:
 
 def levels(found: Judged) -> Section:
     """The scores of each level L0 to L7, its claims, and the policy that each model overrates most."""
-    errors = read_json(found.folder / "reader.json", "errors")
-    reader = (
-        f"Returns of policies in a model hold the errors of the reader of its images, too: it takes "
-        f"{errors['misread']:.2%} of real frames for another macrostate and does not recognize {errors['refused']:.2%}."
-    )
+    reader = "Returns of policies in a model hold the errors of the reader of its images, too, which stand above."
     level_of = {name: level.name for level in LEVELS for name in level.measures}
     films = []
     for model, arrays in shown(found.folder, found.judgement).items():
@@ -323,7 +318,7 @@ def compared(found: Judged) -> Section:
         if set(pair) == set(best):
             named = (f"{_title(model)} ({number(iqm(values[model]))})" for model in best)
             better = "it is better" if p < 0.05 else "no difference is shown"
-            verdict = f"difference {estimate(each, number)}, {p_value(p)}, Holm-corrected: {better}"
+            verdict = f"difference {estimate(each, number)}, p = {number(p)}, Holm-corrected: {better}"
             if not can_show((len(values[best[0]]), len(values[best[1]])), len(pairs)):
                 verdict = "too few seeds to say which is better"
             answers.append(f"Smallest unbiased Brier score{found.after}: {', then '.join(named)}; {verdict}.")

@@ -171,11 +171,6 @@ def number(value: float, digits: int = 3) -> str:
     return printed(value, f".{max(0, digits - whole)}f")
 
 
-def p_value(p: float) -> str:
-    """``p = 0.012``."""
-    return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
-
-
 def p_level(p: float) -> str:
     """``p < .01``: the smallest of the usual levels above a p-value that shows something."""
     return next(f"p < {level}" for level in (".001", ".01", ".05", "1.01") if p < float(level))

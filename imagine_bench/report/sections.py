@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import functools
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,7 +18,6 @@ from imagine_bench.report import figures
 from imagine_bench.report.data import SCORE, ReportData, open_loop_means
 from imagine_bench.report.page import DASH, Image, Section, Table, percent
 from imagine_bench.store.files import reading
-from imagine_bench.store.results import RecordedEpisode
 from imagine_bench.store.run_folder import recording_path
 
 HEAD = ("agent", "seed", "episodes", "tests", "test", "cause")
@@ -55,7 +53,7 @@ def episodes(data: ReportData) -> Section | None:
     for name, wanted in (("solved", True), ("failed", False)):
         found = [(run, each) for run in runs for each in run.recorded if bool(each.success) is wanted]
         for run, episode in found[:1]:
-            strip = functools.partial(_strip, episode, data.spec.action_names)
+            strip = png(episode_strip(episode, data.spec.action_names))
             images.append(Image(f"episode_{name}", strip, f"{run.agent}, seed {run.seed}: {episode.end}."))
     words = (
         "These are greedy episodes after the last training. They are recorded beside the tests, from starts of their "
@@ -66,10 +64,6 @@ def episodes(data: ReportData) -> Section | None:
     page = data.result.folder / "report"
     links = {f"{run.agent}, seed {run.seed}": os.path.relpath(recording_path(run.folder), page) for run in runs}
     return Section("One episode that was solved, and one that was not", words, images, links=links)
-
-
-def _strip(episode: RecordedEpisode, action_names: Sequence[str]) -> bytes:
-    return png(episode_strip(episode, action_names))
 
 
 # Why agents failed ------------------------------------------------------------------------------------------------
