@@ -8,7 +8,8 @@ find it. It has contradictions: the same codes and macro-action have different o
 value last seen stands in its place. Or the factor never changes once that stands there, and the laws become shorter by
 more than it takes to say which images hide it. A factor of one value, and one that hides it, says nothing: the
 one value stands in all of its codes. In the end a factor is left out that drifts and on which no law depends: such as
-a shadow that the perception took for a thing.
+a shadow that the perception took for a thing. Nor does such a factor count when new factors are compared with those
+before.
 """
 
 from __future__ import annotations
@@ -129,12 +130,25 @@ class SeeingWriter:
         codes, _ = self.perception.codes(np.stack(self._images))
         self._codes = dict(enumerate(codes))
         found = self._explained(self.perception.sizes)
-        if frame_factors.factors and _contradicting(known[1]) < _CLEARER * _contradicting(found[1]):
+        if frame_factors.factors and self._is_clearer(known[1], found[1]):
             self.perception.take(frame_factors, found_in)
             self._codes = kept
             found = known
         self._hidden, rows = found
         self.writer.take_up(self.perception.sizes, rows)
+
+    def _is_clearer(self, known: Sequence[CodedRow], found: Sequence[CodedRow]) -> bool:
+        """Whether by the factors before far fewer transitions contradict one another than by those found now.
+
+        Factors found now that drift, and on which no law depends, contradict nothing.
+        """
+        if _contradicting(known) >= _CLEARER * _contradicting(found):
+            return False
+        laws = Laws(self.perception.sizes, self._spec.n_actions, found)
+        left = [place for place in range(len(laws.sizes)) if place not in laws.superfluous]
+        if not left or len(left) == len(laws.sizes):
+            return True
+        return _contradicting(known) < _CLEARER * _contradicting([row.at(left) for row in found])
 
     def _leave_out(self, superfluous: Collection[int]) -> None:
         """See these factors no more, and write anew; all of them are seen if no other one would be left."""

@@ -25,6 +25,11 @@ class CodedRow(NamedTuple):
     ended: bool
     step: int = 0  # macro-actions before it in its episode
 
+    def at(self, places: Sequence[int]) -> CodedRow:
+        """The same transition between the symbols of these places alone."""
+        now, then = (tuple(state[place] for place in places) for state in (self.now, self.then))
+        return self._replace(now=now, then=then)
+
 
 def complete(rows: Sequence[CodedRow]) -> list[CodedRow]:
     """The transitions in which every value was seen."""

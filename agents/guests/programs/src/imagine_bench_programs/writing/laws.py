@@ -5,8 +5,10 @@ A program of laws has three parts, each the shortest that explains the data. Sym
 
 - *Effects*: "if at most two conditions hold, the macro-action makes a factor f(its value)". All effects of a
   macro-action come about together, with one probability; otherwise it changes nothing. Two macro-actions that undo
-  each other on a factor, wherever both were seen, are taken to do so everywhere.
+  each other on a factor, wherever both were seen, are taken to do so everywhere, unless one of them left a value as it
+  was more often than chance explains.
 - *Drifts*: whatever is done, a factor turns into another of its values with one probability, while the episode goes on.
+  A misread image must become no law. So one with conditions explains two transitions, and a drift three.
 - *Ends*: a list of "if at most two conditions hold, this reward, and whether the episode ends", read from the top.
   Laws of a class have one of four forms, and a form with fewer possible conditions makes each law shorter. The first
   form has conditions on the symbols after alone. So a law does not say by coincidence that two codes are alike.
@@ -23,7 +25,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +42,11 @@ _FORMS = 4
 """Forms of a function of a value: a step round the circle of its values, a constant, a permutation, a table."""
 _TESTS = 2
 """Most conditions of a law."""
+_MISREAD = 2
+_FEW = 6
+"""Transitions that one misread image changes, and those under an effect of which one alone may change something."""
+BY_CHANCE = 0.001
+"""All tries may have failed by chance if that is at least so probable."""
 
 
 class Test(NamedTuple):
@@ -130,9 +137,8 @@ class Laws(SymbolRules):
                 for reached, part in self._drifted(macrostate, action, then):
                     end = self.end(macrostate, action, reached)
                     expected[reached, end.reward, end.ended] += chance * part
-            self._known[key] = tuple(
-                Outcome(chance, *end, success=False) for end, chance in expected.items() if chance > 0.0
-            )
+            possible = {end: chance for end, chance in expected.items() if chance > 0.0}
+            self._known[key] = tuple(Outcome(chance, *end, success=False) for end, chance in possible.items())
         return self._known[key]
 
     def turned(self, state: State, action: int) -> State:
@@ -222,10 +228,11 @@ class _Dynamics:
         nats += math.log(len(self.sizes)) + changed * math.log(max(1, self.sizes[factor] - 1))
         found = [self._effects(rows, factor) for rows in self._of_action]
         of_effects = sum(spent for _, spent in found)
-        self.nats += min(nats, of_effects) if changed else of_effects
-        if changed and nats < of_effects:
+        if changed > _MISREAD and nats < of_effects:
+            self.nats += nats
             self.drifts[factor] = chance
             return
+        self.nats += of_effects
         for laws, more in zip(self.effects, self._pooled(factor, [more for more, _ in found]), strict=True):
             laws.extend(more)
 
@@ -239,11 +246,17 @@ class _Dynamics:
         pooled = list(found)
         for action, changed in seen.items():
             known = _with_others(changed, [other for each, other in seen.items() if each != action])
-            stays = {row.now[factor] for row in self._of_action[action]} - changed.keys()
             becomes = _completed(known or changed, self.sizes[factor])
-            if known is not None and all(becomes[value] == value for value in stays):
+            if known is not None and all(becomes[value] == value for value in self._staying(action, factor, changed)):
                 pooled[action] = [Effect(factor, (), becomes)]
         return pooled
+
+    def _staying(self, action: int, factor: int, changed: Mapping[int, int]) -> list[int]:
+        """The values that a macro-action left as they are more often than it may have failed by chance."""
+        tries = Counter(row.now[factor] for row in self._of_action[action])
+        came = sum(row.now[factor] != row.then[factor] for row in self._of_action[action])
+        fails = 1.0 - came / sum(tries[value] for value in changed)
+        return [value for value, times in tries.items() if value not in changed and fails**times < BY_CHANCE]
 
     def _effects(self, rows: Sequence[CodedRow], factor: int) -> tuple[list[Effect], float]:
         """The effects of one macro-action on one factor, and their nats: one after another, each saves the most."""
@@ -279,6 +292,8 @@ class _Dynamics:
                 if form + outside >= best[0]:
                     continue
                 pairs = Counter(zip(now[inside, factor].tolist(), then[inside].tolist(), strict=True))
+                if (changed & inside).sum() < 2 and (count or inside.sum() > _FEW):
+                    continue  # it may be a misread image
                 for length, becomes in _functions(pairs, size):
                     nats = form + outside + length + _misfit(pairs, becomes)
                     if nats < best[0]:

@@ -8,6 +8,7 @@ once if it changed anything, and reward and end wherever every two of the values
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -16,7 +17,7 @@ import numpy as np
 from imagine_bench.interfaces import Outcome, State
 
 from .delay import CodedRow, changes, complete
-from .laws import Laws
+from .laws import BY_CHANCE, Laws
 
 _DEPTH = 20
 """Macro-actions that are planned ahead."""
@@ -24,7 +25,9 @@ _MOST = 400
 """Symbols that one plan visits."""
 _DISCOUNT = 0.95
 _TRIES = 6
-"""Tries that changed nothing after which a macro-action is known to change nothing; it may have slipped."""
+_MOST_TRIES = 12
+"""Tries that changed nothing after which a macro-action is known to change nothing: between these, so many that all of
+them slip with a probability below ``BY_CHANCE``."""
 _GROWTH = 1.1
 """Laws are found anew once so many times the transitions of the last time were seen, or one was unexpected."""
 
@@ -71,7 +74,7 @@ class Writer:
 
     def _count_try(self, row: CodedRow) -> None:
         for factor, value in enumerate(row.now):
-            self._tried[row.action, factor, value] += 1 if row.then == row.now else _TRIES
+            self._tried[row.action, factor, value] += 1 if row.then == row.now else _MOST_TRIES
 
     def _likeliest(self, state: State, action: int) -> Outcome:
         return max(self.laws.outcomes(state, action), key=lambda each: each.probability)
@@ -100,9 +103,16 @@ class Writer:
         places = {place for test in tests for place in ((test.place, test.value) if test.alike else (test.place,))}
         return [tuple((place, values[place]) for place in sorted(places))]
 
+    def _tries(self, action: int) -> int:
+        """Tries after which it is known what a macro-action does."""
+        fails = 1.0 - self.laws.happens[action]
+        if not 0.0 < fails < 1.0:
+            return _TRIES
+        return int(np.clip(math.ceil(math.log(BY_CHANCE) / math.log(fails)), _TRIES, _MOST_TRIES))
+
     def _is_unknown(self, now: State, action: int, expected: Outcome) -> bool:
         row = CodedRow(now, action, expected.macrostate, expected.reward, expected.terminated)
-        tried = all(self._tried[action, factor, value] >= _TRIES for factor, value in enumerate(now))
+        tried = all(self._tried[action, factor, value] >= self._tries(action) for factor, value in enumerate(now))
         return not tried or not self._met.issuperset(self._claims(row))
 
     def explore(self, state: State) -> int:
