@@ -91,6 +91,26 @@ def test_a_reused_outcome_has_the_bits_of_a_simulated_one(task, monkeypatch):
     env.close()
 
 
+@pytest.mark.parametrize(("task", "options"), [("arrows:slip=0.5", {"slip": 0.5}), ("pick_place", {})])
+def test_chance_decides_where_outcomes_are_reused(task, options):
+    """From one state in physics, to the bit, a macro-action leads where the seed says, as without reuse."""
+    spec = registry.task(task)
+    alone, reusing = (gymnasium.make(spec.env_id, execution="physics", **options).unwrapped for _ in range(2))
+    reusing.reuse_outcomes()
+    start = spec.rules.start_states[0]
+    action = max(range(spec.n_actions), key=lambda action: len(spec.rules.outcomes(start, action)))
+    found = []
+    for env in (alone, reusing):
+        env.reset(seed=0, options={"macrostate": start})
+        here = env.world.get_state()
+        for seed in range(6):
+            env.reset(seed=seed, options={"macrostate": start})
+            env.world.set_state(here)
+            found.append(env.step(action)[4]["macrostate"].tolist())
+        env.close()
+    assert found[:6] == found[6:] and any(each != found[0] for each in found)
+
+
 @pytest.mark.parametrize("task", WORLDS)
 def test_both_executions_walk_the_same_macrostates(task):
     envs = [make(task, execution=execution) for execution in EXECUTIONS]

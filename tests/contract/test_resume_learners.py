@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from small_runs import final_state, measured, run_observed, small
 from whole_outputs import Expected, rounded
 
 from imagine_bench import registry
-from imagine_bench.interfaces import AgentState
+from imagine_bench.interfaces import AgentState, Observation, capabilities
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import run_state
 from imagine_bench.store import encoders
@@ -85,6 +87,48 @@ def test_copies_and_pickles_of_a_learner_learn_on_by_themselves(agent: str) -> N
     for actions, state in ends[:2]:
         assert actions == ends[2][0] and same(state, ends[2][1])
     assert same(early, as_it_was), "a snapshot does not change while the learner learns on"
+
+
+Asked = Callable[[Any, list[Observation], np.random.Generator], object]
+READINGS: dict[type, Asked] = {
+    capabilities.ValueReader: lambda agent, seen, rng: agent.q_values(seen[0]),
+    capabilities.NoveltyReader: lambda agent, seen, rng: agent.novelty(seen[0], rng),
+    capabilities.MemoryReader: lambda agent, seen, rng: agent.read_memory(seen[0].frame, (4, 4, 4, 3)),
+    capabilities.SeeingLearner: lambda agent, seen, rng: list(agent.perceived()),
+    capabilities.Imaginer: lambda agent, seen, rng: [
+        agent.imagine(seen[0].frame, actions=actions, depth=3, rng=rng) for actions in (None, np.array([0, 4, 1]))
+    ],
+    capabilities.FrameReader: lambda agent, seen, rng: agent.read_frames(np.stack([each.frame for each in seen])),
+    capabilities.OutcomePredictor: lambda agent, seen, rng: agent.predict_outcomes(
+        np.stack([each.frame for each in seen[:3]]), rng
+    ),
+}
+"""How a learner is asked, by the capability."""
+
+
+@pytest.mark.parametrize("agent", EACH)
+def test_a_learner_that_is_asked_learns_on_as_one_that_is_not(agent: str) -> None:
+    """And equal questions with equal generators have equal answers, of each frame by itself."""
+    one = checked_agent(agent, "arrow_puzzle")
+    drawing = registry.own_settings(agent, {"model.dropout": 0.3})  # so that its answers are random
+    one = one._replace(context=dataclasses.replace(one.context, overrides={**one.context.overrides, **drawing}))
+    asked, alone = one.make(), one.make()
+    for each in (asked, alone):
+        one.train(each, range(2))
+    states = np.array(one.spec.rules.start_states[::20])
+    frames = one.spec.render_macrostates(states, "clean", np.random.default_rng(0))
+    shown = states if one.entry.privileged else [None] * len(states)
+    seen = [Observation(frame=frame, macrostate=state) for frame, state in zip(frames, shown, strict=True)]
+    capabilities.begin_episode(asked)
+    for capability, ask in READINGS.items():
+        if isinstance(asked, capability):
+            answers = [pickle.dumps(ask(asked, seen, np.random.default_rng(1))) for _ in range(2)]
+            assert answers[0] == answers[1], capability
+    if isinstance(asked, capabilities.FrameReader):
+        assert np.array_equal(asked.read_frames(frames), [asked.read_frames(frame[None])[0] for frame in frames])
+    assert same(asked.state(), alone.state())
+    assert one.train(asked, range(2, 3)) == one.train(alone, range(2, 3))
+    assert same(asked.state(), alone.state())
 
 
 @pytest.mark.parametrize("agent", EACH)

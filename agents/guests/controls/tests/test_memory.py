@@ -274,6 +274,12 @@ def test_a_read_out_is_fitted_on_every_episode_the_newest_too(lengths: list[int]
     assert np.mean(np.array(read) == (newest[:, 0] > 0.0).numpy()) > 0.7
 
 
+def test_the_newest_value_stays_until_another_is_seen() -> None:
+    """Of two and of three values: 2 and 3 are none."""
+    read = np.array([[2, 0], [0, 9], [1, 3], [2, 1]])
+    assert readout.last_seen(read, (2, 3)).tolist() == [[readout.NEVER_SEEN, 0], [0, 0], [1, 0], [1, 1]]
+
+
 class CueEncoder(FakeEncoder):
     """Reads the cue that a frame shows, or that it shows none."""
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -10,6 +12,8 @@ import numpy as np
 import pytest
 from imagine_bench_regression import robot_ik as ik
 from imagine_bench_regression.planar_arm import MOVE_S, PlanarArm
+from imagine_bench_regression.recordings import CHOICES, record_robot
+from rerun.chunk import RrdReader
 
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.regression import Prediction
@@ -121,3 +125,23 @@ def test_decisions_are_carried_out_by_the_arm(monkeypatch: pytest.MonkeyPatch) -
     assert not np.array_equal(found["decision/points"][0], found["decision/points"][1]), "networks are asked elsewhere"
     outside = found["map/outside_m"] > 0
     assert np.isnan(found["map/error"][:, outside]).all() and np.isfinite(found["map/error"][:, ~outside]).all()
+
+
+def test_a_recorded_choice_says_by_how_many_centimetres_it_misses(tmp_path: Path) -> None:
+    """Of the least uncertain candidate, and of all on average."""
+    shape = (1, CHOICES, 3)
+    rng = np.random.default_rng(10)
+    data = {f"decision/{end}": rng.random((*shape, 2)) for end in ("points", "reached")}
+    data["decision/joints"] = joints(CHOICES * 3).reshape(*shape, 3)
+    data["decision/epistemic"] = np.tile([0.3, 0.1, 0.2], (*shape[:2], 1))
+    data["decision/error"] = np.linspace(0.01, 0.9, CHOICES * 3).reshape(shape)
+    path = record_robot({"100": data}, task=ik.SPEC, name="mdn", path=tmp_path / "arm.rrd")
+    chunks = [each.to_record_batch() for each in RrdReader(path).stream() if each.entity_path == "/choice/text"]
+    told = "\n".join(str(each.column("TextDocument:text").to_pylist()) for each in chunks)
+    errors_cm = 100.0 * data["decision/error"][0]
+    said = {
+        int(choice): [float(number) for number in re.findall(r"misses by ([\d.]+) cm", text)]
+        for choice, text in re.findall(r"### Choice (\d+)(.*?on average)", told)
+    }
+    for choice, errors in enumerate(errors_cm, start=1):
+        np.testing.assert_allclose(said[choice], [errors[1], errors.mean()], atol=0.051)
