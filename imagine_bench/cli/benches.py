@@ -247,13 +247,13 @@ class Report(OfBench):
 
     merge: Annotated[Repeated[Path], shown("PATH [PATH ...]")] = ()
     """Folders of other benches, or of results that were kept, whose agents are added, or where those are the same,
-    whose seeds; all else in their protocols must be the same."""
+    whose seeds; all else in their protocols must be the same. The merged bench is written into --out."""
     track: TrackWord = None
     """Write the metrics so far for a tool instead; wandb offline."""
 
     def __call__(self) -> None:
         """Load and write."""
-        given, task = self.meant()
+        given, task = self.meant(writes=bool(self.merge))
         if self.track is not None and self.merge:
             raise InvalidValueError("--track writes the metrics of one bench; leave it or --merge out.")
         folder = given or newest_bench(self.out, task)

@@ -93,12 +93,14 @@ class OfBench:
     out: Path = Path("runs")
     """Folder of all benches, where the newest is looked for."""
 
-    def meant(self) -> tuple[Path | None, str | None]:
+    def meant(self, *, writes: bool = False) -> tuple[Path | None, str | None]:
         """The path that was given, and the task, by its canonical name; a first word that is a task is that.
+
+        ``writes`` says whether something is written into the folder of all benches.
 
         Raises:
             UnknownNameError: No such task.
-            InvalidValueError: A path and a task are given.
+            InvalidValueError: A path and a task are given, or a path and a folder of all benches that is not needed.
         """
         word = self.folder
         task = self.task
@@ -108,6 +110,8 @@ class OfBench:
             word = None
             task = name
         require_either(word, task)
+        if word is not None and self.out != OfBench.out and not writes:
+            raise InvalidValueError(f"{word} is given, so none is looked for in --out {self.out}; leave one out.")
         if task is not None:
             task_type(task)  # knows every name
             task = registry.task_name(task)
