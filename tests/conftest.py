@@ -201,6 +201,18 @@ def guests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Guests]:
 
 
 @pytest.fixture
+def own_names() -> Iterator[None]:
+    """The names of tasks, agents and world models that a test changes are as before when it ends."""
+    from imagine_bench import registry
+
+    tables = [(table, dict(table)) for table in (registry.TASKS, registry.AGENTS, registry.WORLD_MODELS)]
+    yield
+    for table, before in tables:
+        table.clear()
+        table.update(before)
+
+
+@pytest.fixture
 def without_shadows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Views for people drawn without shadows and soft edges, which cost a software renderer 0.1 s each."""
     from imagine_bench.tasks import observations, scene_reader

@@ -23,10 +23,10 @@ _FEW: dict[str, Any] = {"budgets": (3,), "evaluation_episodes": 2, "execution": 
 
 
 @pytest.fixture(autouse=True)
-def pupils(monkeypatch: pytest.MonkeyPatch) -> list[Pupil]:
+def pupils(own_names: None) -> list[Pupil]:
     """Those that are made, as an agent that takes all but the human's view."""
     entry = dataclasses.replace(registry.AGENTS["pupil"], observes=("frame", "state", "proprio"))
-    monkeypatch.setitem(registry.AGENTS, "pupil", entry)
+    registry.AGENTS["pupil"] = entry
     Pupil.made.clear()
     return Pupil.made
 

@@ -16,10 +16,10 @@ from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import BusyError, ImagineBenchError, InvalidValueError
 from imagine_bench.judge.verify import verify_runs
 from imagine_bench.protocols.control import Protocol, protocol
-from imagine_bench.running import player
 from imagine_bench.running.bench import bench
 from imagine_bench.running.player import FinishedError, PlayedRun, played_run, protocol_of_player
 from imagine_bench.store import run_folder
+from imagine_bench.store.files import write_json
 from imagine_bench.store.loading import load_so_far, merge
 from imagine_bench.tools.audits import why_report
 
@@ -179,23 +179,21 @@ def test_one_process_at_a_time_and_no_episode_more(tmp_path: Path) -> None:
             run.reset()
 
 
-def test_an_appearance_that_is_asked_for_is_that_of_the_tests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_appearance_that_is_asked_for_is_that_of_the_tests(tmp_path: Path) -> None:
     there = protocol("arrow_puzzle", "smoke", agents=("random",), test_appearance="strong")
-    monkeypatch.setattr(player, "read_control", lambda folder: there)
+    write_json(tmp_path / "protocol.json", there.as_dict())
     for asked, found in ((None, "strong"), ("mild", "mild")):
         wanted = protocol_of_player(None, "person", "anna", like=tmp_path, appearance=asked)
         assert wanted.appearance_in_tests == found
 
 
-def test_nothing_of_the_learners_of_a_bench_is_said_of_a_player(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_of_the_learners_of_a_bench_is_said_of_a_player(tmp_path: Path) -> None:
     plain = protocol("arrow_puzzle", "smoke", agents=("dqn",))
     made = {"encoder": "a@0123456789ab", "codes": "c@ba9876543210", "code": (("dqn", "1"),), "settings_digest": "one"}
     players = []
     for changes in ({}, made, {"agents": ("dqn", "oracle"), "few_seeds": (("oracle", 0),), "seeds": (0, 1)}):
         there = dataclasses.replace(plain, **changes)
-        monkeypatch.setattr(player, "read_control", lambda folder, there=there: there)
+        write_json(tmp_path / "protocol.json", there.as_dict())
         players.append(protocol_of_player(None, "person", "anna", like=tmp_path))
     assert players[0] == players[1] == players[2]
 

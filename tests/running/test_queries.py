@@ -102,32 +102,22 @@ def test_no_more_queries_than_allowed_and_no_macrostate(tmp_path: Path) -> None:
 # --- feedback ----------------------------------------------------------------------------------------------------
 
 
-def test_feedback_is_reward_for_optimal_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_feedback_is_reward_for_optimal_actions(tmp_path: Path) -> None:
     """By counting plans: an action is optimal where it leads to a goal by as few actions as any."""
-    lived, real = [], runner.play
-
-    def watching(env: Any, agent: Any, **options: Any) -> Any:
-        state = None
-
-        def before_acting(observation: Any, info: Any) -> None:
-            nonlocal state
-            state = tuple(info["macrostate"].tolist())
-            options["before_acting"](observation, info)
-
-        for transition, info in real(env, agent, **{**options, "before_acting": before_acting}):
-            lived.append((state, transition.reward, transition.terminated, info))
-            yield transition, info
-
-    monkeypatch.setattr(runner, "play", watching)
-    do(tmp_path / "run", feedback=3.0, budgets=(30,))
+    played = do(tmp_path / "run", feedback=3.0, budgets=(30,)).training
     (pupil,) = Pupil.made
+    shown = iter(pupil.shown)
     rules, right = registry.task("arrow_puzzle").rules, []
-    for (state, reward, terminated, info), (_, seen) in zip(lived, pupil.shown, strict=True):
-        success, after = bool(info["is_success"]), tuple(info["macrostate"].tolist())
-        steps = 1 if success else 999 if terminated else 1 + fewest_actions(rules, after)
-        right.append(steps == fewest_actions(rules, state))
-        assert seen.reward == reward + (3.0 if right[-1] else -3.0) and seen.observation.macrostate is None
-    assert 5 < sum(right) < len(right) - 5
+    for episode, start in enumerate(played.starts.tolist()):
+        state = tuple(start)
+        for action in played.actions_of(episode):
+            ((outcome,), (number, seen)) = rules.outcomes(state, action), next(shown)
+            goes_on = 1 + fewest_actions(rules, outcome.macrostate) if not outcome.terminated else 999
+            right.append((1 if outcome.success else goes_on) == fewest_actions(rules, state))
+            assert (number, seen.action, seen.observation.macrostate) == (episode, action, None)
+            assert seen.reward == outcome.reward + (3.0 if right[-1] else -3.0)
+            state = outcome.macrostate
+    assert next(shown, None) is None and 5 < sum(right) < len(right) - 5
 
 
 def test_a_noisy_teacher_errs_as_often_as_said() -> None:

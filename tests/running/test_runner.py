@@ -194,10 +194,10 @@ class Elsewhere(bench_fakes.TableAgent):
 
 
 def test_a_loop_of_its_own_has_all_agents_starts_and_own_cpu_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own_names: None
 ) -> None:
     made = AgentEntry(make=f"{__name__}:Elsewhere", needs_encoder=False, external_training_loop=True)
-    monkeypatch.setitem(registry.AGENTS, "elsewhere", made)
+    registry.AGENTS["elsewhere"] = made
     of: dict[str, Any] = {"task": "arrows:horizon=7", "budgets": (2, 5), "evaluation_episodes": 2, "seeds": (3,)}
     usual = do(tmp_path / "usual", "table", 3, **of)
     monkeypatch.setattr(time, "process_time", lambda: Elsewhere.clock_s)
@@ -216,14 +216,19 @@ def test_an_agent_that_does_not_learn_is_tested_once(tmp_path: Path) -> None:
     assert (first.env_steps, first.success_rate, first.mean_length > 1) == (0, 1.0, True)
 
 
-def test_divergence_leaves_its_state_for_inspection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def diverge(agent: bench_fakes.TableAgent, transition: Transition, *, episode: int) -> None:
+class Diverging(bench_fakes.TableAgent):
+    """Diverges in its third episode."""
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
         if episode == 2:
             raise DivergedError("The loss is NaN.")
 
-    monkeypatch.setattr(bench_fakes.TableAgent, "observe", diverge)
+
+@pytest.mark.usefixtures("own_names")
+def test_divergence_leaves_its_state_for_inspection(tmp_path: Path) -> None:
+    registry.AGENTS["diverging"] = AgentEntry(make=f"{__name__}:Diverging", needs_encoder=False)
     with pytest.raises(DivergedError, match=r"The loss is NaN\. The agent's state lies in .*diverged"):
-        do(tmp_path / "run")
+        do(tmp_path / "run", "diverging", agents=("diverging",))
     saved = load_newest(tmp_path / "run" / "diverged")
     assert saved is not None and saved.episode == 2
 

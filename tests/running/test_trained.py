@@ -53,9 +53,9 @@ def test_a_real_agent_is_taken_up_as_its_run_left_it(tmp_path: Path) -> None:
         run(other, tmp_path / "another node", lambda progress: None)
 
 
-def test_learners_are_those_that_learned_and_can_be_taken_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    entry = registry.AGENTS["table"]
-    monkeypatch.setitem(registry.AGENTS, "of_a_library", dataclasses.replace(entry, external_training_loop=True))
+@pytest.mark.usefixtures("own_names")
+def test_learners_are_those_that_learned_and_can_be_taken_up(tmp_path: Path) -> None:
+    registry.AGENTS["of_a_library"] = dataclasses.replace(registry.AGENTS["table"], external_training_loop=True)
     wanted = small(agents=("table", "imaginer", "of_a_library", "random"))
     store = BenchStore(tmp_path, wanted)
     write_json(tmp_path / "protocol.json", wanted.as_dict())
@@ -66,12 +66,22 @@ def test_learners_are_those_that_learned_and_can_be_taken_up(tmp_path: Path, mon
     assert learners(tmp_path) == (store.run_folder("table", 0),), "imaginer is still at the tasks before"
 
 
-def test_training_in_the_model_comes_before_an_analysis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    do(tmp_path, budgets=(2,), evaluation_episodes=1)
-    left = [True, True, False]
-    monkeypatch.setattr(TableAgent, "train_in_model", lambda agent: left.pop(0), raising=False)
-    load_trained(tmp_path)
-    assert left == []
+class ModelOnly(TableAgent):
+    """Trains in its model in three parts, anew each time that it is made."""
+
+    trained: list[ModelOnly] = []  # noqa: RUF012 - how a test finds them
+
+    def train_in_model(self) -> bool:
+        self.trained.append(self)
+        return self.trained.count(self) < 3
+
+
+@pytest.mark.usefixtures("own_names")
+def test_training_in_the_model_comes_before_an_analysis(tmp_path: Path) -> None:
+    registry.AGENTS["model_only"] = dataclasses.replace(registry.AGENTS["table"], make=f"{__name__}:ModelOnly")
+    do(tmp_path, "model_only", agents=("model_only",), budgets=(2,), evaluation_episodes=1)
+    loaded = load_trained(tmp_path).agent
+    assert ModelOnly.trained[3:] == [loaded] * 3
 
 
 def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> None:

@@ -33,11 +33,11 @@ SEVERAL = {**WORLDS, "toy_regression": 0, "robot_ik": 0}
 
 
 @pytest.fixture(autouse=True)
-def _ours_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def _ours_alone(own_names: None) -> None:
     """Agents that other tests have registered in this process are not listed."""
     for entries in (registry.AGENTS, registry.WORLD_MODELS):
         for name in [name for name, entry in entries.items() if not entry.make.startswith("imagine_bench")]:
-            monkeypatch.delitem(entries, name)
+            del entries[name]
 
 
 def test_list(expected: Expected, capsys: pytest.CaptureFixture[str]) -> None:
