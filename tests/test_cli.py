@@ -39,8 +39,8 @@ DRAWING = {"MUJOCO_GL", "LP_NUM_THREADS", "PYOPENGL_PLATFORM", "SDL_FRAMEBUFFER_
 """Variables that MuJoCo, PyOpenGL, Mesa and SDL read as long as the process draws (docs/reference/api.md)."""
 
 
-def bench_words(out: Path, *more: str) -> list[str]:
-    words = "bench --task arrow_puzzle --preset smoke --execution kinematic --out"
+def bench_words(out: Path, *more: str, preset: str = "smoke") -> list[str]:
+    words = f"bench --task arrow_puzzle --preset {preset} --execution kinematic --out"
     return [*words.split(), str(out), *more]
 
 
@@ -130,10 +130,10 @@ def test_a_failing_seed_fails_the_command_and_names_its_log(
 
 
 def test_a_bench_ends_with_a_table_a_report_and_recordings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], inline: Inline
 ) -> None:
-    monkeypatch.setitem(PRESETS["smoke"], "recorded_seeds", 1)
-    words = bench_words(tmp_path, *"--agents random oracle --seeds 0 1 --evaluation-episodes 10".split())
+    few = "--agents random oracle --seeds 0 1 --budgets 10 20 --evaluation-episodes 10"
+    words = bench_words(tmp_path, *few.split(), preset="quick")
     assert main(words) == 0
     said = capsys.readouterr().out
     folder = newest_bench(tmp_path)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from forger import FORGERIES, IN_TRAINING, forged, mend, rewrite_protocol, share_weights
 from forging import OpenRun, oracle
+from guest_packages import Guests
 from kinds import take_row
 from small_runs import Inline, small, written
 
@@ -20,7 +21,6 @@ from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, SetupError, UnknownNameError
 from imagine_bench.judge.verify import Replays, has_own_failures, verdicts
 from imagine_bench.protocols.control import protocol
-from imagine_bench.registry import AgentEntry
 from imagine_bench.report import bench_page
 from imagine_bench.report.page import texts
 from imagine_bench.running.bench import bench, load_bench
@@ -92,18 +92,15 @@ NAMED = {
 }
 
 
-@pytest.mark.parametrize("error", [UnknownNameError("agent", "table", ()), SetupError("Its package is not installed.")])
+@pytest.mark.usefixtures("own_names")
+@pytest.mark.parametrize("offered", [{}, {registry.AGENT_GROUP: {"table": "their_module:gone"}}])
 def test_a_bench_of_agents_that_are_not_installed_here_is_not_blamed(
-    finished: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+    finished: Path, guests: Guests, offered: dict[str, dict[str, str]]
 ) -> None:
-    entry = registry.agent_entry
-
-    def absent(agent: str) -> AgentEntry:
-        if agent == "table":
-            raise error
-        return entry(agent)
-
-    monkeypatch.setattr(registry, "agent_entry", absent)
+    guests.write("their_module", "", offered)
+    del registry.AGENTS["table"]
+    with pytest.raises(SetupError if offered else UnknownNameError):
+        registry.agent_entry("table")
     first, *others, last = verify(finished)
     assert str(first).startswith("table seed 0: holds") and [each.complaint for each in others] == ["", ""]
     assert str(last) == "report: not compared; not shown: its words, for no package here offers table"

@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -191,22 +192,29 @@ def test_the_row_of_most_episodes_of_the_first_seed_is_converted() -> None:
     assert rows.converted(card, [{}, log, {}]) is None
 
 
-def _moved(
-    monkeypatch: pytest.MonkeyPatch, tests: int, name: str = "expert-motion-arrow_puzzle", **change: Any
-) -> tuple[MotionRow, dict[str, Any]]:
-    """A row of the board with its first tests alone and a change of its protocol or motions; and it for the page."""
+Moved = Callable[..., tuple[MotionRow, dict[str, Any]]]
+
+
+@pytest.fixture
+def moved(made: None, monkeypatch: pytest.MonkeyPatch) -> Moved:
+    """Gives a row of the board with its first tests alone and a change of its protocol or motions; and it for the
+    page.
+    """
     import rows
 
-    kept = read_motions(rows.BOARD / name)
-    task = change.pop("task", kept.protocol.task)
-    row = dataclasses.replace(
-        kept,
-        protocol=dataclasses.replace(kept.protocol, task=task, tests=tests),
-        motions=tuple(dataclasses.replace(each, **change) for each in kept.motions[:tests]),
-    )
-    monkeypatch.setattr(rows.motion_rows, "read_motions", lambda _: row)
-    monkeypatch.setattr(rows.motions, "check_motions", lambda *_: row)
-    return row, json.loads(json.dumps(rows.moved(rows.BOARD)))
+    def changed(tests: int, name: str = "expert-motion-arrow_puzzle", **change: Any) -> tuple[MotionRow, Any]:
+        kept = read_motions(rows.BOARD / name)
+        task = change.pop("task", kept.protocol.task)
+        row = dataclasses.replace(
+            kept,
+            protocol=dataclasses.replace(kept.protocol, task=task, tests=tests),
+            motions=tuple(dataclasses.replace(each, **change) for each in kept.motions[:tests]),
+        )
+        monkeypatch.setattr(rows.motion_rows, "read_motions", lambda _: row)
+        monkeypatch.setattr(rows.motions, "check_motions", lambda *_: row)
+        return row, json.loads(json.dumps(rows.moved(rows.BOARD)))
+
+    return changed
 
 
 @needs_node
@@ -219,12 +227,11 @@ def _moved(
         ("random-motion-pick_place", 0, 2),
     ],
 )
-@pytest.mark.usefixtures("made")
 def test_actions_of_continuous_control_are_the_events_of_the_replay(
-    monkeypatch: pytest.MonkeyPatch, name: str, solved: int, faults: int
+    moved: Moved, name: str, solved: int, faults: int
 ) -> None:
     """Each command is one step of the environment here, and infos are read; the page's script reads events."""
-    row, found = _moved(monkeypatch, 4, name)
+    row, found = moved(4, name)
     agent, _, task = name.split("-")
     assert found["title"].startswith(f"{agent}, continuous control in {task}, each event as a planned movement: ")
     assert found["world"] == task
@@ -251,10 +258,9 @@ def test_actions_of_continuous_control_are_the_events_of_the_replay(
 
 
 @needs_node
-@pytest.mark.usefixtures("made")
-def test_a_test_is_solved_only_if_it_is_reproducible(monkeypatch: pytest.MonkeyPatch) -> None:
-    (_, whole), (_, cut) = _moved(monkeypatch, 1), _moved(monkeypatch, 1, task="arrows:horizon=1")
-    _, row = _moved(monkeypatch, 1, reproducible=False)
+def test_a_test_is_solved_only_if_it_is_reproducible(moved: Moved) -> None:
+    (_, whole), (_, cut) = moved(1), moved(1, task="arrows:horizon=1")
+    _, row = moved(1, reproducible=False)
     ((long,), (short,), (episode,)) = (each["episodes"] for each in (whole, cut, row))
     assert len(long["actions"]) > 1 and long["success"]
     assert (short["actions"], short["states"], short["success"]) == (long["actions"][:1], long["states"][:1], False)

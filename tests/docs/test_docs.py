@@ -87,11 +87,10 @@ def test_commands_could_be_carried_out(page: Path) -> None:
             command.planned()
 
 
-@pytest.mark.usefixtures("without_shadows")
+@pytest.mark.usefixtures("own_names", "without_shadows")
 @pytest.mark.parametrize(("page", "code"), [block for block in BLOCKS if block not in SCRIPTS], ids=name)
 def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
     if "import lerobot" in code or "from lerobot" in code:
         pytest.importorskip("lerobot", reason="LeRobot is large, and no dependency of the tests")
     variables: dict[str, object] = {}
@@ -110,8 +109,8 @@ def script() -> str:
     return code
 
 
-def test_the_ten_lines_define_an_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
+@pytest.mark.usefixtures("own_names")
+def test_the_ten_lines_define_an_agent(tmp_path: Path) -> None:
     variables: dict[str, Any] = {}
     exec(script().partition("result =")[0], variables)
     imagine_bench.register_agent("mine", variables["MyAgent"])
@@ -124,10 +123,9 @@ def cells() -> list[dict[str, Any]]:
     return [cell for cell in found if cell["cell_type"] == "code"]
 
 
-@pytest.mark.usefixtures("without_shadows")
+@pytest.mark.usefixtures("own_names", "without_shadows")
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "AGENTS", dict(registry.AGENTS))
     matplotlib.use("agg")
     short = 'agents=["random", MyAgent], launcher="this_process", ' + SHORT
     code = "\n".join("".join(cell["source"]) for cell in cells()[1:])

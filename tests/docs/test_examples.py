@@ -36,14 +36,10 @@ EXAMPLES = ROOT / "docs" / "examples"
 
 
 @pytest.fixture
-def example(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+def example(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, own_names: None) -> Iterator[ModuleType]:
     monkeypatch.syspath_prepend(EXAMPLES)
-    tables = [(table, dict(table)) for table in (registry.TASKS, registry.AGENTS, registry.WORLD_MODELS)]
     monkeypatch.delitem(sys.modules, request.param, raising=False)
     yield importlib.import_module(request.param)
-    for table, before in tables:
-        table.clear()
-        table.update(before)  # type: ignore[arg-type]
     gymnasium.registry.pop("own/Corridor-v0", None)
 
 

@@ -246,10 +246,11 @@ def test_a_loaded_judgement_marks_privileged_models(said: Said) -> None:
         assert "frame (privileged)" not in text
 
 
-def test_a_cell_says_whether_its_model_was_privileged(said: Said, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("own_names")
+def test_a_cell_says_whether_its_model_was_privileged(said: Said) -> None:
     entry = registry.world_model_entry("cheat")
     assert _cells(said, "cheat")
-    monkeypatch.setitem(registry.WORLD_MODELS, "cheat", dataclasses.replace(entry, privileged=False))
+    registry.WORLD_MODELS["cheat"] = dataclasses.replace(entry, privileged=False)
     with pytest.raises(ArtefactError, match="cheat was privileged when it was judged"):
         _cells(said, "cheat")
 

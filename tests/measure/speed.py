@@ -256,9 +256,9 @@ def _ratio(what: str, ours: float, plain: float, sign: str, target: float, unit:
     return figure_of(what, ours / plain, ".2f", sign, target, f" ({ours:.3g} against {plain:.3g} {unit})")
 
 
-def main() -> int:
-    """Measure, print a Markdown table line by line, keep the figures; 1 if a target is missed."""
-    require_writable(OUT.parent)
+def main(out: Path = OUT) -> int:
+    """Measure, print a Markdown table line by line, keep the figures in ``out``; 1 if a target is missed."""
+    require_writable(out.parent)
     gl_renderer()  # fails here, in one sentence, rather than in a child
     facts = describe_environment()
     print(f"{facts['machine']['cpu']}, {facts['machine']['cores']} cores, {facts['gl_renderer']}\n\n{HEAD}")
@@ -266,7 +266,7 @@ def main() -> int:
     for figure in measure():
         figures.append(figure)
         print(figure.row, flush=True)
-    write_json(OUT, {"environment": facts, "figures": [asdict(figure) for figure in figures]})
+    write_json(out, {"environment": facts, "figures": [asdict(figure) for figure in figures]})
     return int(not all(figure.met for figure in figures))
 
 

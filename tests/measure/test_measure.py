@@ -159,10 +159,10 @@ def test_a_control_step_costs_little_more_than_mujoco_alone(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_every_ratio_is_measured_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(speed, "OUT", tmp_path / "deep" / "speed.json")
-    failed = speed.main()
-    kept = json.loads(speed.OUT.read_text())
+def test_every_ratio_is_measured_and_kept(tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "speed.json"
+    failed = speed.main(out)
+    kept = json.loads(out.read_text())
     assert kept["environment"]["versions"]["mujoco"]
     assert failed == (not all(figure["met"] for figure in kept["figures"]))
     assert sum("gain of 16 lanes" in figure["what"] for figure in kept["figures"]) == 4

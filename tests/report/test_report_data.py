@@ -7,11 +7,11 @@ import json
 import math
 from collections import Counter
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
 from fake_results import WIDE, bench_result, rewritten
+from guest_packages import Guests
 
 from imagine_bench import reference, registry, statistics
 from imagine_bench.errors import SetupError, UnknownNameError
@@ -195,9 +195,11 @@ def test_an_agent_whose_tests_are_not_known_leaves_nothing_to_pair(result: Bench
     assert not any("alone" in record for record in data.records)
 
 
-@pytest.mark.parametrize("error", [UnknownNameError("task", "theirs", ()), SetupError("It cannot be loaded.")])
-def test_a_task_of_an_absent_package_has_no_facts(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "task", mock.Mock(side_effect=error))
+@pytest.mark.parametrize("offered", [{}, {registry.TASK_GROUP: {"their_task": "their_module:gone"}}])
+def test_a_task_of_an_absent_package_has_no_facts(offered: dict[str, dict[str, str]], guests: Guests) -> None:
+    guests.write("their_module", "", offered)
+    with pytest.raises(SetupError if offered else UnknownNameError):
+        registry.task("their_task")
     found = known_task("their_task")
     assert (found.id, found.title, found.horizon) == ("their_task", "their task", 0)
     assert math.isnan(found.facts().chance_level)

@@ -14,7 +14,7 @@ from imagine_bench.tasks.arrows.rules import ArrowRules
 from imagine_bench.tasks.macro_env import MacroEnv
 
 from imagine_bench import registry
-from imagine_bench.interfaces import AgentState
+from imagine_bench.interfaces import AgentContext, AgentState
 from imagine_bench.testing.contract import Checks, checks, report
 
 
@@ -98,8 +98,14 @@ class _Moody(FakeAgent):
         self.asked = int(state.arrays["asked"]) // 2
 
 
-def test_wrong_agents_are_found(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(registry, "make_agent", lambda name, context: _Moody())
+def _moody(context: AgentContext) -> _Moody:
+    """A factory, as a registry line names it."""
+    return _Moody()
+
+
+@pytest.mark.usefixtures("own_names")
+def test_wrong_agents_are_found(capsys: pytest.CaptureFixture[str]) -> None:
+    registry.AGENTS["dqn"] = dataclasses.replace(registry.AGENTS["dqn"], make=f"{__name__}:_moody")
     assert report(_without_options("dqn")) == 3
     moody, forgetful, blind = _failed(capsys)
     assert "learned otherwise" in blind

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -83,15 +82,10 @@ class _Drawn(_Wrong):
         (_Drawn, "the same episodes", "two models with equal episodes and generators differ"),
     ],
 )
-def test_wrong_models_are_found(
-    monkeypatch: pytest.MonkeyPatch, made: Callable[[Any], Any], holds: str, words: str
-) -> None:
-    others = registry.made  # the episodes are played by an agent
-
-    def make(what: str, *given: Any) -> Any:
-        return made(given[-1]) if what == "World model copy" else others(what, *given)
-
-    monkeypatch.setattr(registry, "made", make)
+@pytest.mark.usefixtures("own_names")
+def test_wrong_models_are_found(made: type, holds: str, words: str) -> None:
+    copy = registry.WORLD_MODELS["copy"]
+    registry.WORLD_MODELS["copy"] = dataclasses.replace(copy, make=f"{__name__}:{made.__name__}")
     found = checks(task="arrow_puzzle_easy", model="copy")
     for what, check in found.items():
         if what.startswith(holds):

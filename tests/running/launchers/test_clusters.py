@@ -174,10 +174,10 @@ def test_an_address_without_a_cluster_says_so(tmp_path: Path, monkeypatch: pytes
     assert list(tmp_path.iterdir()) == []
 
 
-def test_paths_of_a_job_mean_the_same_on_every_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_paths_of_a_job_mean_the_same_on_every_node() -> None:
+    here = Path.cwd()
     wanted = protocol("arrow_puzzle", "smoke", agents=("dqn",))
     spec = RunSpec(protocol=wanted, agent="dqn", seed=0, encoder=Path("e.safetensors"), dataset=Path("mixed"))
     job = absolute(Job(spec=spec, folder=Path("runs")))
-    assert (job.spec.encoder, job.spec.dataset) == (tmp_path / "e.safetensors", tmp_path / "mixed")
-    assert job.folder == tmp_path / "runs"
+    assert (job.spec.encoder, job.spec.dataset) == (here / "e.safetensors", here / "mixed")
+    assert job.folder == here / "runs"
