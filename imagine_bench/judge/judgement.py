@@ -98,6 +98,7 @@ class Judgement:
             raise InvalidValueError(f"samples is {self.samples}; give 1 to 1,000.")
         for name in self.models:
             model_entry(name)
+        object.__setattr__(self, "task", registry.task_name(self.task))  # a file of options may change
         object.__setattr__(self, "appearance", appearance_name(self.appearance))
         if registry.task(self.task).sight is not None:
             raise InvalidValueError(

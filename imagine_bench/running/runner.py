@@ -140,13 +140,13 @@ def _row(run: Run, budget: int, observers: Sequence[RunObserver]) -> Checkpoint:
 
 
 def transfer(run: Run) -> None:
-    """Train on the tasks that come before; after the last episode of each, the agent takes its model to the next.
+    """Train on the tasks that come before; after the last episode of each, a learner takes its model to the next.
 
     In a run of unannounced changes it is told nothing, and its episodes are counted on.
     """
     counters = run.counters
     each = run.protocol.after_episodes
-    untold = run.protocol.unannounced
+    untold = run.protocol.unannounced and run.entry.learns
     for index, task in enumerate(run.protocol.after):
         carries = isinstance(run.agent, TransferLearner)
         if counters.before >= (index + 1) * each or not (carries or untold):

@@ -120,7 +120,7 @@ def check_physics(
     levels = [appearance_name(each) for each in appearances]
     require_writable(out.parent)
     gl_renderer()  # fails here, in one sentence, rather than in a macro-action
-    kept: dict[str, Json] = {"task": task, "seed": 0}
+    kept: dict[str, Json] = {"task": spec.id, "seed": 0}
     figures = []
     if turns:
         print(HEAD)

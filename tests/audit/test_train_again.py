@@ -171,6 +171,7 @@ def commanded(seeds: str) -> Forge:
         (commanded("=0-1"), 0, "Holds."),
         (commanded(" 0 1 2"), 1, "Does not hold. 1 of 3 verdicts"),
         (commanded("=0-2"), 1, "Does not hold. 1 of 3 verdicts"),
+        (commanded(" 4 5 --until-decided"), 0, "Holds."),  # of a later stage
         (share_weights, 1, "Does not hold. 1 of 2 verdicts are complaints."),
         (in_runs(lambda run: run.values.update(before=7)), 1, "Does not hold. 2 of 2"),
         (sessions(lambda found: found["certificate"].update(chance_level=0.5)), 1, "Does not hold. 1 of 3 verdicts"),

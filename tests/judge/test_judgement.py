@@ -483,6 +483,17 @@ def test_judgements_that_cannot_be_compared_lie_apart() -> None:
         assert folder(**more) == folder(), "these are cells of one folder"
 
 
+def test_a_judgement_is_of_the_world_that_a_file_describes_now(tmp_path: Path) -> None:
+    file = tmp_path / "world.json"
+    folders = []
+    for horizon in (3, 4):
+        file.write_text(f'{{"cubes": 1, "horizon": {horizon}}}')
+        judgement = Judgement(task=f"arrows:@{file}", models=("copy",))
+        assert judgement.task == f"arrows:cubes=1,horizon={horizon}"
+        folders.append(judgement.folder_name)
+    assert len(set(folders)) == 2
+
+
 def test_models_take_the_given_encoder_if_it_is_of_their_kind() -> None:
     costs = [_source(name, "pick_place", encoder=_LATENTS).cost for name in ("gaussian", "structured")]
     assert [cost["encoder"] for cost in costs] == [_LATENTS, "pick_place-clean-codes"]

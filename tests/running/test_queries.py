@@ -177,6 +177,13 @@ def test_an_unannounced_change_stays_hidden(tmp_path: Path) -> None:
     assert result.checkpoints[0].env_steps == result.training_length.sum(), "budgets count the last task alone"
 
 
+def test_an_agent_that_learns_nothing_plays_no_earlier_task(tmp_path: Path) -> None:
+    after = {"after": ("arrow_puzzle_hard",), "after_episodes": 3, "unannounced": True}
+    run = small_runs.do(tmp_path, "random", agents=("random", "pupil"), evaluation_episodes=1, **after)
+    snapshot = load_newest(run.folder / "checkpoints")
+    assert snapshot is not None and snapshot.values["before"] == 0
+
+
 # --- all of it, killed and resumed -------------------------------------------------------------------------------
 
 
