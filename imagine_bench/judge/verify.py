@@ -294,8 +294,9 @@ def _seeds(protocol: Protocol, sessions: Sequence[Mapping[str, str]]) -> list[st
     seeds = protocol.seeds
     for session in sessions:
         said = _SEEDS_OF_COMMAND.search(session["command"])
-        is_stage = "--until-decided" in session["command"]  # a later one has further seeds
-        planned = seeds if said is None or is_stage else tuple(sorted(chain.from_iterable(map(seed_range, said[1].split()))))
+        if "--until-decided" in session["command"]:  # later stages have further seeds
+            said = None
+        planned = seeds if said is None else tuple(sorted(chain.from_iterable(map(seed_range, said[1].split()))))
         require(planned == seeds, f"it has the seeds {brief(seeds)}, and {brief(session['command'])} ran others.")
     task = registry.task(protocol.task)
     preset = {**PRESETS.get(protocol.preset, {}), **task.presets.get(protocol.preset, {})}
