@@ -199,7 +199,7 @@ def test_rewards_follow_what_was_read_where_a_cube_does_not_turn():
     assert (reward, terminated) == (-1.0, False)
 
 
-def test_a_pushed_cube_is_a_fault(monkeypatch):
+def test_a_pushed_cube_is_a_fault():
     env = make().unwrapped
     env.reset(seed=0, options={"macrostate": (3, 1, 2, 0)})
     assert not env.step(0)[4]["fault"]
@@ -210,13 +210,13 @@ def test_a_pushed_cube_is_a_fault(monkeypatch):
         env.data.joint("cube_2_joint").qpos[0] += 0.006
         return result
 
-    monkeypatch.setattr(env.world.executor, "turn", clumsy)
+    env.world.executor.turn = clumsy
     *_, info = env.step(0)
     env.close()
     assert info["fault_reason"] == "cube 2 was pushed 6 mm while cube 0 was turned"
 
 
-def test_a_cube_that_slips_and_is_shoved_along_is_a_fault(monkeypatch):
+def test_a_cube_that_slips_and_is_shoved_along_is_a_fault():
     """It should have stayed, so that it counts among those that must not move."""
     world = ArrowWorld(appearance("clean"), Arrows(cubes=2, forbid="none", slip=0.2))
     world.place((1, 3, 0), np.random.default_rng(0))
@@ -228,7 +228,7 @@ def test_a_cube_that_slips_and_is_shoved_along_is_a_fault(monkeypatch):
             world.data.joint("cube_0_joint").qpos[0] += shove_m
             return result
 
-        monkeypatch.setattr(world.executor, "turn", clumsy)
+        world.executor.turn = clumsy
         fault = world.execute(0, (1, 3, 0)).fault
         assert (fault or "").startswith("cube 0 was pushed 6 mm" if shove_m else "")
         assert bool(fault) == bool(shove_m)

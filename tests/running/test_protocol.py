@@ -83,13 +83,12 @@ def test_a_preset_that_changes_is_another_bench(
     assert asked.settings_digest == after.settings_digest
 
 
-def test_the_caller_overrides_the_task_overrides_the_preset(monkeypatch):
-    own = {"quick": {"seeds": (7, 8), "budgets": (5,)}}
-    spec = dataclasses.replace(task("arrow_puzzle"), config_group="chapter_3", presets=own)
-    monkeypatch.setattr("imagine_bench.protocols.control.task", lambda name: spec)
-    wanted = protocol("arrow_puzzle", "quick", budgets=(6,))
-    assert (wanted.config_group, wanted.seeds, wanted.budgets) == ("chapter_3", (7, 8), (6,))
-    assert protocol("arrow_puzzle", "smoke").seeds == PRESETS["smoke"]["seeds"]
+def test_the_caller_overrides_the_task_overrides_the_preset():
+    own = task("pick_place").presets["quick"]
+    assert own["seeds"] != PRESETS["quick"]["seeds"] and own["budgets"] != (6,)
+    wanted = protocol("pick_place", "quick", budgets=(6,))
+    assert (wanted.config_group, wanted.seeds, wanted.budgets) == ("chapter_3", own["seeds"], (6,))
+    assert protocol("pick_place", "smoke").seeds == PRESETS["smoke"]["seeds"]
 
 
 def test_agents_of_a_file_that_are_no_names_are_refused():

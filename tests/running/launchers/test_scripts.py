@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from bench_fakes import FakeRunSpec
+from guest_packages import Guests
 from small_runs import small
 
 from imagine_bench.errors import SetupError
@@ -81,9 +82,8 @@ def test_main_gets_the_name_that_others_import(
     assert AGENTS["mine"].make == target and AGENTS["table"].make == "bench_fakes:TableAgent"
 
 
-def test_a_module_that_runs_a_command_when_imported_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "unguarded.py").write_text("from imagine_bench.cli import main\nmain(['describe'])\n")
-    monkeypatch.syspath_prepend(tmp_path)
+def test_a_module_that_runs_a_command_when_imported_is_named(guests: Guests) -> None:
+    guests.write("unguarded", "from imagine_bench.cli import main\nmain(['describe'])\n", {})
     with pytest.raises(SetupError, match=r"unguarded runs a command when it is imported.*Write the line 'if __name__"):
         load("unguarded:make")
 

@@ -141,14 +141,14 @@ def test_only_friction_holds_and_a_slip_ends_the_episode(macrostate, action, rea
     assert info["macrostate"][3] == WITHDRAWN
 
 
-def test_an_end_against_the_draw_is_judged_from_its_beginning(monkeypatch):
+def test_an_end_against_the_draw_is_judged_from_its_beginning():
     """The handover should have slipped, and the car came into the palm all the same: a fault, and the wish is
     fulfilled.
     """
     env = gymnasium.make("imagine_bench/PickPlace-v0", slip=0.99).unwrapped
     env.reset(seed=0, options={"macrostate": (0, 1, 0, OPEN_PALM)})
     executor = env.world.executor
-    monkeypatch.setattr(executor, "visit", lambda **_: executor.hand_over(index=1, palm_m=np.array(PALM_M)))
+    executor.visit = lambda **_: executor.hand_over(index=1, palm_m=np.array(PALM_M))
     _, reward, terminated, _, info = env.step(HAND_OVER)
     env.close()
     assert info["macrostate"].tolist() == [0, 2, 0, OPEN_PALM] and info["fault"]
