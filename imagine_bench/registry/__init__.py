@@ -27,7 +27,7 @@ from imagine_bench.registry.entries import (
 )
 from imagine_bench.registry.environments import motion_id, motion_name, register_env, vector_id
 from imagine_bench.registry.loading import guests_faults, load, refuse_while_loading
-from imagine_bench.registry.packages import (
+from imagine_bench.registry.plugins import (
     AGENT_GROUP,
     ENCODER_GROUP,
     MOTION,
@@ -38,12 +38,17 @@ from imagine_bench.registry.packages import (
     WORLD_MODEL_GROUP,
     absent_guests,
     command,
+    describe_group,
     guest_packages,
     guest_with,
+    installed_of,
     is_ours,
+    offered,
+    offers,
+    refused_offers,
     require_guest,
+    usable,
 )
-from imagine_bench.registry.plugins import describe_group, installed_of, offered, offers, refused_offers, usable
 from imagine_bench.values import Setting
 
 __all__ = [

@@ -1,4 +1,7 @@
-"""The objects that installed packages offer by entry points, and the reasons why some of them cannot be used."""
+"""Installed packages: the objects that they offer by entry points, and why some of these cannot be used.
+
+Nothing of a package is imported before one of its objects is asked for.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,17 @@ from typing import Any, NamedTuple
 
 from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known, unprintable
 from imagine_bench.interfaces.regression import RegressionSpec
-from imagine_bench.registry.builtin import AGENTS, PLAYERS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
+from imagine_bench.registry.builtin import (
+    AGENTS,
+    PLAYERS,
+    REGRESSIONS,
+    REGRESSORS,
+    TASKS,
+    WORLD_MODELS,
+    Guest,
+    guests,
+)
+from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import (
     LABEL_OF_OLD_AGENT,
     AgentEntry,
@@ -20,15 +33,20 @@ from imagine_bench.registry.entries import (
     parse_configuration,
 )
 from imagine_bench.registry.loading import fault, load
-from imagine_bench.registry.packages import (
-    AGENT_GROUP,
-    ENCODER_GROUP,
-    REGRESSION_GROUP,
-    REGRESSOR_GROUP,
-    TASK_GROUP,
-    WORLD_MODEL_GROUP,
-    guest_with,
-)
+
+MOTION = "imagine-bench-motion"
+"""The plug-in of continuous control."""
+TASK_GROUP = "imagine_bench.tasks"
+AGENT_GROUP = "imagine_bench.agents"
+ENCODER_GROUP = "imagine_bench.encoders"
+REGRESSION_GROUP = "imagine_bench.regressions"
+REGRESSOR_GROUP = "imagine_bench.regressors"
+COMMAND_GROUP = "imagine_bench.commands"
+STUDY_GROUP = "imagine_bench.studies"
+WORLD_MODEL_GROUP = "imagine_bench.world_models"
+"""Entry points in which installed packages make their offers: each the ``"module:attr"`` of a TaskEntry, AgentEntry,
+EncoderEntry, RegressionSpec, RegressorEntry, Study or WorldModelEntry; of a plug-in of this suite, the function that
+carries out a command."""
 
 
 class _Group(NamedTuple):
@@ -134,3 +152,55 @@ def installed_of(names: Sequence[str], group: str = AGENT_GROUP) -> tuple[tuple[
     installs = "; ".join(dict.fromkeys(guest.install for guest in absent.values()))
     note = f"Left out, as not installed: {', '.join(absent)}. To install: {installs}" if absent else ""
     return tuple(name for name in names if name not in absent), note
+
+
+def guest_with(group: str, name: str) -> Guest | None:
+    """The guest of this suite that offers a name in a group, installed or not; None where none does."""
+    return next((guest for guest in guests() if name in guest.names.get(group, ())), None)
+
+
+def is_ours(target: str | CodeByValue) -> bool:
+    """Whether code is this suite's: the core's, or that of a guest of its own that needs no library of others."""
+    top = str(target).partition(":")[0].partition(".")[0]
+    return top in {"imagine_bench", *(guest.module for guest in guests() if guest.is_ours_alone)}
+
+
+def absent_guests() -> list[Guest]:
+    """The guests of this suite that are not installed here."""
+    installed = guest_packages()
+    return [guest for guest in guests() if guest.package not in installed]
+
+
+def require_guest(package: str, doing: str) -> None:
+    """Raise SetupError, with the line that installs it, where a plug-in of this suite is missing that does something.
+
+    Args:
+        package: The plug-in, as pip knows it.
+        doing: The work that needs it, as the beginning of a sentence.
+    """
+    for guest in absent_guests():
+        if guest.package == package:
+            raise SetupError(
+                f"{doing} needs the package {package}, which is not installed. Install it with: {guest.install}"
+            )
+
+
+def command(name: str) -> str:
+    """The place of the function that carries out a command of a plug-in, as :func:`.loading.load` takes it.
+
+    Raises SetupError, with the line that installs it, where the plug-in is missing.
+    """
+    (guest,) = (each for each in guests() if name in each.names.get(COMMAND_GROUP, {}))
+    require_guest(guest.package, f"'imagine-bench {name}'")
+    return guest.names[COMMAND_GROUP][name]
+
+
+def guest_packages() -> dict[str, set[str]]:
+    """The installed packages that offer anything, by name, and where their entries lie: names of top modules."""
+    found: dict[str, set[str]] = {}
+    everything = entry_points()
+    for group in (each for each in everything.groups if each.startswith("imagine_bench.")):
+        for point in everything.select(group=group):
+            if point.dist:
+                found.setdefault(point.dist.name, set()).add(point.module.partition(".")[0])
+    return dict(sorted(found.items()))

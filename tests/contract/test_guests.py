@@ -93,8 +93,7 @@ def without_guests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     def others(**chosen: str) -> EntryPoints:
         return EntryPoints(there).select(**chosen)
 
-    for module in ("packages", "plugins"):
-        monkeypatch.setattr(f"imagine_bench.registry.{module}.entry_points", others)
+    monkeypatch.setattr("imagine_bench.registry.plugins.entry_points", others)
     registry.offers.cache_clear()
     yield
     registry.offers.cache_clear()
