@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agent_states import same
+from agent_states import count_updates, same
 from numpy.typing import NDArray
 from small_runs import final_state, measured, run_observed, small
 from whole_outputs import Expected, rounded
@@ -107,14 +107,21 @@ READINGS: dict[type, Asked] = {
 
 
 @pytest.mark.parametrize("agent", EACH)
-def test_a_learner_that_is_asked_learns_on_as_one_that_is_not(agent: str) -> None:
-    """And equal questions with equal generators have equal answers, of each frame by itself."""
+def test_a_learner_that_is_asked_learns_on_as_one_that_is_not(agent: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And equal questions with equal generators have equal answers, of each frame by itself.
+
+    It says as many gradient updates and real transitions as there were.
+    """
     one = checked_agent(agent, "arrow_puzzle")
     drawing = registry.own_settings(agent, {"model.dropout": 0.3})  # so that its answers are random
     one = one._replace(context=dataclasses.replace(one.context, overrides={**one.context.overrides, **drawing}))
     asked, alone = one.make(), one.make()
-    for each in (asked, alone):
-        one.train(each, range(2))
+    one.train(asked, range(2))
+    updates = count_updates(monkeypatch)
+    said = {"real_transitions": len(one.train(alone, range(2)))}
+    said["gradient_updates"] = len(updates) / (3 if agent.startswith("dreamer") else 1)  # world model, actor, critic
+    assert said.items() <= alone.diagnostics().items()
+    asked.diagnostics()
     states = np.array(one.spec.rules.start_states[::20])
     frames = one.spec.render_macrostates(states, "clean", np.random.default_rng(0))
     shown = states if one.entry.privileged else [None] * len(states)

@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import pytest
+import torch
+from imagine_bench.agents.networks.adam import Adam
+
 from imagine_bench.interfaces import AgentState
 
 
@@ -37,3 +41,16 @@ def goes_on(agent: Any, other: Any, live: Callable[[Any, int, int], object], ste
     assert same(agent.state(), other.state())
     assert not same(agent.state(), saved), "later learning changed no snapshot"
     return saved
+
+
+def count_updates(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """From now on the optimiser of every gradient update, ours or torch's, is added."""
+    updates: list[object] = []
+
+    def counted(step: Callable[..., object]) -> Callable[..., object]:
+        return lambda optimiser, *args, **named: (updates.append(optimiser), step(optimiser, *args, **named))[1]
+
+    for kind in (Adam, torch.optim.Adam, torch.optim.AdamW):
+        if "step" in vars(kind):
+            monkeypatch.setattr(kind, "step", counted(kind.step))
+    return updates

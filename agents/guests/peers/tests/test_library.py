@@ -12,6 +12,7 @@ from unittest import mock
 import gymnasium
 import numpy as np
 import pytest
+from agent_states import count_updates
 from small_runs import measured, run_observed, small
 
 import imagine_bench  # noqa: F401 - registers the environments
@@ -32,7 +33,7 @@ pytest.importorskip("sb3_contrib")
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
 LATENTS = "sb3_dqn_latents"
 FEW: dict[str, Any] = {
-    "sb3.learning_starts": 10, "sb3.batch_size": 8, "sb3.buffer_size": 500, "ppo.n_steps": 8, "ppo.batch_size": 4,
+    "sb3.learning_starts": 5, "sb3.batch_size": 8, "sb3.buffer_size": 500, "ppo.n_steps": 8, "ppo.batch_size": 4,
     "imagination.start_episode": 3, "mix.imagined_episodes": 2,
 }  # fmt: skip
 IMAGINING = ("sb3_dqn_imagined", "sb3_ppo_imagined")
@@ -61,6 +62,7 @@ def test_its_loop_is_counted_and_tested_and_leaves_no_temporary_files(
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    updates = count_updates(monkeypatch)
     result = do(tmp_path / "run", agent)
     left = [path.name for path in temporary.iterdir() if not path.name.startswith("torchinductor")]  # torch's import
     assert not left
@@ -72,6 +74,8 @@ def test_its_loop_is_counted_and_tested_and_leaves_no_temporary_files(
         assert last.diagnostics["epsilon"] < first.diagnostics["epsilon"] < 1.0
     if agent in ("sb3_ppo_latents", "sb3_ppo_rnd_latents"):  # ten epochs of two batches for each 8 macro-actions
         assert last.diagnostics["gradient_updates"] == 20 * ((last.env_steps - 1) // 8) > 0
+    if "rnd" not in agent:  # whose network of novelty is trained beside it
+        assert last.diagnostics["gradient_updates"] == len(updates) > 0
     if agent in IMAGINING:
         assert [row.diagnostics["real_transitions"] for row in result.checkpoints] == [first.env_steps, last.env_steps]
         assert last.diagnostics["loss/dynamics"] and "imagination/acceptance_rate" in last.diagnostics
