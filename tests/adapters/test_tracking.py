@@ -55,7 +55,7 @@ def test_tensorboard_reads_the_scalars_back(bench, capsys):
 
 
 class Told:
-    """A launcher that says how two runs go in turn, tests one of them after two episodes, and fails the other."""
+    """A launcher that says twice how two runs go in turn, tests one of them after two episodes, and fails the other."""
 
     def __init__(self, look):
         self.look = look
@@ -68,7 +68,8 @@ class Told:
                 if episode == 3 and spec.seed == 0:
                     (job.folder / "metrics.csv").write_text("episodes,test_episodes,successes,solved\n2,20,5,1\n")
                 told = {"agent": spec.agent, "seed": spec.seed, "bench": spec.protocol.hash, "done": episode, "work": 9}
-                on_progress(Progress(**told, phase="training", episode=episode, success=episode / 10))
+                for _ in range(2):
+                    on_progress(Progress(**told, phase="training", episode=episode, success=episode / 10))
                 self.look(job, episode)
         on_progress(Failure(job=jobs[1], reason="it broke").progress)
         return (Failure(job=jobs[1], reason="it broke"),)

@@ -55,6 +55,14 @@ def test_an_uncertainty_that_an_agent_does_not_know_is_not_drawn(data: ReportDat
     assert all(len(panels["reward error"]) == 1 for panels in drawn)
 
 
+@pytest.mark.parametrize("count", [1, 3, 5])
+@pytest.mark.parametrize("columns", [1, 2, 4])
+def test_a_figure_has_as_many_panels_as_there_is_something_to_draw(count: int, columns: int) -> None:
+    figure, panels = figures.small_multiples(count, columns, width=2.0, height=1.0)
+    assert len(panels) == count
+    assert [axes for axes in figure.axes if axes.get_visible()] == panels
+
+
 def test_lines_along_an_axis_are_not_clipped() -> None:
     panels = {"zeros": {"a": {1: 0.0, 2: 0.0}}, "ones": {"a": {1: 1.0, 2: 1.0}, "b": {1: 0.5, 2: 1.0}}}
     figure = figures.lines(panels, {name: figures.line_style(name) for name in "ab"}, "depth")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
@@ -40,12 +41,15 @@ def test_every_family_has_words_and_an_answer_for_each_option(task: str) -> None
 def test_a_person_is_asked_until_the_last_question_or_until_leaving(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = tmp_path / "judge" / "it" / "report"
-    report.mkdir(parents=True)
-    (report.parent / "judgement.json").write_text(json.dumps({"task": EASY, "appearance": "clean"}))
-    rows = ["model,transitions,seed,family,right", "patches,9,0,masked frame,0.1"]
-    rows += [f"patches,30,{seed},masked frame,{right}" for seed, right in enumerate((0.25, 0.75))]
-    (report / "worlds.csv").write_text("\n".join(rows))
+    judged = ((EASY, "clean", "0.5"), (EASY, "clean", "0.75"), (EASY, "mild", "1"), ("arrow_puzzle", "clean", "1"))
+    for made_s, (task, look, right) in enumerate(judged):  # the later ones are of other looks and of another task
+        report = tmp_path / "judge" / str(made_s) / "report"
+        report.mkdir(parents=True)
+        (report.parent / "judgement.json").write_text(json.dumps({"task": task, "appearance": look}))
+        rows = ["model,transitions,seed,family,right", "patches,9,0,masked frame,0.1"]
+        rows += [f"patches,30,{seed},masked frame,{each}" for seed, each in enumerate(("0.25", right))]
+        (report / "worlds.csv").write_text("\n".join(rows))
+        os.utime(report / "worlds.csv", (made_s, made_s))
     said = quiz(EASY, 8, ask=typed("x", "0", "9", "1", "2"), judged=tmp_path / "judge", folder=tmp_path)
     lines = [line.split() for line in said.splitlines()]
     assert ["family", "questions", "you", "chance", "copy", "exact", "patches"] in lines
