@@ -44,6 +44,7 @@ from imagine_bench.registry import task_name as canonical
 from imagine_bench.registry.by_value import CodeByValue
 from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.seeding import SeedTree
+from imagine_bench.values import Setting
 
 _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
@@ -106,9 +107,9 @@ class WorldSection:
         return (self.observation, self.observation_size) == (OBSERVATIONS[0], FRAME_PX)
 
     @property
-    def world(self) -> dict[str, Any]:
+    def world(self) -> dict[str, Setting]:
         """The arguments of this protocol's environments, but for their appearance."""
-        made: dict[str, Any] = {"execution": self.execution}
+        made: dict[str, Setting] = {"execution": self.execution}
         if self.physics:
             made["physics"] = dict(self.physics)
         if not self.shows_frames_alone:

@@ -76,15 +76,14 @@ def plan(task: str, preset: str, **changes: Any) -> tuple[RegressionProtocol, di
     if preset == "smoke":
         values.setdefault("variants", registry.regression(task).variants[:2])
     wanted = RegressionProtocol(task=task, preset=preset, **values)
-    offered: dict[str, Any] = {}
-    for agent in wanted.agents:
-        target = registry.regressor_entry(agent).settings
+    targets = {agent: registry.regressor_entry(agent).settings for agent in wanted.agents}
+    offered = {target: registry.load(target) for target in targets.values() if target}
+    for agent, target in targets.items():
         given = wanted.overrides_of(agent)
         if target:
-            offered[target] = registry.load(target)
+            groups = list(offered[target].groups)
             group = parse_configuration(agent).agent
-            groups = offered[target].groups
-            offered[target].resolve(wanted.hyperparameters, given, group if group in groups else next(iter(groups)))
+            offered[target].resolve(wanted.hyperparameters, given, group if group in groups else groups[0])
         elif given:
             raise InvalidValueError(f"Regressor {agent} names no settings; leave {', '.join(sorted(given))} out.")
     settings = [

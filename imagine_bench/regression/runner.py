@@ -9,7 +9,6 @@ Networks that say how sure they are, are asked on points that they have never se
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -268,17 +267,15 @@ def calibrate(
 
 def coverage(mixtures: Mixtures, outcomes: Floats, level: float) -> Bools:
     """Whether each of the outcomes (..., D) lies inside its central predictive interval of probability ``level``."""
-    scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas  # [..., K, D]
-    below = (mixtures.weights[..., None] * scipy.special.ndtr(scaled)).sum(axis=-2)
+    of_each = scipy.stats.norm.cdf(outcomes[..., None, :], mixtures.means, mixtures.sigmas)  # [..., K, D]
+    below = (mixtures.weights[..., None] * of_each).sum(axis=-2)
     return np.abs(below - 0.5) <= 0.5 * level
 
 
 def log_score(mixtures: Mixtures, outcomes: Floats) -> Floats:
     """Negative log density of the whole outcome, all dimensions together, in nats. Outcomes (..., D), result (...)."""
-    scaled = (outcomes[..., None, :] - mixtures.means) / mixtures.sigmas
-    log_normal = (-0.5 * (scaled**2 + math.log(2.0 * math.pi)) - np.log(mixtures.sigmas)).sum(axis=-1)  # [..., K]
-    with np.errstate(divide="ignore"):
-        return np.asarray(-scipy.special.logsumexp(np.log(mixtures.weights) + log_normal, axis=-1))
+    of_each = scipy.stats.norm.logpdf(outcomes[..., None, :], mixtures.means, mixtures.sigmas)  # [..., K, D]
+    return np.asarray(-scipy.special.logsumexp(of_each.sum(axis=-1), axis=-1, b=mixtures.weights))
 
 
 REGRESSION = TaskType(
