@@ -36,6 +36,8 @@ _MC_DROPOUT = {"model.members": 1, "model.dropout": 0.25, "imagination.weight_sa
 class LatentModel:
     """Encoder, environment model and decoder as a world model."""
 
+    imagination_kind: type[Imagination] = Imagination
+
     def __init__(self, encoder: Encoder, settings: Settings, context: AgentContext) -> None:
         self.encoder = encoder
         self.settings = settings
@@ -49,7 +51,9 @@ class LatentModel:
         size = self.encoder.latent_size
         seeds = context.seeds
         device = self.encoder.device
-        return Imagination(size, context.n_actions, self.settings, filtered=self.compares, seeds=seeds, device=device)
+        return self.imagination_kind(
+            size, context.n_actions, self.settings, filtered=self.compares, seeds=seeds, device=device
+        )
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """Encode every frame once and make :data:`UPDATES` updates."""

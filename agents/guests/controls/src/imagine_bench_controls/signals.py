@@ -29,7 +29,7 @@ from imagine_bench.agents.encoders.perception import load_perception, prepare_to
 from imagine_bench.agents.imagination import mixture as mdn
 from imagine_bench.agents.imagination.mixture import Mixture
 from imagine_bench.agents.imagination.rollouts import Imagination, ImaginedStep, Weights
-from imagine_bench.agents.imagination.settings import HYPERPARAMETERS
+from imagine_bench.agents.imagination.settings import HYPERPARAMETERS, Settings
 from imagine_bench.agents.world_models.latent import LatentModel
 from torch import Tensor
 
@@ -122,13 +122,7 @@ class Infoprop(LatentModel):
     """The ensemble with Infoprop's uncertainty and stopping rule."""
 
     imagination: InfopropImagination
-
-    def new_imagination(self, context: AgentContext) -> InfopropImagination:
-        """The model that imagines, of which nothing is learned yet."""
-        return InfopropImagination(
-            self.encoder.latent_size, context.n_actions, self.settings,
-            filtered=True, seeds=context.seeds, device=self.encoder.device,
-        )  # fmt: skip
+    imagination_kind = InfopropImagination
 
     def fit(self, dataset: Episodes, rng: np.random.Generator) -> None:
         """As ever; then the limits are taken from the same real transitions."""
@@ -190,15 +184,7 @@ def round_trip(z: Tensor, again: Tensor, before: Tensor) -> Tensor:
 class _Signal(LatentModel):
     """The ensemble with another uncertainty, and no filter."""
 
-    kind: type[SignalImagination]
     imagination: SignalImagination
-
-    def new_imagination(self, context: AgentContext) -> SignalImagination:
-        """The model that imagines, of which nothing is learned yet."""
-        return self.kind(
-            self.encoder.latent_size, context.n_actions, self.settings,
-            filtered=True, seeds=context.seeds, device=self.encoder.device,
-        )  # fmt: skip
 
     def imagine(self, frames: Frame, actions: Ints, samples: int, rng: np.random.Generator) -> Imagined:
         """As ever, without the filter, which reads another uncertainty."""
@@ -209,22 +195,18 @@ class _Signal(LatentModel):
 class RoundTrip(_Signal):
     """The ensemble with the round trip as its uncertainty."""
 
-    kind = RoundTripImagination
+    imagination_kind = RoundTripImagination
+    imagination: RoundTripImagination
 
-    def new_imagination(self, context: AgentContext) -> SignalImagination:
-        """As ever, with the encoder that makes the round trip."""
-        found = RoundTripImagination(
-            self.encoder.latent_size, context.n_actions, self.settings,
-            filtered=True, seeds=context.seeds, device=self.encoder.device,
-        )  # fmt: skip
-        found.encoder = self.encoder
-        return found
+    def __init__(self, encoder: Encoder, settings: Settings, context: AgentContext) -> None:
+        super().__init__(encoder, settings, context)
+        self.imagination.encoder = encoder
 
 
 class Spread(_Signal):
     """The ensemble with the spread over futures as its uncertainty."""
 
-    kind = SpreadImagination
+    imagination_kind = SpreadImagination
 
 
 def _make(context: AgentContext, *, model: type[LatentModel]) -> LatentModel:

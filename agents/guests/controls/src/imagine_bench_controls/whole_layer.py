@@ -45,16 +45,7 @@ class WholeLayerImagination(Imagination):
 class WholeLayerLatentModel(LatentModel):
     """Encoder, such a model and decoder as a world model."""
 
-    def new_imagination(self, context: AgentContext) -> Imagination:
-        """The model that imagines, of which nothing is learned yet."""
-        return WholeLayerImagination(
-            self.encoder.latent_size,
-            context.n_actions,
-            self.settings,
-            filtered=self.compares,
-            seeds=context.seeds,
-            device=self.encoder.device,
-        )
+    imagination_kind = WholeLayerImagination
 
 
 def make(context: AgentContext) -> WholeLayerLatentModel:
