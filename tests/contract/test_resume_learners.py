@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import pickle
@@ -17,6 +18,7 @@ from small_runs import final_state, measured, run_observed, small
 from whole_outputs import Expected, rounded
 
 from imagine_bench import registry
+from imagine_bench.errors import UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation, capabilities
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import run_state
@@ -136,6 +138,14 @@ def test_a_learner_that_is_asked_learns_on_as_one_that_is_not(agent: str, monkey
     assert same(asked.state(), alone.state())
     assert one.train(asked, range(2, 3)) == one.train(alone, range(2, 3))
     assert same(asked.state(), alone.state())
+
+
+@pytest.mark.parametrize("agent", EACH)
+def test_a_device_that_there_is_not_is_refused(agent: str) -> None:
+    one = checked_agent(agent, "arrow_puzzle")
+    without_torch = agent == "elimination" or agent.endswith("_macrostate")
+    with contextlib.nullcontext() if without_torch else pytest.raises(UnknownNameError, match="gpu"):
+        registry.make_agent(agent, dataclasses.replace(one.context, device="gpu"))
 
 
 @pytest.mark.parametrize("agent", EACH)
