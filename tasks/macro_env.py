@@ -35,7 +35,8 @@ _outcomes: OrderedDict[tuple[Hashable, ...], tuple[MacroResult, Floats]] = Order
 class EnvState:
     """A snapshot of an environment: scene, looks, randomness and the episode so far. It can be pickled."""
 
-    kind: tuple[str, str, str, PhysicsSettings]  #: task, execution, appearance and physics: where it may be set
+    #: Where it may be set: task, execution, appearance, physics, and where frames are late, the kind of observation
+    kind: tuple[object, ...]
     world: WorldState
     generator: Mapping[str, Json]  #: state of the generator that everything random is drawn from
     macrostate: State
@@ -140,7 +141,8 @@ class MacroEnv(SceneEnv):
         self._lag = spec.sight.lag if spec.sight else 0
         self._steps = 0
         self._observations: tuple[Observed, ...] = ()
-        self._kind = (spec.id, self.execution, level.name, self.physics)
+        late = (observation, size) if self._lag else ()  # a state holds the observations under way
+        self._kind = (spec.id, self.execution, level.name, self.physics, *late)
         self.action_space = gymnasium.spaces.Discrete(spec.n_actions)
         self._n_actions = spec.n_actions
         self.takes_long = self.execution == "physics"

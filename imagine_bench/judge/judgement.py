@@ -277,7 +277,7 @@ def _judged(
 ) -> tuple[dict[str, Any], Arrays]:
     asked = world.asked
     table = None
-    if judged.visited is not None:  # its data and the cost of its training are its bench's to say
+    if not judged.learns:  # its data and the cost of its training are its bench's to say
         seen = judged.visited
         learned: Costs = {"data": "", "fit_s": math.nan, "parameters": math.nan}
     else:
@@ -305,7 +305,7 @@ def _judged(
     scores = one_step_scores(world.spec, asked["one_step"], answers["one_step"], seen)
     one_step = (asked["one_step"], answers["one_step"])
     ranks, film = policy_scores(world.policies, *one_step, world.spec.rules, table, seeds.child("exploit"))
-    policy = judgement.policy if judged.visited is None else ""
+    policy = judgement.policy if judged.learns else ""
     accepts = acceptance_scores(world.policies, policy, *one_step, seeds.child("conformal"))
     futures = [answers["rollouts"].distribution(0, step) for step in range(questions.DEPTH)]
     cpu_s = sum(each.cpu_s for each in answers.values())

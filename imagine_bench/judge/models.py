@@ -230,7 +230,8 @@ class JudgedModel:
 
     model: WorldModel
     cost: dict[str, str | float]  # spent beforehand: the encoder's name and frames, and how well it is read if badly
-    visited: set[tuple[State, int]] | None  # tried in an agent's training; None for a model that learns here
+    learns: bool  # whether it is fitted here; an agent has learned in its run
+    visited: set[tuple[State, int]] | None  # tried in an agent's training; None where that is not known
     cpu_s: Callable[[], float]  # CPU seconds so far of the process that it is in
 
 
@@ -244,9 +245,10 @@ def opened(source: ModelSource, task: str, *, folder: Path, log: Path) -> Iterat
     Raises:
         ImagineBenchError: It cannot be made.
     """
-    visited = None if source.kept is None else _visited(source.kept.folder)
+    learns = source.kept is None
+    visited = None if source.kept is None else _visited(source.kept)
     if source.privileged:
-        yield JudgedModel(source.model(), source.cost, visited, time.process_time)
+        yield JudgedModel(source.model(), source.cost, learns, visited, time.process_time)
         return
     hidden = [place.parent for place in folder.parent.glob("*/.lock")]
     tasks = find_spec(_TASKS)
@@ -255,7 +257,7 @@ def opened(source: ModelSource, task: str, *, folder: Path, log: Path) -> Iterat
     served = replace(source, make=importable(source.make))
     closed = closed_modules(task, source.make)
     with Isolated(f"{__name__}:{serve.__name__}", served, log=log, forbidden=closed, hidden=hidden) as process:
-        yield JudgedModel(IsolatedModel(process), source.cost, visited, lambda: process.cpu_s)
+        yield JudgedModel(IsolatedModel(process), source.cost, learns, visited, lambda: process.cpu_s)
 
 
 def closed_modules(task: str, make: str) -> list[str]:
@@ -306,11 +308,13 @@ def one_name(model: str) -> str:
     return str(Path(model).resolve()) if runs_of(model) else str(parse_configuration(model))
 
 
-def _visited(run: Path) -> set[tuple[State, int]]:
-    """Every macrostate and macro-action of a run's training."""
-    tried = load_run(run).tried
+def _visited(kept: KeptAgent) -> set[tuple[State, int]] | None:
+    """Every macrostate and macro-action of a run's training; None where a dataset or earlier tasks had more of them."""
+    tried = load_run(kept.folder).tried
     if tried is None:
-        raise ArtefactError(f"{run} was written by a version that kept no experience; run it anew.")
+        raise ArtefactError(f"{kept.folder} was written by a version that kept no experience; run it anew.")
+    if kept.spec.protocol.dataset or kept.spec.protocol.after:
+        return None
     return {(tuple(row[:-2]), row[-2]) for row in tried.tolist()}
 
 

@@ -90,12 +90,12 @@ def by_depth(questions: EvalSet, predictions: Predictions) -> dict[str, list[flo
 
 
 def one_step_scores(
-    spec: TaskSpec, questions: EvalSet, predictions: Predictions, visited: set[tuple[State, int]]
+    spec: TaskSpec, questions: EvalSet, predictions: Predictions, visited: set[tuple[State, int]] | None
 ) -> dict[str, Any]:
-    """Every score of single transitions. ``visited`` are the (macrostate, action) pairs in the model's data."""
+    """Every score of single transitions. ``visited`` are the (macrostate, action) pairs in its data, or None."""
     pairs = _distributions(questions, predictions)
     away = _away(pairs)
-    seen = np.array([pair in visited for pair in questions.pairs])
+    unseen = None if visited is None else np.array([pair not in visited for pair in questions.pairs])
     distances = by_depth(questions, predictions)
     return {
         "total_variation": float(away.mean()),
@@ -108,7 +108,7 @@ def one_step_scores(
         **_reward_scores(questions, predictions),
         **_end_scores(questions, predictions),
         **_costs(spec, questions, predictions),
-        **_uncertainty_scores(pairs, predictions, away, seen),
+        **_uncertainty_scores(pairs, predictions, away, unseen),
         "worst": np.argsort(-away, kind="stable")[:10].tolist(),
     }
 
@@ -405,21 +405,21 @@ def _end_scores(questions: EvalSet, predictions: Predictions) -> Scores:
     }
 
 
-def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Floats, seen: Bools) -> Scores:
+def _uncertainty_scores(pairs: Pairs[State], predictions: Predictions, away: Floats, unseen: Bools | None) -> Scores:
     """How well each uncertainty that a model offers finds its errors."""
     wrong = away > _WRONG
     entropy = np.array([-sum(p * math.log(p) for p in exact.values()) for exact, _ in pairs])
     to_tell = {
         "wrong": ("epistemic", wrong),
-        "never": ("epistemic", ~seen),
-        "either": ("epistemic", wrong | ~seen),
+        "never": ("epistemic", unseen),
+        "either": ("epistemic", None if unseen is None else wrong | unseen),
         "noisy": ("aleatoric", entropy > np.median(entropy)),
         "several": ("modal", np.array([len(exact) > 1 for exact, _ in pairs])),
     }
     found: Scores = {}
     for name, (uncertainty, truth) in to_tell.items():
         offered = predictions.of_one_step(uncertainty)
-        found[f"auroc_{name}"] = math.nan if offered is None else auroc(offered, truth)
+        found[f"auroc_{name}"] = math.nan if offered is None or truth is None else auroc(offered, truth)
     epistemic = predictions.of_one_step("epistemic")
     found["risk_coverage"] = math.nan if epistemic is None else risk_coverage(epistemic, wrong)
     accepted = predictions.of_one_step("accepted")

@@ -25,7 +25,7 @@ from kept import ROOT
 from recordings import contents, times, view_names
 from report_pages import page_in_words
 from same_values import assert_same
-from small_runs import Inline, small
+from small_runs import Inline, do, small
 from whole_outputs import Expected, short
 
 import imagine_bench
@@ -448,6 +448,14 @@ def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Pat
     found = visited("imaginer", "arrow_puzzle")
     assert found and len(found) <= 2 * 20, "its experience is the one that the bench counted"
     assert all(len(state) == 4 and 0 <= action < 6 for state, action in found)
+
+
+def test_the_experience_of_a_run_is_not_known_where_others_were_learned_from(tmp_path: Path) -> None:
+    after = {"after": ("arrow_puzzle_hard",), "after_episodes": 1, "unannounced": True}
+    run = do(tmp_path, "imaginer", agents=("imaginer",), budgets=(2,), **after)
+    source = dataclasses.replace(_source(str(run.folder), "arrow_puzzle"), privileged=True)
+    with opened(source, "arrow_puzzle", folder=tmp_path, log=tmp_path / "log") as judged:
+        assert judged.visited is None and not judged.learns
 
 
 _TWICE = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:model.dropout=0.1,model.members=2")

@@ -266,6 +266,10 @@ def test_known_mistakes_are_charged_exactly() -> None:
     assert wrong == {pairs[row // FRAMES] for row in scores["worst"][: FRAMES * len(wrong)]}
     assert scores["auroc_wrong"] == scores["best_skill"] == scores["filter_skill"] == 1.0
     assert (scores["filter_keeps"], scores["filter_error"]) == (pytest.approx(1.0 - share), 0.0)
+    answers = world.predictions(mistaken(world, wrong), world.one_step)
+    unknown = one_step_scores(world.spec, world.one_step, answers, None)
+    assert unknown["auroc_wrong"] == 1.0
+    assert math.isnan(unknown["auroc_never"]) and math.isnan(unknown["auroc_either"]), "its data are not known"
 
 
 def test_the_value_of_a_filter_is_the_cost_of_mistakes() -> None:

@@ -12,6 +12,7 @@ from imagine_bench.tasks.motion import orientation
 from imagine_bench.tasks.scenes.objects import standing_m
 
 from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
 
 KINEMATIC = {"execution": "kinematic"}
 NAMES = {"imagine_bench/Arrows": "arrows", "imagine_bench/PickPlace": "pick_place"}
@@ -138,6 +139,19 @@ def test_a_state_holds_old_frames_what_is_hidden_and_distractors(id_, options):
     np.testing.assert_array_equal(first.agent_view(), second.agent_view())
     for action in (0, 3, 1, 2, 2):
         np.testing.assert_array_equal(first.step(action)[0], second.step(action)[0])
+
+
+@pytest.mark.parametrize(("id_", "options"), [("Arrows-v0", KINEMATIC), ("ArrowsMotion-v0", {})])
+def test_a_state_with_old_observations_is_not_of_an_environment_that_shows_others(id_, options):
+    first, second, small = (
+        gymnasium.make(f"imagine_bench/{id_}", lag=1, observation=seen, size=size, **options).unwrapped
+        for seen, size in (("state", 64), ("proprio", 64), ("state", 32))
+    )
+    for env in (first, second, small):
+        env.reset(seed=0)
+    for env in (second, small):
+        with pytest.raises(InvalidValueError, match="is no state of"):
+            env.set_state(first.get_state())
 
 
 def test_frames_of_macrostates_hide_what_the_environment_hides():
