@@ -46,6 +46,8 @@ def test_bundled_encoder_reads_fresh_frames_as_its_card_says(task: str, appearan
     rng = SeedTree(987_654_321).child("encoder_probe", appearance).generator()
     frames, macrostates = draw_frames(spec, appearance_of_tests(appearance), FRESH, rng)
     mu, sigma = encoder.encode(frames)
+    information = float(encoder.network.information(mu, 2.0 * sigma.log()))
+    assert information == pytest.approx(encoder.card.kl_nats, rel=0.05)
     read = (encoder.read_macrostate(mu) == macrostates).all(axis=1).mean()
     assert read >= required - 3 * math.sqrt(required * (1 - required) / FRESH)
     sampled = Latents(mu=mu, sigma=sigma).sample(torch.Generator().manual_seed(0))
@@ -93,7 +95,11 @@ def test_bundled_codes_give_every_macrostate_a_code_of_its_own(task: str, appear
     encoder = Encoder.load(bundled_encoder(f"{spec.encoder}-{appearance}-codes"))
     rng = SeedTree(987_654_321).child("encoder_probe", appearance, "codes").generator()
     frames, macrostates = draw_frames(spec, appearance, 1000, rng)
-    codes = [tuple(row) for row in encoder.encode(frames)[0].tolist()]
+    mu, sigma = encoder.encode(frames)
+    nats = math.log(math.prod(encoder.network.code_sizes))
+    assert encoder.card.kl_nats == pytest.approx(nats, abs=1e-3)
+    assert float(encoder.network.information(mu, 2.0 * sigma.log())) == pytest.approx(nats)
+    codes = [tuple(row) for row in mu.tolist()]
     pairs = Counter(zip(map(tuple, macrostates.tolist()), codes, strict=True))
     usual: dict[tuple[int, ...], tuple[float, ...]] = {}
     for (macrostate, code), _ in pairs.most_common():
