@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import tempfile
 import warnings
 from collections import Counter
 
@@ -267,11 +266,10 @@ def test_a_wrong_macrostate_is_refused(kinematic, given):
     assert len(str(caught.value)) < 500
 
 
+@pytest.mark.usefixtures("own_folder")  # for MuJoCo's own log
 @pytest.mark.parametrize("task", ["arrow_puzzle", "arrows:lag=2"])
-def test_a_simulation_that_blows_up_truncates(task, monkeypatch, tmp_path):
+def test_a_simulation_that_blows_up_truncates(task):
     """The scene stands as before."""
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.chdir(tmp_path)  # MuJoCo's own log
     env = gymnasium.make(registry.task(task).env_id)
     scene = env.unwrapped
     with pytest.raises(InvalidValueError, match=r"call reset\(\) first"):

@@ -8,7 +8,6 @@ import os
 import pickle
 import subprocess
 import sys
-import tempfile
 import textwrap
 import threading
 import time
@@ -139,10 +138,9 @@ def blown_up(env, actions):
     return [*step, infos]
 
 
+@pytest.mark.usefixtures("own_folder")  # for MuJoCo's own log
 @pytest.mark.parametrize("mode", MODES)
-def test_a_lane_that_blows_up_ends_as_a_single_environment(mode, monkeypatch, tmp_path):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.chdir(tmp_path)  # MuJoCo's own log
+def test_a_lane_that_blows_up_ends_as_a_single_environment(mode):
     sync, vector = make_sync(mode), make(autoreset_mode=mode)
     first, action = quiet_plan(registry.task("arrow_puzzle").rules, START, 2, np.random.default_rng(0))
     for env in (sync, vector):

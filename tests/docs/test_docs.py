@@ -87,10 +87,9 @@ def test_commands_could_be_carried_out(page: Path) -> None:
             command.planned()
 
 
-@pytest.mark.usefixtures("own_names", "without_shadows")
+@pytest.mark.usefixtures("own_folder", "own_names", "without_shadows")
 @pytest.mark.parametrize(("page", "code"), [block for block in BLOCKS if block not in SCRIPTS], ids=name)
-def test_python_on_pages_runs(page: Path, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_python_on_pages_runs(page: Path, code: str) -> None:
     if "import lerobot" in code or "from lerobot" in code:
         pytest.importorskip("lerobot", reason="LeRobot is large, and no dependency of the tests")
     variables: dict[str, object] = {}
@@ -124,8 +123,7 @@ def cells() -> list[dict[str, Any]]:
 
 
 @pytest.mark.usefixtures("own_names", "without_shadows")
-def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_notebook_runs(own_folder: Path) -> None:
     matplotlib.use("agg")
     short = 'agents=["random", MyAgent], launcher="this_process", ' + SHORT
     code = "\n".join("".join(cell["source"]) for cell in cells()[1:])
@@ -133,7 +131,7 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert SHORT in code
     exec(code, {})
     pyplot.close("all")
-    assert len(list(tmp_path.glob("runs/arrow_puzzle/*/MyAgent/seed_1/DONE"))) == 1
+    assert len(list(own_folder.glob("runs/arrow_puzzle/*/MyAgent/seed_1/DONE"))) == 1
 
 
 def test_the_notebook_keeps_the_outputs_of_a_run_without_errors(capsys: pytest.CaptureFixture[str]) -> None:

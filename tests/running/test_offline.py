@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bench_fakes import Pupil
+from bench_fakes import Pupil, TableAgent
 from small_runs import collected, final_arrays, measured, run_observed, written
 
 from imagine_bench import registry
@@ -17,10 +17,10 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Transition
 from imagine_bench.protocols.data import OnProgress, RunSpec
 from imagine_bench.rules import states_of
-from imagine_bench.running import run_state
 from imagine_bench.running.bench import plan
 from imagine_bench.running.control import plan_control
 from imagine_bench.store.results import RunResult
+from imagine_bench.store.run_folder import load_newest
 
 _FEW: dict[str, Any] = {
     "seeds": (0,), "evaluation_episodes": 2, "execution": "kinematic", "open_loop_starts": 0,
@@ -89,22 +89,29 @@ def test_in_an_unannounced_change_a_datasets_episodes_are_counted_on(tmp_path: P
     assert [*dict.fromkeys(episode for episode, _ in Pupil.made[-1].shown)] == list(range(3 + 8))
 
 
-def test_a_kill_within_a_dataset_changes_no_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_state, "_REPORT_EVERY_S", 0.0)
-    told = 0
+class Killed(TableAgent):
+    """Is killed once, in the middle of its third episode, if it may be."""
 
-    def killing(progress: Any) -> None:
-        nonlocal told
-        told += progress.phase == "training"
-        if told == 3:
-            told += 1
+    kills = 0
+
+    def observe(self, transition: Transition, *, episode: int) -> None:
+        if episode == 2 and Killed.kills > 0:
+            Killed.kills -= 1
             raise KeyboardInterrupt
+        super().observe(transition, episode=episode)
 
-    spec = spec_of(written(tmp_path / "set").folder, "table", budgets=(4, 8))
+
+@pytest.mark.usefixtures("own_names")
+def test_a_kill_within_a_dataset_changes_no_bit(tmp_path: Path) -> None:
+    registry.AGENTS["killed"] = dataclasses.replace(registry.AGENTS["table"], make=f"{__name__}:Killed")
+    spec = spec_of(written(tmp_path / "set").folder, "killed", budgets=(4, 8))
     whole = run(tmp_path / "whole", spec)
     often = dataclasses.replace(spec, checkpoint_every_s=0.0)
+    Killed.kills = 1
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "killed", often, killing)
+        run(tmp_path / "killed", often)
+    left = load_newest(tmp_path / "killed" / "checkpoints")
+    assert left is not None and left.episode == 2
     assert measured(run(tmp_path / "killed", often)) == measured(whole)
     assert final_arrays(tmp_path / "killed")["table"].tobytes() == final_arrays(tmp_path / "whole")["table"].tobytes()
 
