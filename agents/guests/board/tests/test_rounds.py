@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from datetime import date
 from pathlib import Path
@@ -15,6 +16,7 @@ from imagine_bench_board.rows import NAME, read_row, row_name
 from imagine_bench_board.submit import file_agents, submit
 from small_runs import Inline, small
 
+from imagine_bench import registry
 from imagine_bench.cli import exit_code
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.running.bench import bench
@@ -96,6 +98,33 @@ def test_days_decide_what_may_be_done(finished: Path, tmp_path: Path) -> None:
             file_agents(finished, folder)
     with pytest.raises(ArtefactError, match=r"There is no .*revealed\.json"):
         submit(finished, tmp_path / "rows", author="", round_folder=folder, encoder=None)
+
+
+def test_all_that_can_be_wrong_with_a_row_is_said_before_its_tests_are_played(finished: Path, tmp_path: Path) -> None:
+    folder, _ = opened(tmp_path)
+    with on(BEFORE):
+        (filed,) = file_agents(finished, folder)
+    out = tmp_path / "rows"
+    given = {"round_folder": folder, "encoder": None}
+    with pytest.raises(InvalidValueError, match=r"The claim 'author' is 'aaa.*give at most 300 printable"):
+        submit(finished, out, author="a" * 301, **given)
+    (out / filed.stem).mkdir(parents=True)
+    with pytest.raises(InvalidValueError, match="exists; remove it, or give another folder to --out"):
+        submit(finished, out, author="", **given)
+    with pytest.raises(ArtefactError, match=r"There is no .*revealed\.json"):
+        submit(finished, tmp_path / "others", author="", **given)
+
+
+@pytest.mark.parametrize("kind", ["external_training_loop", "is_player"])
+def test_who_cannot_play_in_a_round_is_not_filed(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    folder, _ = opened(tmp_path)
+    changed = dataclasses.replace(registry.AGENTS["table"], **{kind: True})
+    monkeypatch.setitem(registry.AGENTS, "table", changed)
+    with on(BEFORE), pytest.raises(InvalidValueError, match="table cannot be taken up again; submit the tests of its"):
+        file_agents(finished, folder)
+    assert [each.name for each in folder.iterdir()] == ["round.json"]
 
 
 def test_only_what_was_filed_and_promised_is_published(finished: Path, tmp_path: Path) -> None:

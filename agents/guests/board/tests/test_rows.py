@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -64,6 +65,29 @@ def test_a_bench_is_submitted_agent_by_agent(run: Path, tmp_path: Path) -> None:
     assert [read_row(folder).claimed.agent for folder in written] == ["table", "random"]
     with pytest.raises(InvalidValueError, match="exists; remove it, or give another folder to --out"):
         submit(run, tmp_path, author="", round_folder=None, encoder=None)
+    shutil.rmtree(written[0])
+    with pytest.raises(InvalidValueError, match=f"{written[1].name} exists"):
+        submit(run.parents[1], tmp_path, author="", round_folder=None, encoder=None)
+    assert list(tmp_path.iterdir()) == written[1:], "none is written unless all can be"
+
+
+def test_a_page_that_cannot_be_written_is_said_before_the_check(
+    row: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "page").write_text("")
+    assert exit_code(["board", "page", str(row), "--out", str(tmp_path / "page")]) == 2
+    said = capsys.readouterr()
+    assert not said.out and "page" in said.err
+
+
+@pytest.mark.parametrize(("shown", "frames"), [(0, 0), (2, None)])
+def test_frames_of_demonstrations_are_not_said_to_be_none(tmp_path: Path, shown: int, frames: int | None) -> None:
+    wanted = small(budgets=(4,), demonstrations=shown)
+    done = bench(wanted, {}, root=tmp_path / "bench", launcher=Inline())
+    (folder,) = submit(done.folder, tmp_path / "rows", author="", round_folder=None, encoder=None)
+    claimed = read_row(folder).claimed
+    assert claimed.frames_beforehand == frames
+    assert claimed.seen_beforehand == (f"{shown} demonstrations" if shown else "nothing")
 
 
 def test_rows_of_unlike_tests_stand_in_tables_of_their_own() -> None:

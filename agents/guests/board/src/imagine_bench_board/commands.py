@@ -7,6 +7,7 @@ from pathlib import Path
 
 from imagine_bench.errors import CheckFailedError, InvalidValueError
 from imagine_bench.judge.verify import cost
+from imagine_bench.store.files import require_writable
 
 from . import rounds
 from . import submit as submitting
@@ -50,6 +51,8 @@ def board(
 
 def _check(path: Path, page: Path | None) -> None:
     """Print the verdict on every row, and write the page of the board if a folder for it is given."""
+    if page is not None:
+        require_writable(page)
     begun_s = time.process_time()
     found = check(named(path))
     verdicts = [each.verdict for each in found]

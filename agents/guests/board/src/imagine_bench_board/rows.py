@@ -179,11 +179,17 @@ def world_words(protocol: Protocol) -> str:
     return ", ".join(words)
 
 
-def write_row(folder: Path, row: Row) -> Path:
-    """Write a row below ``folder``, under its name. Raises InvalidValueError: there is one of this name."""
-    where = folder / row.name
+def place_of(folder: Path, name: str) -> Path:
+    """The folder of a new row below ``folder``. Raises InvalidValueError: there is one of this name."""
+    where = folder / name
     if where.exists():
         raise InvalidValueError(f"{where} exists; remove it, or give another folder to --out.")
+    return where
+
+
+def write_row(folder: Path, row: Row) -> Path:
+    """Write a row below ``folder``, under its name. Raises as :func:`place_of`."""
+    where = place_of(folder, row.name)
     episodes = json.dumps([_columns(log) for log in row.logs], separators=(",", ":")).encode()
     card: dict[str, Json] = {
         "format": FORMAT,

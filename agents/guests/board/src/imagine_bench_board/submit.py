@@ -19,11 +19,11 @@ from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore, bench_facts, is_archive, read_control
-from imagine_bench.store.files import sha256
+from imagine_bench.store.files import require_writable, sha256
 from imagine_bench.store.results import Checkpoint
 
 from . import rounds
-from .rows import Claims, Cost, Figures, Row, one_line, row_name, write_row
+from .rows import Claims, Cost, Figures, Row, one_line, place_of, row_name, write_row
 
 T = TypeVar("T")
 
@@ -55,6 +55,12 @@ class Submitter:
         """The name of its row in a round."""
         return row_name(file_name(self.agent), f"{self.hash}-{round_folder.name}")
 
+    def require_player(self) -> None:
+        """Raise InvalidValueError for an agent that cannot play the tests of a round."""
+        entry = known_agent(self.agent)
+        if entry.external_training_loop or entry.is_player or not self.protocol.shows_frames_alone:
+            raise InvalidValueError(f"{self.agent} cannot be taken up again; submit the tests of its bench.")
+
     def digests(self) -> dict[int, str]:
         """The digest of the trained agent of each seed; empty where it has no weights."""
         found = {}
@@ -75,8 +81,7 @@ class Submitter:
             ArtefactError: The seed is not published, or these agents were not filed before.
             InvalidValueError: An agent that cannot be taken up again.
         """
-        if known_agent(self.agent).external_training_loop:
-            raise InvalidValueError(f"{self.agent} cannot be taken up again; submit the tests of its bench.")
+        self.require_player()
         name = self.name_in(folder)
         start_seed, filed = rounds.revealed_seed(folder, name)
         digests = {str(seed): weights for seed, weights in self.digests().items()}
@@ -138,8 +143,10 @@ def _seen_beforehand(protocol: Protocol, agent: str) -> str:
 
 
 def _frames_beforehand(protocol: Protocol, agent: str) -> int | None:
-    """The frames that an agent's encoder was trained on; None where nobody knows."""
+    """The frames that an agent had before its first episode; None where nobody counted them."""
     entry = known_agent(agent)
+    if entry.learns and (protocol.dataset or protocol.demonstrations or protocol.after):
+        return None
     if not entry.make or not entry.needs_encoder:
         return 0 if entry.make else None
     card = encoders.card(protocol.encoder_of(entry.encoder_kind))
@@ -175,8 +182,13 @@ def submitters(path: Path) -> list[Submitter]:
 
 def submit(path: Path, out: Path, *, author: str, round_folder: Path | None, encoder: str | None) -> list[Path]:
     """Write the rows of a run or a bench below ``out``. Errors as of :class:`Submitter` and :func:`.write_row`."""
+    Claims(agent="", author=author)  # raises its error before any test is played, as the next two do
+    require_writable(out)
+    found = submitters(path)
+    for each in found:
+        place_of(out, each.name if round_folder is None else each.name_in(round_folder))
     written = []
-    for each in submitters(path):
+    for each in found:
         row = each.row(author) if round_folder is None else each.row_of_round(round_folder, author, encoder)
         written.append(write_row(out, row))
     return written
@@ -189,4 +201,7 @@ def file_agents(path: Path, round_folder: Path) -> list[Path]:
     """
     if path.is_file():
         return [rounds.file_agents(round_folder, rounds.policy_row(round_folder, path), {rounds.POLICY: sha256(path)})]
-    return [rounds.file_agents(round_folder, each.name_in(round_folder), each.digests()) for each in submitters(path)]
+    found = submitters(path)
+    for each in found:
+        each.require_player()
+    return [rounds.file_agents(round_folder, each.name_in(round_folder), each.digests()) for each in found]
