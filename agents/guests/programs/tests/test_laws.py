@@ -312,6 +312,19 @@ def test_a_value_that_hides_a_factor_is_found_without_contradictions() -> None:
     assert still_value(dials((1, 2, 0), (2, 0, 1)), (4, 8), 1) is None, "a dial that turns is not hidden"
 
 
+def test_transitions_that_are_left_out_make_an_explanation_no_shorter() -> None:
+    """A macro-action turns a dial from 3 to 0; without 3 the dial never changes, and 40 noisy transitions are gone."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(8, size=(100, 2)).tolist()
+    rows = [
+        row((3 * turns, before), (0, after), action=int(not turns))
+        for turns, (before, after) in zip([True] * 40 + [False] * 60, noise, strict=True)
+    ]
+    filled = Hidden(0, 3).filled(rows)
+    assert sum(min(*each.now, *each.then) >= 0 for each in filled) == 60
+    assert still_value(rows, (4, 8), 2) is None
+
+
 def test_a_light_that_flips_by_chance_is_not_hidden() -> None:
     rng = np.random.default_rng(0)
     lights = np.cumsum(rng.random(201) < 0.2) % 2

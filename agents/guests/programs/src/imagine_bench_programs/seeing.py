@@ -244,7 +244,8 @@ def still_value(rows: Sequence[CodedRow], sizes: Sequence[int], n_actions: int) 
         filled = complete(each.filled(rows))
         if 2 * len(filled) <= len(rows) or any(row.now[each.factor] != row.then[each.factor] for row in filled):
             continue
-        other = Laws(sizes, n_actions, each.filled(rows)).nats + each.nats(rows)
+        of_all = len(rows) / len(filled)  # those that are left out are no shorter than the others
+        other = Laws(sizes, n_actions, each.filled(rows)).nats * of_all + each.nats(rows)
         if other < nats:
             best, nats = each, other
     return best
