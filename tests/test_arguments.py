@@ -1,9 +1,12 @@
-"""Arguments in the sources: 0 is not taken for None, and an option that a function has reaches those that it calls."""
+"""Arguments in the sources: each is read, 0 is not taken for None, and an option that a function has reaches those that
+it calls.
+"""
 
 from __future__ import annotations
 
 import ast
 import functools
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -168,3 +171,48 @@ def test_an_argument_is_passed_on_to_those_that_take_it() -> None:
 def test_an_argument_that_is_not_passed_on_would_be_seen() -> None:
     found = left_out(ast.parse("def f(run, encoder):\n    load_trained(run)\n    load_trained(run, encoder=encoder)"))
     assert list(found) == ["f calls load_trained without encoder"]
+
+
+# Reading -------------------------------------------------------------------------------------------------------------
+
+
+def is_declared_alone(function: ast.FunctionDef) -> bool:
+    """Whether it has no body but words, or raises at once."""
+    words = [each for each in function.body if isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant)]
+    return all(each in words or isinstance(each, ast.Raise | ast.Pass) for each in function.body)
+
+
+@functools.cache
+def methods() -> Counter[str]:
+    """In how many classes there is a method of a name."""
+    classes = (node for tree in trees() for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+    return Counter(each.name for node in classes for each in node.body if isinstance(each, ast.FunctionDef))
+
+
+def unread(tree: ast.AST) -> Iterator[str]:
+    """Arguments of functions that these never read, but for those of a method that several classes have."""
+    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        if methods()[function.name] < 2 and not is_declared_alone(function):
+            read = {name.id for each in function.body for name in ast.walk(each) if isinstance(name, ast.Name)}
+            taken = {each.arg for each in parameters(function)} - {"self", "cls"} - read
+            yield from (f"{function.name}: {name}" for name in taken)
+
+
+NEEDLESS = {
+    "write_motion: card": "as all formats of datasets",
+    "testing: variant": "as all regression tasks",
+    "errors: variant": "likewise",
+    "_collect_one: on_news": "as all jobs of a pool",
+    "_frame_renderer: thread": "each has its own, by the cache",
+    "_never: macrostate": "as all conditions",
+    "get_source: fullname": "of Python's loaders",
+}
+"""Arguments that are not read, and why they are taken."""
+
+
+def test_every_argument_is_read() -> None:
+    assert {said for tree in trees() for said in unread(tree)} == NEEDLESS.keys()
+
+
+def test_an_argument_that_is_not_read_would_be_seen() -> None:
+    assert list(unread(ast.parse("def f(a, b):\n    return a\ndef g(c):\n    raise NotImplementedError"))) == ["f: b"]
