@@ -61,7 +61,8 @@ class AgentContext:
     #: makes an optimal policy, from the observation and so many macro-actions of an episode; only
     #: for agents registered as privileged, None for every other
     optimal_policy: Callable[[], Callable[[State, int], int]] | None = None
-    exact_world: ExactWorld | None = None  #: only for agents registered as privileged, and where frames hide nothing
+    #: only for agents registered as privileged, where frames hide nothing and no other task is trained on before
+    exact_world: ExactWorld | None = None
     argument: str = ""  #: the text after the colon of the name that it was asked for by
     #: shape of each part of an observation, by its name in :data:`OBSERVATIONS`
     observation: Mapping[str, tuple[int, ...]] = field(default_factory=lambda: {"frame": (FRAME_PX, FRAME_PX, 3)})

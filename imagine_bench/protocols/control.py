@@ -446,6 +446,7 @@ def context_of(spec: RunSpec[Protocol]) -> AgentContext:
     world = task(protocol.task)
     size = (protocol.observation_size, protocol.observation_size, 3)
     shapes = {"state": (sum(map(len, world.macrostate_values)),), "proprio": (PROPRIO_SIZE,)}
+    is_only_world = entry.privileged and not (entry.learns and protocol.after)  # the earlier tasks have other rules
     return AgentContext(
         n_actions=world.n_actions,
         preprocessing=world.preprocessing,
@@ -457,6 +458,6 @@ def context_of(spec: RunSpec[Protocol]) -> AgentContext:
         argument=parse_configuration(spec.agent).argument,
         device=protocol.device,
         optimal_policy=optimal_policy_of(world) if entry.privileged else None,
-        exact_world=ExactWorld.of(world, protocol.appearance) if entry.privileged else None,
+        exact_world=ExactWorld.of(world, protocol.appearance) if is_only_world else None,
         observation={part: shapes.get(part, size) for part in protocol.observation.split(",")},
     )

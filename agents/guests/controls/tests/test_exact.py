@@ -17,6 +17,8 @@ from imagine_bench_controls.exact import ExactFilterAgent, ExactImaginationAgent
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import ExactWorld, Outcome, Transition
+from imagine_bench.protocols.control import context_of, protocol
+from imagine_bench.protocols.data import RunSpec
 
 STATES = 6
 GOAL = 5
@@ -126,3 +128,14 @@ def test_only_who_is_given_the_world_imagines_exactly() -> None:
     with pytest.raises(InvalidValueError, match="was shown none"):
         knowing().observe(transition(0, 1, -1.0, 1), episode=0)
     assert ExactWorld.of(registry.task("arrows:gesture=0.5"), "clean") is None, "its frames hide something"
+
+
+@pytest.mark.parametrize("agent", ["imagination_exact", "imagination_exact_filter"])
+def test_the_rules_of_a_task_are_not_taken_for_those_of_the_tasks_before_it(agent: str) -> None:
+    before = {"after": ("arrow_puzzle_hard",), "unannounced": True}
+    given = [
+        context_of(RunSpec(protocol=protocol("arrow_puzzle", "smoke", agents=(agent,), **more), agent=agent, seed=0))
+        for more in ({}, before)
+    ]
+    assert given[0].exact_world is not None
+    assert given[1].exact_world is None

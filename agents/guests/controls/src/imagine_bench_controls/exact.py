@@ -209,7 +209,7 @@ def build(
     if context.exact_world is None:
         raise InvalidValueError(
             "This control is given the exact world, which an agent gets that is registered as privileged, in a world "
-            "whose frames hide nothing; here there is none."
+            "whose frames hide nothing, and before which no other task comes; here there is none."
         )
     settings = HYPERPARAMETERS.of(context)
     device = prepare_torch(context.device)
