@@ -139,6 +139,7 @@ def test_every_transition_is_counted_once_however_often_it_sees_anew() -> None:
             assert learner.table.arrays()["count"].sum() == lived
             sights.add(learner.diagnostics()["perception/looked_at"])
     assert len(sights) > 2
+    assert sum(learner.perception.begins) == 8, "the first of each episode"
     before = learner.q_values(transition.observation)
     learner._happened = [(reward + 1.0, ended) for reward, ended in learner._happened]
     learner._recount()

@@ -40,6 +40,14 @@ def test_a_clone_sees_images_of_its_own_size() -> None:
     assert CloneExecutedEnv(clone=clone).motion.observation_space["front"].shape == (96, 96, 3)
 
 
+def test_a_clone_that_does_not_feel_its_arm_is_refused() -> None:
+    clone = Clone.load(BUNDLED)
+    for seen in ("proprio", "front,state"):
+        clone.about["observation"] = seen
+        with pytest.raises(InvalidValueError, match=f"The clone sees {seen}; give one that sees proprio, and more"):
+            CloneExecutedEnv(clone=clone)
+
+
 def test_the_clone_turns_the_cube_of_its_instruction() -> None:
     """And its arm ends where it began, with open fingers."""
     env = environment()

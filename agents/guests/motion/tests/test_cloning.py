@@ -78,6 +78,10 @@ def test_demonstrations_depend_on_the_seed_and_come_back(tmp_path: Path) -> None
     assert kept.observation == kept.first(2).observation == VECTORS
     with pytest.raises(InvalidValueError, match="The demonstrations show proprio,objects, not front,proprio; give"):
         train(kept, seed=0, observation="front,proprio", settings=Training(updates=1))
+    with pytest.raises(InvalidValueError, match="chunk is 0; give an integer from 1 on"):
+        train(kept, seed=0, observation=VECTORS, settings=Training(updates=1), layout={"chunk": 0})
+    with pytest.raises(InvalidValueError, match="updates is 0; give an integer from 1 on"):
+        Training(updates=0)
     np.testing.assert_array_equal(kept.commands, data.commands)
     assert kept.instructions.tolist() == data.instructions.tolist()
     assert kept.first(2).count == 2

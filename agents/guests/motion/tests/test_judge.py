@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import re
 from dataclasses import replace
@@ -37,6 +38,16 @@ def test_a_model_of_no_known_level_or_encoder_is_no_entry(others: dict[str, str]
 
 
 FEW = MotionJudgement(task="arrow_puzzle", models=("no_change",), sizes=(3,), seeds=(0,), pairs=2, chains=1)
+
+
+def test_a_world_has_one_name_however_it_is_typed() -> None:
+    one, other = (
+        dataclasses.replace(FEW, task=f"arrows:{typed}") for typed in ("cubes=2,slip=0.1", "slip=0.1,cubes=2")
+    )
+    assert one == other
+    assert one.folder_name == other.folder_name
+
+
 FAMILIES = {"arrows": make_arrows, "pick_place": make_pick_place}
 
 

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from imagine_bench.errors import ImagineBenchError
+from imagine_bench.errors import ImagineBenchError, InvalidValueError
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.store.files import require_writable, write_json
 
@@ -237,6 +237,8 @@ def _level(given: argparse.Namespace) -> None:
         kept["curve"].append(asdict(point))
         write_json(given.out, kept)
 
+    if given.clone is not None and given.execution != "clone":
+        raise InvalidValueError("The planner needs no clone; leave out --clone, or give --execution clone.")
     require_writable(given.out.parent)
     world = {"cubes": given.cubes, "slip": given.slip, "clone": given.clone}
     env, test_env = (environment(given.execution, **world) for _ in range(2))

@@ -120,7 +120,7 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
 
     Raises:
         ArtefactError: No such file.
-        InvalidValueError: Another execution.
+        InvalidValueError: Another execution, or a clone that does not see proprio and something more.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own declaration
@@ -135,6 +135,9 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
         if execution != "physics":
             raise InvalidValueError(f"A clone executes macro-actions in physics; execution={brief(execution)} is none.")
         self.clone = clone if isinstance(clone, Clone) else Clone.load(Path(clone or BUNDLED))
+        sees = self.clone.observation.split(",")
+        if "proprio" not in sees or len(sees) < 2:  # one part alone has no name
+            raise InvalidValueError(f"The clone sees {self.clone.observation}; give one that sees proprio, and more.")
         size = self.clone.about.get("size_px", FRAME_PX)
         self.motion = skill_env(self.clone.observation, appearance, **{"time_limit_s": 1e9, "size": size, **options})
         self.action_names = self.motion.task.action_names

@@ -14,7 +14,7 @@ from imagine_bench.agents.encoders.perception import prepare_torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError, require_integer
 
 from .demonstrations import DemonstrationData
 from .instruction import GO_BACK, words_vector
@@ -28,7 +28,7 @@ _VERSION = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """Settings of training."""
+    """Settings of training. Raises InvalidValueError: a number of gradient steps or pixels out of range."""
 
     updates: int = 6_000  #: gradient steps
     batch: int = 48  #: periods a gradient step
@@ -40,6 +40,11 @@ class Training:
     number_noise: float = 0.05  #: standard deviation added to standardised inputs
     shift_px: int = 4  #: images are moved by up to so many pixels along both axes, and points of heat maps moved back
     brightness: float = 0.1  #: images are made brighter or darker by up to this share
+
+    def __post_init__(self) -> None:
+        require_integer("updates", self.updates, 1)
+        require_integer("encoder_updates", self.encoder_updates, 1)
+        require_integer("shift_px", self.shift_px, 0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench.tasks.scenes.constants import CONTROL_CAMERAS
 from numpy.typing import NDArray
 
 from imagine_bench.errors import InvalidValueError, require_integer, writing
@@ -118,10 +119,12 @@ def collect(
         **options: Of the world, and its ``family``.
 
     Raises:
-        InvalidValueError: The expert fails too often in this world, or none is to be kept.
+        InvalidValueError: The expert fails too often in this world, none is to be kept, or images alone.
     """
     require_integer("count", count, 1)
     require_integer("seed", seed, 0)
+    if set(observation.split(",")) <= set(CONTROL_CAMERAS):
+        raise InvalidValueError(f"observation is {observation}, images alone; give proprio too.")
     rng = np.random.default_rng(seed)
     stages = [_Stage(observation, appearance, options) for appearance in appearances]
     kept: list[_Episode] = []

@@ -28,6 +28,8 @@ from .cloned_env import CloneExecutedEnv
 Env = gymnasium.Env[Any, Any]
 PUZZLE_CUBES = 3
 _TEST_SEED = 10**9
+_EPISODES = 10**5
+"""Seeds of environments that each seed has for training; the first of all tests is behind them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,15 +125,17 @@ def learn(
         told: Called with each point of the curve.
 
     Raises:
-        InvalidValueError: No test, or a budget below 1.
+        InvalidValueError: No test, a budget below 1, or a seed whose training episodes would be tests.
     """
+    if not 0 <= seed < _TEST_SEED // _EPISODES:
+        raise InvalidValueError(f"seed is {seed}; give 0 to {_TEST_SEED // _EPISODES - 1:,}.")
     if tests < 1 or not budgets or min(budgets) < 1:
         raise InvalidValueError(f"tests is {tests} and budgets {brief(list(budgets))}; give at least 1 for each.")
     began_s = time.process_time()
     count = _Count()
     curve = []
     for episode in range(1, max(budgets) + 1):
-        _train_episode(env, agent, episode, horizon, seed * 10**5 + episode, count)
+        _train_episode(env, agent, episode, horizon, seed * _EPISODES + episode, count)
         if episode in budgets:
             while isinstance(agent, ModelOnlyTrainer) and agent.train_in_model():
                 pass

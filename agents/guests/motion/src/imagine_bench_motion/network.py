@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from imagine_bench.errors import require_integer
+
 from .instruction import WIDTH
 
 _MEAN_BRIGHTNESS = 0.4
@@ -20,7 +22,7 @@ _SHARPNESS = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyLayout:
-    """Sizes of inputs and outputs."""
+    """Sizes of inputs and outputs. Raises InvalidValueError: no command, or a negative number of points."""
 
     cameras: tuple[str, ...]  #: names of the images
     numbers: int  #: of the vector of other inputs
@@ -29,6 +31,10 @@ class PolicyLayout:
     hidden: int = 256  #: units of the two hidden layers
     features: int = 64  #: numbers that each camera's image becomes, without heat maps
     heat_maps: int = 0  #: points that are looked for in each camera's image; 0: it becomes ``features`` instead
+
+    def __post_init__(self) -> None:
+        require_integer("chunk", self.chunk, 1)
+        require_integer("heat_maps", self.heat_maps, 0)
 
 
 class ImageEncoder(nn.Sequential):

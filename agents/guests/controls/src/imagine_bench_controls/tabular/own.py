@@ -27,6 +27,7 @@ class OwnCountTableAgent(CountTableAgent):
         super().__init__(self._see, n_actions, settings, seeds, directed=True)
         self._happened: list[tuple[float, bool]] = []
         """Reward and end of every remembered transition."""
+        self._begins = True
 
     def _see(self, observation: Observation) -> int:
         return self.perception.code(observation.frame)[0]
@@ -35,11 +36,13 @@ class OwnCountTableAgent(CountTableAgent):
         """Remember the frame, find factors anew if that is due, and count."""
         perception = self.perception
         if not perception.full:
-            perception.remember(transition.observation.frame, transition.action, transition.next_observation.frame)
+            before, after = transition.observation.frame, transition.next_observation.frame
+            perception.remember(before, transition.action, after, begins=self._begins)
             if perception.renew():
                 self._recount()
             self._happened.append((transition.reward, transition.terminated))
         super().observe(transition, episode=episode)
+        self._begins = transition.terminated or transition.truncated
 
     def _recount(self) -> None:
         """Count every remembered transition by the codes that its frames have now."""
@@ -69,6 +72,7 @@ class OwnCountTableAgent(CountTableAgent):
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot; ArtefactError if it does not fit this agent, and then nothing was changed."""
         super().restore(state)
+        self._begins = True
         self.perception.load(state)
         columns = (state.arrays[f"replay/{name}"].tolist() for name in ("reward", "terminated"))
         self._happened = list(zip(*columns, strict=True))

@@ -64,6 +64,7 @@ class MotionJudgement:
     chains: int = CHAINS  #: chains of motions that are asked about
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "task", registry.task_name(self.task))  # seeds and folder depend on it
         if not registry.task_entry(self.task).motion:
             raise InvalidValueError(f"Task {self.task} has no continuous control; give one of this suite.")
         if not self.models or not self.seeds or min(self.seeds) < 0:
