@@ -118,6 +118,10 @@ class InvalidValueError(ImagineBenchError, ValueError):
     """A value out of its range, of the wrong shape or of the wrong type."""
 
 
+class UnableError(InvalidValueError):
+    """An agent cannot do what an option asks for."""
+
+
 class ArtefactError(ImagineBenchError):
     """A file (checkpoint, encoder, result) that is missing, damaged or made by something else. It is left untouched."""
 

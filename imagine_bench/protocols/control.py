@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 from imagine_bench.appearance import appearance_name, appearance_typed
-from imagine_bench.errors import ArtefactError, InvalidValueError, brief, require_known
+from imagine_bench.errors import ArtefactError, InvalidValueError, UnableError, brief, require_known
 from imagine_bench.exact.beliefs import optimal_policy_of
 from imagine_bench.exact.splits import StartingFrom, split_of
 from imagine_bench.interfaces import (
@@ -393,12 +393,12 @@ def _require_same_code(agent: str, protocol: Protocol) -> None:
 
 
 def _require_learner(wanted: Protocol) -> None:
-    """Raise InvalidValueError for an option of training where no agent of the bench learns."""
+    """Raise UnableError for an option of training where no agent of the bench learns."""
     if any(agent_entry(agent).learns for agent in wanted.agents):
         return
     for option in ("dataset", "demonstrations", "queries", "feedback", "after"):
         if getattr(wanted, option):
-            raise InvalidValueError(
+            raise UnableError(
                 f"No agent of this bench learns ({', '.join(wanted.agents)}), so --{option} changes nothing; leave it "
                 "out, or give an agent that learns."
             )

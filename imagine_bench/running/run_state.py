@@ -15,7 +15,7 @@ import gymnasium
 from imagine_bench import registry
 from imagine_bench.arrays import Action, Info, Observed
 from imagine_bench.data.folder import read_dataset
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, UnableError
 from imagine_bench.interfaces import OBSERVATIONS, Agent, AgentState
 from imagine_bench.interfaces.capabilities import ExternalTrainer, QueryingAgent, TransferLearner
 from imagine_bench.interfaces.environments import Env
@@ -154,7 +154,7 @@ def reuse_outcomes(env: Env) -> None:
 
 
 def require_able(agent: object, name: str, protocol: Protocol) -> None:
-    """Raise InvalidValueError where a learner cannot carry over to the next task, watch or ask, as a protocol wants."""
+    """Raise UnableError where a learner cannot carry over to the next task, watch or ask, as a protocol wants."""
     external = isinstance(agent, ExternalTrainer)
     privileged = registry.agent_entry(name).privileged
     own_loop = "trains in a loop of its own"
@@ -170,7 +170,7 @@ def require_able(agent: object, name: str, protocol: Protocol) -> None:
     }
     for option, reason in reasons.items():
         if getattr(protocol, option) and reason:
-            raise InvalidValueError(f"Agent {name!r} {reason}; leave --{option} out, or that agent.")
+            raise UnableError(f"Agent {name!r} {reason}; leave --{option} out, or that agent.")
 
 
 class Run:
@@ -178,7 +178,7 @@ class Run:
 
     Raises:
         ArtefactError: The folder was begun with something else, or the encoder is not the protocol's.
-        InvalidValueError: The agent lacks an ability that the protocol asks for.
+        UnableError: The agent lacks an ability that the protocol asks for.
     """
 
     def __init__(self, spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress, env: Env, test_env: Env) -> None:

@@ -99,6 +99,8 @@ class Level:
 
     def __post_init__(self) -> None:
         require_types(self)
+        if "@" in self.task:  # a file of options may change
+            object.__setattr__(self, "task", registry.task_name(self.task))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ import numpy as np
 
 from imagine_bench import registry
 from imagine_bench.arrays import Floats
-from imagine_bench.errors import ArtefactError, InvalidValueError
+from imagine_bench.errors import ArtefactError, UnableError
 from imagine_bench.interfaces import Rules
 from imagine_bench.judge.causes import expected_rightly
 from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData, require_different
@@ -87,9 +87,6 @@ def _line(study: Study, variant: Variant, results: Mapping[str, BenchResult], ru
 
 def plan_variant(study: Study, task: str, variant: Variant) -> Planned:
     """The bench of a variant. Raises as :func:`.bench.plan`."""
-    world = dict(variant.world)
-    if "physics" in world:
-        world["physics"] = tuple(sorted(world["physics"].items()))
     return plan(
         task,
         study.preset,
@@ -98,8 +95,14 @@ def plan_variant(study: Study, task: str, variant: Variant) -> Planned:
         budgets=study.budgets,
         evaluation_episodes=study.evaluation_episodes,
         overrides=tuple(sorted(variant.settings.items())),
-        **{**_FIGURES_ONLY, "execution": study.execution, "appearance": study.appearance, **world},
+        **{**_FIGURES_ONLY, "execution": study.execution, "appearance": study.appearance, **_fields(variant.world)},
     )
+
+
+def _fields(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a protocol, from those of a grid, where settings of physics are a table."""
+    physics = given.get("physics")
+    return {**given, "physics": tuple(physics.items())} if isinstance(physics, Mapping) else {**given}
 
 
 def imagined_right(rules: Rules, runs: Sequence[RunResult]) -> Floats:
@@ -162,11 +165,11 @@ def plan_level(suite: Suite, level: Level, agent: str) -> list[Planned]:
         "evaluation_episodes": suite.evaluation_episodes,
         "hyperparameters": suite.hyperparameters,
         **_FIGURES_ONLY,
-        **level.protocol,
+        **_fields(level.protocol),
     }
     try:
         whole, encoders = plan(level.task, "quick", **fields)
-    except InvalidValueError:
+    except UnableError:
         if "after" not in fields:
             raise
         alone = {name: value for name, value in fields.items() if name not in _EARLIER_TASKS}

@@ -15,6 +15,7 @@ from small_runs import Inline
 from whole_outputs import masked
 
 from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.exact.splits import split_of
 from imagine_bench.report.page import texts
 from imagine_bench.report.sweep import levels_csv, scores_csv, suite_page
@@ -171,3 +172,26 @@ def test_who_cannot_carry_over_starts_anew():
     (alone, _), *_ = plan_level(TINY, level, "table")
     (carried, _), *_ = plan_level(TINY, level, "factored:given")
     assert (alone.after, carried.after) == ((), ("arrow_puzzle",))
+
+
+def test_a_level_keeps_the_world_that_a_file_described(tmp_path):
+    world = tmp_path / "world.json"
+    made = []
+    for cubes in (1, 2):
+        world.write_text(json.dumps({"cubes": cubes}))
+        levels = (Level(name="a", task=f"arrows:@{world}"),)
+        made.append(Suite(name="own", experiments=(Experiment(name="a", parameter="p", question="?", levels=levels),)))
+    assert [each.experiments[0].levels[0].task for each in made] == ["arrows:cubes=1", "arrows:cubes=2"]
+    assert made[0].hash != made[1].hash
+
+
+def test_a_level_with_a_wrong_earlier_task_is_no_level_without_one():
+    level = Level(name="4", task="arrows:cubes=4", protocol={"after": ("arrow_puzzle",)})
+    with pytest.raises(InvalidValueError, match="cannot come after arrow_puzzle"):
+        plan_level(TINY, level, "table")
+
+
+def test_settings_of_physics_are_a_table_in_a_level():
+    fields = {"physics": {"pad_friction": 0.5}, "execution": "physics"}
+    ((planned, _), *_) = plan_level(TINY, Level(name="smooth", task="arrows", protocol=fields), "table")
+    assert planned.physics == (("pad_friction", 0.5),)
