@@ -178,6 +178,18 @@ def mcnemar(first: str, second: str) -> PairedTests:
     return PairedTests(alone, other, p)
 
 
+def detectable_paired(found: PairedTests, pairs: int, *, cells: int) -> float:
+    """Smallest difference of two success rates that :func:`mcnemar` would have shown with probability 80 %.
+
+    From the share of ``pairs`` in which one alone succeeded, which is at least the difference, at the strictest level
+    of :func:`holm` in a table of so many ``cells``; the normal approximation (Connor 1987).
+    """
+    level = (1.0 - LEVEL) / max(cells, 1)
+    square = float(scipy.stats.norm.isf(level / 2.0) + scipy.stats.norm.ppf(POWER)) ** 2
+    least = square / (pairs + square)
+    return math.sqrt(least * max(least, (found.first + found.second) / pairs))
+
+
 def probability_of_improvement(treated: ArrayLike, base: ArrayLike) -> float:
     """Probability that a run of the one scores more than one of the other, half where they tie (Agarwal et al., 2021).
 

@@ -240,9 +240,28 @@ def test_equal_starts_are_compared_exactly(first: str, second: str, alone: tuple
         statistics.mcnemar(first, second + "1")
 
 
+@pytest.mark.parametrize(("pairs", "alone", "cells"), [(400, 80, 1), (1000, 100, 6), (200, 1, 1)])
+def test_a_detectable_difference_of_pairs_is_found_as_often(pairs: int, alone: int, cells: int) -> None:
+    """Benches whose agents differ by just that: four in five of McNemar's exact tests say so."""
+    rng = np.random.default_rng(0)
+    size = statistics.detectable_paired(statistics.PairedTests(alone // 2, alone - alone // 2, 1.0), pairs, cells=cells)
+    share = max(size, alone / pairs)
+    chances = [(share + size) / 2, (share - size) / 2]
+    found = [
+        stats.binomtest(int(b), int(b + c)).pvalue < 0.05 / cells if b + c else False
+        for b, c, _ in rng.multinomial(pairs, [*chances, 1.0 - share], size=1000)
+    ]
+    assert 0.7 < np.mean(found) < 0.9
+
+
 def test_a_table_without_other_cells_is_strict() -> None:
+    pairs = statistics.PairedTests(40, 20, 1.0)
     least, one = (
-        (statistics.detectable(FIVE, OTHERS, cells=cells), statistics.more_seeds(FIVE, OTHERS, cells=cells))
+        (
+            statistics.detectable(FIVE, OTHERS, cells=cells),
+            statistics.detectable_paired(pairs, 400, cells=cells),
+            statistics.more_seeds(FIVE, OTHERS, cells=cells),
+        )
         for cells in (0, 1)
     )
     assert least == one and min(one) > 0.0

@@ -11,6 +11,7 @@ from typing import Any
 
 from imagine_bench.errors import InvalidValueError, SetupError, UnknownNameError, brief, require_known, unprintable
 from imagine_bench.interfaces import Agent, AgentContext, TaskSpec
+from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.interfaces.regression import RegressionSpec, Regressor, RegressorContext
 from imagine_bench.registry.builtin import AGENTS, DEMONSTRATOR, PLAYERS, REGRESSIONS, REGRESSORS, TASKS, WORLD_MODELS
 from imagine_bench.registry.by_value import CodeByValue
@@ -382,3 +383,10 @@ def world_model_entry(name: str) -> WorldModelEntry:
 def make_regressor(name: str, context: RegressorContext) -> Regressor:
     """A new regressor by its registered name. Raises as :func:`make_agent`."""
     return made(f"Regressor {name}", regressor_entry(name).make, context)
+
+
+def make_world_model(name: str, *given: Any) -> WorldModel:
+    """A new world model by its registered name, from the arguments that its entry names. Raises as
+    :func:`make_agent`.
+    """
+    return made(f"World model {name}", world_model_entry(name).make, *given)

@@ -18,7 +18,6 @@ from imagine_bench.errors import SetupError, UnknownNameError
 from imagine_bench.exact.certificate import Certificate
 from imagine_bench.interfaces import RenderMacrostates, RuleFacts, Rules, State, TaskSpec
 from imagine_bench.report.page import estimate, percent
-from imagine_bench.rules import facts as rule_facts
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running.headlines import Headline, headlines
 from imagine_bench.statistics import Estimate
@@ -134,9 +133,7 @@ def collect(result: BenchResult) -> ReportData:
 def _facts(result: BenchResult, spec: TaskSpec) -> RuleFacts | Certificate:
     if result.certificate is not None:
         return result.certificate
-    if result.protocol.split is not None and spec.action_names:
-        return rule_facts(result.protocol.spec(testing=True).rules, spec.horizon)
-    return spec.facts()
+    return _NO_FACTS if result.protocol.split else spec.facts()  # a task's own are of all its starts
 
 
 def _record(data: ReportData, agent: str, place: int, fewest: Callable[[State], int]) -> Record:

@@ -29,8 +29,18 @@ BASE = "base"
 MEASURES = ("success", "auroc")
 """``"success"`` of test episodes, between a level's exact chance and optimum; or ``"auroc"``, with which epistemic
 uncertainty tells wrong imagined transitions from right ones, between 0.5 and 1."""
-_STUDY_SETS = {"task", "preset", "agents", "seeds", "budgets", "evaluation_episodes", "overrides", "settings_digest"}
-_VARIED = sorted({each.name for each in dataclasses.fields(Protocol)} - _STUDY_SETS - {"codes"})
+_STUDY_SETS = {
+    "task",
+    "preset",
+    "agents",
+    "seeds",
+    "budgets",
+    "evaluation_episodes",
+    "overrides",
+    "settings_digest",
+    "codes",
+}
+_VARIED = sorted({each.name for each in dataclasses.fields(Protocol)} - _STUDY_SETS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,6 +225,7 @@ SUITE = "suite"
 """Name of the suite of ``make suite``, which two cores are meant to finish within the hour."""
 GRIDS = {path.stem: read_grid(path) for path in sorted((Path(__file__).parent / "grids").glob("*.toml"))}
 """The grids in ``sweep/grids``, by name."""
+LADDER = GRIDS[SUITE]
 registry.describe_group(registry.STUDY_GROUP, what="study", kind=Study, own=GRIDS)
 
 

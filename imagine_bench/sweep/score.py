@@ -49,7 +49,7 @@ def score(values: Floats, scales: Sequence[Scale], *, trials: int | None = None)
     value = float(seeds.mean())
     low, high = statistics.interval(seeds, trim=0.0, share=False)
     if trials is not None and (len(seeds) == 1 or not math.isnan(low)):
-        half = float(scipy.stats.norm.isf(0.025)) * _error_of_tests(known, span, trials)
+        half = scipy.stats.norm.isf(0.025) * _error_of_tests(known, span, trials)
         low, high = np.fmin(low, value - half), np.fmax(high, value + half)
     return statistics.Estimate(value, float(low), float(high))
 

@@ -20,15 +20,13 @@ from imagine_bench.regression.runner import PairResult, RegressionResult
 from imagine_bench.report.figures import INK, image, small_multiples
 from imagine_bench.report.page import DASH, Section, Table, decimals, estimate, mean_std, number
 
+from .toy_regression import EDGE, FARTHEST, REGION
+
 Cells = dict[str, str]
 """A row of a table, by column."""
 _BLUE = "#0072b2"
 _GRAY = "#8c8c8c"
 _ORANGE = "#d55e00"
-_EDGE = 30.0
-"""Where the toy data ends; beyond, networks extrapolate."""
-_REGION = 10.0
-"""Half the width of the region around 0 where the toy datasets differ."""
 _KINDS = {"epistemic": 60, "modal": 60, "aleatoric": 20}
 """The kinds of uncertainty, and the top of each one's axis in figure 4.1."""
 
@@ -133,9 +131,9 @@ def change(pair: PairResult, base: PairResult, kind: str) -> Floats:
     """
     x = pair.first["x"]
     if pair.variant == base.variant:
-        beyond = x > _EDGE
+        beyond = x > EDGE
         return np.array([stats.spearmanr(x[beyond], row[beyond]).statistic for row in pair.arrays(kind)])
-    inside = np.abs(x) <= _REGION
+    inside = np.abs(x) <= REGION
     return pair.arrays(kind)[:, inside].mean(axis=1) / base.arrays(kind)[:, inside].mean(axis=1)
 
 
@@ -158,7 +156,7 @@ def squared_error_terms(pair: PairResult) -> dict[str, Floats]:
 def _decomposition(pair: PairResult) -> list[Cells]:
     x = pair.first["x"]
     rows = []
-    for words, here in (("data", np.abs(x) <= _EDGE), ("region", np.abs(x) <= _REGION), ("beyond", x > _EDGE)):
+    for words, here in (("data", np.abs(x) <= EDGE), ("region", np.abs(x) <= REGION), ("beyond", x > EDGE)):
         terms = {name: values[:, here] for name, values in squared_error_terms(pair).items()}
         rest = 2 * terms["measured"] - np.sum(list(terms.values()), axis=0)
         means = {name: number(float(values.mean())) for name, values in terms.items()}
@@ -180,8 +178,8 @@ def figure_4_1(data: Mapping[str, Arrays]) -> Figure:
             axes.plot(found["x"], np.sqrt(found[kind][0]), color=_BLUE)
             axes.set(ylim=(0, top), title=f"{kind} (std of y)")
         for axes in (first, *others):
-            axes.axvspan(_EDGE, 40, color=_ORANGE, alpha=0.15)
-            axes.axvspan(-_REGION, _REGION, color=_GRAY, alpha=0.15)
+            axes.axvspan(EDGE, FARTHEST, color=_ORANGE, alpha=0.15)
+            axes.axvspan(-REGION, REGION, color=_GRAY, alpha=0.15)
     return figure
 
 
