@@ -35,12 +35,14 @@ class SuccessTerminates(Wrapper):
     draws for its bookkeeping come from a generator of the wrapper.
 
     Raises:
-        InvalidValueError: An environment of something else.
+        InvalidValueError: An environment of something else, or one whose frames are late.
     """
 
     def __init__(self, env: Env) -> None:
         if not hasattr(env.unwrapped, "agent_view"):
             raise InvalidValueError(f"{env} is no task of imagine_bench; give one.")
+        if env.spec is not None and env.spec.kwargs.get("lag"):
+            raise InvalidValueError("The library records how the scene looks now; give a world without lag.")
         super().__init__(env)
         self._bookkeeping = np.random.default_rng(0)
 

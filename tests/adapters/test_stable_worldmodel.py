@@ -56,6 +56,13 @@ def test_a_recorded_macrostate_is_where_an_episode_begins():
 def test_another_environment_is_one_clear_error():
     with pytest.raises(InvalidValueError, match="no task of imagine_bench"):
         SuccessTerminates(gymnasium.make("CartPole-v1"))
+    for late in (
+        gymnasium.make("imagine_bench/Arrows-v0", lag=1),
+        gymnasium.make(registry.task("arrows:lag=1").env_id),
+    ):
+        with pytest.raises(InvalidValueError, match="give a world without lag"):
+            SuccessTerminates(late)
+        late.close()
 
 
 @pytest.mark.parametrize("task", TASKS)

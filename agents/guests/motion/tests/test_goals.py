@@ -7,7 +7,9 @@ import imagine_bench_motion
 import numpy as np
 import pytest
 from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench_motion.cloned_env import CloneExecutedEnv
 from imagine_bench_motion.control.goals import make
+from imagine_bench_motion.judge.judgement import MotionJudgement
 from stable_baselines3.common.env_checker import check_env
 
 from imagine_bench import registry
@@ -54,6 +56,18 @@ def test_every_control_task_has_a_goal_id_of_its_own() -> None:
 def test_goals_of_images_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="vectors"):
         make("arrow_puzzle", observation="hand,proprio")
+
+
+@pytest.mark.parametrize("hides", ["gesture=0.5", "lag=1"])
+def test_nothing_that_images_hide_is_shown_by_another_way(hides: str) -> None:
+    name, _, value = hides.partition("=")
+    for refused, why in (
+        (lambda: make(f"arrows:{hides}"), "Goals say what the scene is like now"),
+        (lambda: CloneExecutedEnv(**{name: float(value) if "." in value else int(value)}), "A clone acts by what it"),
+        (lambda: MotionJudgement(task=f"arrows:{hides}", models=("no_change",)), "without the parameters gesture and"),
+    ):
+        with pytest.raises(InvalidValueError, match=why):
+            refused()
 
 
 @pytest.mark.slow

@@ -149,6 +149,7 @@ def test_a_path_may_hold_an_at_sign(mine: Path) -> None:
         (f"score nosuchtask {ARROWS}", "No task 'nosuchtask'."),
         ("experience arrow_puzzle_easy FILE", "Cannot write FILE"),
         ("experience arrow_puzzle_easy new --seed -1", "seed is -1; give an integer from 0 on."),
+        ("write arrow_puzzle_easy nosuchtask --seeds 0", "No task 'nosuchtask'."),
         ("write arrow_puzzle_easy --seeds -1", "--seeds is -1; give an integer from 0 on."),
         ("write arrow_puzzle_easy --times 0", "--times is 0, and the cautious learner of arrow_puzzle_easy has 20"),
         ("write arrow_puzzle_easy --times nan", "--times is nan, and"),
@@ -166,7 +167,9 @@ def test_an_error_of_a_command_ends_with_its_own_exit_code(
     with pytest.raises(SystemExit) as ended:
         commands.main()
     assert ended.value.code == 2
-    assert capsys.readouterr().err.startswith(sentence)
+    said = capsys.readouterr()
+    assert said.err.startswith(sentence)
+    assert not said.out, "it ends before any work"
     assert [path.name for path in tmp_path.iterdir()] == ["FILE"]
 
 

@@ -120,7 +120,8 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
 
     Raises:
         ArtefactError: No such file.
-        InvalidValueError: Another execution, or a clone that does not see proprio and something more.
+        InvalidValueError: Another execution, a clone that does not see proprio and something more, or a world whose
+            images hide something or are late.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own declaration
@@ -140,6 +141,8 @@ class CloneExecutedEnv(gymnasium.Env[Frame, np.int64]):
             raise InvalidValueError(f"The clone sees {self.clone.observation}; give one that sees proprio, and more.")
         size = self.clone.about.get("size_px", FRAME_PX)
         self.motion = skill_env(self.clone.observation, appearance, **{"time_limit_s": 1e9, "size": size, **options})
+        if self.motion.task.sight is not None:
+            raise InvalidValueError("A clone acts by what it sees now; leave out gesture and lag.")
         self.action_names = self.motion.task.action_names
         self.action_space = gymnasium.spaces.Discrete(len(self.action_names))
         view = agent_camera_view()

@@ -119,23 +119,26 @@ def _write(given: argparse.Namespace) -> None:
     if given.own and not given.codes:
         raise InvalidValueError("--own reads images; name their appearance with --codes, such as --codes clean.")
     kind = f"own {given.codes}" if given.own else given.codes
-    for name in given.tasks:
-        spec = task(name)
-        learner = _learner(spec)
-        if learner is None:
-            raise InvalidValueError(
-                f"The cautious learner does not end in {name}, so there is no budget; leave it out."
-            )
-        if not 1.0 <= given.times * learner < math.inf:
-            few = f"--times is {given.times:g}, and the cautious learner of {name} has {learner:.0f} macro-actions"
-            raise InvalidValueError(f"{few}; give more, so that the writer has at least one.")
+    for spec, learner in [_budgeted(name, given.times) for name in given.tasks]:
         budget = int(given.times * learner)
-        for seed in [seed for seed in given.seeds if (name, kind, seed, budget) not in done]:
+        for seed in [seed for seed in given.seeds if (spec.id, kind, seed, budget) not in done]:
             found = written(spec, budget, seed, given.codes, own=given.own)
-            rows.append({"task": name, "codes": kind, "learner": learner, **found})
+            rows.append({"task": spec.id, "codes": kind, "learner": learner, **found})
             print(*(f"{value:.4g}" if isinstance(value, float) else value for value in rows[-1].values()), flush=True)
             if given.out is not None:
                 write_json(given.out, {"rows": rows, "environment": describe_environment()})
+
+
+def _budgeted(name: str, times: float) -> tuple[TaskSpec, float]:
+    """A task, and the cautious learner's macro-actions. Raises InvalidValueError: they are no budget of a writer."""
+    spec = task(name)
+    learner = _learner(spec)
+    if learner is None:
+        raise InvalidValueError(f"The cautious learner does not end in {name}, so there is no budget; leave it out.")
+    if not 1.0 <= times * learner < math.inf:
+        few = f"--times is {times:g}, and the cautious learner of {name} has {learner:.0f} macro-actions"
+        raise InvalidValueError(f"{few}; give more, so that the writer has at least one.")
+    return spec, learner
 
 
 def _kept(out: Path) -> tuple[list[dict[str, Any]], set[tuple[Any, ...]]]:

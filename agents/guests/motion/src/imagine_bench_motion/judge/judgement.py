@@ -53,7 +53,8 @@ class MotionJudgement:
 
     Raises:
         UnknownNameError: No such task or model.
-        InvalidValueError: A task without continuous control, or sizes or seeds out of range.
+        InvalidValueError: A task without continuous control or whose frames hide something, or sizes or seeds out of
+            range.
     """
 
     task: str  #: task of macro-actions that has continuous control
@@ -67,6 +68,11 @@ class MotionJudgement:
         object.__setattr__(self, "task", registry.task_name(self.task))  # seeds and folder depend on it
         if not registry.task_entry(self.task).motion:
             raise InvalidValueError(f"Task {self.task} has no continuous control; give one of this suite.")
+        if registry.task(self.task).sight is not None:
+            raise InvalidValueError(
+                f"Frames of {self.task} hide some of the world or are late, and motions are judged by frames that show "
+                "it as it is. Judge a task without the parameters gesture and lag."
+            )
         if not self.models or not self.seeds or min(self.seeds) < 0:
             raise InvalidValueError("There is nothing to judge; give at least one model and one seed of at least 0.")
         for name, given in (("models", self.models), ("seeds", self.seeds)):
