@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
@@ -139,10 +139,11 @@ _WORDS = {
     "What does it cost?": "CPU seconds are those of one core: of fitting, and of imagining 1,000 macro-actions. Frames "
     "beforehand are those on which the model's encoder had been trained before.",
 }
-SHORT = (
+_MAIN = (
     *("total_variation", "perfect_sampler", "unbiased", "unreadable", "value_loss"),
     *("policy_tau", "lift", "exploit", "auroc_wrong", "counterfactual", "fit_s"),
 )
+SHORT = {name: COLUMNS[name] for name in _MAIN}
 _SHARES = {
     *("total_variation", "tv_3", "tv_5", "tv_10", "perfect_sampler", "perfect_10", "after_the_end", "unreadable"),
     *("outcome_ece", "reward_ece", "end_error", "end_ece"),
@@ -240,27 +241,23 @@ def _title(model: str) -> str:
     return model_entry(model).label
 
 
-def _scores(found: Judged, table: str, names: Collection[str]) -> Table:
-    """A row a model and number of transitions, a column a score over seeds."""
+def _scores(found: Judged, table: str, columns: Mapping[str, str]) -> Table:
+    """A row a model and number of transitions, a column a score over seeds; ``columns`` are their titles by score."""
     rows: list[list[str]] = []
     for (model, size), cells in found.cells.items():
         transitions = DASH if runs_of(model) else f"{size:,}"  # those of a trained agent are its bench's to say
-        scores = (over_seeds([score(cell, name) for cell in cells], _number, share=name in _SHARES) for name in names)
+        scores = (over_seeds([score(cell, name) for cell in cells], _number, share=name in _SHARES) for name in columns)
         marks = {encoders.mark(cell.get("encoder_reads")) for cell in cells}
         rows.append([_title(model) + max(marks), transitions, *scores])
-    header = ["world model", "transitions", *map(COLUMNS.__getitem__, names)]
+    header = ["world model", "transitions", *columns.values()]
     caption = "Interquartile means over seeds or runs, with 95 % intervals. 0 is best in every error; value loss and "
     return Table(table, header, rows, f"{caption}regret are in units of reward.", _WHY_DASH)
 
 
-def _tables(found: Judged, name: str, scores: Sequence[str]) -> list[Table]:
-    """Tables of all scores, as many as fit the page beside each other in each."""
-    parts = math.ceil(len(scores) / _MOST_SCORES)
-    size = math.ceil(len(scores) / parts)
-    return [
-        _scores(found, f"{name}_{part + 1}" if part else name, scores[part * size : (part + 1) * size])
-        for part in range(parts)
-    ]
+def _tables(found: Judged, name: str, columns: Mapping[str, str]) -> list[Table]:
+    """Tables of all these scores, as many as fit the page beside each other in each."""
+    parts = np.array_split(list(columns.items()), math.ceil(len(columns) / _MOST_SCORES))
+    return [_scores(found, f"{name}_{at}" if at > 1 else name, dict(part)) for at, part in enumerate(parts, 1)]
 
 
 def in_short(found: Judged) -> Section:
@@ -281,23 +278,19 @@ def in_short(found: Judged) -> Section:
 def question(found: Judged, title: str) -> Section:
     """The scores that answer one question, after every number of transitions."""
     name = title.lower().strip("?").replace(" ", "_").replace(",", "")
-    return Section(title, [_WORDS[title]], tables=_tables(found, name, tuple(QUESTIONS[title])))
+    return Section(title, [_WORDS[title]], tables=_tables(found, name, QUESTIONS[title]))
 
 
 def levels(found: Judged) -> Section:
     """The scores of each level L0 to L7, its claims, and the policy that each model overrates most."""
     reader = "Returns of policies in a model hold the errors of the reader of its images, too, which stand above."
-    level_of = {name: level.name for level in LEVELS for name in level.measures}
     films = []
     for model, arrays in shown(found.folder, found.judgement).items():
         if arrays.get("film"):
             films.append(film_image(model, _title(model), found.spec, arrays["film"], arrays))
-    titles = {COLUMNS[name]: f"{level} {COLUMNS[name]}" for name, level in level_of.items()}
-    tables = [
-        replace(table, header=[titles.get(title, title) for title in table.header])
-        for table in _tables(found, "levels", tuple(level_of))
-    ]
-    return Section("From looks to exploits: L0 to L7", [reader], tables=[*tables, claims_table()], images=films)
+    columns = {name: f"{level.name} {COLUMNS[name]}" for level in LEVELS for name in level.measures}
+    tables = [*_tables(found, "levels", columns), claims_table()]
+    return Section("From looks to exploits: L0 to L7", [reader], tables=tables, images=films)
 
 
 def compared(found: Judged) -> Section:
