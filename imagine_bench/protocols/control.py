@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -326,7 +326,7 @@ def usual_agents(task_name: str, preset: str) -> tuple[str, ...]:
 
 
 def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
-    """The protocol of a preset as the task has it, with ``changes`` to single fields.
+    """The protocol of a preset as the task has it, with ``changes`` to single fields; ``physics`` may be a mapping.
 
     Where no agents are named, those of this suite's guests that are not installed are left out.
 
@@ -353,6 +353,8 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     if isinstance(values.get("agents"), list | tuple):  # any other type is refused below
         values["agents"] = tuple(spelled(agent, AGENT_GROUP) for agent in values["agents"])
     values["after"] = tuple(map(canonical, values.get("after", ())))
+    if isinstance(values.get("physics"), Mapping):
+        values["physics"] = tuple(values["physics"].items())
     if values.get("split") is not None:
         values["split"] = split_of(spec.rules, values["split"]).identity
     wanted = Protocol(task=spec.id, preset=preset, **values)

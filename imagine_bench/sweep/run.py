@@ -95,14 +95,8 @@ def plan_variant(study: Study, task: str, variant: Variant) -> Planned:
         budgets=study.budgets,
         evaluation_episodes=study.evaluation_episodes,
         overrides=tuple(sorted(variant.settings.items())),
-        **{**_FIGURES_ONLY, "execution": study.execution, "appearance": study.appearance, **_fields(variant.world)},
+        **{**_FIGURES_ONLY, "execution": study.execution, "appearance": study.appearance, **variant.world},
     )
-
-
-def _fields(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a protocol, from those of a grid, where settings of physics are a table."""
-    physics = given.get("physics")
-    return {**given, "physics": tuple(physics.items())} if isinstance(physics, Mapping) else {**given}
 
 
 def imagined_right(rules: Rules, runs: Sequence[RunResult]) -> Floats:
@@ -165,7 +159,7 @@ def plan_level(suite: Suite, level: Level, agent: str) -> list[Planned]:
         "evaluation_episodes": suite.evaluation_episodes,
         "hyperparameters": suite.hyperparameters,
         **_FIGURES_ONLY,
-        **_fields(level.protocol),
+        **level.protocol,
     }
     try:
         whole, encoders = plan(level.task, "quick", **fields)
