@@ -311,3 +311,5 @@ def test_actions_frames_and_episode_lengths_are_remembered(trained: Trained) -> 
     state = learner.state()
     resumed.restore(AgentState(arrays=state.arrays, values={**state.values, "longest": 6}))
     assert np.abs(np.subtract(*late(resumed))).max() > 1.0, "with one macro-action left, other things are worth doing"
+    resumed.reset_for_new_task()
+    assert resumed.state().values["longest"] is None, "another task may cut episodes elsewhere"

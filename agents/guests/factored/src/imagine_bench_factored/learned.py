@@ -53,6 +53,11 @@ class LearnedPerceptionAgent(CodeAgent):
         self._acted = 0
         self.perception.begin_episode()
 
+    def reset_for_new_task(self) -> None:
+        """As on any codes; and the next task may cut episodes elsewhere."""
+        super().reset_for_new_task()
+        self._longest = None
+
     @property
     def _left(self) -> int | None:
         return None if self._longest is None else self._longest - max(self._acted, self._observed)

@@ -44,6 +44,13 @@ def main() -> None:
         sys.exit(error.exit_code)
 
 
+def _require_new(file: Path) -> None:
+    """Raise InvalidValueError, before long work, where its result would replace another; SetupError as it is said."""
+    require_writable(file.parent)
+    if file.exists():
+        raise InvalidValueError(f"{file} exists; give another file.")
+
+
 def _add_demonstrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, help="the .npz file to write")
     parser.add_argument("--count", type=int, default=300)
@@ -58,7 +65,7 @@ def _add_demonstrate(parser: argparse.ArgumentParser) -> None:
 
 
 def _demonstrate(given: argparse.Namespace) -> None:
-    require_writable(given.file.parent)
+    _require_new(given.file)
     began_s = time.process_time()
     data = collect(
         given.count,
@@ -93,7 +100,7 @@ def _add_clone(parser: argparse.ArgumentParser) -> None:
 
 
 def _clone(given: argparse.Namespace) -> None:
-    require_writable(given.file.parent)
+    _require_new(given.file)
     data = DemonstrationData.load(given.demonstrations)
     if given.first is not None:
         data = data.first(given.first)
@@ -126,7 +133,7 @@ def _add_try(parser: argparse.ArgumentParser) -> None:
 def _try(given: argparse.Namespace) -> None:
     clone = Clone.load(given.file)
     if given.out is not None:
-        require_writable(given.out.parent)
+        _require_new(given.out)
     began_s = time.process_time()
     found = tries(
         clone,
@@ -208,7 +215,7 @@ def _flat(given: argparse.Namespace) -> None:
         kept = {**_asked(given), "commit": commit, "curve": curve}
         write_json(given.out, kept)
 
-    require_writable(given.out.parent)
+    _require_new(given.out)
     commit = describe_environment()["commit"]
     curve: list[dict[str, float]] = []
     chosen = {"settings": given.settings, "reward": given.reward}
@@ -239,7 +246,7 @@ def _level(given: argparse.Namespace) -> None:
 
     if given.clone is not None and given.execution != "clone":
         raise InvalidValueError("The planner needs no clone; leave out --clone, or give --execution clone.")
-    require_writable(given.out.parent)
+    _require_new(given.out)
     world = {"cubes": given.cubes, "slip": given.slip, "clone": given.clone}
     env, test_env = (environment(given.execution, **world) for _ in range(2))
     kept: dict[str, Any] = {**_asked(given), "commit": describe_environment()["commit"], "curve": []}
