@@ -300,3 +300,26 @@ def test_a_read_out_finds_what_the_first_frame_said() -> None:
             agent.act(Observation(frame=shown), explore=False)
         assert agent.read_memory(blank, (ACTIONS,)).tolist() == [cue], "and the blank frame shows no cue"
     assert same(before, agent.state())
+
+
+@pytest.mark.parametrize("how", ["reset_for_new_task", "restore"])
+def test_a_read_out_is_of_the_present_world_alone(how: str) -> None:
+    """As many steps as in the world before, where frames showed a cue."""
+
+    def live(agent: RememberingAgent, shown: int) -> list[int]:
+        agent.perception.plain.encoder = CueEncoder()
+        for episode in range(3):
+            agent.begin_episode()
+            agent.observe(transition(shown, 0, 0.0, 0, terminated=True), episode=episode)
+        agent.begin_episode()
+        return agent.read_memory(frame(0), (ACTIONS,)).tolist()
+
+    agent, other = (make("imagination_memory") for _ in range(2))
+    assert live(agent, shown=2) == [1]
+    assert live(other, shown=0) == [readout.NEVER_SEEN]
+    if how == "restore":
+        agent.restore(other.state())
+        assert agent.read_memory(frame(0), (ACTIONS,)).tolist() == [readout.NEVER_SEEN]
+    else:
+        agent.reset_for_new_task()
+        assert live(agent, shown=0) == [readout.NEVER_SEEN]

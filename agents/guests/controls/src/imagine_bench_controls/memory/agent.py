@@ -48,7 +48,7 @@ class RememberingAgent(DQN, ABC):
     ) -> None:
         remembering = Remembering(perception, settings.recurrence.units, self.recurrence_now)
         super().__init__(remembering, n_actions, settings, seeds, device, **more)
-        self._read_out: tuple[int, ReadOut] | None = None  # of how many real steps
+        self.read_out: tuple[int, ReadOut] | None = None  #: the newest read-out, of so many real steps
         self.begin_episode()
 
     def begin_episode(self) -> None:
@@ -120,11 +120,12 @@ class RememberingAgent(DQN, ABC):
 
     def read_memory(self, frame: Frame, sizes: Sequence[int]) -> NDArray[np.int64]:
         """The values that a linear read-out finds in the memory; see :class:`.capabilities.MemoryReader`."""
-        if self._read_out is None or self._read_out[0] != self.steps:
-            self._read_out = self.steps, fit(self.real, self.recurrence, self.perception.plain.encoder, sizes)
-        return self._read_out[1](self.perceive(frame)[self.perception.plain.latent_size :])
+        if self.read_out is None or self.read_out[0] != self.steps:
+            self.read_out = self.steps, fit(self.real, self.recurrence, self.perception.plain.encoder, sizes)
+        return self.read_out[1](self.perceive(frame)[self.perception.plain.latent_size :])
 
     def restore(self, state: AgentState) -> None:
         """Take up a snapshot between two episodes; ArtefactError if it does not fit this agent."""
         super().restore(state)
+        self.read_out = None
         self.begin_episode()

@@ -72,6 +72,11 @@ class ImaginingMemoryAgent(RememberingAgent, ImaginingAgent):
         """That of the world model."""
         return self.imagination.model.recurrence
 
+    def reset_for_new_task(self) -> None:
+        """As without memory, and what is remembered is read anew."""
+        super().reset_for_new_task()
+        self.read_out = None
+
     def draw_model_batches(self, generator: torch.Generator) -> Iterator[Batch]:
         """Replayed sequences as transitions between states, through which losses reach the recurrent network."""
         settings = self.settings.model
