@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import gymnasium
 import imagine_bench_motion
 import numpy as np
 import pytest
 from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench.tasks.continuous.spec import make_arrows
 from imagine_bench_motion.cloned_env import CloneExecutedEnv
-from imagine_bench_motion.control.goals import make
+from imagine_bench_motion.control.goals import GoalEnv, make
 from imagine_bench_motion.judge.judgement import MotionJudgement
 from stable_baselines3.common.env_checker import check_env
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
+from imagine_bench.interfaces import Outcome, Rules, State
+from imagine_bench.rules import states_of
 
 IDS = sorted(env_id for env_id in gymnasium.registry if env_id.startswith(f"{imagine_bench_motion.__name__}/"))
 
@@ -43,6 +49,29 @@ def test_a_goal_is_reached_by_the_optimal_macro_actions_alone(task: str, start: 
     relabelled = goals.compute_reward(achieved, np.broadcast_to(achieved[-1], achieved.shape), {})
     assert relabelled[-1] == 0.0
     assert relabelled[0] == -1.0
+
+
+class Unlucky:
+    """Rules by which every macro-action ends the episode in a forbidden macrostate, every second time."""
+
+    def __init__(self, rules: Rules) -> None:
+        self._rules = rules
+        self._forbidden = next(state for state in states_of(rules) if not rules.is_legal(state))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._rules, name)
+
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
+        usual = (replace(each, probability=each.probability / 2) for each in self._rules.outcomes(macrostate, action))
+        return (Outcome(0.5, self._forbidden, -5.0, terminated=True, success=False), *usual)
+
+
+def test_a_goal_is_no_failure_that_may_come_on_the_way() -> None:
+    usual, unlucky = (make_arrows(observation="proprio,objects") for _ in range(2))
+    unlucky.task = replace(unlucky.task, rules=Unlucky(unlucky.task.rules))
+    start = {"macrostate": (1, 2, 0, 1)}
+    goals = [GoalEnv(each).reset(seed=0, options=start)[0]["desired_goal"] for each in (usual, unlucky)]
+    np.testing.assert_array_equal(*goals)
 
 
 def test_every_control_task_has_a_goal_id_of_its_own() -> None:

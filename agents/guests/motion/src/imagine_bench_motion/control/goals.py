@@ -51,7 +51,8 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
         self._motion = env
         self._planned = env.another_world()
         tables = tabulate(env.task.rules)
-        self._to_go = dict(zip(tables.index, shortest_plans(tables).tolist(), strict=True))
+        lengths = dict(zip(tables.index, shortest_plans(tables).tolist(), strict=True))
+        self._to_go = {macrostate: length for macrostate, length in lengths.items() if length > 0}
         low, high = (np.concatenate([getattr(space, end).ravel() for space in spaces]) for end in ("low", "high"))
         goal = gymnasium.spaces.Box(-2.0, 2.0, (_PER_OBJECT * len(env.world.object_names),), np.float32)
         vector = gymnasium.spaces.Box(low, high, dtype=np.float32)
@@ -101,9 +102,9 @@ class GoalEnv(gymnasium.Wrapper[Observed, Any, Observed, Any]):
         """The macrostate in which the optimal policy succeeds, where chance is as kind as it can be."""
         rules = self._motion.task.rules
         macrostate = start
-        while self._to_go.get(macrostate, 0) > 0:
+        while macrostate in self._to_go:
             outcomes = rules.outcomes(macrostate, rules.optimal_action(macrostate))
-            best = min(outcomes, key=lambda outcome: 0 if outcome.success else self._to_go[outcome.macrostate])
+            best = min(outcomes, key=lambda each: 0 if each.success else self._to_go.get(each.macrostate, math.inf))
             macrostate = best.macrostate
             if best.terminated:
                 break
