@@ -39,7 +39,7 @@ from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, show
 from imagine_bench.judge.models import ModelSource, model_entry, opened, source_of
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.judge.scores import FORMER
-from imagine_bench.report.judge import COLUMNS, Judged, judged, judgement_page
+from imagine_bench.report.judge import COLUMNS, Judged, in_short, judged, judgement_page
 from imagine_bench.report.page import DASH
 from imagine_bench.running import bench as benches
 from imagine_bench.seeding import SeedTree
@@ -334,6 +334,14 @@ def test_the_page_of_a_judgement(said: Said, expected: Expected) -> None:
     words = page_in_words(dataclasses.replace(page, facts={}))
     text = f"{words}\n== terminal\n{page.summary}".replace(str(said.folder), "HERE")
     expected("judgement", short(text), exactly=False)
+
+
+def test_the_short_table_has_the_most_transitions_in_any_order(said: Said) -> None:
+    """Such as where a cell of few transitions was lost, and is made last."""
+    found = judged(said.folder, _of("nearest", "copy"))
+    turned = dataclasses.replace(found, cells=dict(reversed(found.cells.items())))
+    rows, others = (sorted(in_short(each).tables[0].rows) for each in (found, turned))
+    assert rows == others and {row[1] for row in rows} == {"60"}
 
 
 def test_lost_cells_and_images_alone_are_made_anew(copied: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import math
 import re
 from pathlib import Path
 
@@ -19,8 +20,20 @@ from imagine_bench.protocols.control import Protocol
 from imagine_bench.report import bench_page, write_report
 from imagine_bench.report.bench import shown, verdict
 from imagine_bench.report.data import DIFFERENCE, SCORE, collect
-from imagine_bench.report.page import Page, Table, percent
+from imagine_bench.report.page import Page, Table, number, percent
 from imagine_bench.store.results import BenchResult, Checkpoint, RunResult
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        *((0.0, "0.000"), (0.0004, "4.00e\u221204"), (0.9994, "0.999"), (0.9996, "1.00"), (9.994, "9.99")),
+        *((9.996, "10.0"), (-9.996, "\u221210.0"), (99.96, "100"), (1234.6, "1235"), (1e5, "1.00e+05")),
+        *((math.nan, "–"), (math.inf, "∞")),
+    ],
+)
+def test_a_number_is_printed_to_three_digits(value: float, words: str) -> None:
+    assert number(value) == words
 
 
 @pytest.fixture(scope="module")
