@@ -357,10 +357,16 @@ def separating() -> None:
     Failed tests stand above the solved ones, by cause, where causes are kept; those of all seeds that have them.
     """
     folders = [RESULTS / f"separating-{name}" for name in ("world-453", *(f"{name}-450" for name in CHALLENGES))]
-    also = {"separating-world-453": ("separating-world-lewm-453", "separating-world-lewm-454")}
+    also = {
+        "separating-world-453": {
+            "factored": ["separating-world-710"],
+            "lewm": ["separating-world-lewm-453", "separating-world-lewm-454"],
+        }
+    }
     benches = [json.loads((folder / "bench.json").read_text()) for folder in folders]
     widths = [
-        len(kept["protocol"]["agents"]) + (folder.name in also) for folder, kept in zip(folders, benches, strict=True)
+        len({*kept["protocol"]["agents"], *also.get(folder.name, ())})
+        for folder, kept in zip(folders, benches, strict=True)
     ]
     figure, every = plt.subplots(
         1, len(folders), figsize=(13.6, 3.4), width_ratios=widths, sharey=True, layout="constrained"
@@ -369,13 +375,14 @@ def separating() -> None:
         protocol = kept["protocol"]
         last = protocol["budgets"][-1]
         shown = {agent_label(agent, protocol): [folder.name] for agent in protocol["agents"]}
-        shown |= {"lewm": list(also[folder.name])} if folder.name in also else {}
+        shown |= also.get(folder.name, {})
         agents = sorted(shown)
         for place, agent in enumerate(agents):
             values = 100 * np.concatenate([rates(name, agent)[last] for name in shown[agent]])
             bottom = values.mean()
             axes.bar(place, bottom, width=0.6, color="#d9d9d9", label="solved" if agent == agents[0] else None)
-            counts = failures(folder).get(agent, {}).get(str(last), Counter())
+            places = {folder, *(RESULTS / name for name in shown[agent])}
+            counts = sum((failures(each).get(agent, {}).get(str(last), Counter()) for each in places), Counter())
             for cause, color in zip(CAUSES, CAUSE_COLORS, strict=True):
                 share = (100 - values.mean()) * counts[cause] / max(1, counts.total())
                 axes.bar(place, share, bottom=bottom, width=0.6, color=color, label=cause if counts[cause] else None)
