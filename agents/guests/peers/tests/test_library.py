@@ -18,7 +18,7 @@ from small_runs import measured, run_observed, small
 import imagine_bench  # noqa: F401 - registers the environments
 from imagine_bench import registry
 from imagine_bench.errors import ArtefactError, SetupError
-from imagine_bench.interfaces import AgentState
+from imagine_bench.interfaces import AgentState, Observation
 from imagine_bench.protocols.control import context_of
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running import runner
@@ -81,6 +81,17 @@ def test_its_loop_is_counted_and_tested_and_leaves_no_temporary_files(
         assert last.diagnostics["loss/dynamics"] and "imagination/acceptance_rate" in last.diagnostics
 
 
+@pytest.mark.parametrize("explore", [False, True])
+def test_it_acts_greedily_unless_it_explores(explore: bool) -> None:
+    from imagine_bench_peers.sb3 import LibraryAgent
+
+    agent = object.__new__(LibraryAgent)
+    agent._encoder = None
+    agent._model = mock.Mock(**{"predict.return_value": (np.int64(2), None)})
+    assert agent.act(Observation(frame=np.zeros((64, 64, 3), np.uint8)), explore=explore) == 2
+    assert agent._model.predict.call_args.kwargs == {"deterministic": not explore}
+
+
 def test_exploration_does_not_depend_on_the_last_budget(tmp_path: Path) -> None:
     """Fewer possible steps than exploration takes, and more: one run gives all budgets."""
     eighty = tuple(sorted({**registry.own_settings(LATENTS, FEW), "sb3.exploration_steps": 80}.items()))
@@ -138,7 +149,6 @@ LISTENER = mock.MagicMock()
 
 
 def test_the_library_sees_rewards_of_about_one(world: gymnasium.Env[Any, Any]) -> None:
-    from imagine_bench_peers.sb3 import LibraryAgent
 
     agent = LibraryAgent(context_of(spec("sb3_dqn")), f"{__name__}:LISTENER")
     agent.train(world, episodes=1, horizon=30, on_episode=lambda solved, length: False)
