@@ -149,6 +149,7 @@ LISTENER = mock.MagicMock()
 
 
 def test_the_library_sees_rewards_of_about_one(world: gymnasium.Env[Any, Any]) -> None:
+    from imagine_bench_peers.sb3 import LibraryAgent
 
     agent = LibraryAgent(context_of(spec("sb3_dqn")), f"{__name__}:LISTENER")
     agent.train(world, episodes=1, horizon=30, on_episode=lambda solved, length: False)
