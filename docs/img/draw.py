@@ -360,6 +360,7 @@ def separating() -> None:
     also = {
         "separating-world-453": {
             "factored": ["separating-world-710"],
+            "laws:given": ["separating-world-453", "separating-world-given-710"],
             "lewm": ["separating-world-lewm-453", "separating-world-lewm-454"],
         }
     }
