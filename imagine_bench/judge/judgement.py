@@ -22,7 +22,7 @@ from imagine_bench.interfaces import TaskSpec
 from imagine_bench.interfaces.model import WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.change import Streams, change_detection_delay, counterfactual_error, streams_of
-from imagine_bench.judge.models import JudgedModel, model_entry, one_name, opened, runs_of, source_of
+from imagine_bench.judge.models import JudgedModel, code_of, model_entry, one_name, opened, runs_of, source_of
 from imagine_bench.judge.policies.levels import counted_table
 from imagine_bench.judge.policies.policy_set import PolicyWorld, policy_world
 from imagine_bench.judge.predictions import Predictions, ask_together, call, evaluate, imagined_by
@@ -250,8 +250,16 @@ def carry_out(judgement: Judgement, folder: Path, cell: ModelFit, tell: Callable
 
 def _is_whole(folder: Path, cell: ModelFit) -> bool:
     """Whether a cell is kept, and its images are where it has some. Raises ArtefactError: it is damaged."""
+    found = _read(folder, cell)
+    return found is not None and ("images" not in found or (folder / cell.images).exists())
+
+
+def _read(folder: Path, cell: ModelFit) -> dict[str, Any] | None:
+    """A cell as it is kept; None where it is not, or its model's code has changed."""
     file = folder / cell.file
-    return file.exists() and ("images" not in read_sealed(file, "a judged cell") or (folder / cell.images).exists())
+    found = read_sealed(file, "a judged cell") if file.exists() else {"code": None}
+    now = code_of(cell.model)
+    return found if found.get("code", now) == now else None
 
 
 def judge_cell(judgement: Judgement, folder: Path, cell: ModelFit) -> tuple[dict[str, Any], Arrays]:
@@ -332,6 +340,7 @@ def _judged(
         "reader": world.reader_digest,
         "policies": world.policies_digest,
         "privileged": model_entry(cell.model).privileged,
+        "code": code_of(cell.model),
     }
     images = _images(cell.model, judged.model, world, scores["worst"], seeds.child("pictures").generator())
     return found, images if film is None else images | film.images(world.index.frame)
@@ -437,7 +446,7 @@ def _images(name: str, model: WorldModel, world: AskedWorld, worst: list[int], r
 def kept(folder: Path, judgement: Judgement) -> list[dict[str, Any]]:
     """Every cell of a judgement that is kept. Raises ArtefactError: one is damaged."""
     cells = sorted(judgement.cells, key=lambda cell: judgement.models.index(cell.model))
-    found = [today(read_sealed(folder / cell.file, "a judged cell")) for cell in cells if (folder / cell.file).exists()]
+    found = [today(each) for cell in cells if (each := _read(folder, cell)) is not None]
     made_by = {
         "read by different readers": {cell.get("reader", "") for cell in found},
         "judged by different policies": {cell["policies"] for cell in found if "policies" in cell},

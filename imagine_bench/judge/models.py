@@ -5,6 +5,7 @@ An agent's own reading of its images counts for nothing when it is judged: they 
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -194,7 +195,7 @@ def source_of(
         appearance: How frames vary.
         seeds: The model's node of the seed tree.
         encoder: A bundled name or a file, for models that read its latents or codes; the others see through the task's
-            own.
+            own, or that of their run.
 
     Raises:
         UnknownNameError: No such model.
@@ -203,7 +204,12 @@ def source_of(
     """
     entry = model_entry(name)
     if Path(name) in runs_of(name).values():
-        kept = read_agent(Path(name))
+        try:
+            kept = read_agent(Path(name))
+        except ArtefactError:
+            if encoder is None:
+                raise
+            kept = read_agent(Path(name), encoder=encoder)
         learned = kept.spec.protocol.task
         if registry.task(learned).id != spec.id:
             raise InvalidValueError(f"{name} learned {learned}, not {spec.id}; give a run of {spec.id}.")
@@ -300,7 +306,21 @@ def model_entry(model: str) -> WorldModelEntry:
     title = entry.title or agent
     if folder == Path(model):
         title = f"{title}, seed {seed}"
-    return WorldModelEntry(make=str(entry.make), title=title, privileged=entry.privileged)
+    kind = entry.encoder_kind if entry.needs_encoder else None
+    return WorldModelEntry(make=str(entry.make), title=title, privileged=entry.privileged, encoder_kind=kind)
+
+
+def code_of(model: str) -> str:
+    """A digest of the package that offers a world model; empty for one of this suite, and for the agents of runs."""
+    make = model_entry(model).make
+    if runs_of(model) or registry.is_ours(make):
+        return ""
+    found = find_spec(make.partition(":")[0].partition(".")[0])
+    folders = (found.submodule_search_locations or ()) if found else ()
+    files = sorted(file for folder in folders for file in Path(folder).rglob("*.py"))
+    if found and not files and found.origin:
+        files = [Path(found.origin)]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
 def one_name(model: str) -> str:

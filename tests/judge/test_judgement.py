@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,10 +40,12 @@ from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, show
 from imagine_bench.judge.models import ModelSource, model_entry, opened, source_of
 from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.judge.scores import FORMER
+from imagine_bench.protocols.control import protocol
 from imagine_bench.report.judge import COLUMNS, Judged, in_short, judged, judgement_page
 from imagine_bench.report.page import DASH
 from imagine_bench.running import bench as benches
 from imagine_bench.seeding import SeedTree
+from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.files import read_arrays, read_sealed, sealed, write_arrays, write_json
 
 _PYPROJECT = """
@@ -277,6 +280,22 @@ def test_cells_of_other_readers_or_policies_are_not_compared(copied: Path) -> No
         shown(copied, _of("exact"))
 
 
+def test_a_model_whose_code_has_changed_is_judged_anew(copied: Path) -> None:
+    cell = ModelFit("nearest", 1000, 20)
+    before = read_sealed(copied / cell.file, "a cell")
+    package = find_spec("their_models")
+    assert package is not None and package.origin is not None and len(before["code"]) == 12
+    module = Path(package.origin)
+    code = module.read_text()
+    module.write_text(f"{code}# another version\n")
+    try:
+        assert {each["model"] for each in kept(copied, _of("nearest", "copy"))} == {"copy"}
+        assert not judgement.carry_out(_of("nearest", "copy", "exact"), copied, cell)
+        assert read_sealed(copied / cell.file, "a cell")["code"] != before["code"]
+    finally:
+        module.write_text(code)
+
+
 def test_former_names_of_scores_are_read(copied: Path) -> None:
     cell = copied / ModelFit("exact", 1000, 60).file
     before = kept(copied, _of("exact"))
@@ -456,6 +475,18 @@ def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Pat
     found = visited("imaginer", "arrow_puzzle")
     assert found and len(found) <= 2 * 20, "its experience is the one that the bench counted"
     assert all(len(state) == 4 and 0 <= action < 6 for state, action in found)
+
+
+def test_a_run_is_judged_through_the_encoder_that_is_given(tmp_path: Path) -> None:
+    own = tmp_path / "own.safetensors"
+    shutil.copy(encoders.own(registry.task("arrow_puzzle"), "clean"), own)
+    wanted = protocol("arrow_puzzle", "smoke", agents=("imagination",), encoder=encoders.identity(own))
+    config = {"format": run_folder.FORMAT, "protocol": wanted.as_dict(), "agent": "imagination", "seed": 0}
+    write_json(tmp_path / "config.json", sealed({**config, "settings": {}}))
+    assert model_entry(str(tmp_path)).encoder_kind == "latents"
+    for given, words in ((None, "which is not here"), (str(own), "has no checkpoint")):  # else it was found
+        with pytest.raises(ArtefactError, match=words):
+            _source(str(tmp_path), "arrow_puzzle", encoder=given)
 
 
 def test_the_experience_of_a_run_is_not_known_where_others_were_learned_from(tmp_path: Path) -> None:
