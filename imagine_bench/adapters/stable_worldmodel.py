@@ -18,8 +18,6 @@ where the recorded episodes do, ``callables=[{"method": "start_at", "args": {"ma
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -27,7 +25,6 @@ from imagine_bench.arrays import Action, Info, Observed, State
 from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces import Frame
 from imagine_bench.interfaces.environments import Env, Wrapper
-from imagine_bench.interfaces.episodes import FRAME_SHAPE
 
 
 class SuccessTerminates(Wrapper):
@@ -48,26 +45,22 @@ class SuccessTerminates(Wrapper):
             raise InvalidValueError("The library records how the scene looks now; give a world without lag.")
         super().__init__(env)
         self._bookkeeping = np.random.default_rng(0)
-        self._seen: Observed = {}
 
     def reset(self, *, seed: int | None = None, options: dict[str, State] | None = None) -> tuple[Observed, Info]:
         """Begin an episode."""
         if seed is not None:
             self._bookkeeping = np.random.default_rng(seed)
-        self._seen, info = self.env.reset(seed=seed, options=options)
-        return self._seen, _plain(info)
+        seen, info = self.env.reset(seed=seed, options=options)
+        return seen, _plain(info)
 
     def step(self, action: Action) -> tuple[Observed, float, bool, bool, Info]:
         """Carry out one macro-action."""
-        self._seen, reward, terminated, truncated, info = self.env.step(action)
+        seen, reward, terminated, truncated, info = self.env.step(action)
         success = bool(info["success"])
-        return self._seen, float(reward), success, not success and (terminated or truncated), _plain(info)
+        return seen, float(reward), success, not success and (terminated or truncated), _plain(info)
 
     def render(self) -> Frame:
-        """The agent's frame; drawn now, shape (64, 64, 3), where none is observed."""
-        frame = self._seen.get("frame") if isinstance(self._seen, Mapping) else self._seen
-        if frame is not None and frame.ndim == len(FRAME_SHAPE):
-            return frame
+        """The observation of the agent. Shape (64, 64, 3)."""
         return self.env.unwrapped.agent_view()  # type: ignore[attr-defined]
 
     def start_at(self, macrostate: ArrayLike) -> None:

@@ -53,14 +53,6 @@ def test_a_recorded_macrostate_is_where_an_episode_begins():
     env.close()
 
 
-def test_pixels_are_as_late_as_the_frames_of_the_agent():
-    env = SuccessTerminates(gymnasium.make("imagine_bench/Arrows-v0", lag=1, render_mode="rgb_array", **KINEMATIC))
-    first, _ = env.reset(seed=0)
-    env.step(0)
-    assert np.array_equal(env.render(), first)
-    env.close()
-
-
 def test_another_environment_is_one_clear_error():
     with pytest.raises(InvalidValueError, match="no task of imagine_bench"):
         SuccessTerminates(gymnasium.make("CartPole-v1"))
