@@ -51,6 +51,8 @@ class StartingFrom:
     start_states: tuple[State, ...]
 
     def __getattr__(self, name: str) -> Any:
+        if name == "rules":  # of a copy that is being made
+            raise AttributeError(name)
         return getattr(self.rules, name)
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import pickle
 
 import pytest
 from machines import Wheels
 
 from imagine_bench.errors import InvalidValueError
-from imagine_bench.exact.splits import Split, split_of
+from imagine_bench.exact.splits import Split, StartingFrom, split_of
 
 RULES = Wheels()
 
@@ -33,6 +35,15 @@ def test_a_split_is_known_by_its_content():
     assert len({split.hash, *(each.hash for each in fewer)}) == 3
     with pytest.raises(InvalidValueError, match="leaves no start for test"):
         split_of(RULES, "values=3:9")
+
+
+def test_rules_with_fewer_starts_are_copied_and_pickled_and_are_the_rules_in_all_else():
+    rules = StartingFrom(RULES, RULES.start_states[:2])
+    for each in (rules, copy.deepcopy(rules), pickle.loads(pickle.dumps(rules))):
+        assert each.start_states == RULES.start_states[:2] and each.rules == RULES
+        assert each.outcomes(each.start_states[0], 0) == RULES.outcomes(RULES.start_states[0], 0)
+        with pytest.raises(AttributeError, match="no_such_thing"):
+            _ = each.no_such_thing
 
 
 def test_a_text_names_a_split():
