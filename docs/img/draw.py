@@ -361,7 +361,7 @@ def separating() -> None:
         "separating-world-453": {
             "factored": ["separating-world-710"],
             "laws:given": ["separating-world-453", "separating-world-given-710"],
-            "lewm": ["separating-world-lewm-453", "separating-world-lewm-454"],
+            "lewm": [f"separating-world-lewm-{seed}" for seed in (453, 454, 455)],
         }
     }
     benches = [json.loads((folder / "bench.json").read_text()) for folder in folders]
