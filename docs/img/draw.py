@@ -360,7 +360,8 @@ def separating() -> None:
     also = {
         "separating-world-453": {
             "factored": ["separating-world-710"],
-            "laws:given": ["separating-world-453", "separating-world-given-710"],
+            "factored:given": ["separating-world-given-710"],
+            "laws:given": ["separating-world-given-710"],
             "lewm": [f"separating-world-lewm-{seed}" for seed in (453, 454, 455)],
         }
     }
@@ -382,7 +383,8 @@ def separating() -> None:
             values = 100 * np.concatenate([rates(name, agent)[last] for name in shown[agent]])
             bottom = values.mean()
             axes.bar(place, bottom, width=0.6, color="#d9d9d9", label="solved" if agent == agents[0] else None)
-            places = {folder, *(RESULTS / name for name in shown[agent])}
+            own = [RESULTS / name for name in shown[agent] if (RESULTS / name / "why.json").is_file()]
+            places = own or [folder]  # causes of some folders are kept beside those of the first
             counts = sum((failures(each).get(agent, {}).get(str(last), Counter()) for each in places), Counter())
             for cause, color in zip(CAUSES, CAUSE_COLORS, strict=True):
                 share = (100 - values.mean()) * counts[cause] / max(1, counts.total())
