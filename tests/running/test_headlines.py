@@ -55,6 +55,7 @@ def test_headlines_of_a_preset_are_about_its_own_agents() -> None:
 
 def test_headlines_are_corrected_for_one_another_and_for_all_looks(tmp_path: Path) -> None:
     found = {}
+    needed = {}
     for looks in (1, 4):
         result = result_of(dataclasses.replace(FIRST, most_looks=looks), tmp_path, 30)
         runs = [[result.success_rates(agent)[:, -1] for agent in pair] for pair in PAIRS]
@@ -62,7 +63,12 @@ def test_headlines_are_corrected_for_one_another_and_for_all_looks(tmp_path: Pat
         found[looks] = [each.found.p for each in headlines(result)]
         assert found[looks] == pytest.approx((looks * statistics.holm(raw)).clip(max=1.0).tolist())
         assert decided(result) == (max(found[looks]) < 0.05)
-    assert found[1] < found[4]
+        close = result_of(dataclasses.replace(FIRST, most_looks=looks), tmp_path / "close", 12)
+        runs = [[close.success_rates(agent)[:, -1] for agent in pair] for pair in PAIRS]
+        more = [statistics.more_seeds(*pair, cells=looks * len(PAIRS), trials=200) for pair in runs]
+        assert [each.more for each in headlines(close)] == more and sum(more) > 0
+        needed[looks] = sum(more)
+    assert found[1] < found[4] and needed[1] < needed[4]
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from imagine_bench.interfaces.capabilities import Label
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.rules import fewest_actions
 from imagine_bench.running import run_state, runner
-from imagine_bench.running.evaluation import LabelOracle, Teacher
+from imagine_bench.running.evaluation import LabelOracle, Teacher, as_seen
 from imagine_bench.store import encoders
 from imagine_bench.store.results import RunResult
 from imagine_bench.store.run_folder import load_newest
@@ -37,6 +37,18 @@ def do(folder: Path, **changes: Any) -> RunResult:
 
 
 # --- demonstrations ----------------------------------------------------------------------------------------------
+
+
+def test_a_demonstration_keeps_its_images_and_hides_the_truth() -> None:
+    state = np.array([1, 2, 0, 1])
+    images = [np.full((64, 64, 3), shade, np.uint8) for shade in (1, 2)]
+    before, after = (Observation(frame=image, macrostate=state, shown=state) for image in images)
+    ends = {"terminated": True, "truncated": False}
+    seen = as_seen(Transition(observation=before, action=3, reward=50.0, next_observation=after, **ends))
+    for real, given in ((before, seen.observation), (after, seen.next_observation)):
+        assert np.array_equal(given.frame, real.frame)
+        assert given.macrostate is None and given.shown is None
+    assert (seen.action, seen.reward, seen.terminated, seen.truncated) == (3, 50.0, True, False)
 
 
 def test_demonstrations_are_optimal_and_seen_as_frames(tmp_path: Path) -> None:

@@ -130,6 +130,15 @@ def test_dense_rewards_sum_to_sparse_ones_less_the_potential(family: str) -> Non
     assert early > 0.6
 
 
+def test_an_object_held_at_the_start_does_not_slip() -> None:
+    env, _ = environment("pick_place", slip=0.99)
+    closed = np.array([0.0] * 6 + [-1.0])
+    for seed in range(3):
+        env.reset(seed=seed, options={"macrostate": (1, 0, 0, 1)})
+        *_, info = env.step(closed)
+        assert env.episode.gripped_m is not None and not env.episode.slipping and not info["fault"]
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_grip_that_slips_leaves_the_object_where_it_is(family: str) -> None:
     """Each grip slips or not, as drawn; a slip is no event and no fault, a firm grip is its macro-action."""
