@@ -11,18 +11,22 @@ from small_runs import Inline, small
 from whole_outputs import Expected, masked
 
 from imagine_bench import registry
+from imagine_bench.arrays import Bools, Ints
 from imagine_bench.cli import exit_code as main
 from imagine_bench.errors import ArtefactError, ImagineBenchError
-from imagine_bench.interfaces import AgentContext
+from imagine_bench.interfaces import AgentContext, TaskSpec
 from imagine_bench.judge import causes
 from imagine_bench.judge.causes import CAUSES, FORMER_CAUSES, beliefs, frames_to_ask_with, misread
 from imagine_bench.report.page import Page, texts
 from imagine_bench.report.sections import causes_table, read_causes
 from imagine_bench.rules import states_of
 from imagine_bench.running.bench import bench, load_bench
+from imagine_bench.running.trained import load_trained
 from imagine_bench.seeding import SeedTree
 from imagine_bench.store import encoders
 from imagine_bench.store.files import make_folder, write_bytes
+from imagine_bench.store.results import PolicyTable
+from imagine_bench.store.run_folder import load_run
 from imagine_bench.testing.checks import same_arrays
 from imagine_bench.tools import audits
 from imagine_bench.tools.audits import verify, why_report
@@ -67,6 +71,27 @@ def test_the_shares_of_a_bench_sum_to_all_failures(
         assert list(map(float, shares)) == [round(100 * mine.count(name) / len(mine), 1) for name in CAUSES]
     assert "\ntable " in said and 'id="causes"' in (folder / "report" / "index.html").read_text()
     assert not any(each.complaint for each in verify(folder)), "the report with its causes follows from the runs"
+
+
+def test_experience_at_a_budget_is_that_of_the_episodes_before_it(
+    pair: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the first of two budgets it is that of a run that ends there."""
+    given = []
+    real = causes.Attribution
+
+    def attribution(spec: TaskSpec, held: PolicyTable, tried: Ints, readable: Bools) -> causes.Attribution:
+        given.append(tried.tolist())
+        return real(spec, held, tried, readable)
+
+    monkeypatch.setattr(causes, "Attribution", attribution)
+    causes.causes_of(load_trained(pair / "table" / "seed_0"))
+    first = small(agents=("table",), seeds=(0,), budgets=(4,), evaluation_episodes=8)
+    ended = bench(first, {}, root=tmp_path, launcher=Inline()).folder
+    tried = load_run(ended / "table" / "seed_0").tried
+    assert tried is not None
+    assert given[0] == tried[:, :-1].tolist()
+    assert len(given[0]) < len(given[1])
 
 
 def test_tests_in_which_nothing_failed_are_counted_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
