@@ -20,34 +20,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from fake_reader import read_nothing
 from guest_packages import Guests
 from kept import ROOT
 from recordings import contents, times, view_names
 from report_pages import page_in_words
 from same_values import assert_same
-from small_runs import Inline, do, small
 from whole_outputs import Expected, short
 
 import imagine_bench
 from imagine_bench import registry
 from imagine_bench.arrays import Arrays
 from imagine_bench.cli import exit_code as main
-from imagine_bench.errors import ArtefactError, InvalidValueError
-from imagine_bench.interfaces import State
-from imagine_bench.judge import judgement, questions
+from imagine_bench.errors import ArtefactError
+from imagine_bench.judge import judgement
 from imagine_bench.judge.judgement import Judgement, ModelFit, judge, kept, shown
-from imagine_bench.judge.models import ModelSource, model_entry, opened, source_of
-from imagine_bench.judge.reading import RenderedFrameIndex
 from imagine_bench.judge.scores import FORMER
-from imagine_bench.protocols.control import protocol
 from imagine_bench.report.judge import COLUMNS, Judged, in_short, judged, judgement_page
 from imagine_bench.report.page import DASH
-from imagine_bench.running import bench as benches
-from imagine_bench.seeding import SeedTree
-from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.files import read_arrays, read_sealed, sealed, write_arrays, write_json
 
+pytestmark = pytest.mark.usefixtures("blind")
 _PYPROJECT = """
 [project]
 name = "their_models"
@@ -157,17 +149,6 @@ class Said(NamedTuple):
     status: int
     out: str
     err: str
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _blind() -> Iterator[None]:
-    """A reader that costs nothing, and few rollouts."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(judgement, "reader_in", read_nothing)
-        patch.setattr(questions, "ROLLOUTS", 16)
-        yield
-    judgement.prepare.cache_clear()
-    judgement.data_of.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -405,148 +386,6 @@ def test_a_cell_judged_by_several_has_images_of_the_same_fit(tmp_path: Path, mon
         jobs = [pool.submit(judgement.carry_out, one, tmp_path, cell) for _ in range(4)]
     assert [job.result() for job in jobs] == [""] * 4
     assert shown(tmp_path, one).keys() == {"exact"}
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The run of seed 0 of each agent; that of seed 1 lies beside it."""
-    wanted = small(budgets=(2,), agents=("table", "imaginer"), seeds=(0, 1))
-    result = benches.bench(wanted, {}, root=tmp_path_factory.mktemp("bench"), launcher=Inline())
-    return {run.agent: run.folder for run in result.runs if run.seed == 0}
-
-
-@pytest.fixture
-def _few(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Few questions."""
-    for name, count in {"STATES": 10, "AFTER_THE_END": 10, "ROLLOUTS": 4, "PAIRS": 4}.items():
-        monkeypatch.setattr(questions, name, count)
-    judgement.prepare.cache_clear()
-    yield
-    judgement.prepare.cache_clear()
-
-
-def _judged(root: Path, *models: str, seeds: tuple[int, ...]) -> tuple[Path, Judgement]:
-    one = Judgement(task="arrow_puzzle", models=models, sizes=(20, 40), seeds=seeds, samples=1)
-    folder, failed = judge(one, root, workers=1)
-    assert failed == []
-    return folder, one
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_few")
-def test_right_macrostates_beside_black_frames_are_fog(runs: dict[str, Path], tmp_path: Path) -> None:
-    """An agent's own reading of its images counts for nothing."""
-    run = str(runs["imaginer"])
-    folder, one = _judged(tmp_path, run, "copy", seeds=(1000, 1001))
-    (cell,) = (cell for cell in kept(folder, one) if cell["model"] == run)
-    assert (cell["seed"], cell["transitions"]) == (0, 40), "it learns nothing here: once"
-    assert cell["unreadable"] == cell["total_variation"] == cell["after_the_end"] == 1.0
-    assert cell["fit_s"] is None
-    assert "imaginer, seed 0  " in judgement_page(judged(folder, one)).summary
-    folder, other = _judged(tmp_path, "copy", seeds=(1001,))
-    assert [shown(folder, each)["copy"]["seed"] for each in (one, other)] == [1000, 1001], "images of the first seed"
-
-
-@pytest.mark.usefixtures("_few")
-def test_the_folder_of_an_agent_stands_for_all_its_runs(runs: dict[str, Path], tmp_path: Path) -> None:
-    agent = str(runs["imaginer"].parent)
-    folder, one = _judged(tmp_path, agent, seeds=(1000,))
-    assert [(cell["model"], cell["seed"]) for cell in kept(folder, one)] == [(agent, 0), (agent, 1)]
-    assert not list(folder.glob("data-*")), "nothing is collected for a model that does not learn"
-    assert list(shown(folder, one)) == [agent]
-
-
-def _source(name: str, task: str, appearance: str = "clean", encoder: str | None = None) -> ModelSource:
-    spec = registry.task(task)
-    return source_of(name, spec, RenderedFrameIndex(spec, appearance), appearance, SeedTree(1000), encoder)
-
-
-def test_runs_that_cannot_be_judged_say_why(runs: dict[str, Path], tmp_path: Path) -> None:
-    def visited(agent: str, task: str) -> set[tuple[State, int]] | None:
-        source = _source(str(runs[agent]), task)
-        with opened(source, task, folder=tmp_path, log=tmp_path / "log") as judged:
-            return judged.visited
-
-    assert model_entry(str(runs["table"])).title == "table, seed 0"
-    with pytest.raises(InvalidValueError, match="does not imagine"):
-        visited("table", "arrow_puzzle")
-    with pytest.raises(InvalidValueError, match="learned arrow_puzzle, not pick_place"):
-        visited("imaginer", "pick_place")
-    found = visited("imaginer", "arrow_puzzle")
-    assert found and len(found) <= 2 * 20, "its experience is the one that the bench counted"
-    assert all(len(state) == 4 and 0 <= action < 6 for state, action in found)
-
-
-def test_a_run_is_judged_through_the_encoder_that_is_given(tmp_path: Path) -> None:
-    own = tmp_path / "own.safetensors"
-    shutil.copy(encoders.own(registry.task("arrow_puzzle"), "clean"), own)
-    wanted = protocol("arrow_puzzle", "smoke", agents=("imagination",), encoder=encoders.identity(own))
-    config = {"format": run_folder.FORMAT, "protocol": wanted.as_dict(), "agent": "imagination", "seed": 0}
-    write_json(tmp_path / "config.json", sealed({**config, "settings": {}}))
-    assert model_entry(str(tmp_path)).encoder_kind == "latents"
-    for given, words in ((None, "which is not here"), (str(own), "has no checkpoint")):  # else it was found
-        with pytest.raises(ArtefactError, match=words):
-            _source(str(tmp_path), "arrow_puzzle", encoder=given)
-
-
-def test_the_experience_of_a_run_is_not_known_where_others_were_learned_from(tmp_path: Path) -> None:
-    after = {"after": ("arrow_puzzle_hard",), "after_episodes": 1, "unannounced": True}
-    run = do(tmp_path, "imaginer", agents=("imaginer",), budgets=(2,), **after)
-    source = dataclasses.replace(_source(str(run.folder), "arrow_puzzle"), privileged=True)
-    with opened(source, "arrow_puzzle", folder=tmp_path, log=tmp_path / "log") as judged:
-        assert judged.visited is None and not judged.learns
-
-
-_TWICE = ("mdn_thesis:model.members=2,model.dropout=0.1", "copy", "mdn_thesis:model.dropout=0.1,model.members=2")
-
-
-def test_nonsense_is_refused(runs: dict[str, Path]) -> None:
-    run = runs["imaginer"]
-    nonsense: tuple[tuple[str, dict[str, Any]], ...] = (
-        ("ascending numbers", {"sizes": (30, 20)}),
-        ("hide or delay a part .* without the parameters", {"task": "arrows:cubes=2,lag=1"}),
-        (
-            r"No model of \('copy', 'structured'\) reads latents",
-            {"models": ("copy", "structured"), "encoder": _LATENTS},
-        ),
-        ("give each world model or run once", {"models": _TWICE}),
-        ("give each world model or run once", {"models": (str(run), str(run / ".." / "seed_0"))}),
-    )
-    for words, given in nonsense:
-        with pytest.raises(InvalidValueError, match=words):
-            Judgement(**{"task": "pick_place", "models": ("copy",), **given})
-
-
-def test_judgements_that_cannot_be_compared_lie_apart() -> None:
-    def folder(**changes: Any) -> str:
-        return Judgement(**{"task": "pick_place", "models": ("gaussian",), **changes}).folder_name
-
-    others = {
-        "task": "arrow_puzzle", "sizes": (5,), "samples": 3, "appearance": "mild", "policy": "optimal", "order": 1,
-        "encoder": _LATENTS,
-    }  # fmt: skip
-    assert len({folder(), *(folder(**{name: value}) for name, value in others.items())}) == 1 + len(others)
-    for more in ({"models": ("copy", "exact")}, {"seeds": (7,)}, {"sizes": (2, 10_000)}):
-        assert folder(**more) == folder(), "these are cells of one folder"
-
-
-def test_a_judgement_is_of_the_world_that_a_file_describes_now(tmp_path: Path) -> None:
-    file = tmp_path / "world.json"
-    folders = []
-    for horizon in (3, 4):
-        file.write_text(f'{{"cubes": 1, "horizon": {horizon}}}')
-        judgement = Judgement(task=f"arrows:@{file}", models=("copy",))
-        assert judgement.task == f"arrows:cubes=1,horizon={horizon}"
-        folders.append(judgement.folder_name)
-    assert len(set(folders)) == 2
-
-
-def test_models_take_the_given_encoder_if_it_is_of_their_kind() -> None:
-    costs = [_source(name, "pick_place", encoder=_LATENTS).cost for name in ("gaussian", "structured")]
-    assert [cost["encoder"] for cost in costs] == [_LATENTS, "pick_place-clean-codes"]
-    assert "encoder_reads" not in costs[0]
-    few = _source("structured", "arrow_puzzle", "strong").cost["encoder_reads"]
-    assert few == pytest.approx(0.115, abs=1e-3)
 
 
 def test_a_model_whose_encoder_reads_few_frames_is_marked(copied: Path) -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import pytest
 
-_TOP = Path(__file__).parent.parent
+_TOP = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module", autouse=True)
