@@ -306,10 +306,15 @@ def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
     return answers(folder, agent, paths[int(which)])
 
 
+OWN_PERCEPTION = ("factored", "lewm")
+"""Agents whose perception is learned from their own frames, so that no probe reads it: they cannot be found to misread."""
+
+
 def caused(agent: str, episodes: str, cause: str) -> str:
     """Failed tests of all seeds, or the share of them that has a cause, %; or the number of seeds.
 
-    A folder may stand before the agent.
+    A folder may stand before the agent. A cause that cannot be named of an agent is a dash: ``misread`` without a
+    probe; and of ``values`` and the two causes in a world model those that do not apply.
     """
     folder, _, agent = agent.rpartition("/")
     kept = facts(f"{folder or 'arrow_puzzle-mild-why'}/why.json")
@@ -318,6 +323,10 @@ def caused(agent: str, episodes: str, cause: str) -> str:
     count = sum(sum(run.values()) for run in runs)
     if cause in ("all", "seeds"):
         return f"{count:,}" if cause == "all" else f"{len(runs)}"
+    without_model = any("values" in run for failures in own for run in failures.values())
+    excluded = {"planning", "model"} if without_model else {"values"}
+    if cause in excluded or (cause == "misread" and agent in OWN_PERCEPTION):
+        return "–"
     return percent(sum(run.get(cause, 0) for run in runs) / count) if count else "–"
 
 
