@@ -307,7 +307,7 @@ def two_answers(folder: str, agent: str, which: str, *paths: str) -> str:
 
 
 OWN_PERCEPTION = ("factored", "lewm")
-"""Agents whose perception is learned from their own frames, so that no probe reads it: they cannot be found to misread."""
+"""Agents that learn their perception from their own frames: no probe reads it, so nobody knows what they misread."""
 
 
 def caused(agent: str, episodes: str, cause: str) -> str:
