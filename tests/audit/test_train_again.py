@@ -15,8 +15,8 @@ from typing import Any
 import forging
 import numpy as np
 import pytest
-from forger import forged, rewrite_protocol, share_weights
-from forging import OpenRun, mixed
+from forger import forged, share_weights
+from forging import OpenRun, mixed, rewrite_protocol
 from small_runs import Inline, small, written
 
 from imagine_bench.cli import exit_code as main

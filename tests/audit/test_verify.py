@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from forger import FORGERIES, IN_TRAINING, forged, mend, rewrite_protocol, share_weights
-from forging import OpenRun, oracle
+from forger import FORGERIES, IN_TRAINING, forged, share_weights
+from forging import OpenRun, of_second, oracle, rewrite_protocol
 from guest_packages import Guests
 from kinds import take_row
 from small_runs import Inline, small, written
@@ -30,7 +30,6 @@ from imagine_bench.running.retraining import Retraining
 from imagine_bench.running.run_state import environments
 from imagine_bench.seeding import episode_seed
 from imagine_bench.store.files import read_sealed, sealed
-from imagine_bench.store.run_folder import load_newest, save_snapshot
 from imagine_bench.tools.audits import verify, what_is_shown, with_report
 
 
@@ -208,17 +207,6 @@ def share_first_tests(one: OpenRun, other: OpenRun) -> None:
     take_row(other, 0, one, 0, with_figures=True)
 
 
-def of_second(change: Callable[[OpenRun, OpenRun], object]) -> Callable[[Path], None]:
-    """The second run is changed, as the first one is."""
-
-    def forge(folder: Path) -> None:
-        one, other = (OpenRun.read(folder / "table" / f"seed_{seed}") for seed in (0, 1))
-        change(one, other)
-        other.write()
-
-    return forge
-
-
 @pytest.mark.parametrize(
     ("what", "forge"),
     [("weights", share_weights), ("CPU s", of_second(share_cpu_seconds)), ("tests", of_second(share_first_tests))],
@@ -278,17 +266,15 @@ def test_an_earlier_run_holds_and_names_its_missing_facts(tmp_path: Path) -> Non
 def test_a_changed_sealed_file_is_a_complaint_in_one_line(pair: Path, replays: Replays, tmp_path: Path) -> None:
     """Texts, numbers of 4,000 digits, and parts that are missing: none of them ends in a raw error."""
     folder = forged(pair, tmp_path, lambda folder: None)
-    run = folder / "table" / "seed_1"
-    snapshot = load_newest(run / "checkpoints")
-    assert snapshot is not None
-    row = snapshot.values["rows"][0]
+    run = OpenRun.read(folder / "table" / "seed_1")
+    row = run.rows[0]
     spots = [(row, name) for name in row if name not in ("beliefs", "open_loop", "diagnostics")]
-    spots += [(snapshot.values, name) for name in ("success", "length", "tried", "rows")]
+    spots += [(run.values, name) for name in ("success", "length", "tried", "rows")]
     for number, (place, name) in enumerate(spots):
         honest = place[name]
         place[name] = ("text", 10**4000, [], {}, float("nan"), -1)[number % 6]
-        save_snapshot(run / "checkpoints", snapshot)
-        mend(run)
+        run.write_state()
+        run.seal()
         _, other, *_ = with_report(folder, verdicts(folder, replays))
         assert other.complaint and "\n" not in str(other) and len(str(other)) < 2000, name
         place[name] = honest

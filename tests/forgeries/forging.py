@@ -20,6 +20,7 @@ import numpy as np
 from small_runs import run_observed
 
 from imagine_bench import registry
+from imagine_bench.arrays import Arrays
 from imagine_bench.errors import ImagineBenchError
 from imagine_bench.interfaces import Agent, Observation
 from imagine_bench.interfaces.environments import Env
@@ -174,13 +175,24 @@ class OpenRun:
         return self.values["rows"]
 
     def write(self) -> None:
-        """Seal everything again."""
+        """Write and seal everything again."""
+        self.write_state()
+        self.write_table()
+
+    def write_state(self) -> None:
         shutil.rmtree(self.folder / run_folder.CHECKPOINTS)
         write_json(self.folder / "config.json", sealed(self.config))
         snapshot = Snapshot(episode=self.episode, agent=self.agent, arrays=self.arrays, values=self.values)
-        state = run_folder.save_snapshot(self.folder / run_folder.CHECKPOINTS, snapshot) / "state.json"
+        run_folder.save_snapshot(self.folder / run_folder.CHECKPOINTS, snapshot)
+
+    def write_table(self) -> None:
+        """Write the table alone, and seal everything again."""
         rows = unpack(tuple[Checkpoint, ...], self.rows, grouped(self.arrays).get("rows", {}))
         run_folder.write_metrics(self.folder, rows)
+        self.seal()
+
+    def seal(self) -> None:
+        (state,) = self.folder.glob("checkpoints/*/state.json")
         names = ["config.json", "metrics.csv", "imagined.npz", state.relative_to(self.folder).as_posix()]
         run_folder.mark_done(self.folder, names)
 
@@ -199,11 +211,14 @@ class OpenRun:
         self.arrays |= arrays
         self.rows[row] |= tests.figures()
 
+    def kept(self, row: int) -> Arrays:
+        """The arrays of a budget's tests."""
+        start = f"rows/{row}/kept/"
+        return {name.removeprefix(start): array for name, array in self.arrays.items() if name.startswith(start)}
+
     def tests(self, row: int) -> EvaluationCounts:
         """A budget's tests."""
-        start = f"rows/{row}/kept/"
-        kept = {name.removeprefix(start): array for name, array in self.arrays.items() if name.startswith(start)}
-        return EvaluationCounts.of(unpack(KeptEpisodes, None, kept))
+        return EvaluationCounts.of(unpack(KeptEpisodes, None, self.kept(row)))
 
     def training_actions(self) -> list[list[int]]:
         """The macro-actions of each training episode."""
@@ -232,6 +247,32 @@ class OpenRun:
         self.values["starts"] = self.arrays["training/starts"].tolist() if "training/starts" in self.arrays else []
         self.drop("training/")
         self.drop("rows/", suffix="/sim_times_s")
+
+
+def all_runs(bench: Path) -> Iterator[OpenRun]:
+    for path in sorted(bench.glob("*/seed_*/DONE")):
+        yield OpenRun.read(path.parent)
+
+
+def rewrite_protocol(bench: Path, **values: Any) -> Path:
+    """Other values in every copy of a bench's protocol, and in its hash; returns where the bench lies then."""
+    wanted = Protocol.from_dict(read_json(bench / "protocol.json", "") | values)
+    write_json(bench / "protocol.json", wanted.as_dict())
+    for run in all_runs(bench):
+        run.config |= {"protocol": wanted.as_dict(), "protocol_hash": wanted.hash}
+        run.write()
+    return bench.rename(bench.with_name(bench_folder(bench, wanted).name))
+
+
+def of_second(change: Callable[[OpenRun, OpenRun], object]) -> Callable[[Path], None]:
+    """Of two seeds of the learner ``table`` the second is changed, as the first one is."""
+
+    def forge(folder: Path) -> None:
+        one, other = (OpenRun.read(folder / "table" / f"seed_{seed}") for seed in (0, 1))
+        change(one, other)
+        other.write()
+
+    return forge
 
 
 class Repeats:
@@ -283,10 +324,6 @@ class Forger:
         """The runs to be forged."""
         return [self.run(agent, seed) for agent in self.agents for seed in self.seeds]
 
-    def all_runs(self) -> Iterator[OpenRun]:
-        for path in sorted(self.folder.glob("*/seed_*")):
-            yield OpenRun.read(path)
-
     def rows(self) -> list[int]:
         """Budgets to be forged: one, or all."""
         return self.pick([0], [1], [0, 1])
@@ -304,19 +341,11 @@ class Forger:
     def set_protocol(self, **changes: Any) -> None:
         """Let the bench be of another protocol, in each copy and in its name."""
         self.protocol |= changes
-        wanted = Protocol.from_dict(self.protocol)
-        write_json(self.folder / "protocol.json", wanted.as_dict())
-        for run in self.all_runs():
-            run.config |= {"protocol": wanted.as_dict(), "protocol_hash": wanted.hash}
-            run.write()
-        root = self.folder.parents[1]
-        named = bench_folder(root, wanted)
-        self.folder.rename(named)
-        self.folder = named
+        self.folder = rewrite_protocol(self.folder, **changes)
 
     def rename_seeds(self, names: dict[int, int]) -> None:
         """Call seeds otherwise, in each copy."""
-        for run in self.all_runs():
+        for run in all_runs(self.folder):
             if run.seed in names:
                 run.config["seed"] = names[run.seed]
                 run.write()

@@ -19,6 +19,7 @@ from forging import (
     OpenRun,
     Remembering,
     Repeats,
+    all_runs,
     honest_bench,
     mixed,
     tests_by,
@@ -325,7 +326,7 @@ def called_physics(f: Forger, donors: Donors) -> None:
     """Kinematic episodes, said to be played in physics."""
     how = f.pick("no time", "one time", "drawn times", "older")
     faults = f.chance(0.3)
-    for run in list(f.all_runs()):
+    for run in list(all_runs(f.folder)):
         for group in [name.rpartition("/")[0] for name in run.arrays if name.endswith("/sim_times_s")]:
             lengths = run.arrays[f"{group}/lengths"].astype(float)
             each = f.rng.uniform(4, 12, lengths.shape) if how == "drawn times" else np.full(lengths.shape, 8.13)

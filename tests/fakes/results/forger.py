@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from forging import OpenRun, all_runs, of_second, rewrite_protocol
 
 from imagine_bench.arrays import Arrays
-from imagine_bench.protocols.data import digest
-from imagine_bench.store.files import sealed, sha256
-from imagine_bench.store.results import Checkpoint, KeptEpisodes
-from imagine_bench.store.run_folder import load_newest, load_run, save_snapshot, write_metrics
-from imagine_bench.values import pack
+from imagine_bench.running.evaluation import EvaluationCounts
+from imagine_bench.store.files import sealed
+from imagine_bench.store.results import KeptEpisodes
 
 Forge = Callable[[Path, np.random.Generator], None]
-
-
-def mend(run: Path) -> None:
-    """Bring the digests of a run up to date."""
-    done = json.loads((run / "DONE").read_text())
-    done.pop("seal")
-    names = [name for name in done["sha256"] if "/" not in name]
-    names += [path.relative_to(run).as_posix() for path in run.glob("checkpoints/*/state.json")]
-    done["sha256"] = {name: sha256(run / name) for name in names}
-    (run / "DONE").write_text(json.dumps(sealed(done)))
 
 
 def forged(honest: Path, root: Path, forge: Callable[[Path], object]) -> Path:
@@ -40,44 +27,26 @@ def forged(honest: Path, root: Path, forge: Callable[[Path], object]) -> Path:
     return folder
 
 
-def share_weights(folder: Path) -> None:
-    one, other = (load_newest(folder / "table" / seed / "checkpoints") for seed in ("seed_0", "seed_1"))
-    assert one is not None and other is not None
-    save_snapshot(folder / "table" / "seed_1" / "checkpoints", dataclasses.replace(other, agent=one.agent))
-    mend(folder / "table" / "seed_1")
+def with_weights_of_first(one: OpenRun, other: OpenRun) -> None:
+    other.agent = one.agent
 
 
-def all_runs(bench: Path, agent: str = "*") -> list[Path]:
-    return sorted(path.parent for path in bench.glob(f"{agent}/seed_*/DONE"))
+share_weights = of_second(with_weights_of_first)
 
 
-def one_run(bench: Path, rng: np.random.Generator, agent: str = "*") -> Path:
-    return rng.choice(all_runs(bench, agent))  # type: ignore[arg-type]
+def one_run(bench: Path, rng: np.random.Generator) -> OpenRun:
+    return rng.choice(list(all_runs(bench)))  # type: ignore[arg-type]
 
 
-def rewrite(run: Path, rows: Sequence[Checkpoint], **values: Any) -> None:
-    """Other rows, or other values, in a run's checkpoint, and metrics that say the same."""
-    snapshot = load_newest(run / "checkpoints")
-    assert snapshot is not None
-    plain, arrays = pack(rows, "rows")
-    kept = {name: array for name, array in snapshot.arrays.items() if not name.startswith("rows/")}
-    told = {**snapshot.values, "rows": plain, **values}
-    save_snapshot(run / "checkpoints", dataclasses.replace(snapshot, arrays=kept | arrays, values=told))
-    write_metrics(run, rows)
-    mend(run)
+def one_row(run: OpenRun, rng: np.random.Generator) -> int:
+    return int(rng.integers(len(run.rows)))
 
 
-def with_episodes(row: Checkpoint, arrays: Arrays) -> Checkpoint:
-    """A row with other test episodes, and figures that follow from them."""
-    return dataclasses.replace(
-        row,
-        kept=KeptEpisodes(**arrays),
-        successes=int(arrays["success"].sum()),
-        solved="".join("01"[int(each)] for each in arrays["success"]),
-        mean_return=float(arrays["returns"].mean()),
-        mean_length=float(arrays["lengths"].mean()),
-        faults=int(arrays["faults"].sum()),
-    )
+def with_tests(run: OpenRun, row: int, arrays: Arrays) -> None:
+    """A budget with other test episodes, and figures that follow from them."""
+    run.set_tests(row, EvaluationCounts.of(KeptEpisodes(**arrays)))
+    run.rows[row]["mean_length"] = float(arrays["lengths"].mean())  # a surplus action belongs to no episode
+    run.write()
 
 
 def in_episodes(name: str, change: Callable[[Arrays, np.random.Generator], None]) -> Forge:
@@ -87,14 +56,12 @@ def in_episodes(name: str, change: Callable[[Arrays, np.random.Generator], None]
         changed = False
         while not changed:
             run = one_run(bench, rng)
-            rows = list(load_run(run).checkpoints)
-            index = int(rng.integers(len(rows)))
-            before = vars(rows[index].kept)
+            row = one_row(run, rng)
+            before = run.kept(row)
             arrays = {each: array.copy() for each, array in before.items()}
             change(arrays, rng)
             changed = not np.array_equal(before[name], arrays[name])
-        rows[index] = with_episodes(rows[index], arrays)
-        rewrite(run, rows)
+        with_tests(run, row, arrays)
 
     return forge
 
@@ -127,19 +94,13 @@ def shift_length(arrays: Arrays, rng: np.random.Generator) -> None:
         lengths.flat[other] += 1
 
 
-def metric(name: str, everywhere: bool = True) -> Forge:
-    """One more of a figure of a test, in the table alone or in the checkpoint too."""
+def metric(name: str, write: Callable[[OpenRun], None] = OpenRun.write) -> Forge:
+    """One more of a figure of a test, in the checkpoint and the table, or in the table alone."""
 
     def forge(bench: Path, rng: np.random.Generator) -> None:
         run = one_run(bench, rng)
-        rows = list(load_run(run).checkpoints)
-        index = int(rng.integers(len(rows)))
-        rows[index] = dataclasses.replace(rows[index], **{name: getattr(rows[index], name) + 1})
-        if everywhere:
-            rewrite(run, rows)
-        else:
-            write_metrics(run, rows)
-            mend(run)
+        run.rows[one_row(run, rng)][name] += 1
+        write(run)
 
     return forge
 
@@ -149,111 +110,78 @@ def surplus(lengthen: bool) -> Forge:
 
     def forge(bench: Path, rng: np.random.Generator) -> None:
         run = one_run(bench, rng)
-        *rows, last = load_run(run).checkpoints
-        arrays = {name: array.copy() for name, array in vars(last.kept).items()}
+        last = len(run.rows) - 1
+        arrays = run.kept(last)
         arrays["actions"] = np.append(arrays["actions"], arrays["actions"][-1:])
+        arrays["lengths"] = arrays["lengths"].copy()
         arrays["lengths"][-1] += int(lengthen)
-        rewrite(run, [*rows, with_episodes(last, arrays)])
+        with_tests(run, last, arrays)
 
     return forge
 
 
-def change_checkpoint(run: Path, change: Callable[[dict[str, Any], Arrays], None]) -> None:
-    """Change the values and arrays of a run's checkpoint, and bring all digests up to date."""
-    snapshot = load_newest(run / "checkpoints")
-    assert snapshot is not None
-    values = json.loads(json.dumps(snapshot.values))
-    arrays = {name: array.copy() for name, array in snapshot.arrays.items()}
-    change(values, arrays)
-    save_snapshot(run / "checkpoints", dataclasses.replace(snapshot, arrays=arrays, values=values))
-    mend(run)
+def in_learner(change: Callable[[OpenRun, np.random.Generator], None]) -> Forge:
+    """Change the checkpoint of a learner."""
+
+    def forge(bench: Path, rng: np.random.Generator) -> None:
+        run = OpenRun.read(rng.choice(sorted(bench.glob("table/seed_*"))))  # type: ignore[arg-type]
+        change(run, rng)
+        run.write()
+
+    return forge
 
 
 def in_training(name: str) -> Forge:
     """One more somewhere in an array of the training episodes, or another number in a list of them."""
 
-    def change(values: dict[str, Any], arrays: Arrays, rng: np.random.Generator) -> None:
-        if name in values:
-            index = int(rng.integers(len(values[name])))
-            values[name][index] = 1 - values[name][index]
+    def change(run: OpenRun, rng: np.random.Generator) -> None:
+        if name in run.values:
+            index = int(rng.integers(len(run.values[name])))
+            run.values[name][index] = 1 - run.values[name][index]
         else:
-            array = arrays[name]
+            array = run.arrays[name].copy()
             index = int(rng.integers(array.size))
             array.flat[index] = not array.flat[index] if array.dtype == bool else (array.flat[index] + 1) % 6
+            run.arrays[name] = array
 
-    return in_checkpoint(change)
-
-
-def in_checkpoint(change: Callable[[dict[str, Any], Arrays, np.random.Generator], None]) -> Forge:
-    """Change the checkpoint of a learner."""
-
-    def forge(bench: Path, rng: np.random.Generator) -> None:
-        run = one_run(bench, rng, "table")
-        change_checkpoint(run, lambda values, arrays: change(values, arrays, rng))
-
-    return forge
+    return in_learner(change)
 
 
 def no_digests(bench: Path, rng: np.random.Generator) -> None:
-    (one_run(bench, rng) / "DONE").write_text(json.dumps(sealed({"format": "imagine_bench run 3", "sha256": {}})))
+    (one_run(bench, rng).folder / "DONE").write_text(
+        json.dumps(sealed({"format": "imagine_bench run 3", "sha256": {}}))
+    )
 
 
-def tried(values: dict[str, Any], arrays: Arrays, rng: np.random.Generator) -> None:
+def tried(run: OpenRun, rng: np.random.Generator) -> None:
     """A macro-action was tried an episode later than it was."""
-    del arrays
-    values["tried"][str(rng.choice(list(values["tried"])))] += 1
+    run.values["tried"][str(rng.choice(list(run.values["tried"])))] += 1
 
 
-def exchanged_lengths(values: dict[str, Any], arrays: Arrays, rng: np.random.Generator) -> None:
+def exchanged_lengths(run: OpenRun, rng: np.random.Generator) -> None:
     """Two training episodes before the first test exchange their lengths, so that every sum of them stays."""
-    del arrays, rng
-    length = values["length"]
-    early = range(values["rows"][0]["episodes"])
+    del rng
+    length = run.values["length"]
+    early = range(run.rows[0]["episodes"])
     other = next(each for each in early if length[each] != length[0])
     length[0], length[other] = length[other], length[0]
 
 
 def without(beginning: str) -> Forge:
     """The arrays of a learner's checkpoint whose names begin so are deleted, though its format says they are kept."""
-
-    def change(values: dict[str, Any], arrays: Arrays, rng: np.random.Generator) -> None:
-        del values, rng
-        for name in [name for name in arrays if name.startswith(beginning)]:
-            del arrays[name]
-
-    return in_checkpoint(change)
-
-
-def protocol_of(bench: Path) -> dict[str, Any]:
-    return dict(json.loads((bench / "protocol.json").read_text()))
-
-
-def rewrite_config(run: Path, **values: Any) -> None:
-    """Other values in what a run says of itself."""
-    config = json.loads((run / "config.json").read_text()) | values
-    config.pop("seal")
-    (run / "config.json").write_text(json.dumps(sealed(config)))
-    mend(run)
-
-
-def rewrite_protocol(bench: Path, **values: Any) -> Path:
-    """Other values in every copy of a bench's protocol, and in its hash; returns where the bench lies then."""
-    protocol = protocol_of(bench) | values
-    (bench / "protocol.json").write_text(json.dumps(protocol))
-    for run in all_runs(bench):
-        rewrite_config(run, protocol=protocol, protocol_hash=digest(protocol))
-    return bench.rename(bench.with_name(f"{protocol['preset']}-{digest(protocol)}"))
+    return in_learner(lambda run, rng: run.drop(beginning))
 
 
 def seed(bench: Path, rng: np.random.Generator) -> None:
     """A run is of another seed, here alone or in everything that names it, the protocol and its hash included."""
     other, run = int(rng.integers(1, 99)), one_run(bench, rng)
-    runs = [run] if rng.random() < 0.5 else all_runs(bench)
-    for each in runs:
-        rewrite_config(each, seed=other)
-    if len(runs) == len(all_runs(bench)):
-        for each in runs:
-            each.rename(each.with_name(f"seed_{other}"))
+    everywhere = rng.random() >= 0.5
+    for each in all_runs(bench) if everywhere else [run]:
+        each.config["seed"] = other
+        each.write()
+        if everywhere:
+            each.folder.rename(each.folder.with_name(f"seed_{other}"))
+    if everywhere:
         rewrite_protocol(bench, seeds=[other])
 
 
@@ -270,7 +198,7 @@ def table(bench: Path, rng: np.random.Generator) -> None:
 
 def damage(bench: Path, rng: np.random.Generator) -> None:
     """Any byte of any file with a digest, which is left as it was."""
-    run = one_run(bench, rng)
+    run = one_run(bench, rng).folder
     names = list(json.loads((run / "DONE").read_text())["sha256"])
     names += [path.relative_to(run).as_posix() for path in run.glob("checkpoints/*/runner.safetensors")]
     path = run / str(rng.choice(names))
@@ -287,7 +215,7 @@ FORGERIES: dict[str, Forge] = {
     "damage": damage, "surplus": surplus(lengthen=False),
     "after the end": surplus(lengthen=True), "budget": metric("episodes"), "successes": metric("successes"),
     "mean return": metric("mean_return"), "mean length": metric("mean_length"), "sum of faults": metric("faults"),
-    "table of a run": metric("mean_length", everywhere=False), "no digests": no_digests,
+    "table of a run": metric("mean_length", OpenRun.write_table), "no digests": no_digests,
 }  # fmt: skip
 IN_TRAINING: dict[str, Forge] = {
     "training steps": metric("env_steps"), "training start": in_training("training/starts"),
@@ -295,7 +223,7 @@ IN_TRAINING: dict[str, Forge] = {
     "training success": in_training("success"), "training kept success": in_training("training/success"),
     "training length": in_training("length"), "training faults": in_training("training/faults"),
     "training return": in_training("training/returns"), "simulated time": in_training("training/sim_times_s"),
-    "exchanged lengths": in_checkpoint(exchanged_lengths),
+    "exchanged lengths": in_learner(exchanged_lengths),
     "nothing": without("training/"), "no simulated time": without("training/sim_times_s"),
-    "no simulated time of tests": without("rows/0/kept/sim_times_s"), "tried": in_checkpoint(tried),
+    "no simulated time of tests": without("rows/0/kept/sim_times_s"), "tried": in_learner(tried),
 }  # fmt: skip
