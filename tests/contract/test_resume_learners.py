@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 from agent_states import count_updates, same
 from numpy.typing import NDArray
-from small_runs import final_state, measured, run_observed, small
+from small_runs import KilledError, final_state, measured, run_observed, small
 from whole_outputs import Expected, rounded
 
 from imagine_bench import registry
 from imagine_bench.errors import UnknownNameError
 from imagine_bench.interfaces import AgentState, Observation, capabilities
 from imagine_bench.protocols.data import RunSpec
-from imagine_bench.running import run_state
 from imagine_bench.store import encoders
 from imagine_bench.store.results import RunResult
 from imagine_bench.testing.checks import checked_agent
@@ -32,10 +31,6 @@ LEARNERS = [
     if entry.learns and not entry.external_training_loop and entry.make.startswith("imagine_bench")
 ]
 """All of the suite but those that a library trains, which begin anew; fakes of other tests are registered too."""
-
-
-class KilledError(Exception):
-    pass
 
 
 def do(folder: Path, agent: str, every_s: float) -> RunResult:
@@ -80,14 +75,16 @@ EACH = [pytest.param(agent, marks=[pytest.mark.slow] * (agent in _DO_LESS)) for 
 @pytest.mark.parametrize("agent", EACH)
 def test_copies_and_pickles_of_a_learner_learn_on_by_themselves(agent: str) -> None:
     one = checked_agent(agent, "arrow_puzzle")
-    original = one.make()
+    original, restored = one.make(), one.make()
     one.train(original, range(2))
     early = original.state()
     as_it_was = copy.deepcopy(early)
-    twins = [copy.deepcopy(original), pickle.loads(pickle.dumps(original))]
-    ends = [(one.train(each, range(2, 4)), each.state()) for each in (*twins, original)]
-    for actions, state in ends[:2]:
-        assert actions == ends[2][0] and same(state, ends[2][1])
+    one.train(restored, range(5, 6))
+    restored.restore(early)
+    twins = [restored, copy.deepcopy(original), pickle.loads(pickle.dumps(original))]
+    *ends, (actions, state) = [(one.train(each, range(2, 4)), each.state()) for each in (*twins, original)]
+    for its_actions, its_state in ends:
+        assert its_actions == actions and same(its_state, state)
     assert same(early, as_it_was), "a snapshot does not change while the learner learns on"
 
 
@@ -150,20 +147,12 @@ def test_a_device_that_there_is_not_is_refused(agent: str) -> None:
 
 @pytest.mark.parametrize("agent", EACH)
 def test_a_killed_learner_ends_in_the_same_bits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agent: str, expected: Expected
+    tmp_path: Path, die_after_saves: Callable[..., None], agent: str, expected: Expected
 ) -> None:
     """And the uninterrupted one in the actions, diagnostics and magnitudes that are kept."""
     whole = do(tmp_path / "whole", agent, 1e9)
     expected("learners", as_text(whole, final_state(tmp_path / "whole")), section=agent, exactly=False)
-    real, saves = run_state.save_snapshot, []
-
-    def killing(folder: Path, snapshot: Any) -> Path:
-        saves.append(real(folder, snapshot))
-        if len(saves) in (3, 6, 9):  # training before and after the first test, and within a test
-            raise KilledError
-        return saves[-1]
-
-    monkeypatch.setattr(run_state, "save_snapshot", killing)
+    die_after_saves(3, 6, 9)  # training before and after the first test, and within a test
     for _ in range(3):
         with pytest.raises(KilledError):
             do(tmp_path / "run", agent, 0.0)

@@ -62,7 +62,7 @@ SHORT = {"max_episode_steps": 2}
 @pytest.mark.parametrize(
     ("name", "execution", "mode", "steps", "world"),
     [
-        ("Arrows", "kinematic", SAME_STEP, 16, {"cubes": 1}),
+        ("Arrows", "kinematic", SAME_STEP, 16, {"cubes": 1, "appearance": "harsh"}),
         ("Arrows", "kinematic", SAME_STEP, 16, {"cubes": 5, "gesture": 0.5, "lag": 2, "slip": 0.3, "fickle": 0.3}),
         ("PickPlace", "kinematic", SAME_STEP, 16, {"gesture": "first", "distractors": 2}),
         ("Arrows", "physics", SAME_STEP, 3, {"cubes": 5, "coupling": "neighbour", "slip": 0.3, "distractors": 3}),

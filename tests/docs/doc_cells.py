@@ -145,12 +145,6 @@ def scaled(budget: str, where: str) -> str:
     return f"{found:.2f}".replace("-", "−")
 
 
-def bounds(where: str) -> str:
-    """Chance and optimum of a bench's world, %."""
-    exact = facts(f"{where}/bench.json")["certificate"]
-    return f"{percent(exact['chance_level'])} / {percent(exact['optimum'])}"
-
-
 def seeds(budget: str, where: str) -> str:
     """Every seed, %."""
     return ", ".join(percent(value) for value in scores(budget, where))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -24,23 +23,6 @@ def same(first: AgentState, second: AgentState) -> bool:
         and first.arrays.keys() == second.arrays.keys()
         and all(array.tobytes() == second.arrays[name].tobytes() for name, array in first.arrays.items())
     )
-
-
-def goes_on(agent: Any, other: Any, live: Callable[[Any, int, int], object], steps: int) -> AgentState:
-    """Have ``other`` live otherwise, take up the snapshot of ``agent``, and live on as it does; the snapshot.
-
-    ``live`` trains an agent for some steps by a seed.
-    """
-    live(agent, steps, 1)
-    live(other, steps // 2, 9)
-    saved = agent.state()
-    other.restore(saved)
-    assert same(agent.state(), other.state())
-    for each in (agent, other):
-        live(each, steps, 3)
-    assert same(agent.state(), other.state())
-    assert not same(agent.state(), saved), "later learning changed no snapshot"
-    return saved
 
 
 def count_updates(monkeypatch: pytest.MonkeyPatch) -> list[object]:

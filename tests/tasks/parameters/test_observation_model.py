@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-
 import gymnasium
 import numpy as np
 import pytest
@@ -124,21 +122,6 @@ def test_who_writes_into_a_late_frame_changes_none_that_comes_after():
         frames[0][:] = 0
         frames = [each.step(action)[0] for each in (env, other)]
         np.testing.assert_array_equal(*frames)
-
-
-@pytest.mark.parametrize(
-    ("id_", "options"),
-    [(IDS[0], {"gesture": 0.5, "lag": 2, "fickle": 0.4, "appearance": "photo"}), (IDS[1], {"appearance": "strong"})],
-)
-def test_a_state_holds_old_frames_what_is_hidden_and_distractors(id_, options):
-    first, second = (make(id_, distractors=3, **options) for _ in range(2))
-    walk(first, 4)
-    state = pickle.loads(pickle.dumps(first.get_state()))
-    second.reset(seed=9)
-    second.set_state(state)
-    np.testing.assert_array_equal(first.agent_view(), second.agent_view())
-    for action in (0, 3, 1, 2, 2):
-        np.testing.assert_array_equal(first.step(action)[0], second.step(action)[0])
 
 
 @pytest.mark.parametrize(("id_", "options"), [("Arrows-v0", KINEMATIC), ("ArrowsMotion-v0", {})])

@@ -1,9 +1,6 @@
-"""Nuisances change frames and rewards alone, and are a part of states, lanes and datasets."""
+"""Nuisances change frames and rewards alone, and are a part of datasets."""
 
 from __future__ import annotations
-
-import copy
-import pickle
 
 import gymnasium
 import numpy as np
@@ -31,33 +28,6 @@ def test_truth_stays_as_it_is():
             steps = [env.step(action)[2:] for action in (0, 1)]
             walks.append([(*step[:2], *step[2]["macrostate"].tolist(), bool(step[2]["legal"])) for step in steps])
     assert walks[0] == walks[1]
-
-
-def test_states_copies_and_pickles_go_on_to_the_bit():
-    with make("harsh") as env:
-        env.reset(seed=1, options={"macrostate": START})
-        env.step(0)
-        state = pickle.loads(pickle.dumps(env.unwrapped.get_state()))
-        twin = copy.deepcopy(env)
-        walks = [[each.step(action)[:2] for action in (1, 0)] for each in (env, twin)]
-        env.unwrapped.set_state(state)
-        walks.append([env.step(action)[:2] for action in (1, 0)])
-    for walk in walks:
-        np.testing.assert_equal(walk, walks[0])
-        assert walk[-1][1] != round(walk[-1][1])
-
-
-def test_lanes_equal_single_environments():
-    lanes = gymnasium.make_vec(
-        "imagine_bench/ArrowPuzzle-vector-v0", num_envs=2, execution="kinematic", appearance="harsh"
-    )
-    seen, _ = lanes.reset(seed=4)
-    after = lanes.step(np.array([0, 3]))
-    for lane, action in enumerate((0, 3)):
-        with make("harsh") as env:
-            assert np.array_equal(env.reset(seed=4 + lane)[0], seen[lane])
-            assert env.step(action)[1] == after[1][lane]
-    lanes.close()
 
 
 def test_a_dataset_holds_noisy_rewards_and_frames(tmp_path):

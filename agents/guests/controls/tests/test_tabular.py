@@ -5,7 +5,6 @@ from __future__ import annotations
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import same
 from fake_codes import ACTIONS, frame, live, starts
 from fake_pictures import played
 from imagine_bench_controls.tabular.agent import ReadState, read_codes, read_macrostate
@@ -217,26 +216,6 @@ def test_each_reading_sees_its_own_state_alone() -> None:
     assert CODES(shown) == CODES(Observation(frame=shown.frame)) == np.ravel_multi_index((2, 1, 0), (3, 3, 2))
     with pytest.raises(InvalidValueError, match=r"reads the true state, of at most 10 .* was shown none"):
         read_macrostate(Observation(frame=shown.frame))
-
-
-def test_learning_after_a_restore_leaves_the_snapshot() -> None:
-    learner, resumed, again = (dyna_q(5, read=CODES, seed=seed) for seed in (0, 7, 9))
-    live(learner, range(10), np.random.default_rng(1))
-    saved = learner.state()
-    resumed.restore(saved)
-    live(resumed, range(10), np.random.default_rng(2))
-    again.restore(saved)
-    assert same(again.state(), learner.state()) and not same(resumed.state(), learner.state())
-
-
-def test_a_restored_table_plans_anew() -> None:
-    """What it planned before is of other counts."""
-    learner, other = sampler(), sampler()
-    learner.observe(moved(0, 1, 5.0, 1, ended=True), episode=0)
-    other.observe(moved(0, 0, 7.0, 1, ended=True), episode=0)
-    assert [each.act(at(0), explore=False) for each in (learner, other)] == [1, 0]
-    other.restore(learner.state())
-    assert other.act(at(0), explore=False) == 1
 
 
 def test_posterior_sampling_keeps_one_model_for_an_episode() -> None:

@@ -10,7 +10,6 @@ from unittest import mock
 import fake_codes
 import numpy as np
 import pytest
-from agent_states import same
 from fake_codes import ACTIONS, agent, frame, live
 from imagine_bench_factored import agent as own
 from imagine_bench_factored.agent import FactoredAgent
@@ -91,22 +90,6 @@ def test_an_earlier_outcome_is_believed_by_its_tested_causes() -> None:
     add(-1.0, (3, 0), (3, 1))
     wall, goal = expected()
     assert wall > 0.65 > told[0] + 0.1 and goal < 0.35 < told[1] - 0.1
-
-
-def test_resumed_on_a_second_task_equals_uninterrupted() -> None:
-    learner, resumed = agent(), agent(99)
-    rng = np.random.default_rng(0)
-    live(learner, range(8), rng)
-    learner.reset_for_new_task()
-    ask(learner, 2)
-    live(learner, range(3), rng)
-    resumed.restore(learner.state())
-    one, other = (live(each, range(3, 8), np.random.default_rng(1)) for each in (learner, resumed))
-    assert one == other
-    for each in (learner, resumed):
-        each.reset_for_new_task()
-        live(each, range(4), np.random.default_rng(2))
-    assert same(learner.state(), resumed.state())
 
 
 # --- queries -----------------------------------------------------------------------------------------------------
