@@ -11,11 +11,12 @@ test is the first of its process to import: which test that is depends on the or
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import tempfile
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
@@ -198,6 +199,29 @@ def guests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Guests]:
     installed = Guests(tmp_path / "site", monkeypatch)
     yield installed
     installed.forget()
+
+
+@pytest.fixture
+def die_after_saves(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """From now on runs of this process die right after their saves of these numbers, counted from 1."""
+    from small_runs import KilledError
+
+    from imagine_bench.running import run_state
+    from imagine_bench.store.run_folder import Snapshot
+
+    def die(*numbers: int) -> None:
+        save = run_state.save_snapshot
+        saves = itertools.count(1)
+
+        def saved(folder: Path, snapshot: Snapshot) -> Path:
+            path = save(folder, snapshot)
+            if next(saves) in numbers:
+                raise KilledError
+            return path
+
+        monkeypatch.setattr(run_state, "save_snapshot", saved)
+
+    return die
 
 
 @pytest.fixture

@@ -233,13 +233,10 @@ def test_a_misspelt_name_is_answered_by_the_nearest(group: str) -> None:
 
 
 @pytest.mark.parametrize("given", [[], ["list", "more"]])
-def test_words_of_a_caller_are_read_instead_of_those_of_the_process(
-    given: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["imagine-bench", "list"])
-    with pytest.raises(SystemExit) as ended:
-        cli.main(given)
-    assert ended.value.code == 2
+def test_words_of_a_caller_are_read_instead_of_those_of_the_process(given: list[str]) -> None:
+    caller = f"from imagine_bench.cli import main; main({given})"
+    done = subprocess.run([sys.executable, "-c", caller, "list"], capture_output=True, check=False)
+    assert done.returncode == 2
 
 
 @pytest.mark.parametrize("offered", [registry.agents, registry.world_models, registry.regressors])

@@ -307,18 +307,18 @@ def test_every_option_of_the_command_is_a_keyword(tmp_path: Path) -> None:
         imagine_bench.register_agent("mine", functools.partial(Shifting, _LOCK))
 
 
-def test_a_class_that_is_changed_keeps_its_name_and_fields(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_class_that_is_changed_keeps_its_name_and_fields() -> None:
     imagine_bench.register_agent("mine", Shifting, title="my own", observes=("frame", "state"))
     imagine_bench.register_agent("made", code()["make"])
     first = registry.AGENTS["mine"]
     assert first.description == "Acts by the sum of pixels." and not first.needs_encoder
-    monkeypatch.setattr(Shifting, "shift", 1)
+    changed = type("Shifting", (Shifting,), {"shift": 1, "__doc__": Shifting.__doc__})
     with pytest.raises(UnknownNameError, match="preset"):
-        imagine_bench.bench("arrow_puzzle", [Shifting, code()["make"], code()["MyAgent"]], preset="smke")
+        imagine_bench.bench("arrow_puzzle", [changed, code()["make"], code()["MyAgent"]], preset="smke")
     now = registry.AGENTS["mine"]
     assert "Shifting" not in registry.AGENTS and "make" not in registry.AGENTS and "MyAgent" in registry.AGENTS
     assert now.make != first.make and dataclasses.replace(now, make=first.make) == first
-    for make in ("imagine_bench.agents:nope", Shifting):
+    for make in ("imagine_bench.agents:nope", changed):
         imagine_bench.register_agent("mine", make)
     assert registry.AGENTS["mine"].make == now.make, "a second call replaces it"
 

@@ -57,9 +57,8 @@ def command() -> str:
     return shlex.join([*program, *sys.argv[1:]])
 
 
-def commit() -> str | None:
-    """The checkout's commit, None outside one; code that differs, new files too, adds ``+changes.`` and its digest."""
-    top = PACKAGE_FOLDER.parent
+def commit(top: Path = PACKAGE_FOLDER.parent) -> str | None:
+    """A checkout's commit, None outside one; code that differs, new files too, adds ``+changes.`` and its digest."""
     if not (top / ".git").exists():
         return None
     head = _output("git", "-C", str(top), "rev-parse", "--short=12", "HEAD")

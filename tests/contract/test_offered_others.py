@@ -21,7 +21,7 @@ from imagine_bench.protocols.data import RunSpec
 from imagine_bench.registry.machine import versions
 from imagine_bench.regression.runner import run
 from imagine_bench.running.bench import plan
-from imagine_bench.running.trained import load_trained
+from imagine_bench.running.trained import encoder_of_run, load_trained
 from imagine_bench.store import encoders
 
 _OFFERS = {
@@ -101,7 +101,8 @@ def test_an_own_representation_trains_an_agent(tmp_path: Path, capsys: pytest.Ca
     assert (run.checkpoints[0].open_loop is None) == (agent == "dqn")
     path = load_trained(run.folder).spec.encoder
     assert path is not None
-
+    elsewhere = replace(first.protocol, test_appearance="strong")
+    assert encoder_of_run(elsewhere, agent, "tiles") == path, "the one of the appearance in training"
     encoder, spec = Encoder.load(path), registry.task("arrow_puzzle")
     states = np.array(spec.rules.states[:50])
     frames = spec.render_macrostates(states, "clean", np.random.default_rng(1))

@@ -9,19 +9,18 @@ import gymnasium
 import numpy as np
 import pytest
 from bench_fakes import TableAgent
-from fake_agents import FakeAgent
 from small_runs import Inline, collected, do, small
 
 from imagine_bench import registry
 from imagine_bench.arrays import Frame, Info
 from imagine_bench.cli import exit_code as main
 from imagine_bench.data.folder import read_dataset
-from imagine_bench.errors import InvalidValueError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Observation
-from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running.collect import collect, describe, policy_of
-from imagine_bench.running.trained import Trained
 from imagine_bench.seeding import episode_seed
+from imagine_bench.store import encoders, run_folder
+from imagine_bench.store.files import sealed, write_json
 from imagine_bench.tools import standard_data
 
 TASK = registry.task("arrow_puzzle")
@@ -66,14 +65,15 @@ def test_starts_macro_actions_and_chance_all_follow_from_the_seed() -> None:
         assert not np.array_equal(hidden["privileged"][name][::2], others["privileged"][name][::2]), name
 
 
-def test_a_runs_agent_plays_through_the_given_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = "pupil_privileged"
-    spec = RunSpec(protocol=small(agents=(agent,)), agent=agent, seed=0)
-    trained = Trained(agent=FakeAgent(), spec=spec, task=TASK, episodes=3, folder=tmp_path)
-    loading = mock.Mock(return_value=trained)
-    monkeypatch.setattr("imagine_bench.running.collect.load_trained", loading)
-    assert policy_of(str(tmp_path), TASK, 0, "given").players == [(trained.agent, True)]
-    loading.assert_called_once_with(tmp_path, encoder="given")
+def test_a_runs_agent_sees_as_in_its_run_and_through_the_given_encoder(tmp_path: Path) -> None:
+    do(tmp_path / "run", "pupil_privileged", agents=("pupil_privileged",))
+    ((_, privileged),) = policy_of(str(tmp_path / "run"), TASK, 0).players
+    assert privileged
+    wanted = small(agents=("dqn",), encoder=encoders.identity(encoders.own(TASK, "clean")))
+    config = {"format": run_folder.FORMAT, "protocol": wanted.as_dict(), "agent": "dqn", "seed": 0, "settings": {}}
+    write_json(tmp_path / "config.json", sealed(config))
+    with pytest.raises(ArtefactError, match=r"through encoder arrow_puzzle-clean@.*, which arrow_puzzle-mild is not"):
+        policy_of(str(tmp_path), TASK, 0, "arrow_puzzle-mild")
 
 
 def test_starts_are_those_of_no_run() -> None:

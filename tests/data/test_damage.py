@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,10 +17,10 @@ import pyarrow.parquet as pq
 import pytest
 from small_runs import FORMATS, collected, written
 
-from imagine_bench.data import npz
-from imagine_bench.data.folder import read_dataset
+from imagine_bench.arrays import Arrays
+from imagine_bench.data.folder import read_dataset, write_dataset
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError
-from imagine_bench.interfaces.episodes import joined
+from imagine_bench.interfaces.episodes import Episodes, joined
 from imagine_bench.running.collect import describe
 
 
@@ -163,13 +164,15 @@ def test_what_is_no_dataset_is_refused(tmp_path: Path, make: Callable[[Path], No
         read_dataset(tmp_path / "set")
 
 
-def test_a_set_that_could_not_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("imagine_bench.data.npz.write", full)
-    with pytest.raises(ImagineBenchError, match="the disk is full"):
-        written(tmp_path / "set")
+def test_a_set_that_could_not_be_written_leaves_nothing(tmp_path: Path) -> None:
+    collected()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))  # bytes of a file of this process
+    try:
+        with pytest.raises(ImagineBenchError, match=r"Cannot write .*: File too large"):
+            written(tmp_path / "set")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not list(tmp_path.iterdir())
 
 
@@ -188,18 +191,18 @@ def test_what_a_killed_writer_left_is_in_no_other_set(sets: Path, tmp_path: Path
     assert sorted(path.name for path in tmp_path.iterdir()) == [".set.partial", "set"]
 
 
-def test_writers_of_one_name_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writers_of_one_name_do_not_mix(tmp_path: Path) -> None:
     """The second begins while the first is at it: one set is whole, and the other writer says why it has none."""
-    write = npz.write
 
-    def write_while_another_does(folder: Path, episodes: Any, card: Any) -> None:
-        monkeypatch.setattr(npz, "write", write)
-        written(tmp_path / "set", episodes=3)
-        write(folder, episodes, card)
+    class Overtaken(Episodes):
+        def arrays(self) -> Arrays:
+            if not (tmp_path / "set").exists():
+                written(tmp_path / "set", episodes=3)
+            return super().arrays()
 
-    monkeypatch.setattr(npz, "write", write_while_another_does)
+    episodes, apart, card = collected()
     with pytest.raises(ImagineBenchError, match="Cannot write"):
-        written(tmp_path / "set")
+        write_dataset(tmp_path / "set", Overtaken(**episodes.arrays()), apart, card, "npz")
     assert len(read_dataset(tmp_path / "set").episodes) == 3
     assert [path.name for path in tmp_path.iterdir()] == ["set"]
 

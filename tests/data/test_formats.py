@@ -70,10 +70,10 @@ def test_success_is_lost_where_an_episode_is_cut() -> None:
 # --- Minari ----------------------------------------------------------------------------------------------------------
 
 
-def test_minari_loads_the_set_and_its_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_minari_loads_the_set_and_its_environment(tmp_path: Path) -> None:
     written(tmp_path / "set", "minari")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "set"))
-    found = minari.load_dataset("arrow_puzzle-mixed-v0")
+    found = minari.MinariDataset(tmp_path / "set" / "arrow_puzzle-mixed-v0" / "data")
+    assert found.id == "arrow_puzzle-mixed-v0"
     (first, *_) = found.iterate_episodes()
     episodes = collected()[0]
     assert np.array_equal(first.observations, episodes.frames[episodes.steps(0)[1]]), "lossless: no JPEG"

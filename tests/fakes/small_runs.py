@@ -41,6 +41,10 @@ def run_observed(spec: RunSpec[Protocol], folder: Path, on_progress: OnProgress)
     return run_folder.load_run(folder) if run_folder.is_done(folder) else None
 
 
+class KilledError(Exception):
+    """Ends a run in its midst."""
+
+
 def do(folder: Path, agent: str = "table", seed: int = 0, every_s: float = 20.0, **changes: Any) -> RunResult:
     spec = RunSpec(protocol=small(**changes), agent=agent, seed=seed, checkpoint_every_s=every_s)
     return run_observed(spec, folder, lambda progress: None)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
+import re
 import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -21,7 +24,7 @@ from rerun.chunk import RrdReader
 from small_runs import Inline, small
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, InvalidValueError, SetupError
+from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import Agent, Frame, Motion, Observation, Shape3D, State
 from imagine_bench.interfaces.capabilities import ImaginedRollout, Perceived
 from imagine_bench.judge.open_loop import Moment
@@ -159,28 +162,32 @@ def test_a_failure_leaves_a_closed_partial_file_and_what_was_there(tmp_path: Pat
     assert "/real/frame" in contents(partial)
 
 
-def test_viewing_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    there = tmp_path / "there.rrd"
-    there.write_bytes(b"no recording")
-    with pytest.raises(ArtefactError, match=r"there\.rrd is no recording of Rerun"):
-        open_in_viewer(there)
-    there.write_bytes(b"RRF2")
-    failed = subprocess.CompletedProcess[bytes]([], returncode=1)
-    monkeypatch.setattr(stream.subprocess, "run", lambda *_, **__: failed)
-    with pytest.raises(SetupError, match=r"No display .* the viewer failed; .* run 'rerun there.rrd' .* --serve-web"):
-        open_in_viewer(there)
+_VIEW = """
+import os
+from pathlib import Path
+from imagine_bench.recording.stream import open_in_viewer
+os.environ["PYTHONPATH"] = os.environ["VIEWERS"]
+os.environ.pop("PYTHONSAFEPATH", None)
+open_in_viewer(Path("a.rrd"))
+"""
 
 
-def test_a_module_in_the_current_folder_is_no_viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_viewer_that_fails_is_not_one_of_the_current_folder(tmp_path: Path) -> None:
     """A stand-in on Python's path is run, and one in the current folder is not."""
+    path = tmp_path / "here" / "a.rrd"
     for folder in ("path", "here"):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / "rerun.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w').write({folder!r})")
-    (tmp_path / "here" / "a.rrd").write_bytes(b"RRF2")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "path"))
-    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
-    monkeypatch.chdir(tmp_path / "here")
-    open_in_viewer(Path("a.rrd"))
+        viewer = f"open({str(tmp_path / 'ran')!r}, 'w').write({folder!r})\nraise SystemExit(1)"
+        (tmp_path / folder / "rerun.py").write_text(viewer)
+    path.write_bytes(b"no recording")
+    with pytest.raises(ArtefactError, match=r"a\.rrd is no recording of Rerun"):
+        open_in_viewer(path)
+    path.write_bytes(b"RRF2")
+    environment = {**os.environ, "VIEWERS": str(tmp_path / "path")}
+    words = [sys.executable, "-P", "-c", _VIEW]
+    done = subprocess.run(words, env=environment, cwd=path.parent, capture_output=True, text=True, check=False)
+    said = r"No display .* the viewer failed; .* run 'rerun a.rrd' .* --serve-web"
+    assert re.search(f"SetupError: {said}", done.stderr), done.stderr
     assert (tmp_path / "ran").read_text() == "path"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 import small_runs
 from bench_fakes import Pupil
 from imagine_bench.tasks.arrows.rules import ArrowRules
-from small_runs import final_arrays, measured, run_observed, small
+from small_runs import KilledError, final_arrays, measured, run_observed, small
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError
@@ -18,7 +19,7 @@ from imagine_bench.interfaces import Observation, Transition
 from imagine_bench.interfaces.capabilities import Label
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.rules import fewest_actions
-from imagine_bench.running import run_state, runner
+from imagine_bench.running import runner
 from imagine_bench.running.evaluation import LabelOracle, Teacher, as_seen
 from imagine_bench.store import encoders
 from imagine_bench.store.results import RunResult
@@ -199,33 +200,23 @@ def test_an_agent_that_learns_nothing_plays_no_earlier_task(tmp_path: Path) -> N
 # --- all of it, killed and resumed -------------------------------------------------------------------------------
 
 
-class _KilledError(Exception):
-    pass
-
-
-def test_a_killed_and_taught_learner_ends_in_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_and_taught_learner_ends_in_the_same_bits(
+    tmp_path: Path, die_after_saves: Callable[..., None]
+) -> None:
     agent = "factored:given"
     encoder = encoders.own(registry.task("arrow_puzzle"), "clean", kind=registry.agent_entry(agent).encoder_kind)
     taught = {"demonstrations": 2, "queries": 2, "feedback": 1.0, "feedback_error": 0.3}
-    after = {"after": ("arrow_puzzle_hard",), "after_episodes": 4}
-    wanted = small(agents=(agent,), budgets=(4, 7), evaluation_episodes=2, **after, **taught)
+    after = {"after": ("arrow_puzzle_hard", "arrow_puzzle_toward"), "after_episodes": 2}
+    wanted = small(agents=(agent,), budgets=(3, 5), evaluation_episodes=2, **after, **taught)
 
     def go(folder: Path, every_s: float) -> RunResult:
         spec = RunSpec(protocol=wanted, agent=agent, seed=1, encoder=encoder, checkpoint_every_s=every_s)
         return run_observed(spec, folder, lambda progress: None)
 
     whole = go(tmp_path / "whole", 1e9)
-    real, saves = run_state.save_snapshot, []
-
-    def killing(folder: Path, snapshot: Any) -> Path:
-        saves.append(real(folder, snapshot))
-        if len(saves) in (2, 4, 5, 8):  # on the earlier task, right after it, while watching, while asking
-            raise _KilledError
-        return saves[-1]
-
-    monkeypatch.setattr(run_state, "save_snapshot", killing)
+    die_after_saves(1, 2, 5, 7)  # on the first task, right after it, while watching, while asking
     for _ in range(4):
-        with pytest.raises(_KilledError):
+        with pytest.raises(KilledError):
             go(tmp_path / "run", 0.0)
     resumed = go(tmp_path / "run", 0.0)
     assert measured(whole) == measured(resumed)

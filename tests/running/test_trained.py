@@ -20,7 +20,7 @@ from imagine_bench.judge.plans import make_plans
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.running.runner import run
-from imagine_bench.running.trained import best_run, encoder_of_run, learners, load_trained
+from imagine_bench.running.trained import best_run, learners, load_trained
 from imagine_bench.store import encoders, run_folder
 from imagine_bench.store.bench_folder import BenchStore
 from imagine_bench.store.files import sealed, write_json
@@ -99,16 +99,6 @@ def test_one_encoder_file_is_enough_for_agents_of_two_kinds(tmp_path: Path) -> N
         load_trained(tmp_path)
     with pytest.raises(ArtefactError, match=r"own@\w+, which arrow_puzzle-mild is not"):
         load_trained(tmp_path, encoder="arrow_puzzle-mild")
-
-
-def test_a_given_name_is_of_the_appearance_in_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another package's encoder is fitted at an appearance."""
-    path = encoders.own(TASK, "clean")
-    asked: list[str] = []
-    monkeypatch.setattr(encoders, "resolve", lambda spec, appearance, given: [asked.append(appearance), path][1])
-    named = encoders.identity(path)
-    wanted = protocol("arrow_puzzle", "smoke", agents=("dqn",), encoder=named, test_appearance="strong")
-    assert encoder_of_run(wanted, "dqn", "another's") == path and asked == ["clean"]
 
 
 def test_of_runs_that_end_alike_the_earlier_one_is_taken(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ def test_the_broken_pair_is_named() -> None:
     assert doctor.unmet_requirements(alone) == [] == doctor.missing_extras(alone)
 
 
-def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changed_code_is_part_of_the_commit(tmp_path: Path) -> None:
     """Each edit, and a new file that nobody added, has a name of its own; a file that is no code has none."""
 
     def git(words: str) -> None:
@@ -46,9 +46,8 @@ def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.
     def commit_with(name: str, text: str) -> str | None:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-        return environment.commit()
+        return environment.commit(tmp_path)
 
-    monkeypatch.setattr("imagine_bench.registry.machine.PACKAGE_FOLDER", tmp_path / "imagine_bench")
     git("init -q")
     commit_with("agents/a.py", "1")
     git("add .")
@@ -61,7 +60,7 @@ def test_changed_code_is_part_of_the_commit(tmp_path: Path, monkeypatch: pytest.
     (tmp_path / "agents/new.py").unlink()
     assert commit_with("agents/a.py", "1") == head
     (tmp_path / ".git/index").write_bytes(b"damaged")  # git still knows the commit, and not what differs
-    assert environment.commit() == f"{head}+changes.unknown"
+    assert environment.commit(tmp_path) == f"{head}+changes.unknown"
 
 
 @pytest.mark.parametrize(

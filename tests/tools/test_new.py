@@ -46,18 +46,18 @@ def test_the_new_agent_learns_the_new_task(guests: Guests, tmp_path: Path) -> No
     assert run.checkpoints[-1].success_rate > 0.9 > 2 * chance
 
 
-def test_a_new_folder_hides_no_module_and_one_that_does_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_new_folder_hides_no_module_and_one_that_does_is_named(tmp_path: Path) -> None:
     """Beside the folder Python takes it for a package, where an editable install only adds a finder."""
     assert main(["new", "agent", "my_own", "--out", str(tmp_path)]) == 0
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(AttributeError, match=f"no attribute 'ENTRY', as the folder {tmp_path / 'my_own'} hides it"):
-        registry.load("my_own:ENTRY")
-    monkeypatch.delitem(sys.modules, "my_own")
-    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "my_own" / "src")])  # as setuptools adds it
-    assert registry.load("my_own:ENTRY").title == "My own"
-    monkeypatch.delitem(sys.modules, "my_own")
+    reads = "import sys; sys.path += sys.argv[1:]; from imagine_bench import registry; "
+    reads += "print(registry.load('my_own:ENTRY').title)"
+
+    def loaded(*added: Path) -> subprocess.CompletedProcess[str]:
+        words = [sys.executable, "-c", reads, *added]
+        return subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    assert f"no attribute 'ENTRY', as the folder {tmp_path / 'my_own'} hides it" in loaded().stderr
+    assert loaded(tmp_path / "my_own" / "src").stdout == "My own\n", "as setuptools adds it"
 
 
 def test_a_folder_that_exists_is_left_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

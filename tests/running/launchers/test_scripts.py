@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,6 @@ from small_runs import small
 from imagine_bench.errors import SetupError
 from imagine_bench.protocols.data import Job
 from imagine_bench.registry import AGENTS, load
-from imagine_bench.registry.loading import register, registered
 from imagine_bench.running.launchers.jobs import LocalPool
 from imagine_bench.store import run_folder
 
@@ -60,26 +58,30 @@ def test_a_worker_needs_no_script_and_knows_what_it_registers(tmp_path: Path, mo
     assert run_folder.is_done(job.folder) and sys.modules["__main__"] is main
 
 
+_REGISTERS = """
+from dataclasses import replace
+from imagine_bench.registry import AGENTS
+from imagine_bench.registry.loading import register, registered
+AGENTS["mine"] = replace(AGENTS["random"], make="__main__:make")
+there = registered()
+del AGENTS["mine"]
+register(there)
+print(AGENTS["mine"].make, AGENTS["random"].make)
+"""
+
+
 @pytest.mark.parametrize(
-    ("file", "spec", "target"),
-    [
-        ("/nowhere/my_agent.py", None, "__main__:make"),
-        ("my_agent.py", None, "my_agent:make"),
-        (None, "a.b", "a.b:make"),
-    ],
+    ("words", "name"), [(["-"], "__main__"), (["my_agent.py"], "my_agent"), (["-m", "a.b"], "a.b")]
 )
-def test_main_gets_the_name_that_others_import(
-    file: str | None, spec: str | None, target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "my_agent.py").touch()
-    main = sys.modules["__main__"]
-    monkeypatch.setattr(main, "__file__", file and str(tmp_path / file), raising=False)
-    monkeypatch.setattr(main, "__spec__", spec and type(__spec__)(spec, None))
-    monkeypatch.setitem(AGENTS, "mine", dataclasses.replace(AGENTS["table"], make="__main__:make"))
-    there = registered()
-    monkeypatch.delitem(AGENTS, "mine")
-    register(there)
-    assert AGENTS["mine"].make == target and AGENTS["table"].make == "bench_fakes:TableAgent"
+def test_main_gets_the_name_that_others_import(words: list[str], name: str, tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    for file in ("my_agent.py", "a/b.py"):
+        (tmp_path / file).write_text(_REGISTERS)
+    given = f"__file__ = '<stdin>'\n{_REGISTERS}"
+    done = subprocess.run(
+        [sys.executable, *words], cwd=tmp_path, input=given, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == [f"{name}:make", AGENTS["random"].make]
 
 
 def test_a_module_that_runs_a_command_when_imported_is_named(guests: Guests) -> None:

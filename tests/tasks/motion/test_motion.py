@@ -2,7 +2,7 @@
 
 import math
 import os
-import tempfile
+import shutil
 
 import mujoco
 import numpy as np
@@ -153,21 +153,24 @@ def test_what_the_robot_cannot_do_is_a_fault(world, columns, values, message):
     np.testing.assert_array_equal(world.object_poses(), before)
 
 
-def test_exploded_physics_is_reported_with_its_start(world, tmp_path, monkeypatch):
+def explode(world, said):
+    world.data.qpos[world.object_qpos[2]] = [1e11, 0, 0, 1, 0, 0, 0]
+    with pytest.raises(DivergedError, match=f"its start state and controls {said}"):
+        world.executor.turn(cube=0, clockwise=True)
+
+
+def test_exploded_physics_is_reported_with_its_start(world, own_folder):
     """In one file of a bounded number, or without one where none can be written."""
-    monkeypatch.chdir(tmp_path)  # MuJoCo's own log
     for index in range(MAX_SAVED + 3):
-        old = tmp_path / f"imagine_bench_diverged_{index}.npz"
+        old = own_folder / f"imagine_bench_diverged_{index}.npz"
         old.touch()
         os.utime(old, (index, index))
     place(world)
-    for folder, said in ((tmp_path, "were saved in"), (tmp_path / "gone", "could not be saved")):
-        monkeypatch.setattr(tempfile, "tempdir", str(folder))
-        world.data.qpos[world.object_qpos[2]] = [1e11, 0, 0, 1, 0, 0, 0]
-        with pytest.raises(DivergedError, match=f"its start state and controls {said}"):
-            world.executor.turn(cube=0, clockwise=True)
-    saved = sorted(tmp_path.glob("imagine_bench_diverged_*.npz"), key=os.path.getmtime)
+    explode(world, "were saved in")
+    saved = sorted(own_folder.glob("imagine_bench_diverged_*.npz"), key=os.path.getmtime)
     assert len(saved) == MAX_SAVED and saved[0].stem.endswith("_4")
     with np.load(saved[-1]) as contents:
         assert contents["start_state"].max() == 1e11
         assert contents["control"].shape[1] == world.model.nu
+    shutil.rmtree(own_folder)
+    explode(world, "could not be saved")
