@@ -97,6 +97,7 @@ class Hyperparameters(Generic[S]):
     """All settings that an agent can have, by config group, which the registry names and the bench reads."""
 
     groups: Mapping[str, ConfigGroup[S]]
+    has_no_effect: frozenset[str] = frozenset()  #: Settings by dotted name; a bench refuses them
 
     @classmethod
     def everywhere(cls, settings: S, **sets: Mapping[str, Override]) -> Hyperparameters[S]:
@@ -106,6 +107,14 @@ class Hyperparameters(Generic[S]):
     def names(self) -> frozenset[str]:
         """The dotted names of all settings."""
         return frozenset(flatten(next(iter(self.groups.values())).published))
+
+    def inert(self) -> frozenset[str]:
+        """The dotted names of settings that have no effect on the agent in any group."""
+        return self.has_no_effect.union(frozenset[str].intersection(*(each.unused for each in self.groups.values())))
+
+    def without(self, *names: str) -> Hyperparameters[S]:
+        """The same settings of an agent on which some have no effect; their values stay in its settings."""
+        return replace(self, has_no_effect=frozenset(names))
 
     def of(self, context: AgentContext) -> S:
         """The settings that an agent's context asks for; raises as :meth:`resolve`."""

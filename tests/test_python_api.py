@@ -205,7 +205,7 @@ def test_a_changed_class_resumes_no_run(results: api.Comparison, capsys: pytest.
         load_trained(run)
     other = imagine_bench.bench("arrow_puzzle", **{**again, "agents": ["random", changed]})
     assert other.folder != results.folder
-    assert f"the code of an agent was changed since {results.folder}" in capsys.readouterr().out
+    assert f"the code of an agent or of the task was changed since {results.folder}" in capsys.readouterr().out
     kept = {path: path.read_bytes() for path in content}
     assert kept == content, "the former bench stays as it is"
     imagine_bench.register_agent("Shifting", Shifting)

@@ -134,6 +134,7 @@ class Judgement:
         same: list[Json] = [_FORMAT, self.task, self.appearance, self.policy, self.samples, self.sizes[-1], self.order]
         if self.encoder_file is not None:
             same.append(encoders.identity(self.encoder_file))
+        same += filter(None, [registry.package_code(registry.task_entry(self.task).spec)])  # its code may change
         return f"{file_name(self.task)}-{self.appearance}-{digest(same)[:8]}"
 
 

@@ -5,7 +5,6 @@ An agent's own reading of its images counts for nothing when it is judged: they 
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -312,15 +311,7 @@ def model_entry(model: str) -> WorldModelEntry:
 
 def code_of(model: str) -> str:
     """A digest of the package that offers a world model; empty for one of this suite, and for the agents of runs."""
-    make = model_entry(model).make
-    if runs_of(model) or registry.is_ours(make):
-        return ""
-    found = find_spec(make.partition(":")[0].partition(".")[0])
-    folders = (found.submodule_search_locations or ()) if found else ()
-    files = sorted(file for folder in folders for file in Path(folder).rglob("*.py"))
-    if found and not files and found.origin:
-        files = [Path(found.origin)]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+    return "" if runs_of(model) else registry.package_code(model_entry(model).make)
 
 
 def one_name(model: str) -> str:

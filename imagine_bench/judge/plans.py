@@ -8,7 +8,7 @@ agent never sees them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +34,7 @@ class PlanResult:
     compared: ComparedRollout  # the imagined frames beside those of the camera, cut where the episode ended
     refused: str  # why it was not carried out, or an empty string
     solved: bool  # whether the task was solved when the plan was done
-    shortest: int  # the fewest macro-actions that can solve it from there, by the rules
+    shortest: int | None  # the fewest macro-actions that can solve it from there, by the rules; None where none can
     faults: int  # macro-actions whose physics disagreed with the rules
 
     @property
@@ -65,7 +65,8 @@ class PlanResult:
         if self.refused:
             return f"refused: {self.refused}"
         if self.solved:
-            return "solved" if self.optimal else f"solved, {self.done - self.shortest} longer than needed"
+            longer = self.done - (self.shortest or self.done)
+            return f"solved, {longer} longer than needed" if longer else "solved"
         if self.compared.real_terminated[-1]:
             return f"failed at macro-action {self.done}"
         return "over before anything was solved"
@@ -127,13 +128,16 @@ def carry_out(
         tell(len(real))
         if terminated or truncated:
             break
+    shortest = None
+    with suppress(InvalidValueError):  # nothing is solved from there
+        shortest = fewest_actions(trained.task.rules, start)
     return PlanResult(
         number=number,
         start=start,
         compared=beside_reality(rollout, frame, start, real),
         refused=refused,
         solved=solved,
-        shortest=fewest_actions(trained.task.rules, start),
+        shortest=shortest,
         faults=faults,
     )
 

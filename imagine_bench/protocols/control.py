@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import ItemsView, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -29,6 +29,7 @@ from imagine_bench.protocols.data import (
     OPTIONAL_IN_HASH,
     ProtocolData,
     RunSpec,
+    package_digests,
     require_different,
 )
 from imagine_bench.registry import (
@@ -36,6 +37,7 @@ from imagine_bench.registry import (
     agent_entry,
     installed_of,
     own_settings,
+    package_code,
     spelled,
     task,
     task_entry,
@@ -50,6 +52,8 @@ _THESIS_AGENTS = ("dqn", "imagination", "imagination_uncertainty")
 _ALL_AGENTS = ("random", "oracle", *_THESIS_AGENTS)
 _THESIS_BUDGETS = (250, 500, 1000, 1500, 2000, 3000, 4000, 5000, 6000)
 
+TASK_CODE = "task "
+"""Beginning of the names of tasks in :attr:`.ProtocolData.code`; no agent's name has a space."""
 _AFTER_EPISODES = 100
 _AT_LEAST = {
     "after_episodes": 1,
@@ -129,8 +133,6 @@ class LearnerSection:
     encoder: str | None = None
     #: That of the encoder for the agents that see codes of parts; None if there is no such agent.
     codes: str | None = None
-    #: Digest of the code of each agent that was registered as a class or a function (:mod:`.by_value`), by its name.
-    code: tuple[tuple[str, str], ...] = field(default=(), metadata=OPTIONAL_IN_HASH)
 
     def encoder_of(self, kind: str) -> str | None:
         """Return the identity of the encoder for the agents that take this kind."""
@@ -238,6 +240,13 @@ class Protocol(WorldSection, LearnerSection, BudgetSection, EvaluationSection, P
         """The seeds that an agent is run with."""
         last = dict(self.few_seeds).get(agent, self.seeds[-1])
         return tuple(seed for seed in self.seeds if seed <= last)
+
+    def code_places(self) -> dict[str, str]:
+        """As :meth:`.ProtocolData.code_places`."""
+        made_by = {parse_configuration(agent).agent: agent_entry(agent).make for agent in self.agents}
+        places = {name: make for name, make in made_by.items() if isinstance(make, str)}
+        tasks = {name.partition(":")[0]: task_entry(name).spec for name in (self.task, *self.after)}
+        return {**places, **{f"{TASK_CODE}{name}": place for name, place in tasks.items()}}
 
     def work(self, agent: str) -> int:
         """Return the episodes that a run of this agent plays, for training and for tests."""
@@ -353,8 +362,7 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     if isinstance(values.get("agents"), list | tuple):  # any other type is refused below
         values["agents"] = tuple(spelled(agent, AGENT_GROUP) for agent in values["agents"])
     values["after"] = tuple(map(canonical, values.get("after", ())))
-    if isinstance(values.get("physics"), Mapping):
-        values["physics"] = tuple(values["physics"].items())
+    values["physics"] = _pairs_of_physics(values.get("physics", ()))
     if values.get("split") is not None:
         values["split"] = split_of(spec.rules, values["split"]).identity
     wanted = Protocol(task=spec.id, preset=preset, **values)
@@ -368,7 +376,8 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
             if agent in agents and most < len(wanted.seeds)
         ),
     )
-    wanted = dataclasses.replace(wanted, code=registered_code(wanted.agents))
+    code = (*registered_code(wanted.agents), *package_digests(wanted.code_places()))
+    wanted = dataclasses.replace(wanted, code=tuple(sorted(code)))
     for agent in wanted.agents:  # a protocol that is only read may be of a package that is not here
         _require_takes(agent, wanted)
     _require_learner(wanted)
@@ -376,21 +385,33 @@ def protocol(task_name: str, preset: str = "quick", **changes: Any) -> Protocol:
     return wanted
 
 
+def _pairs_of_physics(given: object) -> tuple[tuple[str, Setting], ...]:
+    """The settings of physics as pairs, given as a mapping or as pairs. Raises InvalidValueError for anything else."""
+    pairs = given.items() if isinstance(given, Mapping) else given
+    items: list[tuple[str, Setting]] | None = [*pairs] if isinstance(pairs, ItemsView | list | tuple) else None
+    if items is None or not all(isinstance(each, list | tuple) and len(each) == 2 for each in items):
+        raise InvalidValueError(f"physics is {brief(given)}; give a table of settings, such as pad_friction = 0.5.")
+    return tuple((name, value) for name, value in items)
+
+
 def registered_code(agents: Iterable[str]) -> tuple[tuple[str, str], ...]:
-    """The digests of the agents' code, as :attr:`LearnerSection.code` has them."""
+    """The digests of agents that were registered as a class or a function, as :attr:`.ProtocolData.code` has them."""
     made_by = {parse_configuration(agent).agent: agent_entry(agent).make for agent in agents}
     return tuple(sorted((name, make.digest) for name, make in made_by.items() if isinstance(make, CodeByValue)))
 
 
 def _require_same_code(agent: str, protocol: Protocol) -> None:
-    """Raise ArtefactError if an agent's class is not the one of the protocol."""
+    """Raise ArtefactError if an agent's class, or the package that offers it, is not the one of the protocol."""
     name = parse_configuration(agent).agent
     wanted = dict(protocol.code).get(name)
-    found = dict(registered_code([agent])).get(name)
+    make = agent_entry(agent).make
+    if isinstance(make, str) and wanted is None:  # this suite's, or of a bench of before packages had digests
+        return
+    found = make.digest if isinstance(make, CodeByValue) else package_code(make)
     if wanted != found:
         raise ArtefactError(
-            f"The code of agent {name} is not that of this bench (digest {wanted}, now {found}). Run the bench command "
-            "again to begin a new bench, or register the agent as it was."
+            f"The code of agent {name} is not that of this bench (digest {wanted}, now {found or None}). Run the bench "
+            "command again to begin a new bench, or bring the agent's code back as it was."
         )
 
 

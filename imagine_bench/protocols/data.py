@@ -20,6 +20,7 @@ from typeguard import CollectionCheckStrategy, TypeCheckError, check_type
 
 from imagine_bench.errors import InvalidValueError, brief, require_known
 from imagine_bench.interfaces import DEVICES
+from imagine_bench.registry import package_code
 from imagine_bench.registry.entries import FIRST, TODAY, agent_label, edition_of, name_in_edition_1, parse_configuration
 from imagine_bench.seeding import SEEDS, TUNING_SEEDS, is_tuning_seed
 from imagine_bench.values import Json, Setting, has_switch, kind_in_words
@@ -53,6 +54,9 @@ class ProtocolData(ABC):
     #: :func:`digest` of every setting of every learner: a hyper-parameter set may be another one tomorrow, and a run
     #: with that one belongs to another bench. Empty in a protocol that no plan made.
     settings_digest: str = ""
+    #: Digests of code by name, sorted: of each agent that was registered as a class or a function (:mod:`.by_value`),
+    #: and of the package of each agent, regressor and task that is not this suite's (:func:`.registry.package_code`).
+    code: tuple[tuple[str, str], ...] = field(default=(), metadata=OPTIONAL_IN_HASH)
     device: str = "cpu"  #: ``"cpu"`` or ``"cuda"``, where the agents compute: the bits of a result depend on it
     #: Edition of agents' names that files and the hash of this protocol have; ``agents`` are today's labels in any.
     #: A file says it only where names would be taken for older ones without it. See :mod:`.registry.entries`.
@@ -111,8 +115,19 @@ class ProtocolData(ABC):
         return [(agent, seed) for seed in self.seeds for agent in self.agents if seed in self.seeds_of(agent)]
 
     @abstractmethod
+    def code_places(self) -> dict[str, str]:
+        """The ``"module:attr"`` of all agents, regressors and tasks that are imported by a name, by names of
+        ``code``.
+        """
+
+    @abstractmethod
     def work(self, agent: str) -> int:
         """Parts of work of a run of this agent, of whatever the protocol counts."""
+
+
+def package_digests(places: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
+    """Name and :func:`.registry.package_code` of each ``"module:attr"``, but of this suite's own."""
+    return tuple((name, code) for name, place in sorted(places.items()) if (code := package_code(place)))
 
 
 def require_types(one: DataclassInstance) -> None:

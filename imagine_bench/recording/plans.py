@@ -76,7 +76,8 @@ def _words(plan: PlanResult, done: int, count: int, names: Sequence[str]) -> str
     if plan.refused:
         lines += ["", f"**Refused:** {plan.refused}."]
     elif done == plan.done:
-        lines += ["", f"**{plan.outcome[0].upper()}{plan.outcome[1:]}.** The shortest possible: {plan.shortest}."]
+        shortest = plan.shortest or "none"
+        lines += ["", f"**{plan.outcome[0].upper()}{plan.outcome[1:]}.** The shortest possible: {shortest}."]
     else:
         lines += ["", "The arm does this without looking again."]
     return "\n".join(lines)

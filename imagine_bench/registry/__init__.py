@@ -46,6 +46,8 @@ from imagine_bench.registry.plugins import (
     is_ours,
     offered,
     offers,
+    package_code,
+    packages_of,
     refused_offers,
     require_guest,
     usable,
@@ -85,6 +87,8 @@ __all__ = [
     "motion_name",
     "offered",
     "offers",
+    "package_code",
+    "packages_of",
     "refuse_while_loading",
     "refused_offers",
     "register_env",
@@ -261,6 +265,13 @@ def setting_names(agent: str) -> frozenset[str]:
     """The dotted names of all settings that an agent has."""
     where = agent_entry(agent).settings
     return load(where).names() if where else frozenset()
+
+
+def inert_settings(agent: str) -> frozenset[str]:
+    """The dotted names of an agent's settings that have no effect on it, as far as it says so."""
+    where = agent_entry(agent).settings
+    inert = getattr(load(where), "inert", None) if where else None
+    return frozenset() if inert is None else inert()
 
 
 def own_settings(agent: str, overrides: Mapping[str, Setting]) -> dict[str, Setting]:

@@ -54,6 +54,7 @@ TASKS: dict[str, TaskEntry] = {
 }
 
 _IMAGINATION_SETTINGS = "imagine_bench.agents.imagination.settings:HYPERPARAMETERS"
+_EFFECTIVE = "imagine_bench.agents.imagination.inert"
 
 AGENTS: dict[str, AgentEntry] = {
     "random": AgentEntry(
@@ -87,13 +88,13 @@ AGENTS: dict[str, AgentEntry] = {
     "imagination": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make",
         relative_cost=5.0,
-        settings=_IMAGINATION_SETTINGS,
+        settings=f"{_EFFECTIVE}:UNFILTERED",
         description="DQN that also learns a world model and trains on all transitions that it imagines with it.",
     ),
     "imagination_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.agent:make_uncertainty",
         relative_cost=5.0,
-        settings=_IMAGINATION_SETTINGS,
+        settings=f"{_EFFECTIVE}:FILTERED",
         title="imagination + uncertainty",
         description="Like imagination, but an imagined transition is thrown away, with the rest of its rollout, where "
         "the model is uncertain.",
@@ -101,14 +102,14 @@ AGENTS: dict[str, AgentEntry] = {
     "imagination_only": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make",
         relative_cost=4.0,
-        settings=_IMAGINATION_SETTINGS,
+        settings=f"{_EFFECTIVE}:MODEL_ONLY",
         description="Explores like DQN and learns a world model on the side; a fresh controller that never meets the "
         "world is trained in that model alone, and is then tested.",
     ),
     "imagination_only_uncertainty": AgentEntry(
         make="imagine_bench.agents.imagination.model_only:make_uncertainty",
         relative_cost=4.0,
-        settings=_IMAGINATION_SETTINGS,
+        settings=f"{_EFFECTIVE}:MODEL_ONLY_FILTERED",
         title="imagination only + uncertainty",
         description="Like imagination only, but an imagined episode ends where the model is uncertain.",
     ),

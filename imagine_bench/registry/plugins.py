@@ -6,8 +6,11 @@ Nothing of a package is imported before one of its objects is asked for.
 from __future__ import annotations
 
 import functools
-from collections.abc import Container, Mapping, Sequence
+import hashlib
+from collections.abc import Container, Iterable, Mapping, Sequence
 from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from imagine_bench.errors import InvalidValueError, SetupError, brief, require_known, unprintable
@@ -161,8 +164,34 @@ def guest_with(group: str, name: str) -> Guest | None:
 
 def is_ours(target: str | CodeByValue) -> bool:
     """Whether code is this suite's: the core's, or that of a guest of its own that needs no library of others."""
-    top = str(target).partition(":")[0].partition(".")[0]
-    return top in {"imagine_bench", *(guest.module for guest in guests() if guest.is_ours_alone)}
+    return _top(str(target)) in {"imagine_bench", *(guest.module for guest in guests() if guest.is_ours_alone)}
+
+
+def package_code(target: str) -> str:
+    """Twelve hex digits of the Python files of the package, or of the single module, in which a ``"module:attr"`` lies.
+
+    All of its files count, since nobody knows which of them decide; none is imported. Empty for code of this suite, all
+    of its guests included, of which benches keep the commit, and for code of a notebook.
+    """
+    top = _top(target)
+    if top in {"__main__", "imagine_bench", *(guest.module for guest in guests())}:
+        return ""
+    found = find_spec(top)
+    folders = (found.submodule_search_locations or ()) if found else ()
+    files = sorted(file for folder in folders for file in Path(folder).rglob("*.py"))
+    if found and found.has_location and not files:
+        files = [Path(str(found.origin))]
+    return hashlib.sha256(b"".join(map(Path.read_bytes, files))).hexdigest()[:12] if files else ""
+
+
+def packages_of(targets: Iterable[str]) -> set[str]:
+    """The installed packages that offer anything of the top modules in which some ``"module:attr"`` lie."""
+    tops = set(map(_top, targets))
+    return {name for name, modules in guest_packages().items() if modules & tops}
+
+
+def _top(target: str) -> str:
+    return target.partition(":")[0].partition(".")[0]
 
 
 def absent_guests() -> list[Guest]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from imagine_bench import registry
 from imagine_bench.errors import InvalidValueError, require_known
-from imagine_bench.protocols.data import ProtocolData, digest, require_different
+from imagine_bench.protocols.data import ProtocolData, digest, package_digests, require_different
 from imagine_bench.registry.entries import parse_configuration
 from imagine_bench.values import Setting
 
@@ -45,6 +45,10 @@ class RegressionProtocol(ProtocolData):
                 f"networks is {self.networks} and test_points {self.test_points}; they must lie in [1, 1000] and "
                 "[2, 100000]."
             )
+
+    def code_places(self) -> dict[str, str]:
+        """As :meth:`.ProtocolData.code_places`."""
+        return {parse_configuration(agent).agent: registry.regressor_entry(agent).make for agent in self.agents}
 
     def work(self, agent: str) -> int:
         """Units of a run's work: 110 a variant, the last ten for measuring."""
@@ -91,4 +95,4 @@ def plan(task: str, preset: str, **changes: Any) -> tuple[RegressionProtocol, di
         for each in offered.values()
         for group in each.groups
     ]
-    return replace(wanted, settings_digest=digest(settings)), {}
+    return replace(wanted, settings_digest=digest(settings), code=package_digests(wanted.code_places())), {}

@@ -44,6 +44,7 @@ from imagine_bench.registry.machine import describe_environment, gl_renderer
 from imagine_bench.store import encoders, loading
 from imagine_bench.store.bench_folder import (
     BenchStore,
+    as_begun,
     bench_folder,
     is_archive,
     read_protocol_as,
@@ -300,10 +301,8 @@ def bench(wanted: ProtocolData, paths: Encoders, *, root: Path, launcher: Launch
         SetupError: The folder cannot be written, there is no GL, or an extra of this package is not installed.
         ArtefactError: A file is damaged or foreign; it is left untouched.
     """
+    wanted = as_begun(root, wanted)
     folder = bench_folder(root, wanted)
-    if isinstance(wanted, Protocol) and wanted.code and not folder.exists():
-        for other in with_other_code(folder, wanted):
-            print(f"Note: the code of an agent was changed since {other}, which stays as it is; all runs begin anew.")
     failures, missing = carry_out([(wanted, paths)], root=root, launcher=launcher)
     require_done(failures, missing)
     if not missing:
@@ -329,6 +328,8 @@ def carry_out(
     """
     require_modules("matplotlib", "PIL", "rerun")  # torch only where an agent is made of it
     _say_doubts(paths for _, paths in planned)
+    for wanted, _ in planned:
+        _say_other_code(bench_folder(root, wanted), wanted)
     with ExitStack() as held:
         work = list[_Bench]()
         missing = 0
@@ -347,6 +348,15 @@ def carry_out(
         jobs = [job for store, paths in work for job in _jobs(store, paths)]
         with ProgressBar([job.spec for job in jobs]) as show:
             return list(launcher.launch(jobs, show)) if jobs else [], missing
+
+
+def _say_other_code(folder: Path, wanted: ProtocolData) -> None:
+    """Say of which benches the agents or the task had other code, if this one is new."""
+    for other in with_other_code(folder, wanted) if wanted.code and not folder.exists() else ():
+        print(
+            f"Note: the code of an agent or of the task was changed since {other}, which stays as it is; all runs "
+            "begin anew. To go on there, bring that code back and run the same command."
+        )
 
 
 def _say_doubts(needed: Iterable[Encoders]) -> None:

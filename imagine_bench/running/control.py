@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,8 @@ def plan_control(
     if not registry.is_own(task):
         _require_sound(wanted)
     filled = {"settings_digest": digest(resolved_settings(wanted))}
+    if encoder is None:
+        _refuse_unable(wanted)
     paths = _encoders(wanted, encoder)
     names = {"encoder": "latents", "codes": "codes"}
     filled |= {field: encoders.identity(paths[kind]) for field, kind in names.items() if kind in paths}
@@ -86,6 +88,26 @@ def _rests_on_others(agent: str) -> bool:
     return entry.external_training_loop or not (is_script or registry.is_ours(entry.make))
 
 
+def _refuse_unable(wanted: Protocol) -> None:
+    """Raise UnableError for a learner that lacks an ability, before an encoder is trained for it, which takes minutes.
+
+    The learner is made with a bundled encoder of the same kind in place of its own.
+    """
+    asks = wanted.dataset or wanted.after or wanted.demonstrations or wanted.queries or wanted.feedback
+    entries = {agent: registry.agent_entry(agent) for agent in wanted.agents}
+    if not asks or not any(entry.needs_encoder for entry in entries.values()):
+        return
+    for agent, entry in entries.items():
+        stand_in = next(path for path in encoders.bundled().values() if encoders.kind(path) == entry.encoder_kind)
+        spec = RunSpec(protocol=wanted, agent=agent, seed=wanted.seeds[0], encoder=stand_in)
+        learner = None
+        with suppress(Exception, SystemExit):  # it is made once more, with its own encoder, and then says why
+            prepared = encoders.card_of(stand_in)["preprocessing"]
+            learner = registry.make_agent(agent, dataclasses.replace(context_of(spec), preprocessing=prepared))
+        if learner is not None and entry.learns:
+            require_able(learner, agent, wanted)
+
+
 def _check_abilities(wanted: Protocol, paths: Encoders) -> None:
     """Build every learner once, to see whether it can use its encoder and has the abilities that are asked for."""
     for agent in wanted.agents:
@@ -101,13 +123,23 @@ def resolved_settings(wanted: Protocol) -> dict[str, Json]:
 
     Raises:
         UnknownNameError: No agent of the protocol has it.
-        InvalidValueError: A value of the wrong type or out of its range.
+        InvalidValueError: A value of the wrong type or out of its range, or a setting that has no effect.
     """
     overrides = dict(wanted.overrides)
-    known = {name for agent in wanted.agents for name in registry.setting_names(agent)} if overrides else set()
+    known: set[str] = set()
+    acting: set[str] = set()
+    for agent in wanted.agents:
+        inert = registry.inert_settings(agent)
+        known |= registry.setting_names(agent)
+        acting |= registry.setting_names(agent) - inert
+        one = parse_configuration(agent)
+        for name in sorted(inert & one.settings.keys()):
+            raise InvalidValueError(f"Setting {name} has no effect on agent {one.agent}; leave it out.")
     for name in overrides:
         if name not in known:
-            raise UnknownNameError("setting", name, sorted(known))
+            raise UnknownNameError("setting", name, sorted(acting))
+        if name not in acting:
+            raise InvalidValueError(f"Setting {name} has no effect on any agent of this bench; leave it out.")
     name = wanted.hyperparameters
     group = wanted.config_group
     found = {agent: registry.settings(agent, name, overrides, group) for agent in wanted.agents}

@@ -120,7 +120,7 @@ def _stage(
         groups.setdefault(fewer, []).append(agent)
     found = []
     for fewer, agents in groups.items():
-        known = frozenset[str]().union(*map(registry.setting_names, agents))
+        known = {name for agent in agents for name in registry.setting_names(agent) - registry.inert_settings(agent)}
         part = plan(
             agents=tuple(agents),
             seeds=seeds[before - fewer : count - fewer],

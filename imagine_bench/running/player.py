@@ -20,7 +20,7 @@ from imagine_bench.arrays import Action, Info, Observed
 from imagine_bench.errors import InvalidValueError, brief, require_integer, writing
 from imagine_bench.interfaces import AgentState
 from imagine_bench.interfaces.environments import Env, Wrapper
-from imagine_bench.protocols.control import Protocol, protocol
+from imagine_bench.protocols.control import TASK_CODE, Protocol, protocol
 from imagine_bench.protocols.data import RunSpec, digest
 from imagine_bench.registry.machine import describe_environment
 from imagine_bench.running.bench import certificate_of
@@ -28,7 +28,7 @@ from imagine_bench.running.evaluation import EvaluationCounts, Options, Recorded
 from imagine_bench.running.run_state import Counters, CountVisits, make_env
 from imagine_bench.seeding import episode_seed, evaluation_split
 from imagine_bench.store import run_folder
-from imagine_bench.store.bench_folder import BenchStore, bench_folder, read_control
+from imagine_bench.store.bench_folder import BenchStore, as_begun, bench_folder, read_control
 from imagine_bench.store.files import write_bytes
 from imagine_bench.store.results import Checkpoint
 
@@ -100,7 +100,7 @@ def protocol_of_player(
         evaluation_episodes=TESTS if tests is None else tests,
         encoder=None,
         codes=None,
-        code=(),
+        code=tuple(pair for pair in found.code if pair[0].startswith(TASK_CODE)),
         settings_digest=digest({} if training is None else {player: {}}),
     )
 
@@ -247,6 +247,7 @@ def played_run(wanted: Protocol, root: Path, **options: str) -> Iterator[PlayedR
     """
     (player,) = wanted.agents
     (seed,) = wanted.seeds
+    wanted = as_begun(root, wanted)
     store = BenchStore(bench_folder(root, wanted), wanted)
     folder = store.run_folder(player, seed)
     env = make_env(wanted, wanted.task, testing=not registry.agent_entry(player).learns, **options)

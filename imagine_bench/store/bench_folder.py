@@ -20,7 +20,9 @@ from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.exact.certificate import Certificate, from_json
 from imagine_bench.protocols.control import Protocol
 from imagine_bench.protocols.data import ProtocolData, digest
+from imagine_bench.registry import packages_of
 from imagine_bench.registry.entries import file_name
+from imagine_bench.registry.machine import versions
 from imagine_bench.store import run_folder
 from imagine_bench.store.files import lock, make_folder, read_json, read_sealed, reading, sealed, sweep, write_json
 from imagine_bench.values import Json
@@ -149,8 +151,24 @@ def bench_folder(root: Path, protocol: ProtocolData) -> Path:
     return Path(root / file_name(protocol.task) / f"{protocol.preset}-{protocol.hash}")
 
 
-def with_other_code(folder: Path, protocol: Protocol) -> list[Path]:
-    """Return the benches beside ``folder`` that differ from this protocol in the code of their agents alone."""
+def as_begun(root: Path, protocol: P) -> P:
+    """A protocol as its bench below ``root`` has it: without digests of packages where that is of before 2026-11-30.
+
+    Such a bench goes on, unless its first session names another version of one of these packages.
+    """
+    places = protocol.code_places()
+    former = dataclasses.replace(protocol, code=tuple(pair for pair in protocol.code if pair[0] not in places))
+    folder = bench_folder(root, former)
+    if former == protocol or bench_folder(root, protocol).exists() or not (folder / _SESSIONS).exists():
+        return protocol
+    then = _facts(folder)["environment"]["versions"]
+    now = versions()
+    packages = packages_of(places.values())
+    return former if all(then.get(name, now[name]) == now[name] for name in packages) else protocol
+
+
+def with_other_code(folder: Path, protocol: ProtocolData) -> list[Path]:
+    """Return the benches beside ``folder`` that differ from this protocol in the code of agents and tasks alone."""
     wanted = {**protocol.as_dict(), "code": None}
     found = []
     for path in sorted(folder.parent.glob(f"{protocol.preset}-*/{_PROTOCOL}")):

@@ -39,6 +39,7 @@ _STUDY_SETS = {
     "overrides",
     "settings_digest",
     "codes",
+    "code",
 }
 _VARIED = sorted({each.name for each in dataclasses.fields(Protocol)} - _STUDY_SETS)
 

@@ -24,7 +24,7 @@ from imagine_bench.protocols.data import Encoders, Launcher, ProtocolData, requi
 from imagine_bench.running.bench import carry_out, plan, require_done, task_type
 from imagine_bench.running.trained import require_control
 from imagine_bench.statistics import Estimate, difference
-from imagine_bench.store.bench_folder import BenchStore, bench_folder
+from imagine_bench.store.bench_folder import BenchStore, as_begun, bench_folder
 from imagine_bench.store.loading import load_so_far
 from imagine_bench.store.results import BenchResult, RunResult
 from imagine_bench.sweep.grid import Experiment, Level, Study, Suite, Variant
@@ -60,7 +60,7 @@ def run_study(study: Study, task: str, *, root: Path, launcher: Launcher) -> tup
     """Carry out the missing runs of every variant and compare. Errors are those of :func:`.bench.bench`."""
     task_type(task)  # knows every name
     require_control(task, task)
-    planned = {variant.name: plan_variant(study, task, variant) for variant in study.variants}
+    planned = {variant.name: _begun(root, [plan_variant(study, task, variant)])[0] for variant in study.variants}
     require_done(*carry_out(list(planned.values()), root=root, launcher=launcher))
     results = {name: load_so_far(bench_folder(root, protocol)) for name, (protocol, _) in planned.items()}
     return tuple(_line(study, variant, results, registry.task(task).rules) for variant in study.variants)
@@ -97,6 +97,11 @@ def plan_variant(study: Study, task: str, variant: Variant) -> Planned:
         overrides=tuple(sorted(variant.settings.items())),
         **{**_FIGURES_ONLY, "execution": study.execution, "appearance": study.appearance, **variant.world},
     )
+
+
+def _begun(root: Path, planned: Sequence[Planned]) -> list[Planned]:
+    """Benches with their protocols as :func:`.bench_folder.as_begun` gives them."""
+    return [(as_begun(root, protocol), encoders) for protocol, encoders in planned]
 
 
 def imagined_right(rules: Rules, runs: Sequence[RunResult]) -> Floats:
@@ -177,7 +182,7 @@ def run_suite(suite: Suite, agents: Sequence[str], *, root: Path, launcher: Laun
     """
     require_different("agents", tuple(agents))
     plans = {
-        (each.name, agent): [plan_level(suite, level, agent) for level in each.levels]
+        (each.name, agent): [_begun(root, plan_level(suite, level, agent)) for level in each.levels]
         for each, agent in itertools.product(suite.experiments, agents)
     }
     planned = [bench for levels in plans.values() for level in levels for bench in level]

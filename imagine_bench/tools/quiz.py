@@ -52,7 +52,7 @@ def quiz(
         folder: Where the images of the questions are written.
 
     Raises:
-        InvalidValueError: No question is asked for, or the world is too large or hides something.
+        InvalidValueError: No question is asked for, or the world is too large or too small or hides something.
         UnknownNameError: No such task or appearance.
     """
     require_integer("quiz", count, 1)
@@ -67,6 +67,8 @@ def quiz(
         )
     first = spec.render_macrostates(np.array(states[:1] * 2, dtype=np.int64), look, rng)
     asked = whole_world(spec, states, FRAMES, frames_vary=bool((first[0] != first[1]).any()))
+    if not asked.families:
+        raise InvalidValueError(f"{task} is too small a world to ask anything about; take another task.")
     place = make_folder(folder / spec.id)
     found: dict[str, list[Floats]] = {}
     for number in range(count):

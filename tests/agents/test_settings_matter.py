@@ -1,8 +1,9 @@
-"""Every setting of an agent changes what it learns: no way through its code leaves one out."""
+"""Every setting of an agent changes what it learns, and a bench refuses one that would not."""
 
 from __future__ import annotations
 
 import functools
+import json
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -12,7 +13,9 @@ import pytest
 from fake_latents import SMALL, built, live, with_own_settings
 
 from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.interfaces.capabilities import ModelOnlyTrainer
+from imagine_bench.running.bench import plan
 
 BASE: dict[str, Any] = {
     **SMALL,
@@ -39,6 +42,8 @@ BASE: dict[str, Any] = {
 }
 """Settings with which all others count."""
 OTHERS: dict[str, dict[str, Any]] = {
+    "imagination.start_episode": {"imagination.start_episode": 2},
+    "imagination.end_episode": {"imagination.end_episode": 3},
     "controller.epsilon_decay": {"controller.epsilon_decay": 5.0},
     "imagination.threshold": {"imagination.threshold": 1e-9},
     "model.precision": {"model.precision": "bfloat16"},
@@ -47,16 +52,17 @@ OTHERS: dict[str, dict[str, Any]] = {
     "reuse.steps": {"reuse.steps": 1},
 }
 """Other values than those that follow from the type of a setting, and the settings that they need."""
-_PRIORITIES = {"memory.priority", "memory.priority_correction"}
-_ROLLOUTS = {f"imagination.{name}" for name in ("start_episode", "end_episode", "start_states", "breadth")}
-INERT = {
-    "dqn": set[str](),
-    "dqn_efficient": _PRIORITIES,
-    "drqn": _PRIORITIES,
-    "imagination_uncertainty": {"imagination.model_only_episodes"},
-    "imagination_only_uncertainty": _ROLLOUTS | {"imagination.updates_per_step"},
-}
-"""Agents, and the settings of each that change nothing: it replays otherwise, or imagines whole episodes."""
+AGENTS = (
+    "dqn",
+    "dqn_efficient",
+    "drqn",
+    "imagination",
+    "imagination_uncertainty",
+    "imagination_only",
+    "imagination_only_uncertainty",
+)
+_WEIGHED = {"imagination.confidence_scale": 0.5}
+"""With it transitions are weighed by their uncertainty, which else only the filter reads."""
 
 
 def other(setting: str, value: Any, allowed: Any) -> dict[str, Any]:
@@ -101,7 +107,15 @@ def learned(agent: str, settings: tuple[tuple[str, Any], ...] = ()) -> dict[str,
     return {"actions": actions, **values, **arrays}
 
 
-@pytest.mark.parametrize(("agent", "setting"), [(agent, name) for agent in INERT for name in settings_of(agent)])
+@pytest.mark.parametrize(("agent", "setting"), [(agent, name) for agent in AGENTS for name in settings_of(agent)])
 def test_a_setting_changes_what_is_learned(agent: str, setting: str) -> None:
     changed = other(setting, *settings_of(agent)[setting])
-    assert (learned(agent, tuple(changed.items())) == learned(agent)) == (setting in INERT[agent])
+    base = _WEIGHED if setting == "imagination.accumulates" else {}
+    same = learned(agent, tuple({**base, **changed}.items())) == learned(agent, tuple(base.items()))
+    assert same == (setting in registry.inert_settings(agent))
+    if same:
+        value = json.dumps(changed[setting])
+        with pytest.raises(InvalidValueError, match=f"Setting {setting} has no effect on agent {agent}"):
+            plan("arrow_puzzle", "smoke", agents=(f"{agent}:{setting}={value}",))
+        with pytest.raises(InvalidValueError, match=f"Setting {setting} has no effect on any agent"):
+            plan("arrow_puzzle", "smoke", agents=(agent,), overrides=tuple(changed.items()))

@@ -15,6 +15,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from bench_fakes import RulesImaginer
+from imagine_bench.tasks.arrows.rules import ArrowRules
 from numpy.typing import NDArray
 from recordings import contents
 from rerun.chunk import RrdReader
@@ -29,7 +30,7 @@ from imagine_bench.judge.plans import PlanResult, carry_out, make_env, make_plan
 from imagine_bench.protocols.control import protocol
 from imagine_bench.protocols.data import RunSpec
 from imagine_bench.recording.plans import record_plans
-from imagine_bench.rules import fewest_actions
+from imagine_bench.rules import Outcome, fewest_actions
 from imagine_bench.running.bench import bench
 from imagine_bench.running.trained import Trained
 from imagine_bench.tools.audits import plan_report, summarise, write_plans
@@ -83,6 +84,23 @@ def _world() -> Iterator[None]:
     with closing(make_env(trained(None), "kinematic")) as env:
         Dreamer.env = env
         yield
+
+
+class Hopeless(ArrowRules):
+    """The rules of the task, which say of no outcome that it is a success."""
+
+    def outcomes(self, macrostate: State, action: int) -> tuple[Outcome, ...]:
+        return tuple(dataclasses.replace(each, success=False) for each in super().outcomes(macrostate, action))
+
+
+def test_a_start_that_the_rules_cannot_solve_has_no_shortest_plan(tmp_path: Path) -> None:
+    task = dataclasses.replace(TASK, rules=Hopeless())
+    whose = dataclasses.replace(trained(Dreamer(TASK.rules.optimal_action)), task=task)
+    plan = carry_out(Dreamer.env, whose, 0)
+    assert (plan.shortest, plan.outcome, plan.optimal) == (None, "solved", False)
+    write_plans(tmp_path, [plan], TASK, {})
+    (row,) = csv.DictReader((tmp_path / "plans.csv").read_text().splitlines())
+    assert (row["shortest"], row["solved"], row["optimal"]) == ("", "1", "0")
 
 
 def carried_out(dreamer: Dreamer, count: int, seed: int = 0, **options: Any) -> list[PlanResult]:

@@ -12,7 +12,7 @@ from safetensors.numpy import save_file
 from small_runs import Inline
 
 from imagine_bench import registry
-from imagine_bench.errors import ArtefactError, ImagineBenchError
+from imagine_bench.errors import ArtefactError, ImagineBenchError, UnableError
 from imagine_bench.report import bench_page
 from imagine_bench.running.bench import bench, plan
 from imagine_bench.store import encoders
@@ -56,6 +56,25 @@ def test_what_looks_otherwise_is_trained_for_itself(trained):
     for settings in ({"config_group": "chapter_3"}, {"preprocessing": "small_rgb"}):  # encoders are trained otherwise
         spec = dataclasses.replace(registry.task("arrows:cubes=2"), **settings)
         assert encoders.cached(spec, "clean", "codes") not in places
+
+
+@pytest.mark.parametrize(
+    ("agent", "option", "reason"),
+    [
+        ("dqn", {"queries": 1}, "cannot query an oracle"),
+        ("dqn_codes", {"queries": 1}, "cannot query an oracle"),
+        ("dqn", {"after": ("arrows:cubes=2,goal=01",)}, "has no model of the world"),
+        ("sb3_dqn_latents", {"demonstrations": 1}, "trains in a loop of its own"),
+        ("sb3_dqn_latents", {"feedback": 1.0}, "trains in a loop of its own"),
+    ],
+)
+def test_no_encoder_is_trained_for_an_unable_agent(trained, agent, option, reason):
+    with pytest.raises(UnableError, match=reason):
+        plan("arrows:cubes=2", "smoke", agents=("random", agent), **option)
+    assert not trained
+    with pytest.raises(ArtefactError):  # the encoder of this test is an empty file
+        plan("arrows:cubes=2", "smoke", agents=("imagination",), demonstrations=1)
+    assert trained, "an able agent needs it"
 
 
 @pytest.mark.parametrize("name", ["arrows", "arrows:slip=0.2", "arrows:goal=012,forbid=none"])

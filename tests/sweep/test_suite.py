@@ -195,3 +195,7 @@ def test_settings_of_physics_are_a_table_in_a_level():
     fields = {"physics": {"pad_friction": 0.5}, "execution": "physics"}
     ((planned, _), *_) = plan_level(TINY, Level(name="smooth", task="arrows", protocol=fields), "table")
     assert planned.physics == (("pad_friction", 0.5),)
+    for wrong in (["pad_friction=0.5"], "pad_friction=0.5", [["pad_friction"]], 1):
+        level = Level(name="smooth", task="arrows", protocol={**fields, "physics": wrong})
+        with pytest.raises(InvalidValueError, match=r"^physics is .*; give a table of settings, such as pad_friction"):
+            plan_level(TINY, level, "table")

@@ -10,14 +10,48 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from guest_packages import Guests
 from PIL import Image
 
 from imagine_bench import registry
+from imagine_bench.errors import InvalidValueError
 from imagine_bench.judge.worlds.making import whole_world
 from imagine_bench.rules import states_of_play
 from imagine_bench.tools.quiz import quiz
 
 EASY = "arrow_puzzle_easy"
+_TINY = """
+import numpy as np
+from imagine_bench.interfaces import Outcome, TaskSpec
+from imagine_bench.registry import TaskEntry
+from imagine_bench.rules import facts
+
+class Rules:
+    n_actions = 1
+    states = ((0,), (1,))
+    start_states = ((0,),)
+    def outcomes(self, macrostate, action):
+        return (self.judge(macrostate, action, (1,)),)
+    def judge(self, macrostate, action, reached):
+        return Outcome(1.0, reached, 1.0, terminated=True, success=True)
+    def is_legal(self, macrostate):
+        return True
+    def is_terminal(self, macrostate):
+        return macrostate == (1,)
+    def optimal_action(self, macrostate):
+        return 0
+
+def frames(macrostates, appearance, rng):
+    return np.zeros((len(macrostates), 64, 64, 3), dtype=np.uint8)
+
+SPEC = TaskSpec(
+    id="tiny", title="Tiny", description="One button.", env_id="tiny/Tiny-v0", horizon=1, action_names=("press",),
+    macrostate_names=("lamp",), macrostate_values=(("off", "on"),), preprocessing="small_rgb", encoder="tiny",
+    rules=Rules(), facts=lambda: facts(Rules(), 1), render_macrostates=frames,
+)
+ENTRY = TaskEntry(spec="tiny:SPEC", env_id="tiny/Tiny-v0", env="tiny:Env", horizon=1)
+"""
+"""A world of one macro-action, of which nothing can be asked."""
 
 
 def typed(*words: str) -> Callable[[str], str]:
@@ -62,3 +96,10 @@ def test_a_person_is_asked_until_the_last_question_or_until_leaving(
     assert all(np.asarray(Image.open(image)).std() > 1.0 for image in images)
     assert "Masked frame. First “" in capsys.readouterr().out
     assert quiz(EASY, 1, ask=typed(), judged=tmp_path, folder=tmp_path) == "No question was answered."
+
+
+def test_a_world_too_small_for_questions_is_refused(guests: Guests, tmp_path: Path) -> None:
+    guests.write("tiny", _TINY, {registry.TASK_GROUP: {"tiny": "tiny:ENTRY"}})
+    with pytest.raises(InvalidValueError, match="tiny is too small a world to ask anything about"):
+        quiz("tiny", 1, ask=typed(), judged=tmp_path, folder=tmp_path / "images")
+    assert not (tmp_path / "images").exists()

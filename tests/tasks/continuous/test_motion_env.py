@@ -14,6 +14,7 @@ from imagine_bench.tasks.arrows.world import MAX_OFF_SLOT_M
 from imagine_bench.tasks.continuous.controls import CONTROL_NAMES
 from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
+from imagine_bench.tasks.continuous.referee import FAULT_REWARD
 from imagine_bench.tasks.continuous.segments import least_seconds, measure, move_aside
 from imagine_bench.tasks.world import Reading
 
@@ -128,6 +129,22 @@ def test_dense_rewards_sum_to_sparse_ones_less_the_potential(family: str) -> Non
                 early = max(early, paid[0])
     assert paid[0] == pytest.approx(paid[1] - begun, abs=1e-9)
     assert early > 0.6
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_dense_reward_keeps_no_potential_after_a_fault(family: str) -> None:
+    """The episode ends in a macrostate from which the rules would go on; the fault costs what it costs, and no more."""
+    env, _ = environment(family, reward="dense", **FREE[family])
+    env.reset(seed=3, options={"macrostate": STARTS[family]})
+    begun = env.episode.potential
+    still = np.zeros(7, dtype=np.float32)
+    paid = env.step(still)[1]
+    assert begun < 0 and not env.task.rules.is_terminal(env.episode.macrostate)
+    env.data.qpos[env.world.object_qpos[1, 2]] -= 0.2
+    _, reward, terminated, _, info = env.step(still)
+    assert terminated and "fell off the table" in info["fault_reason"]
+    assert not env.task.rules.is_terminal(env.episode.macrostate)
+    assert paid + reward == pytest.approx(FAULT_REWARD - begun, abs=1e-9)
 
 
 def test_an_object_held_at_the_start_does_not_slip() -> None:
