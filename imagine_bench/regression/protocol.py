@@ -59,7 +59,7 @@ class RegressionProtocol(ProtocolData):
         return {**dict(self.overrides), **parse_configuration(agent).settings}
 
 
-PRESETS: Mapping[str, Mapping[str, Any]] = {
+PRESETS: Mapping[str, Mapping[str, Setting]] = {
     "smoke": {"hyperparameters": "minimal", "networks": 2, "test_points": 50},
     "quick": {},
     "thesis": {"hyperparameters": "published", "networks": 10},

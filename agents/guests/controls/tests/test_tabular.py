@@ -218,6 +218,16 @@ def test_each_reading_sees_its_own_state_alone() -> None:
         read_macrostate(Observation(frame=shown.frame))
 
 
+def test_a_restored_table_plans_anew() -> None:
+    """What it planned before is of other counts."""
+    learner, other = sampler(), sampler()
+    learner.observe(moved(0, 1, 5.0, 1, ended=True), episode=0)
+    other.observe(moved(0, 0, 7.0, 1, ended=True), episode=0)
+    assert [each.act(at(0), explore=False) for each in (learner, other)] == [1, 0]
+    other.restore(learner.state())
+    assert other.act(at(0), explore=False) == 1
+
+
 def test_posterior_sampling_keeps_one_model_for_an_episode() -> None:
     learner = sampler()
     learner.observe(moved(0, 0, 1.0, 1, cut=True), episode=0)
