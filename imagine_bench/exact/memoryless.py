@@ -8,8 +8,10 @@ HiGHS solves it by branch and bound; its solution is then improved one action at
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +26,7 @@ SOLVED = 8_000
 """Occupancies up to which a policy is looked for, and up to which the programme is solved."""
 NODES = 20
 _GAIN = 1e-7
+_STDOUT, _STDERR = 1, 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,16 +190,33 @@ def _solve(layers: list[_Layer], choices: dict[tuple[State, int], int]) -> tuple
             gain[at], most[at] = layer.wins[pair], weight
     values, rows, columns = zip(*entries, strict=True)
     matrix = sparse.coo_array((values, (rows, columns)), shape=(len(low), total)).tocsr()
-    found = optimize.milp(
-        -gain,
-        integrality=np.arange(total) < len(choices),
-        bounds=optimize.Bounds(0.0, most),
-        constraints=optimize.LinearConstraint(matrix, np.array(low), np.array(high)),
-        options={"node_limit": NODES, "mip_rel_gap": 0.0},
-    )
+    with _remarks_aside():
+        found = optimize.milp(
+            -gain,
+            integrality=np.arange(total) < len(choices),
+            bounds=optimize.Bounds(0.0, most),
+            constraints=optimize.LinearConstraint(matrix, np.array(low), np.array(high)),
+            options={"node_limit": NODES, "mip_rel_gap": 0.0},
+        )
     policy = {} if found.x is None else {shown: action for (shown, action), at in choices.items() if found.x[at] > 0.5}
     bound = 1.0 if found.mip_dual_bound is None else min(1.0, -found.mip_dual_bound)
     return policy, bound
+
+
+@contextmanager
+def _remarks_aside() -> Iterator[None]:
+    """HiGHS writes remarks on its search to standard output, whatever it is told: they go to standard error."""
+    try:
+        kept = os.dup(_STDOUT)
+        os.dup2(_STDERR, _STDOUT)
+    except OSError:  # one of them is closed
+        yield
+        return
+    try:
+        yield
+    finally:
+        os.dup2(kept, _STDOUT)
+        os.close(kept)
 
 
 def _tables(layers: list[_Layer], numbers: dict[State, int]) -> list[_Table]:

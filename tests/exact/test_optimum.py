@@ -176,3 +176,13 @@ def test_too_many_beliefs_leave_a_bound_and_say_so(monkeypatch):
     monkeypatch.setattr("imagine_bench.exact.beliefs.MOST", 5)
     found = certificate(spec_of(Wheels(n=2, goal_change=0.3), 3, Glimpse(finger="first")))
     assert found.beliefs is None and found.optimum == found.seen_optimum
+
+
+def test_remarks_of_the_solver_are_no_output(capfd):
+    """HiGHS prints them whatever it is told; standard output is that of tables and of servers."""
+    spec = registry.task("pick_place:goal_change=0.1,lag=1")
+    best_without_memory(spec.rules, spec.sight, spec.horizon, bound=1.0)
+    print("a table", flush=True)
+    said = capfd.readouterr()
+    assert said.out == "a table\n"
+    assert "HighsMipSolverData" in said.err, "it has learned to be silent: no need to put its remarks aside"
