@@ -5,21 +5,26 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from collections import defaultdict
 
 import numpy as np
 import pytest
-from judged import STILL, judged_world
+from judged import STILL, Altered, asked_pairs, judged_world
 
-from imagine_bench.arrays import Floats
-from imagine_bench.interfaces import State
-from imagine_bench.interfaces.model import WorldModel
+from imagine_bench.arrays import Floats, Frame, Ints
+from imagine_bench.interfaces import State, TaskSpec
+from imagine_bench.interfaces.model import Imagined, WorldModel
 from imagine_bench.judge import questions
 from imagine_bench.judge.policies.acceptance import ALPHA, acceptance_scores, conformal_threshold, occupancies
 from imagine_bench.judge.policies.agreement import DenseModel, dense
 from imagine_bench.judge.policies.fidelity import fidelity, value_in_its_frames
 from imagine_bench.judge.policies.policy_set import PolicyWorld, policy_world
 from imagine_bench.judge.reading import RenderedFrameIndex
+from imagine_bench.judge.scores import acceptance_scores as scores_by_policy
 from imagine_bench.judge.scores import imagined_models, light_scores, risk_coverage
+from imagine_bench.rules import states_of_play
+from imagine_bench.running.collect import POLICIES
+from imagine_bench.seeding import SeedTree
 
 ARROWS = "arrows:cubes=2"
 
@@ -112,6 +117,48 @@ def test_the_guarantee_breaks_where_data_is_rare() -> None:
     found = planted(world, rare, knows=-1.0)  # it is surest where it is wrong
     assert often[rare > 0].sum() < 0.2
     assert found["wrong_on_data"] <= ALPHA < min(found["wrong_rare"], found["wrong_worst_policy"])
+
+
+def collected(spec: TaskSpec, policy: str) -> dict[tuple[State, int], float]:
+    """How often a policy takes each macro-action, up to a factor: every course of its episodes."""
+    found = defaultdict[tuple[State, int], float](float)
+    starts, steps = (states_of_play(spec.rules), 1) if policy == "uniform" else (spec.rules.start_states, spec.horizon)
+    reached = dict.fromkeys(starts, 1.0)
+    for _ in range(steps):
+        after = defaultdict[State, float](float)
+        for (state, share), action in itertools.product(reached.items(), range(spec.n_actions)):
+            found[state, action] += share
+            for outcome in spec.rules.outcomes(state, action):
+                after[outcome.macrostate] += share * outcome.probability * (not outcome.terminated) / spec.n_actions
+        reached = after
+    return found
+
+
+@pytest.mark.parametrize("policy", [*POLICIES, ""])
+def test_the_scores_are_those_of_the_transitions_that_a_policy_collects(policy: str) -> None:
+    """Those of other policies, and of none, are not known."""
+    judged, world = judged_world(ARROWS), world_of(ARROWS)
+
+    def alter(found: Imagined, frames: Frame, actions: Ints) -> Imagined:
+        """Nothing comes of the first macro-action; it is no surer of one transition than of another."""
+        pictures = found.pictures.copy()
+        missed = [action == 0 for _, action in asked_pairs(judged, frames, actions)]
+        pictures[missed] = frames[missed, -1][:, None, None]
+        return dataclasses.replace(found, pictures=pictures, epistemic=frames[:, -1, 1, : actions.shape[1], 0] / 255.0)
+
+    predictions = judged.predictions(Altered(judged, alter), judged.one_step)
+    found = scores_by_policy(world, policy, judged.one_step, predictions, SeedTree(0))
+    if policy not in ("random", "uniform"):
+        assert all(map(math.isnan, found.values()))
+        return
+    counts = collected(judged.spec, policy)
+    data = np.array([[counts[state, action] for action in range(judged.spec.n_actions)] for state in world.states])
+    uncertainty = predictions.of_one_step("epistemic")
+    assert uncertainty is not None
+    wrong = np.array([action == 0 for _, action in judged.one_step.pairs])
+    expected = acceptance_scores(world, data / data.sum(), uncertainty, wrong, SeedTree(0).generator())
+    assert found == pytest.approx({f"conformal_{name}": value for name, value in expected.items()})
+    assert found["conformal_wrong_on_data"] > 0.0
 
 
 def test_the_risk_coverage_area_is_that_by_hand() -> None:
