@@ -185,7 +185,7 @@ class PickWorld(World):
             return PLACED, f"{name} stands {1e3 * off_m:.0f} mm off its place"
         if not spec.upright:
             return PLACED, None
-        turned_rad = abs(orientation.yaw_rad(*pose[3:]) - self.places[index][2])
+        turned_rad = abs(math.remainder(orientation.yaw_rad(*pose[3:]) - self.places[index][2], 2 * math.pi))
         skewed = f"{name} is turned by {math.degrees(turned_rad):.0f} degrees" if turned_rad > MAX_SKEW_RAD else None
         return PLACED, self._tipped(index, pose) or skewed
 

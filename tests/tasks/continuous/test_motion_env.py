@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 from unittest import mock
@@ -16,7 +17,8 @@ from imagine_bench.tasks.continuous.env import MotionEnv
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench.tasks.continuous.referee import FAULT_REWARD
 from imagine_bench.tasks.continuous.segments import least_seconds, measure, move_aside
-from imagine_bench.tasks.world import Reading
+from imagine_bench.tasks.motion.orientation import about_vertical
+from imagine_bench.tasks.world import Reading, World
 
 from imagine_bench.arrays import Floats
 from imagine_bench.errors import InvalidValueError
@@ -202,6 +204,38 @@ def test_a_placement_moves_each_object_and_reads_as_before(family: str, options:
     assert placed.world.places != places
     placed.reset(seed=99)
     assert placed.world.places == places
+
+
+YAWS_DEG = (2, 23, 43, 67, 88, 108, 113, 158, 178)
+"""Turns of an object, none of them by a limit, from its place."""
+
+
+def readings(world: World, index: int, pose: list[float], values: range) -> tuple[object, ...]:
+    """The value and the fault of an object's pose, and its values in the hand and its progress from and to values."""
+    in_hand = tuple(world.value_in_hand(index, pose, before, gripped=True) for before in values)
+    progress = tuple(round(world.progress(index, pose, 0, after), 9) + 0.0 for after in values)
+    return *world.read_object(index, pose), in_hand, progress
+
+
+@pytest.mark.parametrize(("family", "values"), [("arrows", range(4)), ("pick_place", range(2))])
+def test_readings_of_an_object_refer_to_its_place(family: str, values: range) -> None:
+    """An object that is moved and turned with its place is read as before."""
+    world = FAMILIES[family](observation="proprio", **FREE[family]).world
+    slots = world.places
+    starts = world.object_poses()[:, :3]
+    drawn = [(0.03, -0.02, math.radians(5.0)), (-0.025, 0.01, math.radians(-4.0)), (0.01, 0.03, math.radians(3.0))]
+    faults = set()
+    for index, yaw_deg, off_m in itertools.product(range(3), YAWS_DEG, (0.0, 0.01, 0.04)):
+        found = []
+        for places in (slots, drawn):
+            world.places = tuple(places)
+            x_m, y_m, turned_rad = places[index]
+            position_m = starts[index] + (x_m + off_m, y_m, off_m / 2)
+            pose = [*position_m.tolist(), *about_vertical(math.radians(yaw_deg * (-1) ** index) + turned_rad)]
+            found.append(readings(world, index, pose, values))
+        assert found[1] == found[0]
+        faults.add(found[0][1])
+    assert len(faults) > 6
 
 
 def test_a_turned_cube_belongs_to_the_place_of_its_start() -> None:

@@ -12,7 +12,7 @@ import pytest
 from imagine_bench.tasks.continuous.expert import Expert
 from imagine_bench.tasks.continuous.spec import make_arrows
 from imagine_bench_motion.cloned_env import CloneExecutedEnv
-from imagine_bench_motion.control.goals import GoalEnv, make
+from imagine_bench_motion.control.goals import WITHIN_M, GoalEnv, make
 from imagine_bench_motion.judge.judgement import MotionJudgement
 from stable_baselines3.common.env_checker import check_env
 
@@ -49,6 +49,28 @@ def test_a_goal_is_reached_by_the_optimal_macro_actions_alone(task: str, start: 
     relabelled = goals.compute_reward(achieved, np.broadcast_to(achieved[-1], achieved.shape), {})
     assert relabelled[-1] == 0.0
     assert relabelled[0] == -1.0
+
+
+@pytest.mark.parametrize(
+    ("task", "start", "stay"), [("arrow_puzzle", (1, 2, 0, 1), [0, 1, 2]), ("pick_place", (0, 0, 0, 1), [0, 2])]
+)
+def test_a_goal_is_on_the_places_of_the_episode(task: str, start: tuple[int, ...], stay: list[int]) -> None:
+    """Objects that no macro-action carries away have their goal where they stand, as exactly as objects start.
+
+    Cubes are turned by quarters.
+    """
+    goals = make(task, placement=0.04)
+    level = goals.unwrapped.world.level
+    slots_m = make(task).reset(seed=0, options={"macrostate": start})[0]["achieved_goal"].reshape(-1, 5)[stay, :3]
+    off_m = []
+    for seed in range(3):
+        observation, _ = goals.reset(seed=seed, options={"macrostate": start})
+        now, then = (observation[name].reshape(-1, 5)[stay] for name in ("achieved_goal", "desired_goal"))
+        np.testing.assert_allclose(then[:, :3], now[:, :3], atol=2.0 * level.object_offset_m)
+        turned_rad = np.arctan2(then[:, 4], then[:, 3]) - np.arctan2(now[:, 4], now[:, 3])
+        assert (np.cos(4.0 * turned_rad) > np.cos(8.0 * level.object_yaw_rad)).all()
+        off_m.append(np.abs(now[:, :3] - slots_m).max())
+    assert max(off_m) > WITHIN_M
 
 
 class Unlucky:
