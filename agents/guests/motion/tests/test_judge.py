@@ -14,8 +14,9 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
+from guest_packages import Guests
 from imagine_bench.tasks.continuous.spec import make_arrows, make_pick_place
-from imagine_bench_motion.judge.interface import MotionModelEntry
+from imagine_bench_motion.judge.interface import GROUP, MotionModelEntry
 from imagine_bench_motion.judge.judgement import SIMULATOR, MotionJudgement, judge, judged
 from imagine_bench_motion.judge.labelled import Labelled
 from imagine_bench_motion.judge.no_change import NoChange
@@ -24,8 +25,10 @@ from imagine_bench_motion.judge.recurrent import MotionNetwork
 from imagine_bench_motion.judge.report import motion_rows, motion_tables
 from imagine_bench_motion.judge.scores import Simulator, score
 
+from imagine_bench import registry
 from imagine_bench.arrays import Array, Ints
 from imagine_bench.errors import ArtefactError, ImagineBenchError, InvalidValueError, UnknownNameError
+from imagine_bench.store.files import sealed, write_json
 
 
 @pytest.mark.parametrize("others", [{}, {"encoder_kind": "latents"}])
@@ -210,6 +213,24 @@ def test_a_judgement_goes_on_and_refuses_damaged_cells(tmp_path: Path) -> None:
     (folder / cell.file).write_bytes(first.replace(b'"right": 0.0', b'"right": 1.0'))
     with pytest.raises(ArtefactError, match="is damaged"):
         judge(more, tmp_path, workers=1)
+
+
+def test_a_model_whose_code_has_changed_is_judged_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    guests = Guests(tmp_path / "site", monkeypatch)
+    code = "from imagine_bench_motion.judge.interface import MotionModelEntry\n"
+    code += "ENTRY = MotionModelEntry(make='theirs:Model', level='commands', description='A model.')\n"
+    module = guests.write("theirs", code, {GROUP: {"theirs": "theirs:ENTRY"}}) / "theirs.py"
+    judgement = dataclasses.replace(FEW, models=("theirs", "no_change"))
+    for cell in judgement.cells:
+        made_by = registry.package_code("theirs:Model") if cell.model == "theirs" else ""
+        write_json(tmp_path / cell.file, sealed({**cell._asdict(), "questions": "1", "code": made_by}))
+    assert [cell["model"] for cell in judged(judgement, tmp_path)] == ["simulator", "theirs", "no_change"]
+    module.write_text(f"{code}# another version\n")
+    assert [cell["model"] for cell in judged(judgement, tmp_path)] == ["simulator", "no_change"]
+    before = sealed({"model": "theirs", "questions": "1"})  # of a version that kept no digest
+    write_json(tmp_path / judgement.cells[1].file, before)
+    assert [cell["model"] for cell in judged(judgement, tmp_path)] == ["simulator", "theirs", "no_change"]
+    guests.forget()
 
 
 def test_what_is_no_frame_is_refused() -> None:

@@ -122,17 +122,24 @@ def judge(judgement: MotionJudgement, root: Path, *, workers: int) -> tuple[Path
     """
     folder = make_folder(root / judgement.folder_name)
     stage(judgement, folder)
-    waiting = [cell for cell in judgement.cells if not _is_kept(folder, cell)]
+    waiting = [cell for cell in judgement.cells if _read(folder, cell) is None]
     failed = judge_fits(waiting, functools.partial(carry_out, judgement, folder), workers=workers)
     if any((folder / cell.file).exists() for cell in judgement.cells):
         write_json(folder / "judgement.json", {**asdict(judgement), **describe_environment()})
     return folder, failed
 
 
-def _is_kept(folder: Path, cell: ModelFit) -> bool:
-    """Whether a cell is there. Raises ArtefactError: it is damaged."""
+def _read(folder: Path, cell: ModelFit) -> dict[str, Any] | None:
+    """A cell as it is kept; None where it is not, or its model's code has changed. Raises ArtefactError: damaged."""
     file = folder / cell.file
-    return file.exists() and bool(read_sealed(file, "a judged cell"))
+    found = read_sealed(file, "a judged cell") if file.exists() else {"code": None}
+    now = _code(cell)
+    return found if found.get("code", now) == now else None
+
+
+def _code(cell: ModelFit) -> str:
+    """A digest of the package that offers a model; empty for one of this suite."""
+    return "" if cell == SIMULATOR else registry.package_code(motion_model_entry(cell.model).make)
 
 
 def carry_out(judgement: MotionJudgement, folder: Path, cell: ModelFit, tell: Callable[[str], None] = print) -> str:
@@ -153,7 +160,7 @@ def judge_cell(judgement: MotionJudgement, folder: Path, cell: ModelFit) -> dict
         ImagineBenchError: It cannot be made, or fails.
     """
     there = stage(judgement, folder)
-    known = {**cell._asdict(), "questions": there.digest}
+    known = {**cell._asdict(), "questions": there.digest, "code": _code(cell)}
     if cell == SIMULATOR:
         return {**known, **asdict(score(cell.model, Simulator(there.asked), there.asked, there.reader))}
     data = data_of(judgement, folder, cell.seed)
@@ -208,8 +215,7 @@ def judged(judgement: MotionJudgement, folder: Path) -> list[dict[str, Any]]:
     Raises:
         ArtefactError: One is damaged, or they answered different questions.
     """
-    kept = [folder / cell.file for cell in judgement.cells if (folder / cell.file).exists()]
-    cells = [read_sealed(file, "a judged cell") for file in kept]
+    cells = [each for cell in judgement.cells if (each := _read(folder, cell)) is not None]
     if len({cell["questions"] for cell in cells}) > 1:
         raise ArtefactError(
             f"The cells of {folder} answered different questions and cannot be compared; judge into another --out."
