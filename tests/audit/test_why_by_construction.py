@@ -8,15 +8,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
-from flawed_agents import Sound
+from flawed_agents import HalfBlind, Sound
 from small_runs import Inline, small
 
 from imagine_bench import registry
 from imagine_bench.cli import observers
 from imagine_bench.errors import ArtefactError, InvalidValueError
 from imagine_bench.interfaces import AgentContext, Rules, State
-from imagine_bench.interfaces.capabilities import FrameReader
 from imagine_bench.judge import causes as why
 from imagine_bench.protocols.control import protocol
 from imagine_bench.rules import states_of
@@ -83,24 +83,35 @@ def test_what_came_later_was_not_known_before(tmp_path: Path) -> None:
     assert "unexperienced" in found.causes.values()
 
 
-def test_a_course_is_what_was_seen_before_each_action(tmp_path: Path) -> None:
-    run = finished(tmp_path, "half_blind", CUBES, budgets=(20,))
-    (row,), agent, spec = run.checkpoints, load_trained(run.folder).agent, registry.task(CUBES)
-    assert isinstance(agent, FrameReader) and row.kept is not None
-    misread = list[list[bool]]()
+@pytest.mark.parametrize("hides", ["", ",gesture=first", ",gesture=0.5", ",lag=1"])
+def test_a_course_is_what_was_seen_before_each_action(hides: str) -> None:
+    """A frame is misread where the agent reads something else than it shows; a hidden part cannot be misread."""
+    Sound.task = CUBES + hides
+    spec = registry.task(Sound.task)
+    agent = HalfBlind(AgentContext(n_actions=4, preprocessing="", encoder=None, seeds=SeedTree(0)))
+    rng = np.random.default_rng(0)
+    misread, hidden = list[list[bool]](), list[bool]()
     with closing(gymnasium.make(spec.env_id, execution="kinematic")) as env:
-        for test in range(row.test_episodes):
-            seed = episode_seed("evaluation", 0, test)
-            episode = why.lived_again(env, agent, spec.rules, seed, row.kept.actions_of(test))
+        for seed in range(12):
             frame, info = env.reset(seed=seed)
-            states, read, terminated = [tuple(info["macrostate"].tolist())], [], False
-            for action in episode.actions:
-                read.append(tuple(agent.read_frames(frame[None])[0].tolist()))
-                frame, _, terminated, _, info = env.step(action)
-                states.append(tuple(info["macrostate"].tolist()))
-            misread.append([one != other for one, other in zip(read, states, strict=False)])
-            assert (episode.states, episode.misread, episode.terminated) == (states, misread[-1], terminated)
+            states, actions, wrong, hides_some, over = [info["macrostate"].tolist()], [], [], [], False
+            while not over and len(actions) < 5:
+                shown = info.get("shown", info["macrostate"]).tolist()
+                read = agent.read_frames(frame[None])[0].tolist()
+                wrong.append(any(one not in (other, -1) for one, other in zip(shown, read, strict=True)))
+                hides_some.append(-1 in shown)
+                outcomes = [spec.rules.outcomes(tuple(states[-1]), action)[0] for action in range(4)]
+                safe = [action for action, outcome in enumerate(outcomes) if not outcome.terminated]
+                actions.append(int(rng.choice(safe or range(4))))
+                frame, _, over, _, info = env.step(actions[-1])
+                states.append(info["macrostate"].tolist())
+            episode = why.lived_again(env, agent, spec.rules, seed, actions)
+            assert (episode.misread, episode.hidden, episode.terminated) == (wrong, hides_some, over)
+            assert list(map(list, episode.states)) == states and not any(episode.faults)
+            misread.append(wrong)
+            hidden += hides_some
     assert {True, False} == {each[0] for each in misread} and any(len(set(each)) == 2 for each in misread)
+    assert any(hidden) == ("gesture" in hides)
 
 
 def test_what_cannot_be_asked_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
